@@ -437,7 +437,7 @@ OWN: dict[str, dict[str, Any]] = {
         "processor_seconds": 1.0,
     },
     "evaluate": {"out": _new(""), "only": ("nothing",)},
-    "translate": {"source": STACK, "fps": 100.0, "duration_s": 0.001},
+    "translate": {"source": STACK, "duration_s": 0.001},
 }  # fmt: skip
 """Arguments of one callable, before those by name."""
 

@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,7 +14,7 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from amiwarp import Events, RecordingWriter
+from amiwarp import AmiwarpError, Events, RecordingWriter
 from amiwarp.io.hdf5_files import (
     CHUNK,
     ChunkFile,
@@ -114,6 +115,30 @@ def test_a_thread_that_fails_stops_the_others(tmp_path):
     pieces = [fail, *[lambda: (events, flags, {})] * 8]
     with pytest.raises(ValueError, match="no events"), RecordingWriter(tmp_path / "a.h5", width=9, height=9) as writer:
         writer.fill(pieces, count=CHUNK, t_first=0, done=lambda *_: None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_error_of_a_later_thread_is_raised_in_its_turn(tmp_path, monkeypatch):
+    """Not one of the threads before it, which it does not stop."""
+    failed = threading.Event()
+
+    def fail():
+        failed.set()
+        raise ValueError("no events")
+
+    def wait():
+        failed.wait(60)
+        return events, flags, {}
+
+    monkeypatch.setattr("amiwarp.tasks.cpu_threads", lambda: 4)
+    flags, zeros = np.ones(CHUNK, np.uint8), np.zeros(CHUNK, np.uint16)
+    events = Events(zeros, zeros, zeros.astype(np.int64), flags)
+    written = []
+    writer = RecordingWriter(tmp_path / "a.h5", width=9, height=9)
+    with pytest.raises(AmiwarpError, match="after it failed"), writer:  # noqa: PT012
+        with pytest.raises(ValueError, match="no events"):
+            writer.fill([wait, wait, fail], count=CHUNK, t_first=0, done=lambda *piece: written.append(piece))
+        assert len(writer) == len(written) * CHUNK == 2 * CHUNK
     assert list(tmp_path.iterdir()) == []
 
 

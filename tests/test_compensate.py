@@ -25,7 +25,10 @@ from amiwarp import (
     ExactModel,
     Fisheye,
     FlatSide,
+    ImuSamples,
     MemoryEvents,
+    MemoryImages,
+    Poses,
     Prism,
     RadialTangential,
     Recording,
@@ -272,6 +275,29 @@ def test_a_fault_in_the_middle_of_a_file_leaves_nothing(
     assert list(tmp_path.iterdir()) == [tmp_path / "in.h5"]
 
 
+def test_a_native_file_gets_the_calibrated_camera_and_what_is_still_true(
+    recording: Recording, exact: Calibration, tmp_path: Path
+) -> None:
+    imu = ImuSamples(np.array([0, 1000]), np.zeros((2, 3)), np.ones((2, 3)))
+    poses = Poses(np.array([0, 1000]), np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1)))
+    width, height = recording.events.size
+    frames = MemoryImages(np.array([500]), np.zeros((1, height, width), np.uint8))
+    assert recording.truth is not None
+    assert exact.camera != (better := replace(exact.camera, fx=500.0, fy=500.0))
+    given = replace(recording, imu=imu, frames=frames, truth=replace(recording.truth, poses=poses))
+    calibration = replace(exact, parameters={**exact.parameters, "focal_length": 500.0})
+    out = tmp_path / "out.h5"
+    assert compensate(given, calibration, out).left_out == ("ground truth of events", "frames")
+    found = open_recording(out)
+    assert found.camera == better
+    assert found.imu is not None
+    np.testing.assert_array_equal(found.imu.acceleration, imu.acceleration)
+    assert found.truth is not None
+    assert found.truth.poses is not None
+    np.testing.assert_array_equal(found.truth.poses[:].camera, poses.camera)
+    assert found.frames is None
+
+
 def test_empty_recording(recording: Recording, calibration: Calibration, tmp_path: Path) -> None:
     empty = replace(recording, events=MemoryEvents(Events.empty(), *recording.events.size), truth=None)
     summary = compensate(empty, calibration, tmp_path / "empty.h5")
@@ -333,6 +359,14 @@ def native(
     summary = compensate(turn, exact, path, on_block=blocks.append)
     assert sum(map(len, blocks)) == summary.events
     return path, summary
+
+
+@pytest.mark.parametrize("file", ["again.h5", "again.npz"])
+def test_compensated_recordings_are_not_compensated_again(
+    exact: Calibration, native: tuple[Path, CompensationSummary], tmp_path: Path, file: str
+) -> None:
+    with pytest.raises(AmiwarpError, match=r"^native: its events are already compensated; give those of the sensor"):
+        compensate(open_recording(native[0]), exact, tmp_path / file)
 
 
 @pytest.mark.parametrize("file", FORMATS)

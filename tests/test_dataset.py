@@ -218,6 +218,27 @@ def test_what_a_changed_specification_leaves_is_reported(place: Path) -> None:
     assert make(place).made == 2
 
 
+def test_a_recording_moves_to_the_folder_of_its_split(place: Path) -> None:
+    """No recording stays in the folder of its old split, where it would mix test and training data."""
+    halves = "splits = {train = 0.5, test = 0.5}\nduration_s"
+    (place / "spec.toml").write_text(BASE.replace("duration_s", halves, 1) + PICTURES)
+    make(place)
+    before = checksums(place)
+    (place / "spec.toml").write_text(BASE.replace("duration_s", f"split_seed = 5\n{halves}", 1) + PICTURES)
+    items = list_items(load_specification(place / "spec.toml"))
+    moved = sorted({item.file for item in items} - set(before))
+    damaged = place / "out" / next(file for file in before if file.endswith(moved[0].split("/")[1]))
+    damaged.write_bytes(damaged.read_bytes()[:-1] + b"x")
+    assert amiwarp.plan_dataset(place / "spec.toml", place / "out", workers=1).missing == 0
+    again = make(place)
+    assert (again.made, again.kept, again.not_in_specification) == (1, 11, ())
+    after = checksums(place)
+    assert set(after) == {item.file for item in items} == {item["file"] for item in manifest(place)["items"]}
+    assert sorted(after.values()) == sorted(before.values())
+    assert len(moved) > 2
+    assert make(place).kept == 12
+
+
 def test_a_failure_is_reported_and_does_not_stop_the_rest(place: Path) -> None:
     (place / "pictures" / "disc" / "bad.png").write_bytes(b"no picture")
     result = run(place / "spec.toml", place / "out", "--workers", "1", "--device", "cpu", "--json")
@@ -599,6 +620,8 @@ def arrays_of(arrays: dict[str, np.ndarray], labels: dict[str, Any]) -> dict[str
         ('{representation = "voxels"}', "field output.representation is 'voxels'; choose among event_count"),
         ('{representation = "voxel_grid"}', "field output.bins is missing; voxel_grid needs it"),
         ('{representation = "voxel_grid", bins = 0}', "field output.bins = 0 is not a whole number"),
+        ('{representation = "voxel_grid", bins = 2000000}', "field output.bins = 2000000 is not a whole number in 1"),
+        ('{representation = "event_count", t_start = 5, t_end = 1}', "field output.t_end is 1 us, before output.t_st"),
         ('{representation = "event_count", bins = 3}', "field output.bins does not apply to event_count; remove it"),
         ('{representation = "stacked_histogram", bins = 3, limit = 300}', "field output.limit = 300 is not"),
         ('{representation = "time_surface", tau_us = 0.0}', r"field output.tau_us = 0\.0 is not"),
@@ -668,7 +691,8 @@ def test_other_sources(place: Path, recording: amiwarp.Recording) -> None:
     (place / "tile.toml").write_text(
         'format = "amiwarp-world"\nversion = 1\nbodies = [{name = "tile", mesh = "tile.obj"}]\n'
     )
-    (place / "labels.csv").write_text("file,speed,code,name\nreal.h5,1.5,007,a\nother.h5,2,1,b\n")
+    table = "file,speed,code,name\nreal.h5,1.5,007,a\nother.h5,2,1,b\n"
+    (place / "labels.csv").write_text(table, encoding="utf-8-sig")  # as Excel's "CSV UTF-8"
     (place / "spec.toml").write_text(
         HEAD + "duration_s = 0.01\nprisms = [{apex_deg = 1.0}]\nspeeds_rpm = [900.0]\ntruth_hz = 200.0\n"
         'sensors = [{name = "mine", preset = "gen4", refractory_us = 5.0}]\n'
@@ -789,6 +813,7 @@ def test_an_invented_journal_is_not_trusted(place: Path) -> None:
     for line in lines[3:5]:
         append_line(journal, {**line, "sha256": "1" * 64})  # anybody can compute the checksum of a line
     append_line(journal, {**lines[5], "file": "../secret.h5", "key": "0" * 16})
+    append_line(journal, {**lines[5], "file": lines[6]["file"]})
     append_line(journal, {**lines[5], "events": 10**300})
     append_line(journal, {**lines[5], "colour": "red"})
     for line in (lines[6], lines[6], lines[7]):
@@ -797,7 +822,7 @@ def test_an_invented_journal_is_not_trusted(place: Path) -> None:
     done = make(place)
     assert (done.made, done.kept, done.failed) == (10, 2, {})
     assert len(done.damaged) == 3
-    assert "line 1: field checksum is missing; 7 lines are damaged" in done.damaged[0]
+    assert "line 1: field checksum is missing; 8 lines are damaged" in done.damaged[0]
     assert "does not have the checksum of journal.jsonl" in done.damaged[1]
     assert {item["file"]: item["sha256"] for item in manifest(place)["items"]} == checksums(place) == before
     journal.unlink()
@@ -880,6 +905,35 @@ def test_a_mesh_or_a_file_of_poses_that_changed_is_seen(place: Path) -> None:
         (place / "poses.csv").write_text(poses)
         keys |= {item.key for item in list_items(load_specification(place / "spec.toml"))}
     assert len(keys) == 3 * 2
+
+
+def test_what_a_mesh_names_is_part_of_its_world(place: Path) -> None:
+    """A changed texture of an OBJ file changes the recordings, and one that cannot be read stops only them."""
+    (place / "spec.toml").write_text(BASE + '[[sources]]\nworld_files = "w.toml"\n')
+    (place / "w.toml").write_text('bodies = [{mesh = "tile.obj"}]\n')
+    (place / "tile.obj").write_text(
+        "mtllib tile.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n"
+    )
+    keys = []
+    for name, grey in (("t.png", 0), ("t.png", 9), ("t.png\nKs 0 0 0", 9), ("no.png", 9)):
+        (place / "tile.mtl").write_text(f"newmtl a\nmap_Kd {name}\n")
+        Image.new("L", (4, 4), grey).save(place / "t.png")
+        keys.append(list_items(load_specification(place / "spec.toml"))[0].key)
+    assert len(set(keys)) == 4
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("file,a,a\npictures/disc/0.png,1,2\n", "has the column 'a' twice; give each label one column"),
+        ("file,a\nx.png,1\n./x.png,2\n", r"has the file '.*x\.png' twice; keep one row of it"),
+    ],
+)
+def test_a_table_with_two_labels_for_one_file_is_refused(place: Path, table: str, message: str) -> None:
+    (place / "labels.csv").write_text(table)
+    (place / "spec.toml").write_text(BASE + '[[sources]]\npictures = "pictures/*/*.png"\nlabel_table = "labels.csv"\n')
+    with pytest.raises(AmiwarpError, match=f"labels.csv: .*{message}"):
+        list_items(load_specification(place / "spec.toml"))
 
 
 def test_the_specification_of_the_guide(place: Path) -> None:

@@ -224,6 +224,39 @@ def test_what_cannot_be_exported_is_named(made: Path, tmp_path: Path) -> None:
     assert export_dataset(made, out, "webdataset").events == 143
 
 
+def renamed(made: Path, files: tuple[str, ...]) -> Path:
+    """Return the data set with other names for its first recordings."""
+    manifest = json.loads((made / "manifest.json").read_text())
+    for item, file in zip(manifest["items"], files, strict=False):
+        (made / item["file"]).rename(made / file)
+        item["file"] = file
+    (made / "manifest.json").write_text(json.dumps(manifest))
+    return made
+
+
+def test_samples_of_one_name_are_told_apart(made: Path, tmp_path: Path) -> None:
+    """WebDataset's names have no blank, no letter beyond ASCII and no ending."""
+    files = ("train/a b.h5", "train/a_b.h5", "猫.h5", "狗.h5", "train/c.h5")
+    done = export_dataset(renamed(made, files), tmp_path / "out", "webdataset")
+    found = {}
+    for file in done.files:
+        with tarfile.open(tmp_path / "out" / file) as archive:
+            names = archive.getnames()
+            assert len(set(names)) == len(names) == 2 * done.splits[file.rsplit("-", 1)[0]]
+            found |= {json.load(archive.extractfile(n) or io.BytesIO())["file"]: n for n in names if n.endswith("json")}
+    assert found["train/c.h5"] == "train_c.json"
+    assert found["train/a b.h5"].startswith("train_a_b-")
+
+
+def test_labels_of_several_types_are_no_column(made: Path, tmp_path: Path) -> None:
+    manifest = json.loads((made / "manifest.json").read_text())
+    manifest["items"][0]["labels"]["k"] = "none"
+    (made / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(AmiwarpError, match=r"manifest\.json: label_k of the items is no column of a table .*; give "):
+        export_dataset(made, tmp_path / "out", "parquet")
+    assert export_dataset(made, tmp_path / "out", "webdataset").events == 143
+
+
 def test_rows_are_written_in_groups(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import pyarrow.parquet
 

@@ -39,11 +39,18 @@ def large(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("amiwarp.io.prophesee.EVT_BLOCK", 500)
 
 
+def write_later_start(path: Path, events: Events) -> None:
+    """Write a RAW file whose words count from 7 ms on."""
+    header = "% evt 2.1\n% geometry 320x240\n% t0 7000\n"
+    write_evt21(path, Events(events.x, events.y, events.t - 7000, events.p), header=header)
+
+
 WRITERS: dict[str, Any] = {
     # name: (ending, writer, whether the end of the file tells the last time)
     "dat": ("dat", write_dat, True),
     "aedat2": ("aedat", write_aedat2, True),
     "evt21": ("raw", write_evt21, True),
+    "evt21 from t0": ("raw", write_later_start, True),
     "text": ("txt", write_text, True),
 }
 

@@ -140,6 +140,16 @@ def test_the_order_of_cameras_and_the_room_do_not_matter(
         same(of_camera(parts, camera), of_camera(others, place))
 
 
+def test_numbers_of_cameras_and_pixels_need_not_be_powers_of_two(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in 520 cameras of 130 x 130 px, rounding both up leaves no bit of a key for the time."""
+    images = np.random.default_rng(0).uniform(-2.0, 0.0, (4, 5, 3, 3)).astype(np.float32)
+    alone = EventSensor(1, 3, 3, NOISY, seed=4, device=device)
+    expected = [alone.step(batch[4:], 1500 * k) for k, batch in enumerate(images)]
+    monkeypatch.setattr("amiwarp.simulation.event_sensor.LATEST_US", 1 << (61 - 20 - 3 - 4))
+    sensor = EventSensor(5, 3, 3, NOISY, device=device)
+    same(of_camera([sensor.step(batch, 1500 * k) for k, batch in enumerate(images)], 4), of_camera(expected, 0))
+
+
 def test_one_seed_gives_successive_seeds(device: str) -> None:
     found = []
     for seed in (5, [5, 6, 7]):
@@ -237,11 +247,13 @@ def test_bad_images_are_refused_and_change_nothing(device: str, images: Any, t_u
         ({"seed": [1, 2]}, r"seed has shape \(2,\)"),
         ({"seed": [1, 2, -1]}, "one for each of 3 cameras"),
         ({"seed": -1}, "seed = -1"),
-        ({"height": 4000, "width": 40_000}, "limit is 67108864; give fewer cameras"),
+        ({"height": 4000, "width": 40_000}, "480000000 pixels; the limit is 16777216; give fewer cameras"),
+        ({"cameras": 520, "height": 130, "width": 130, "model": SensorModel(row_us=1.0)},
+         "with row_us count as 33554432 pixels; the limit is 16777216"),
         ({"model": SensorModel(row_us=5000.0)}, "give a smaller row_us"),
         ({"model": "gen4"}, "model"),
     ],
-)
+)  # fmt: skip
 def test_bad_values_are_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(AmiwarpError, match=message):
         EventSensor(**{"cameras": 3, "height": 8, "width": 10, **values})

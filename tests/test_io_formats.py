@@ -425,6 +425,8 @@ def test_triggers_become_an_encoder(data_dir, tmp_path):
     write_bin(tmp_path / "a.bin", small(EVENTS, 34, 34, t_first=0))
     with pytest.raises(AmiwarpError, match=r"files of the format bin store no triggers"):
         read_encoder_triggers(tmp_path / "a.bin")
+    with pytest.raises(AmiwarpError, match=r"out.h5: .*only Prophesee's files hold triggers"):
+        read_encoder_triggers(tmp_path / "out.h5")
 
 
 @pytest.mark.parametrize("version", ["2", "3", "2.1"])
@@ -434,17 +436,22 @@ def test_triggers_of_raw_files(tmp_path, version):
     else:
         words = np.array([0x8 << 28 | 1, 0xA << 28 | 5 << 22 | 3 << 8, 1 << 28 | 6 << 22 | 10 << 11 | 7,
                           0xA << 28 | 9 << 22 | 3 << 8, 0xA << 28 | 16 << 22 | 3 << 8], "<u8")  # fmt: skip
-        value = np.array([0, 1, 1, 0, 1], "<u8")
-        words = (
-            (words | value * (np.arange(5) != 2)).astype("<u4") if version == "2" else words << np.uint64(32) | value
-        )
+        words |= np.array([0, 1, 0, 0, 1], "<u8")
+        # The lower half of an EVT 2.1 word holds the pixels of an event; that of a trigger is 0.
+        pixels = np.array([0, 0, 1, 0, 0], "<u8")
+        words = words.astype("<u4") if version == "2" else words << np.uint64(32) | pixels
     layout = "% format EVT21;endianness=little;height=240;width=320\n" if version == "2.1" else "% geometry 320x240\n"
+    layout += "% t0 1700000000000000\n"
     path = tmp_path / "a.raw"
     path.write_bytes(
         f"% evt {version if '.' in version else version + '.0'}\n{layout}% end\n".encode() + words.tobytes()
     )
-    assert open_recording(path).metadata["triggers"] == 3
-    assert np.diff(read_encoder_triggers(path, 3).t).tolist() == [11]
+    recording, start = open_recording(path), 1_700_000_000_000_000 + (4096 if version == "3" else 64)
+    assert recording.metadata["triggers"] == 3
+    assert recording.events.t_first == start + 6
+    assert read_encoder_triggers(path, 3).t.tolist() == [start + 5, start + 16]
+    with pytest.raises(AmiwarpError, match=r"a.raw: holds one stream of events, no topics; leave the topic out"):
+        read_encoder_triggers(path, 3, topic="/events")
 
 
 def test_triggers_of_aedat4(tmp_path):

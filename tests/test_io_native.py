@@ -238,6 +238,30 @@ def test_failure_leaves_nothing(tmp_path, append, message):
     assert_nothing_left(tmp_path)
 
 
+def test_arrays_may_be_used_again_after_append(tmp_path):
+    """Some appends end within a chunk, others fill one or several."""
+    events, points = make(4 * CHUNK), np.random.default_rng(1).random((4 * CHUNK, 2), np.float32)
+    with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        for start, stop in itertools.pairwise([0, 9, 20, CHUNK + 5, 3 * CHUNK, 3 * CHUNK + 7, 4 * CHUNK]):
+            given = Events(*(getattr(events, name)[start:stop].copy() for name in "xytp"))
+            xy = points[start:stop].copy()
+            writer.append(given, truth_points=xy)
+            for array in (given.x, given.y, given.t, given.p, xy):
+                array[:] = 0
+    recording = open_recording(tmp_path / "a.h5")
+    assert_equal(recording.events[:], events)
+    np.testing.assert_array_equal(recording.truth.points(0, 4 * CHUNK), points, strict=True)
+
+
+def test_recording_goes_on_after_refused_events(tmp_path):
+    with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        damaged = Events.from_arrays([1, 1], [1, 1], [7, 2**61], [0, 1])
+        with pytest.raises(AmiwarpError, match="timestamp is damaged"):
+            writer.append(damaged, inside=[1, 1])
+        writer.append(make(10, start=0))
+    assert_equal(open_recording(tmp_path / "a.h5").events[:], make(10, start=0))
+
+
 def test_failure_keeps_the_file_that_was_there(tmp_path):
     path = write(tmp_path / "a.h5", make(10))
     before = path.read_bytes()
@@ -281,8 +305,18 @@ def test_writer_refuses_its_path(tmp_path):
         write(tmp_path / "folder.h5", make(10))
     with pytest.raises(AmiwarpError, match="does not exist"):
         write(tmp_path / "no" / "a.h5", make(10))
-    with pytest.raises(AmiwarpError, match="outside the writer's 'with' block"):
-        RecordingWriter(tmp_path / "b.h5", width=1, height=1).append(make(1))
+    closed = RecordingWriter(tmp_path / "c.h5", width=SIZE[0], height=SIZE[1])
+    with closed:
+        closed.append(make(1))
+    for writer in (RecordingWriter(tmp_path / "b.h5", width=SIZE[0], height=SIZE[1]), closed):
+        for use in (
+            lambda w: w.append(make(1)),
+            lambda w: w.fill([], count=CHUNK, t_first=0, done=lambda *_: None),
+            lambda w: w.append_image(0, np.zeros((2, 3), np.uint8)),
+        ):
+            with pytest.raises(AmiwarpError, match="outside its 'with' block, before or after it"):
+                use(writer)
+    assert len(closed) == len(open_recording(tmp_path / "c.h5").events) == 1
     del recording
     with pytest.raises(AmiwarpError, match=r"a\.h5: exists; .*overwrite=True"):
         write(path, make(20))
@@ -319,7 +353,10 @@ def _replace(name: str, values):
         (lambda f: f.create_group("prism").attrs.update(apex=0.1, index=1.5, flat_side="up"), "flat_side is 'up'"),
         (lambda f: f.create_group("encoder"), "encoder/t"),
         (lambda f: f.update({"encoder/t": [0, 0], "encoder/angle": [0.0, 1.0]}), "sample 1"),
-        (lambda f: f.update({"truth/x": np.zeros(9), "truth/y": np.zeros(9)}), "truth/x and truth/y have 9 and 9 rows"),
+        (
+            lambda f: f.update({"truth/x": np.zeros(9), "truth/y": np.zeros(9)}),
+            r"'truth/x' has shape \(9,\); expected \(50,\)",
+        ),
     ],
 )
 def test_damaged_files_name_the_place(tmp_path, edit, message):
@@ -329,6 +366,17 @@ def test_damaged_files_name_the_place(tmp_path, edit, message):
     with pytest.raises(AmiwarpError, match=message) as caught:
         open_recording(path).events.slice(0, 50)
     assert "a.h5" in str(caught.value)
+
+
+def test_blocks_are_in_order_across_chunks(tmp_path):
+    write(tmp_path / "a.h5", make(2 * CHUNK, mean_us=0))
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        del file["events/t"]
+        file["events/t"] = np.repeat([1, 0], CHUNK)
+    events = open_recording(tmp_path / "a.h5").events
+    for options in ({}, {"count": 1000}, {"duration_us": 10}):
+        with pytest.raises(AmiwarpError, match=rf"a\.h5: event {CHUNK} .* earlier than the one before"):
+            list(events.blocks(**options))
 
 
 def test_index_that_disagrees_is_noticed(tmp_path):

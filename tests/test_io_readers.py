@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -106,6 +107,25 @@ def test_every_format_reads_back(tmp_path, monkeypatch, name, keep):
         assert recording.camera == Camera(*SIZE, 200, 201, 150, 110, RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01))
 
 
+@pytest.mark.parametrize("name", ["t", "array", "a" * 200])
+def test_a_file_is_named_also_if_its_name_is_a_word_of_the_error(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with open(name, "wb") as file:
+        np.savez(file, x=[1], y=[0], t=[0.5], p=[1])
+    assert str(refusal(open_recording, Path(name))).startswith(
+        (f"{name}: before the first event: ", f"{name[:100]}...")
+    )
+
+
+@pytest.mark.parametrize("name", ["text", "native"])
+def test_changed_arrays_leave_the_recording_as_it_is(tmp_path, name):
+    source = open_recording(write_sample(tmp_path, name, EVENTS)).events
+    for given in (source[:], source[5:9], source.between(source.t_first, source.t_last), *source.blocks()):
+        for values in (given.x, given.y, given.t, given.p):
+            values[:] = 0
+    assert_same_source(source, MemoryEvents(EVENTS, *SIZE))
+
+
 @pytest.mark.parametrize("name", WRITERS)
 def test_content_decides_not_the_ending(tmp_path, name):
     path = write_sample(tmp_path, name, EVENTS, ending="bin")
@@ -159,6 +179,15 @@ def test_paths_and_formats_that_are_none(tmp_path):
         open_recording(tmp_path / "old.aedat")
 
 
+def test_compensated_events_far_outside_do_not_count_for_the_size(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["events/x"] = np.array([1.5, 639.6, np.nan, 3e9, -1e9], np.float32)
+        file["events/y"] = np.array([1.5, 2.0, np.nan, 3e9, 70_000], np.float32)
+        file["events/t"], file["events/p"] = np.arange(5), np.ones(5, np.uint8)
+        file["events/inside"] = np.array([1, 1, 0, 0, 0], np.uint8)
+    assert open_recording(tmp_path / "a.h5").events.size == (1280, 720)  # 639.6 px lies on pixel 640
+
+
 def test_a_file_without_a_size_gets_that_of_the_smallest_sensor_that_holds_it():
     sensors = [(128, 128), (240, 180), (304, 240), (320, 240), (346, 260), (640, 480), (1280, 720)]
     for smaller, (width, height) in zip([(0, 0), *sensors], sensors, strict=False):
@@ -202,9 +231,14 @@ def test_text_names_the_bad_line(tmp_path, monkeypatch, line, message):
 
 def test_text_with_a_size_comments_and_no_last_newline(tmp_path):
     path = tmp_path / "events.txt"
-    path.write_text("500 400\n# from a bench\n\n" + "\n".join(LINES))
-    source = open_recording(path).events
-    assert (len(source), source.size) == (1000, (500, 400))
+    for head, size in (
+        ("500 400\n# from a bench\n\n", (500, 400)),
+        ("# a bench\n\n500 400\n", (500, 400)),
+        ("# events\n", (240, 180)),
+    ):
+        path.write_text(head + "\n".join(LINES))
+        source = open_recording(path).events
+        assert (len(source), source.size) == (1000, size)
     path.write_text("500 -4\n" + "\n".join(LINES))
     with pytest.raises(AmiwarpError, match="line 1 '500 -4' is not a size"):
         open_recording(path)
@@ -364,6 +398,7 @@ def test_evt_headers(tmp_path):
         assert_equal(recording.events.slice(0, 999), EVENTS)
     for header, message in (
         (b"% evt 9.0\n", "version in the header is '9.0'"),
+        (b"% evt 2.0\n% t0 5.5\n", "t0 in the header is '5.5'; expected a time"),
         (b"% evt 2.0\n% geometry 10x10\n", "after|before"),
     ):
         path.write_bytes(header + body)

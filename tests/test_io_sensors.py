@@ -114,18 +114,18 @@ def test_wrong_arrays_are_refused(tmp_path: Path) -> None:
         writer.append_imu(make_imu(4))
         with pytest.raises(AmiwarpError, match="imu/t 1000000 us does not follow 1001000 us"):
             writer.append_imu(make_imu(4))
-    with pytest.raises(AmiwarpError, match="append outside the writer's with block"):
+    with pytest.raises(AmiwarpError, match="outside its 'with' block"):
         RecordingWriter(tmp_path / "b.h5", width=4, height=4).append_imu(make_imu(4))
 
 
 def test_damage_is_named(tmp_path: Path) -> None:
     whole = Recording(MemoryEvents(EVENTS, *SIZE), imu=make_imu(9), frames=make_images(np.uint8))
     faults = {
-        "imu/acceleration": (np.zeros((8, 3)), r"'imu/acceleration' has shape \(8, 3\), its times are 9"),
+        "imu/acceleration": (np.zeros((8, 3)), r"'imu/acceleration' has shape \(8, 3\); expected \(9, 3\)"),
         "imu/t": (np.arange(9)[::-1], "IMU times decrease"),
         "imu/angular_velocity": (np.full((9, 3), np.inf), "IMU angular_velocity of sample 0 is .*expected finite"),
         "frames/image": (np.zeros((5, 7, 9)), "dataset 'frames/image' is float64"),
-        "frames/t": (np.arange(4), r"'frames/image' has shape \(5, 7, 9\), its times are 4"),
+        "frames/t": (np.arange(4), r"'frames/image' has shape \(5, 7, 9\); expected \(4, 7, 9\)"),
     }
     for name, (values, message) in faults.items():
         path = tmp_path / f"{name.replace('/', '_')}.h5"

@@ -519,6 +519,26 @@ def test_a_camera_of_another_size_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "b.h5").exists()
 
 
+@pytest.mark.parametrize("name", ["a.h5", "a.npz", "a.raw"])
+def test_events_outside_the_given_camera_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "a.txt").write_text("0.0 1 2 1\n0.1 300 2 0\n")
+    with pytest.raises(AmiwarpError, match=rf"{name}: event 1 \(x=300, .* outside the 240x180 frame"):
+        convert(tmp_path / "a.txt", tmp_path / name, camera=Camera.from_fov(240, 180, 1.0))
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize("name", ["a.h5", "a.npz", "a.txt"])
+def test_the_error_of_a_callers_function_stays_as_it_is(tmp_path: Path, name: str) -> None:
+    source = save(tmp_path / "source.h5", make_events())
+
+    def cancel(step: str, share: float) -> None:
+        raise RuntimeError("cancelled")
+
+    with pytest.raises(RuntimeError, match=r"^cancelled$"):
+        convert(source, tmp_path / name, progress=cancel)
+    assert os.listdir(tmp_path) == ["source.h5"]
+
+
 def test_seeds_beyond_63_bits_are_refused(tmp_path: Path) -> None:
     events = make_events()
     moved = Events(events.x + np.float32(0.25), events.y.astype(np.float32), events.t, events.p)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp import AmiwarpError, Camera, Encoder, Events, ExactModel, Prism, Vote, iwe
+from amiwarp import AmiwarpError, Camera, CameraRotation, Encoder, Events, ExactModel, Prism, Vote, iwe
 from amiwarp.imaging import iwe as pixel_votes
 from amiwarp.imaging.iwe import FIRST_BATCH, CanvasShape, Image, Votes, upload_events
 from amiwarp.optics.models import MODELS, rungs
@@ -189,6 +189,11 @@ def test_compensated_events_are_not_compensated_twice() -> None:
     moved = Events(events.x.astype(np.float32), events.y.astype(np.float32), events.t, events.p)
     with pytest.raises(AmiwarpError, match="already compensated"):
         upload_events(moved, np.zeros(10), "cpu")
+
+
+def test_camera_rotation_without_a_model_is_refused() -> None:
+    with pytest.raises(AmiwarpError, match="camera_rotation is given without a model and an encoder"):
+        iwe(random_events(10, 64, 48), 64, 48, camera_rotation=CameraRotation((0.0, 1.0, 0.0)))
 
 
 def test_model_without_encoder_is_refused() -> None:

@@ -312,6 +312,16 @@ def test_boards_that_cannot_be_are_refused() -> None:
         amiwarp.Board(9, 6, 0.03, "DICT_5")
     with pytest.raises(amiwarp.AmiwarpError, match="has 50 markers; this board needs 60"):
         amiwarp.Board(11, 9, 0.03, "DICT_4X4_50")
+    with pytest.raises(amiwarp.AmiwarpError, match="corners are empty; give those that find returned"):
+        BOARD.has_another(np.zeros((9, 9), np.uint8), Corners(np.zeros(0, np.int64), np.zeros((0, 2))))
+
+
+@pytest.mark.parametrize(("charuco", "least"), [("DICT_4X4_50", 8), ("DICT_6X6_250", 10), ("DICT_7X7_250", 12)])
+def test_the_squares_of_a_picture_show_every_cell_of_a_marker(charuco: str, least: int) -> None:
+    board = amiwarp.Board(9, 6, 0.03, charuco)
+    assert board.picture(least).shape == (9 * least, 12 * least)
+    with pytest.raises(amiwarp.AmiwarpError, match=f"square_px is {least - 1}, too few for .*; give {least}"):
+        board.picture(least - 1)
 
 
 @pytest.mark.parametrize("suffix", [".pdf", ".svg"])
@@ -504,6 +514,14 @@ def test_still_spans_of_one_recording_are_found(moved: amiwarp.Recording) -> Non
     assert spans[1][0] > 0.64
     assert all(0.12 < stop - start < 0.26 for start, stop in spans)
     assert "s" in poses[0].name
+
+
+def test_recordings_of_one_name_are_all_used(recordings: list[amiwarp.Recording]) -> None:
+    """The files ``day0/pose.h5`` and ``day1/pose.h5`` have the same name."""
+    same = [replace(one, name="pose") for one in recordings[:3]]
+    poses, reasons = still_poses([*same, replace(same[0], encoder=None), replace(same[0], encoder=None)])
+    assert [pose.name for pose in poses] == ["pose", "pose (2)", "pose (3)"]
+    assert list(reasons) == ["pose (4)", "pose (5)"]
 
 
 def streamed(recording: amiwarp.Recording, late_us: int = 0) -> list[amiwarp.Recording]:

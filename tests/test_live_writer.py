@@ -405,6 +405,23 @@ def test_what_is_refused_does_not_end_the_recording(tmp_path, append, message):
     assert recording.encoder.t.tolist() == [4, 5, 6]
 
 
+def test_arrays_may_be_used_again_after_append(tmp_path):
+    events = make(CHUNK + 50)
+    with live(tmp_path / "a.h5") as writer:
+        for start, stop in itertools.pairwise([0, 9, 20, CHUNK - 1, CHUNK + 50]):
+            given = Events(*(getattr(events, name)[start:stop].copy() for name in "xytp"))
+            writer.append(given)
+            for array in (given.x, given.y, given.t, given.p):
+                array[:] = 0
+        angles = np.zeros(2)
+        for k in range(3):
+            angles[:] = 2 * k, 2 * k + 1
+            writer.append_encoder([20 * k, 20 * k + 10], angles)
+    recording = open_recording(tmp_path / "a.h5")
+    assert_equal(recording.events[:], events)
+    assert recording.encoder.angle.tolist() == [0, 1, 2, 3, 4, 5]
+
+
 def test_writer_refuses_its_path_and_options(tmp_path):
     with pytest.raises(AmiwarpError, match="does not exist"), live(tmp_path / "no" / "a.h5"):
         pass

@@ -7,7 +7,6 @@ import pytest
 
 from amiwarp import AmiwarpError, Camera, ExactModel, Prism, edge_blur, model_error
 from amiwarp.imaging.metrics import find_edges, picture_quality
-from amiwarp.imaging.sharpness import contrast, entropy
 
 
 def circle_events(sigma: float, noise: int = 0, seed: int = 0) -> np.ndarray:
@@ -76,14 +75,6 @@ def test_model_error_is_the_difference_in_radius() -> None:
     xy = np.array([[159.5, 119.5]])
     radius = [np.linalg.norm(m.compensate_points(xy, np.zeros(1)) - xy) for m in (truth, larger)]
     assert model_error(larger, truth).rms == pytest.approx(radius[1] - radius[0], rel=0.03)
-
-
-def test_contrast_and_entropy_of_known_images() -> None:
-    image = np.zeros((20, 30), dtype=np.float32)
-    image[:, 15] = 6.0
-    assert contrast(image) == pytest.approx(image.var() / image.mean(), rel=1e-5)
-    assert entropy(image) == pytest.approx(math.log(20), rel=1e-5)
-    assert entropy(np.ones((20, 30), dtype=np.float32)) == pytest.approx(math.log(600), rel=1e-5)
 
 
 RAMP = np.linspace(-1.0, 1.0, 1001).reshape(7, 143)

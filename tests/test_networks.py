@@ -285,6 +285,17 @@ def test_whole_numbers_and_numpy_arrays_are_taken(tmp_path: Path) -> None:
     np.testing.assert_array_equal(network(EVENTS, WIDTH, HEIGHT), polarity_histogram(EVENTS, WIDTH, HEIGHT))
 
 
+def test_inputs_with_gaps_are_taken(tmp_path: Path, device: str) -> None:
+    """Such as channels that come last in memory."""
+    torch = pytest.importorskip("torch")
+    values = torch.from_numpy(RNG.random((HEIGHT, WIDTH, 2)).astype(np.float32)).permute(2, 0, 1)
+    given = wp.from_torch(values.to(wp.device_to_torch(wp.get_device(device))))
+    first = np.zeros((1, 2, HEIGHT, WIDTH), np.float32)
+    path = torch_file(tmp_path / "n.pt", "InPlace")
+    network = Network(path, lambda events, width, height: given, multiple=1, states=[first], device=device)
+    np.testing.assert_array_equal(network(EVENTS, WIDTH, HEIGHT), values.numpy())
+
+
 def test_states_of_onnx_files_of_any_size(tmp_path: Path) -> None:
     path = onnx_file(tmp_path / "n.onnx", "rows", "columns")
     with pytest.raises(AmiwarpError, match=r"before has the shape \[1, 1, 'rows', 'columns'\]; give .* in states"):
@@ -511,6 +522,16 @@ def test_own_sums_are_the_gradient_of_polarities(quarter: Any) -> None:
         np.testing.assert_allclose(found[4 + k], np.tensordot(weight / length, total, 1), atol=2e-3)
     towards = np.linalg.pinv(chord) * late
     np.testing.assert_allclose(found[2:4], np.tensordot(towards, signed, 1), atol=2e-3)
+
+
+def test_own_sums_are_those_of_the_events_in_the_window(quarter: Any) -> None:
+    pytest.importorskip("torch")
+    simulation, events, optic, window = quarter
+    found = []
+    for given in (events, simulation.run().events[:]):
+        here = DeviceEvents.from_arrays(given.x, given.y, given.t, given.p)
+        found.append(networks.quarter_turn_sums(here, 160, 120, **window, **optic).numpy())
+    np.testing.assert_array_equal(*found)
 
 
 def test_own_network_shows_the_scene(quarter: Any, device: str) -> None:

@@ -17,6 +17,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_type_hints
@@ -934,6 +935,17 @@ def test_every_image_of_a_window_is_checked_before_the_first(tmp_path: Path) -> 
             IweFiles([tmp_path / p for p in paths], source, window_us=10_000, layers=Layers.MERGED, device="cpu")
     IweFiles([tmp_path / "a.npy"], source, window_us=10_000, layers=Layers.MERGED, device="cpu")
     IweFiles([tmp_path / "a.png"], source, window_us=None, layers=Layers.MERGED, device="cpu")
+
+
+def test_the_image_of_the_only_window_is_checked(tmp_path: Path) -> None:
+    source = MemoryEvents(events(), *SIZE)
+    one = partial(IweFiles, [tmp_path / "a.png"], source, window_us=1 << 40, layers=Layers.MERGED, device="cpu")
+    (tmp_path / "a.png").write_bytes(b"mine")
+    with one() as files:
+        files.add(compensated(events()))
+    assert files.written == [tmp_path / "a_00000.png"]
+    with pytest.raises(AmiwarpError, match=r"a_00000\.png: exists"):
+        one()
 
 
 @pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOSPC, errno.EFBIG])

@@ -216,6 +216,22 @@ def test_unknown_depths_are_filled_by_what_is_known_well_about_them() -> None:
     assert found[30, 199] == 9.0  # too far from all: the nearest
 
 
+@pytest.mark.parametrize(
+    ("inverse", "std", "message"),
+    [
+        (-1.0, 0.1, "inverse_depth has a negative or infinite value"),
+        (math.inf, 0.1, "inverse_depth has a negative or infinite value"),
+        (1.0, math.inf, "std has a negative or infinite value"),
+        (1.0, math.nan, "std is NaN at a pixel whose depth is known"),
+    ],
+)
+def test_a_depth_map_refuses_values_that_would_spoil_the_filling(inverse: float, std: float, message: str) -> None:
+    depths = np.array([[inverse, 2.0], [2.0, math.nan]])
+    deviations = np.array([[std, 0.1], [0.1, math.nan]])
+    with pytest.raises(amiwarp.AmiwarpError, match=message):
+        amiwarp.DepthMap(depths, deviations, np.zeros((2, 2, 3), np.float32))
+
+
 def wedge_of(calibration: amiwarp.Calibration) -> amiwarp.Calibration:
     """Return the calibration with a wedge instead of the plate."""
     return replace(

@@ -51,6 +51,9 @@ def test_items_are_the_events_and_labels_of_a_split(folder: Path) -> None:
     assert dataset[-1][1] == {"k": 3}
     with pytest.raises(IndexError):
         dataset[4]
+    part: Any = slice(0, 1)
+    with pytest.raises(AmiwarpError, match=r"index of an item is slice\(0, 1, None\); give a whole number"):
+        dataset[part]
 
 
 def test_a_transform_makes_the_item(folder: Path) -> None:
@@ -102,6 +105,9 @@ GOOD = {"file": "a.h5", "split": "train", "labels": {}, "events": 1}
         ({"items": [{**GOOD, "file": ""}]}, r"items\[0\].file is ''"),
         ({"items": [{**GOOD, "file": 1}]}, r"items\[0\].file is 1; expected a str"),
         ({"items": [{**GOOD, "split": None}]}, r"items\[0\].split is None; expected a str"),
+        ({"items": [{**GOOD, "split": "../x"}]}, r"items\[0\].split is '../x'; use letters, digits, '-' and '_'"),
+        ({"items": [{**GOOD, "split": "a b"}]}, r"items\[0\].split is 'a b'; use letters"),
+        ({"items": [GOOD, {**GOOD, "file": "./a.h5"}]}, r"items\[1\].file is './a.h5', as items\[0\].file; remove one"),
         ({"items": [{**GOOD, "labels": []}]}, r"items\[0\].labels is \[\]; expected a dict"),
         ({"items": [{**GOOD, "events": -1}]}, r"items\[0\].events = -1"),
         ({"items": [{"file": "a.h5"}]}, r"items\[0\].split is None"),

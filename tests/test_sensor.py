@@ -210,14 +210,18 @@ def test_hot_pixels_do_not_depend_on_light(device: str) -> None:
     assert abs(len(still(sensor, 0.2, device, 1.0)) - expected) < 5.0 * math.sqrt(expected)
 
 
-def test_leak_jitter_is_the_spread_of_the_intervals(device: str) -> None:
-    events = still(quiet_sensor(leak_hz=20.0, leak_jitter_fraction=0.1), 1.0, device)
+@pytest.mark.parametrize(("jitter", "duration", "spread", "mean"), [(0.1, 1.0, 0.103, 1.010), (0.3, 4.0, 0.549, 1.138)])
+def test_leak_jitter_is_the_spread_of_the_rate(
+    device: str, jitter: float, duration: float, spread: float, mean: float
+) -> None:
+    """Expected intervals: integrals over a normal distribution of the rate, raised to a tenth of the mean below it."""
+    events = still(quiet_sensor(leak_hz=20.0, leak_jitter_fraction=jitter), duration, device)
     pixel = events.y.astype(int) * 64 + events.x
     order = np.lexsort((events.t, pixel))
     gaps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
     assert events.p.min() == 1
-    assert gaps.std() / gaps.mean() == pytest.approx(0.1, rel=0.05)
-    assert gaps.mean() == pytest.approx(50_000.0, rel=0.02)  # us
+    assert gaps.std() / gaps.mean() == pytest.approx(spread, rel=0.05)
+    assert gaps.mean() == pytest.approx(50_000.0 * mean, rel=0.01)  # us
 
 
 def test_rates_differ_between_pixels_by_decades(device: str) -> None:
@@ -304,6 +308,7 @@ def test_a_busy_bus_keeps_rows_together(device: str) -> None:
         ({"shot_noise_dark": 0.5}, "shot_noise_dark = 0.5"),
         ({"bus_rate_mev_s": 1e9}, "bus_rate_mev_s"),
         ({"bus_queue": math.nan}, "bus_queue = nan"),
+        ({"leak_jitter_fraction": 0.31}, r"leak_jitter_fraction = 0.31 .* 0 \.\. 0.3"),
     ],
 )
 def test_values_out_of_range_are_refused(values: dict[str, float], message: str) -> None:

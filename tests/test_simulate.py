@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
@@ -38,6 +39,7 @@ from amiwarp.kernels import launch as launching
 from amiwarp.kernels import pixels as kernels
 from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place_picture, read_picture
 from amiwarp.simulation.scenery import step_us
+from amiwarp.simulation.simulator import LATEST_US, Engine
 
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))
 PRISM = Prism(math.radians(3.0), 1.55)
@@ -183,6 +185,21 @@ def test_chunks_do_not_matter(device: str, chunk_us: int) -> None:
     for name in ("x", "y", "t", "p"):
         np.testing.assert_array_equal(getattr(events, name), getattr(whole[0], name))
     np.testing.assert_array_equal(np.concatenate([p for _, p in parts]), whole[1])
+
+
+def test_a_chunk_of_minutes_keeps_the_scene_points() -> None:
+    simulation = base(camera=Camera.from_fov(4, 3, 1.0), motion=PrismMotion(3.0), duration_s=140.0)
+    whole = everything(simulation.run())
+    parts = list(simulation.blocks(chunk_us=140_000_000))
+    assert whole[0].t[-1] > 2**31 / 16  # us; ticks are 32-bit integers
+    np.testing.assert_array_equal(np.concatenate([e.t for e, _ in parts]), whole[0].t)
+    np.testing.assert_array_equal(np.concatenate([p for _, p in parts]), whole[1])
+
+
+def test_the_times_of_a_long_chunk_of_many_pixels_fit_into_their_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("amiwarp.simulation.simulator.EVENTS_PER_PIXEL", 1)  # saves memory
+    engine = Engine(base(camera=Camera.from_fov(1280, 720, 1.0)), 3_000_000)
+    assert 2_000_000 <= engine._chunk_steps * engine._step <= 2**21 - LATEST_US  # us; 22 + 20 bits are below the time
 
 
 @pytest.mark.usefixtures("every_core")
@@ -466,6 +483,21 @@ def test_luminance_is_linear_light() -> None:
     np.testing.assert_allclose(linear_luminance(codes), [[0.0, 1.0], [0.5029, 0.2126]], rtol=0, atol=1e-4)
 
 
+def test_integers_of_a_picture_keep_their_values(tmp_path: Path) -> None:
+    """Of 32 bits, only what 16 bits hold; of either byte order."""
+    codes = np.array([[0, 65535], [30000, 12]])
+    light = linear_luminance(codes.astype(np.uint16))
+    np.testing.assert_array_equal(linear_luminance(codes.astype(">u2")), light)
+    Image.fromarray(codes.astype(np.int32)).save(tmp_path / "wide.tif")
+    np.testing.assert_array_equal(read_picture(tmp_path / "wide.tif"), light)
+    Image.frombytes("I;16B", (2, 2), codes.astype(">u2").tobytes()).save(tmp_path / "big.tif")
+    np.testing.assert_array_equal(read_picture(tmp_path / "big.tif"), light)
+    for value in (-1, 65536):
+        Image.fromarray((codes // 65535 * value).astype(np.int32)).save(tmp_path / "over.tif")
+        with pytest.raises(AmiwarpError, match=rf"over\.tif has values from .*{value}.*; save it with 16 bits, 0 to"):
+            read_picture(tmp_path / "over.tif")
+
+
 def test_a_picture_is_cut_to_the_view() -> None:
     placed = place_picture((200, 100), (-0.5, -0.5, 0.5, 0.5), 64.0)
     assert placed == Placement(64, 64, (50.0, 0.0, 150.0, 100.0), -0.5, -0.5, (64.0, 64.0))
@@ -498,6 +530,8 @@ def test_a_picture_is_cut_to_the_view() -> None:
         (lambda: read_picture("nowhere.png"), "nowhere.png: no such file"),
         (lambda: base(camera_motion=CameraMotion((0.0, 30.0, 0.0))).run(), "turn the camera less far"),
         (lambda: base(motion=PrismMotion(1e9)).run(), "slow down prism"),
+        (lambda: list(base().blocks(chunk_us=0)), "chunk_us = 0 is not a whole number in 1 "),
+        (lambda: list(base().blocks(chunk_us=-5)), "chunk_us = -5"),
     ],
 )
 def test_bad_input_is_told(make: object, message: str) -> None:

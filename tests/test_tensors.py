@@ -220,6 +220,15 @@ def test_surfaces(device: str) -> None:
     assert (expected == 0.0).any()
 
 
+def test_surfaces_are_1_after_the_end_of_the_window(device: str) -> None:
+    """The read-out of a sensor delays events beyond the window in which they are delivered."""
+    events = put(Events.from_arrays([0, 1, 2], [0, 0, 0], [10, 20, 90], [1, 1, 1]), device)
+    cut = amiwarp.Windows(*(np.array([value], np.int64) for value in (0, 3, 0, 20)))
+    for linear, first in ((False, np.exp(-1.0)), (True, 0.0)):
+        found = amiwarp.time_surface(events, 3, 1, 10.0, linear=linear, per_polarity=False, windows=cut)
+        np.testing.assert_allclose(host(found), [[[first, 1.0, 1.0]]], rtol=0, atol=EXACT)
+
+
 def test_latest_times_of_dv_processing() -> None:
     dv = pytest.importorskip("dv_processing")
     events = some_events(300)
@@ -263,6 +272,9 @@ def test_no_events(device: str) -> None:
     assert host(amiwarp.latest_times(none, 4, 3)).shape == (2, 3, 4)
     assert len(amiwarp.windows(none, duration_us=10)) == len(amiwarp.windows(none, count=3)) == 0
     assert host(amiwarp.event_count(none, 4, 3, windows=amiwarp.windows(none, count=3))).shape == (0, 3, 4)
+    short = put(some_events(9), device)
+    no_windows = amiwarp.windows(short, count=10)
+    assert host(amiwarp.voxel_grid(short, 4, 3, 2, normalize=True, windows=no_windows)).shape == (0, 2, 3, 4)
 
 
 @pytest.mark.parametrize("burst", [0, 300, 3000])
@@ -395,6 +407,26 @@ def test_windows_of_turns_at_varying_speed() -> None:
     np.testing.assert_allclose(turned, np.pi, rtol=0, atol=4e-3)  # a whole microsecond
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_windows_of_turns_to_and_fro(sign: float) -> None:
+    """A window ends a quarter turn from its start on either side; less to and fro does not count."""
+    events = Events.from_arrays([0] * 2, [0] * 2, [0, 100], [1] * 2)
+    turned = np.array([-0.5, 0.0, 0.9, -0.1, 2.9, 1.9, -1.1, -1.2])
+    encoder = Encoder(np.array([-10, 0, 20, 30, 60, 70, 100, 110]), sign * np.pi / 2 * turned)
+    found = amiwarp.windows(events, encoder=encoder, turns=0.25)
+    assert found.t_start.tolist() == [0, 41, 51, 79, 89]
+    assert found.t_end.tolist() == [41, 51, 79, 89, 99]
+
+
+def test_the_only_window_of_turns_is_incomplete() -> None:
+    encoder = Encoder.constant_speed(1200.0, 0, 100)
+    for t in ([5], [5, 5]):
+        events = Events.from_arrays([1] * len(t), [0] * len(t), t, [1] * len(t))
+        found = amiwarp.windows(events, encoder=encoder, incomplete=True)
+        assert (found.start.tolist(), found.stop.tolist()) == ([0], [len(t)])
+        assert (found.t_start.tolist(), found.t_end.tolist()) == ([5], [5])
+
+
 def test_time_surface_of_tonic(device: str) -> None:
     """Tonic keeps the times of earlier windows, and lets them decay until the end of each window."""
     events = some_events(400)
@@ -405,6 +437,16 @@ def test_time_surface_of_tonic(device: str) -> None:
     alone = host(amiwarp.time_surface(put(events, device), WIDTH, HEIGHT, 7e3, windows=cut))
     assert (alone <= found).all()
     assert (alone < found).any()
+
+
+def test_times_are_carried_through_a_window_without_events(device: str) -> None:
+    events = put(Events.from_arrays([0, 1, 0, 1], [0] * 4, [100, 110, 160, 170], [1] * 4), device)
+    cut = amiwarp.windows(events, ranges=[(0, 0), (0, 2), (2, 2), (2, 4), (4, 4)])
+    assert cut.t_start.tolist() == [100, 100, 110, 160, 170]
+    assert cut.t_end.tolist() == [100, 110, 110, 170, 170]
+    found = amiwarp.time_surface(events, 2, 1, 20.0, linear=True, per_polarity=False, windows=cut, carry=True)
+    expected = [[0.0, 0.0], [0.5, 1.0], [0.5, 1.0], [0.5, 1.0], [0.5, 1.0]]
+    np.testing.assert_allclose(host(found)[:, 0], expected, rtol=0, atol=EXACT)
 
 
 def test_carried_times_in_several_launches(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -427,6 +469,14 @@ def test_batch_of_recordings(device: str) -> None:
     assert isinstance(found, np.ndarray if device == "cpu" else wp.array)
     assert np.array_equal(host(found), expected)
     assert np.array_equal(amiwarp.voxel_grid(blocks, WIDTH, HEIGHT, BINS, device=device), expected)
+
+
+def test_batch_of_raw_and_compensated_events(device: str) -> None:
+    raw, moved = some_events(300), positions(some_events(400))
+    expected = [amiwarp.voxel_grid(block, WIDTH, HEIGHT, BINS) for block in (raw, moved)]
+    blocks = [DeviceEvents.from_arrays(*(getattr(e, n) for n in "xytp"), device=device) for e in (raw, moved)]
+    for batch in ([raw, moved], blocks):
+        np.testing.assert_allclose(host(amiwarp.voxel_grid(batch, WIDTH, HEIGHT, BINS)), expected, rtol=0, atol=EXACT)
 
 
 # Compensated events.
@@ -606,6 +656,8 @@ def test_refusals() -> None:
         ("limit = 256", lambda: amiwarp.stacked_histogram(events, 9, 9, 2, limit=256)),
         ("tau_us = 0", lambda: amiwarp.time_surface(events, 9, 9, 0.0)),
         ("width = 0", lambda: amiwarp.event_count(events, 0, 9)),
+        ("windows are indexed by 2; give a slice", lambda: cut[2]),
+        ("windows are indexed by 0; give a slice", lambda: list(cut)),
         ("expected int64", lambda: amiwarp.Windows(*np.zeros((4, 2)))),
         ("a window lasts", lambda: amiwarp.voxel_grid(events, 9, 9, 5, t_start=0, t_end=1 << 60)),
         ("give fewer bins", lambda: amiwarp.voxel_grid(events, 9_999, 9_999, 999)),

@@ -54,7 +54,7 @@ def test_folder_takes_its_times_from_the_table(tmp_path: Path) -> None:
         Image.fromarray(np.round(picture * 255).astype(np.uint8)).save(tmp_path / f"p{i + 8}.png")
     times = [1000, 11000, 41000, 42000, 52000]
     rows = "".join(f"p{i + 8}.png,{t}\n" for i, t in enumerate(times))
-    (tmp_path / "times.csv").write_text("file,t_us\n" + rows)
+    (tmp_path / "times.csv").write_text("file,t_us\n" + rows, encoding="utf-8-sig")  # as Excel's "CSV UTF-8"
     events = events_of(translate(tmp_path, CLEAR, sensor=SensorModel.ideal(0.24)))
     first = (events.x == 3) & (events.y == 3)
     expected = [2400, 4800, 7200, 9600, 26800, 45600, 48000, 50400]

@@ -341,6 +341,28 @@ def test_recordings_that_cannot_be_translated_are_told(recording: Recording) -> 
         translate(empty, WEDGE, dataset="imagenet")
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"fps": 50.0}, "fps is given, but does not apply to opened pictures, which have times; leave it out"),
+        ({"dataset": "n-caltech101", "fps": 50.0}, "fps is given, .* to a still picture of n-caltech101"),
+        ({"dataset": "n-caltech101", "events": "a.h5"}, "events is given, .* to a still picture of n-caltech101"),
+        ({"dataset": "n-caltech101", "interpolation": "motion"}, "interpolation is given, .* of n-caltech101"),
+        ({"dataset": "mvsec", "fps": 50.0}, "fps is given, .* to mvsec, whose pictures have times"),
+        ({"fps": 50.0}, "fps is given, but does not apply to a recording, which has no pictures"),
+        ({"interpolation": "blend"}, "interpolation is given, but does not apply to a recording"),
+    ],
+)
+def test_settings_that_do_not_apply_are_refused(settings: dict[str, Any], message: str, tmp_path: Path) -> None:
+    source: Any = tmp_path / "picture.png"
+    if "recording" in message:
+        source = Recording(MemoryEvents(Events.empty(), 8, 8))
+    elif "dataset" not in settings:
+        source = PictureStack(np.zeros((2, 24, 32), np.uint8), 25.0, "grey")
+    with pytest.raises(AmiwarpError, match=message):
+        translate(source, WEDGE, **settings)
+
+
 # -- data sets by name
 
 

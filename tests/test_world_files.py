@@ -384,6 +384,14 @@ def test_files_of_a_mesh_are_inputs_of_the_command(tmp_path: Path) -> None:
     assert noted >= {"quad.obj", "quad.mtl", "paint.png"}
 
 
+def test_a_header_of_poses_may_follow_comments(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("# made by hand\n\nt,x,y,z,qx,qy,qz,qw\n0,0,0,1,0,0,0,1\n2,0,0,1,0,0,0,1\n")
+    assert Trajectory.from_file(tmp_path / "a.csv").t.tolist() == [0.0, 2.0]
+    (tmp_path / "a.csv").write_text("0,0,0,1,0,0,0,1\nt,x,y,z,qx,qy,qz,qw\n")
+    with pytest.raises(AmiwarpError, match=r"a\.csv: line 2 is 't,x.*; expected 8 numbers"):
+        Trajectory.from_file(tmp_path / "a.csv")
+
+
 def test_trajectories_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Their splines take 1.7 kB for each pose."""
     assert world.MOST_POSES * 1700 < 1 << 30  # bytes

@@ -185,6 +185,20 @@ def test_slices_of_events_and_truth_stay_aligned(
             np.testing.assert_array_equal(getattr(truth, name), expected)
 
 
+def test_truth_of_a_file_is_sliced_without_steps(stored: Path) -> None:
+    truth = truth_of(amiwarp.open_recording(stored))
+    for name, rows in {
+        "truth": truth.stored_points, "truth/events/cause": truth.stored_causes, "truth/poses": truth.poses,
+    }.items():  # fmt: skip
+        for which, message in (
+            (slice(None, None, 5), "rows are sliced in steps of 5; slice without steps, then NumPy arrays"),
+            (slice(None, None, -1), "rows are sliced in steps of -1"),
+            (3, "rows are indexed by the number 3; give a slice, such as [3:4] for one"),
+        ):
+            with pytest.raises(AmiwarpError, match=re.escape(f"world.h5: {name}: {message}")):
+                rows[which]  # type: ignore[index]
+
+
 def test_truth_across_chunks_of_the_file(tmp_path: Path) -> None:
     """Places, whose rows have three numbers, in a file of more than one chunk, appended in odd pieces."""
     rng, count = np.random.default_rng(0), CHUNK + 1000
@@ -233,6 +247,50 @@ def test_a_writer_refuses_truth_that_does_not_fit(tmp_path: Path, recording: ami
         with pytest.raises(AmiwarpError, match="does not follow"):
             writer.append_frame(frame)
     assert [path.name for path in tmp_path.iterdir()] == ["good.h5"]
+
+
+def test_refused_truth_leaves_a_file_that_can_be_read(tmp_path: Path, recording: amiwarp.Recording) -> None:
+    """All datasets of a kind of records keep the same length."""
+    frame, later = frames_of(recording)[:2]
+    endless = np.full_like(frame.intensity, np.inf)
+    pose, joint = np.tile([0.0, 0, 0, 0, 0, 0, 1], (1, 1)), np.zeros((1, 3))
+    assert frame.joints
+
+    def poses(t: int, *bodies: str, joints: tuple[str, ...] = ("hand",), camera: Any = pose) -> amiwarp.Poses:
+        return amiwarp.Poses(np.array([t]), camera, dict.fromkeys(bodies, pose), dict.fromkeys(joints, joint))
+
+    path = tmp_path / "a.h5"
+    with amiwarp.RecordingWriter(path, width=SIZE[0], height=SIZE[1], truth_parameters={}) as writer:
+        with pytest.raises(AmiwarpError, match="'truth/frames/intensity' holds inf"):
+            writer.append_frame(dataclasses.replace(frame, joints={"other": np.zeros(3)}, intensity=endless))
+        writer.append_frame(frame)
+        for change, message in (
+            ({"intensity": endless}, "'truth/frames/intensity' holds inf"),
+            ({"joints": {"other": np.zeros(3)}}, r"truth/joints/names comes with \('other',\), before with \("),
+            ({"joints": {}}, "truth/frames/t comes with"),
+        ):
+            with pytest.raises(AmiwarpError, match=message):
+                writer.append_frame(dataclasses.replace(later, **change))  # type: ignore[arg-type]
+        writer.append_frame(later)
+    assert len(frames_of(amiwarp.open_recording(path)).t) == 2
+    with amiwarp.RecordingWriter(path, width=4, height=4, truth_parameters={}, overwrite=True) as writer:
+        writer.append_poses(poses(0, "ball"))
+        for refused, message in (
+            (
+                poses(1, "car"),
+                r"truth/poses/body_names comes with \('car',\), before with \('ball',\); append the same",
+            ),
+            (poses(1), "truth/poses/t comes with"),
+            (poses(1, "ball", joints=()), "truth/poses/t comes with"),
+            (poses(1, "ball", camera=pose * np.nan), "'truth/poses/camera' holds nan"),
+            (poses(0, "ball"), "does not follow 0 us"),
+        ):
+            with pytest.raises(AmiwarpError, match=message):
+                writer.append_poses(refused)
+        writer.append_poses(poses(1, "ball"))
+    found = truth_of(amiwarp.open_recording(path)).poses
+    assert found is not None
+    same_poses(found[:], amiwarp.Poses.concatenate([poses(0, "ball"), poses(1, "ball")]))
 
 
 def test_the_file_is_read_with_h5py_as_the_page_shows(stored: Path, tmp_path: Path) -> None:
@@ -286,8 +344,8 @@ def test_a_file_without_truth_has_no_new_groups(tmp_path: Path) -> None:
 
 
 DAMAGE: list[tuple[str, Any, str]] = [
-    ("truth/events/cause", lambda old: old[:-1], "truth/events/cause has shape"),
-    ("truth/events/place", lambda old: old[:, :2], "truth/events/place has shape"),
+    ("truth/events/cause", lambda old: old[:-1], "dataset 'truth/events/cause' has shape"),
+    ("truth/events/place", lambda old: old[:, :2], "dataset 'truth/events/place' has shape"),
     ("truth/events/place", lambda old: old[:, 0], "no 2-dimensional dataset 'truth/events/place'"),
     ("truth/events/cause", lambda old: old.astype(np.float32), "dataset 'truth/events/cause' is float32"),
     ("truth/frames/t", lambda old: old[::-1], "truth/frames/t does not increase"),
@@ -363,6 +421,13 @@ def test_numbers_that_the_type_cannot_hold_are_refused(stored: Path, tmp_path: P
 
 def test_instants() -> None:
     np.testing.assert_array_equal(chosen_instants(10_000, 300.0), [0, 3333, 6667, 10_000])
+    for duration, rate, count in (
+        (290_000, 100.0, 30),
+        (1_100_000, 30.0, 34),
+        (300_000, 1.0 / 0.03, 11),
+        (9999, 100.0, 1),
+    ):
+        assert len(chosen_instants(duration, rate)) == count
     np.testing.assert_array_equal(chosen_instants(10_000, None, [5, 7000]), [5, 7000])
     assert chosen_instants(10_000).size == 0
     for given in ([-1], [10_001], [5, 5], [[1]]):
@@ -544,6 +609,8 @@ def test_truth_of_events_that_stay_on_the_device(device: str) -> None:
     assert isinstance(found.events, amiwarp.DeviceMemoryEvents)
     assert len(found.events) == len(expected.events)
     same_truth(found, expected)
+    with pytest.raises(AmiwarpError, match="values are sliced in steps of 5"):
+        truth_of(found).stored_causes[::5]  # type: ignore[index]
 
 
 def test_how_pixels_see_the_world(named: Path) -> None:

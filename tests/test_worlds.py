@@ -1,6 +1,7 @@
 """Worlds: rays, truth and events, compared with an independent float64 implementation."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -413,6 +414,7 @@ def test_a_flickering_lamp_makes_events_of_its_rate() -> None:
         (lambda: Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)), "at least one triangle"),
         (lambda: Mesh(np.zeros((3, 3)), [[0, 1, 3]]), "outside of 0 .. 2"),
         (lambda: Material(texture=np.zeros(3)), r"shape \(3,\)"),
+        (lambda: Mesh(np.eye(3), [[0, 1, 2]], light=[0.0, 5.0, -1.0]), r"light is -1 \.\. 5; give factors in 0 \.\. 1"),
         (lambda: World("none", ()), "no bodies"),
         (lambda: Trajectory([0.0, 1e-3], [[0, 0, 0], [9, 0, 0]], [[0, 0, 0, 1]] * 2), "split the trajectory"),
         (lambda: Trajectory([0.0, 0.0], np.zeros((2, 3)), [[0, 0, 0, 1]] * 2), "do not increase"),
@@ -423,6 +425,29 @@ def test_a_flickering_lamp_makes_events_of_its_rate() -> None:
 def test_bad_worlds_are_refused(make: Any, says: str) -> None:
     with pytest.raises(AmiwarpError, match=says):
         make()
+
+
+@pytest.mark.parametrize("width", [64, 128])
+def test_a_panorama_covers_all_directions(width: int) -> None:
+    azimuth = np.pi - (np.arange(width) + 0.5) / width * 2.0 * np.pi
+    elevation = np.pi / 2.0 - (np.arange(64)[:, None] + 0.5) / 64 * np.pi
+    panorama = 0.5 + 0.2 * np.cos(elevation) * np.sin(azimuth) + 0.2 * np.sin(elevation)  # 0.5 + 0.2 y + 0.2 z
+    behind = Body("box", box((0.0, -9.0, 0.0), (1.0, 1.0, 1.0)))
+    world = World("sky", (behind,), sky=Sky(1.0, panorama.astype(np.float32)))
+    path = Trajectory.still((0.0, 0.0, 0.0), look_at=(1.0, 1.0, 0.3))
+    luminance = TruthRenderer(Simulation(WorldScene(world, path), CAMERA, Prism(0.0), 0.1)).luminance(0)
+    pixels = np.stack(np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height)), axis=-1).reshape(-1, 2)
+    directions = CAMERA.pixels_to_rays(pixels.astype(np.float32)) @ path.poses([0.0])[0][0].T
+    expected = 0.5 + 0.2 * directions[:, 1] + 0.2 * directions[:, 2]
+    np.testing.assert_allclose(luminance.ravel(), expected, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("samples", [2, 4.0, True, "4"])
+def test_the_number_of_rays_is_one_of_four(samples: Any) -> None:
+    scene = WorldScene(random_world(1, moving=0), moving_camera(), samples=np.int64(9))  # type: ignore[arg-type]
+    assert type(scene.samples) is int
+    with pytest.raises(AmiwarpError, match="samples"):
+        replace(scene, samples=samples)
 
 
 def test_a_camera_inside_a_body_sees_its_inside() -> None:

@@ -33,6 +33,7 @@ from amiwarp.live.link.link import Link
 from amiwarp.live.link.protocol import FAULTS, STATES
 from amiwarp.live.queues import Policy
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
+from amiwarp.optics.camera import with_lens
 from amiwarp.validation import real
 
 if TYPE_CHECKING:
@@ -511,7 +512,8 @@ def _open_sink(
     from amiwarp.live.stream.packets import encode_hello
     from amiwarp.live.stream.sockets import open_sink
 
-    hello = encode_hello(found.camera.width, found.camera.height, found.camera, _prism(found), encoders)
+    camera = with_lens(found.camera, found.parameters)
+    hello = encode_hello(camera.width, camera.height, camera, _prism(found), encoders)
     sink = open_sink(address, hello, stop=stop, say=say)
     resources.push(sink)
     return sink
@@ -549,9 +551,11 @@ def _writer(
         metadata["optic"] = found.model_name
     if compensated:
         metadata["compensated_with"] = found.model_name
-    return LiveWriter(path, width=width, height=height, camera=found.camera, prism=source.prism or _prism(found),
-                      metadata=metadata, compensated=compensated, encoders=encoders,
-                      clock_offset_us=offset_us)  # fmt: skip
+    return LiveWriter(
+        path, width=width, height=height, camera=with_lens(found.camera, found.parameters),
+        prism=source.prism or _prism(found), metadata=metadata, compensated=compensated, encoders=encoders,
+        clock_offset_us=offset_us,
+    )  # fmt: skip
 
 
 def _recorded_from(source: Source) -> dict[str, Any]:

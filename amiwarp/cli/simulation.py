@@ -312,7 +312,7 @@ class SensorOptions:
         float | None, _in_sensor(help="Rate of random events in the dark, relative to that at white (1 or more).")
     ] = None
     leak_jitter_fraction: Annotated[
-        float | None, _in_sensor(help="Relative standard deviation of the time between leak events.")
+        float | None, _in_sensor(help="Relative standard deviation of the leak rate (0 to 0.3).")
     ] = None
     noise_rate_cov_decades: Annotated[
         float | None,

@@ -29,10 +29,11 @@ from amiwarp.io.export import bag_of, export, left_out
 from amiwarp.io.files import check_output
 from amiwarp.io.formats import Codec, OutputFormat, Rounding, check_codec, check_rounding, output_format
 from amiwarp.io.hdf5_files import CHUNK, NativeEvents, compile_checksums
-from amiwarp.io.native_writer import FlaggedEvents
+from amiwarp.io.native_writer import FlaggedEvents, copy_records
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import join_columns
 from amiwarp.kernels.launch import RecordedLaunch, launch, page_locked
+from amiwarp.optics.camera import with_lens
 from amiwarp.optics.models import Model, PlateModel
 from amiwarp.tasks import Progress, in_order
 from amiwarp.validation import guarded
@@ -148,7 +149,7 @@ class CompensationSummary:
     dropped: int = 0
     """Number of events that were not written, because after rounding they are outside the image."""
     left_out: tuple[str, ...] = ()
-    """Parts of the recording that a format other than the native one does not hold, such as ``"encoder"``."""
+    """Parts of the recording that the new file does not hold, such as ``"encoder"`` in a format without."""
 
     @property
     def mev_per_s(self) -> float:
@@ -285,8 +286,10 @@ def compensate(
     Events keep their time, polarity and order; coordinates become sub-pixel float32 values. Events outside the image
     are kept; the native format marks them in ``events/inside``. Memory use is constant.
 
-    The native format, npz and text (to 1e-6 px) hold sub-pixel coordinates. The other formats need ``rounding``. From a
-    ROS 2 bag to a ROS 2 bag, the messages of all other topics are copied.
+    The native format, npz and text (to 1e-6 px) hold sub-pixel coordinates. The other formats need ``rounding``. A
+    native file gets the calibrated camera, the IMU samples, and the ground truth of instants; frames, which show the
+    image through the optic, and the ground truth of single events are left out. From a ROS 2 bag to a ROS 2 bag, the
+    messages of all other topics are copied.
 
     Parameters
     ----------
@@ -324,9 +327,9 @@ def compensate(
     Raises
     ------
     AmiwarpError
-        If the calibration is for another sensor size, the encoder does not cover the events, a depth map is given for
-        another optic than a plate or has another size, the format cannot hold the events, or the output cannot be
-        written, is the recording itself, or exists. No partial file remains.
+        If the calibration is for another sensor size, the events are already compensated or not covered by the encoder,
+        a depth map is given for another optic than a plate or has another size, the format cannot hold the events, or
+        the output cannot be written, is the recording itself, or exists. No partial file remains.
 
     Examples
     --------
@@ -353,10 +356,12 @@ def compensate(
     n = len(recording.events)
     encoder = recording.encoder
     if n:
+        if not recording.events[:1].whole_pixels:
+            raise AmiwarpError(f"{recording.name}: its events are already compensated; give those of the sensor")
         encoder = calibration.encoder_for(encoder, recording.events.t_first, recording.events.t_last)
     outside = done = dropped = 0
     metadata: dict[str, MetadataValue] = {**recording.metadata, "compensated_with": calibration.model_name}
-    truth = None if recording.truth is None else recording.truth.parameters
+    truth = recording.truth
 
     def count(events: Events, inside: NDArray[np.uint8]) -> None:
         nonlocal outside, done
@@ -379,15 +384,26 @@ def compensate(
         missing = left_out(recording, chosen)
         seconds = time.perf_counter() - began
         return CompensationSummary(done, outside, seconds, chosen, rounding, dropped, missing)
+    parameters, labels = (None, None) if truth is None else (truth.parameters, truth.labels)
+    camera = with_lens(calibration.camera, calibration.parameters)
     with RecordingWriter(
-        out_path, width=width, height=height, camera=recording.camera or calibration.camera, prism=recording.prism,
-        encoder=encoder, truth_parameters=truth, metadata=metadata, overwrite=overwrite, codec=codec,
+        out_path, width=width, height=height, camera=camera, prism=recording.prism, encoder=encoder,
+        truth_parameters=parameters, truth_labels=labels, metadata=metadata, overwrite=overwrite, codec=codec,
     ) as writer:  # fmt: skip
         if compensator is not None:
             compile_checksums()
             pieces = compensated_pieces(recording.events, compensator)
             writer.fill(pieces, count=PIECE, t_first=recording.events.t_first, done=count)
-    return CompensationSummary(done, outside, time.perf_counter() - began)
+        copy_records(recording, writer)
+    of_events = () if truth is None else (
+        truth.stored_points, truth.stored_causes, truth.stored_instances, truth.stored_depths, truth.stored_places
+    )  # fmt: skip
+    lost = {
+        "ground truth of events": any(values is not None for values in of_events),
+        "frames": recording.frames is not None,
+    }
+    missing = tuple(name for name, left in lost.items() if left)
+    return CompensationSummary(done, outside, time.perf_counter() - began, left_out=missing)
 
 
 def at_depths(model: Model, depth: DepthMap) -> PlateModel:

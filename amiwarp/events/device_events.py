@@ -292,13 +292,15 @@ class DeviceEvents:
         Returns
         -------
         DeviceEvents
-            All events.
+            All events. If some are compensated, all coordinates are float32.
         """
         if not blocks:
             raise AmiwarpError("there are no blocks of events to join; give at least one")
         if len(blocks) == 1:
             return blocks[0]
-        events = cls(*(join([getattr(block, name) for block in blocks]) for name in NAMES))
+        pixels = wp.uint16 if all(block.whole_pixels for block in blocks) else wp.float32
+        types = {"x": pixels, "y": pixels, "t": wp.int64, "p": wp.uint8}
+        events = cls(*(join([cast(getattr(block, name), kind) for block in blocks]) for name, kind in types.items()))
         wait(events.device)
         return events
 
@@ -603,8 +605,7 @@ class DeviceValues:
         self._values = values
 
     def __getitem__(self, which: slice, /) -> NDArray[Any]:
-        start, stop, _ = which.indices(len(self._values))
-        return np.asarray(part(self._values, start, stop).numpy())
+        return np.asarray(part(self._values, *slice_bounds(which, len(self._values), "values")).numpy())
 
 
 def device_of(source: EventSource, device: Any) -> Any:

@@ -130,25 +130,25 @@ DEFAULT_BLOCK = 1 << 20
 """Default number of events per block."""
 
 
-def slice_bounds(which: object, length: int) -> tuple[int, int]:
+def slice_bounds(which: object, length: int, what: str = "events") -> tuple[int, int]:
     """Return the start and stop of a slice without steps of ``length`` events: ``0 <= start <= stop <= length``.
 
     Raises :class:`AmiwarpError` for anything else, such as the index of one event. Python's own iteration over an
-    object with an index ends in this error, too.
+    object with an index ends in this error, too. ``what`` is the name of other items than events.
     """
     if isinstance(which, int | np.integer):
         one = "[-1:]" if which == -1 else f"[{which}:{which + 1}]"
-        raise AmiwarpError(
-            f"events are indexed by the number {which}; give a slice, such as {one} for one event, and iterate over a "
-            "recording's events by blocks(count=...) or blocks(duration_us=...)"
-        )
-    found = instance(which, slice, "index of events")
+        remedy = f"give a slice, such as {one} for one"
+        if what == "events":
+            remedy += " event, and iterate over a recording's events by blocks(count=...) or blocks(duration_us=...)"
+        raise AmiwarpError(f"{what} are indexed by the number {which}; {remedy}")
+    found = instance(which, slice, f"index of {what}")
     for end in (found.start, found.stop):
         if end is not None:
-            whole(end, "index of events", *INT64)
+            whole(end, f"index of {what}", *INT64)
     start, stop, step = found.indices(length)
     if step != 1:
-        raise AmiwarpError(f"events are sliced in steps of {step}; slice without steps, then NumPy arrays with them")
+        raise AmiwarpError(f"{what} are sliced in steps of {step}; slice without steps, then NumPy arrays with them")
     return start, max(start, stop)
 
 
@@ -362,7 +362,7 @@ class Events:
         Returns
         -------
         Events
-            All events.
+            All events. If some are compensated, all coordinates are float32.
         """
         if len(blocks) == 1:
             return blocks[0]

@@ -47,7 +47,7 @@ class StoredRows(Protocol[Item]):
     """Protocol of rows that are read by slicing, in memory or in a file that is read on demand."""
 
     def __getitem__(self, which: slice, /) -> Item:
-        """Return the rows in a slice."""
+        """Return the rows in a slice without steps."""
 
 
 class StoredInstants(Protocol[Item]):

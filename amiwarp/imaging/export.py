@@ -191,8 +191,9 @@ class IweFiles:
     def _check_outputs(self) -> None:
         """Check all output paths before any work; raise :class:`AmiwarpError` if one of them cannot be written."""
         for path in self._paths:
-            count = self._count if path.suffix.lower() == ".png" else 1
-            check_output(self._numbered(path, 0) if count > 1 else path)
+            png = path.suffix.lower() == ".png"
+            count = self._count if png else 1
+            check_output(self._numbered(path, 0) if png else path)
             there = set(os.listdir(path.parent)) if count > 1 else set()
             for name in (self._numbered(path, at) for at in range(count)):
                 if name.name in there:

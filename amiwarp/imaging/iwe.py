@@ -843,7 +843,7 @@ def iwe(
     encoder : Encoder, optional
         Encoder that covers the events. Requires ``model``.
     camera_rotation : CameraRotation, optional
-        The camera's own rotation, compensated together with the prism.
+        The camera's own rotation, compensated together with the prism. Requires ``model`` and ``encoder``.
     pad : int, optional
         Border added on each side [px].
     per_polarity : bool, optional
@@ -863,8 +863,8 @@ def iwe(
     Raises
     ------
     AmiwarpError
-        If only one of ``model`` and ``encoder`` is given, the encoder does not cover the events, their times decrease,
-        or they are on another device than ``device``.
+        If only one of ``model`` and ``encoder`` is given, or ``camera_rotation`` without them; if the encoder does not
+        cover the events, their times decrease, or they are on another device than ``device``.
 
     Examples
     --------
@@ -877,6 +877,8 @@ def iwe(
         raise AmiwarpError("only one of model and encoder is given; give both a model and an encoder, or neither")
     if model is not None and encoder is not None:
         check_prisms(encoder, model.ANGLES)
+    elif camera_rotation is not None:
+        raise AmiwarpError("camera_rotation is given without a model and an encoder, which it needs; give all three")
     device = device_for(events, device)
     device_events.check_order(events)
     votes = Votes(CanvasShape(width, height, pad, 1.0, per_polarity, vote), device)

@@ -286,7 +286,7 @@ class _QuarterTurn(Network):
     """amiwarp's own network, which makes the pictures of several windows at a time."""
 
     def _run_grids(self, grids: wp.array, states: Any) -> tuple[wp.array, Any]:
-        """Return the results as a window alone would give them, however many are computed at a time."""
+        """Return the results without TF32. They depend on how many are computed at a time by rounding errors only."""
         with _full_precision():
             return super()._run_grids(grids, states)
 
@@ -387,9 +387,9 @@ def sums_of_windows(
             f"the optic turns by {turns[k]:.2g} of a turn in the window of {lengths[k]} us; amiwarp's own network "
             "takes a quarter turn: cut the events by windows(events, encoder=encoder, turns=0.25)"
         )
-    index = find_indices(events, ends.ravel()).reshape(ends.shape)
+    edges = ends + (np.arange(BINS + 1) == BINS)  # the last event may be at the end
+    index = find_indices(events, edges.ravel()).reshape(ends.shape)
     index = np.clip(index, windows.start[:, None], windows.stop[:, None])
-    index[:, -1] = windows.stop  # the last event may be at the end
     parts = Windows(*(part.ravel() for part in (index[:, :-1], index[:, 1:], ends[:, :-1], ends[:, 1:])))
     found = polarity_histogram(events, width, height, windows=parts, model=model, encoder=encoder, device=events.device)
     counts = torch.from_dlpack(found).reshape(len(windows), BINS, 2, height, width)
@@ -432,11 +432,11 @@ def sums_of_parts(counts: Any, chords: NDArray[np.float32]) -> Any:
 
 
 def _as_array(values: Any, device: Any, what: str) -> wp.array:
-    """Return an array of any library as a Warp array on the device, without a copy if it is there."""
+    """Return an array of any library as a Warp array on the device, without a copy if it is there and has no gaps."""
     try:
         if isinstance(values, wp.array) or (hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)):
             found = values if isinstance(values, wp.array) else wp.from_dlpack(values)
-            return found.to(device)
+            return found.to(device).contiguous()
         numbers = np.ascontiguousarray(values)
         return wp.array(numbers, dtype=wp.dtype_from_numpy(numbers.dtype), device=device)
     except Exception as error:  # libraries raise many kinds of errors

@@ -263,16 +263,6 @@ def sharpness(
     return found
 
 
-def contrast(image: NDArray[np.float32]) -> float:
-    """Return the variance over mean of an IWE: 1 for events at random pixels, higher for sharper images."""
-    return sharpness(image, Sharpness.VARIANCE)
-
-
-def entropy(image: NDArray[np.float32]) -> float:
-    """Return the entropy of the events' distribution over the pixels of an IWE [nat]: lower for sharper images."""
-    return -sharpness(image, Sharpness.ENTROPY)
-
-
 # How much the edges in an image run in one direction.
 
 EDGE_SMOOTHING_PX = 1.5

@@ -92,6 +92,8 @@ class Windows:
 
     def __getitem__(self, which: slice | NDArray[Any]) -> Windows:
         """Return the windows of a slice, or at an index or boolean array."""
+        if np.ndim(self.start[which]) == 0:
+            raise AmiwarpError(f"windows are indexed by {which}; give a slice, such as [k : k + 1] for one window")
         return Windows(self.start[which], self.stop[which], self.t_start[which], self.t_end[which])
 
 
@@ -119,12 +121,13 @@ def windows(
     count : int, optional
         Number of events in a window. It starts at the time of its first event and ends at that of its last one.
     ranges : array_like, optional
-        First index, and index after the last, of each window, shape ``(n, 2)``. Times are as for ``count``.
+        First index, and index after the last, of each window, shape ``(n, 2)``. Times are as for ``count``; a window
+        without events is at the time of the event before it.
     encoder : Encoder, optional
-        Encoder that covers the events. Windows start at the first event, and last until the prism has turned by
-        ``turns`` since their start.
+        Encoder that covers the events. Windows start at the first event. Each lasts until the angle of the prism
+        differs by ``turns``, in either direction, from that at its start.
     turns : float, default 1.0
-        Turns of the prism in a window, in either direction, with ``encoder``.
+        Turns of the prism in a window, with ``encoder``.
     incomplete : bool, default False
         Keep the last window if it is shorter than the others. Its end is then that of a whole window for a duration,
         else the last event's time.
@@ -176,24 +179,54 @@ def windows(
 
 
 def _turn_edges(encoder: Any, first: int, last: int, turns: float, incomplete: bool) -> NDArray[np.int64]:
-    """Return the times at which the prism has turned by multiples of ``turns`` since the first event [us]."""
+    """Return the times at which windows of ``turns`` of the prism start and end, from the first event on [us]."""
     inside = encoder.t[(encoder.t > first + encoder.clock_offset_us) & (encoder.t < last + encoder.clock_offset_us)]
     times = np.unique(np.concatenate([[first], np.rint(inside - encoder.clock_offset_us).astype(np.int64), [last]]))
-    turned = np.maximum.accumulate(np.abs(encoder.angle_at(times) - encoder.angle_at([first])) / (2.0 * math.pi))
-    number = int(turned[-1] / turns)
-    keep = np.concatenate([[True], np.diff(turned) > 0.0])
-    inner = np.interp(np.arange(1, number + 1) * turns, turned[keep], (times[keep] - first).astype(np.float64))
-    edges = np.concatenate([[first], first + np.rint(inner).astype(np.int64)])
-    return np.append(edges, last) if incomplete and edges[-1] < last else edges
+    turned = (encoder.angle_at(times) - encoder.angle_at([first])) / (2.0 * math.pi)
+    moved = np.concatenate([[True], np.diff(turned) != 0.0])
+    turned, elapsed = turned[moved], (times[moved] - first).astype(np.float64)
+    edges = [np.array([first])]
+    for start, stop, level, way, number in _one_way(turned / turns):
+        ahead, t = way * (turned[start:stop] - level * turns), elapsed[start:stop]
+        farthest = np.maximum.accumulate(ahead)
+        wanted = np.minimum(np.arange(1, number + 1) * turns, farthest[-1])
+        after = np.maximum(np.searchsorted(farthest, wanted), 1)
+        slope = (t[after] - t[after - 1]) / (ahead[after] - ahead[after - 1])
+        edges.append(first + np.rint(slope * (wanted - ahead[after - 1]) + t[after - 1]).astype(np.int64))
+    found = np.concatenate(edges)
+    return np.append(found, last) if incomplete and (found[-1] < last or len(found) == 1) else found
+
+
+def _one_way(turned: NDArray[np.float64]) -> Iterator[tuple[int, int, int, int, int]]:
+    """Yield the stretches of samples in which windows end in one direction, for the angle in windows since the start.
+
+    Each has its first sample, the one after its last, the whole number of windows at its start, its direction, 1 or -1,
+    and the number of windows that end in it.
+    """
+    start = way = level = before = 0
+    for k in (np.flatnonzero(np.diff(np.floor(turned) + np.ceil(turned))) + 1).tolist():
+        at = float(turned[k])
+        if abs(at - level) < 1.0:
+            continue
+        ahead = 1 if at > level else -1
+        if way == -ahead:
+            yield start, k, before, way, abs(level - before)
+            start, before = k - 1, level
+        way, level = ahead, ahead * math.floor(ahead * at)
+    if way:
+        yield start, len(turned), before, way, abs(level - before)
 
 
 def _at_indices(events: Events | DeviceEvents, start: NDArray[np.int64], stop: NDArray[np.int64]) -> Windows:
-    """Return windows at indices, which start and end at the times of their first and last events."""
-    filled = stop > start
-    t_start, t_end = np.zeros(len(start), np.int64), np.zeros(len(start), np.int64)
-    times = times_at(events, np.concatenate([start[filled], stop[filled] - 1]))
-    t_start[filled], t_end[filled] = np.split(times, 2)
-    return Windows(start, stop, t_start, t_end)
+    """Return windows at indices, which start and end at the times of their first and last events.
+
+    Those without events start and end at the time of the event before them, or of the first one.
+    """
+    if not len(events):
+        return Windows(start, stop, np.zeros_like(start), np.zeros_like(start))
+    last = np.maximum(np.maximum(start, stop) - 1, 0)
+    times = times_at(events, np.concatenate([np.minimum(start, last), last]))
+    return Windows(start, stop, *np.split(times, 2))
 
 
 # Batches of recordings.
@@ -213,7 +246,8 @@ def collate(blocks: Sequence[Events] | Sequence[DeviceEvents], *, device: Any = 
     Returns
     -------
     Events or DeviceEvents
-        All events, in the order of the recordings. Their times start anew with each recording.
+        All events, in the order of the recordings. Their times start anew with each recording. If some are compensated,
+        all coordinates are float32.
     Windows
         One window for each recording, from its first to its last event.
 
@@ -796,7 +830,7 @@ def voxel_grid(
     intervals = bins - 1 if end_bin else bins
     grid = _grid(width, height, steps=max(intervals, 1), rate=intervals, off=-1)
     out = _shares(batch, grid, bins)
-    if normalize:
+    if normalize and len(batch.windows):
         _normalise(out.reshape((len(batch.windows), -1)))
     return batch.finish(out)
 
@@ -941,7 +975,7 @@ def time_surface(
     Notes
     -----
     With the latest event at time t, a pixel is ``exp(-(t_end - t) / tau_us)`` [1]_, or
-    ``max(0, 1 - (t_end - t) / tau_us)``; without events, it is 0.
+    ``max(0, 1 - (t_end - t) / tau_us)``; without events, it is 0. If t is after ``t_end``, it is 1.
 
     References
     ----------

@@ -127,13 +127,13 @@ def open_aedat2(path: Path) -> Recording:
         chip, offset = _read_aedat2_header(path)
     read, last = partial(_aedat2_packets, path, chip, offset), partial(file_scan.last_word, path, offset, ">u4")
     events = FileEvents(path, read, size=(chip.width, chip.height), last_time=last)
-    imu, notes = _imu(path, chip, offset, events)
+    imu, notes = _imu(path, offset, events)
     notes |= file_scan.only_counted(events.records, "frames")
     metadata = {"format": "aedat2", **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu)
 
 
-def _imu(path: Path, chip: Chip, offset: int, events: FileEvents) -> tuple[ImuSamples | None, dict[str, MetadataValue]]:
+def _imu(path: Path, offset: int, events: FileEvents) -> tuple[ImuSamples | None, dict[str, MetadataValue]]:
     """Return the IMU samples, unless only the head of the file was read, and notes about them."""
     if not events.records.get("imu_samples") or file_scan.head_limit() is not None:
         return None, {}

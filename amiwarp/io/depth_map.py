@@ -58,9 +58,13 @@ class DepthMap(ArrayMap):
             expected = (*shape, 3) if name == "points" else shape
             if values.shape != expected or len(shape) != 2 or not all(1 <= n <= LARGEST_SIZE for n in shape):
                 raise AmiwarpError(f"depth map's {name} has shape {values.shape}; expected (height, width), points x 3")
-            if name != "points" and (values < 0.0).any():
-                raise AmiwarpError(f"depth map's {name} has a negative value; expected values of 0 or above, or NaN")
+            if name != "points" and ((values < 0.0) | np.isinf(values)).any():
+                raise AmiwarpError(
+                    f"depth map's {name} has a negative or infinite value; expected finite values of 0 or above, or NaN"
+                )
             object.__setattr__(self, name, values.astype(np.float32, copy=False))
+        if np.isnan(self.std[self.known]).any():
+            raise AmiwarpError("depth map's std is NaN at a pixel whose depth is known; make both NaN, or none")
 
     def __repr__(self) -> str:
         height, width = self.inverse_depth.shape

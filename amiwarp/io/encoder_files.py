@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder, UnwrapError, check_direction
 from amiwarp.io.files import errors_name, text_lines
-from amiwarp.io.formats import TRIGGERS, Format, detect_format, io_function
+from amiwarp.io.formats import TRIGGERS, Format, check_topic, detect_format, io_function
 from amiwarp.validation import whole
 
 # Reader of encoder logs in CSV: columns ``t_us``, ``angle_deg`` or ``count``, and optionally ``index`` (0 or 1).
@@ -161,6 +161,7 @@ def read_encoder_triggers(
     if found not in TRIGGERS:
         formats = ", ".join(one.value for one in TRIGGERS)
         raise AmiwarpError(f"{path}: files of the format {found.value} store no triggers; expected one of {formats}")
+    check_topic(path, topic, found)
     with errors_name(path, lambda: "reading the triggers"):
         channels, t, rising = _edges(path, found, topic)
     at = np.unique(t[(channels == channel) & rising])

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import SENSOR_DTYPE, Events, EventSource, Recording
+from amiwarp.events.recording import SENSOR_DTYPE, Events, EventSource, Recording, check_coordinates
 from amiwarp.events.truth import FrameStore, Poses, PoseStore
 from amiwarp.io import formats
 from amiwarp.io.file_scan import RECORDS, FileEvents
 from amiwarp.io.files import NewFile, check_output, errors_name
 from amiwarp.io.formats import LIMITS, Bag, Codec, Outline, OutputFormat, Rounding, open_recording
 from amiwarp.io.native_writer import write_recording
+from amiwarp.io.plain_files import write_array
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import NominalPrism
 from amiwarp.tasks import Progress
@@ -62,8 +63,16 @@ def export(
     check_limits(outline, limits)
     pixels = Pixels(limits, size, rounding, seed)
     write: Writer = formats.io_function(formats.WRITERS[chosen])
-    with NewFile(path, overwrite=overwrite) as new, errors_name(path, lambda: f"writing {limits.label}"):
-        write(new.part, _written(source.blocks() if blocks is None else blocks, pixels, len(source), progress), outline)
+    foreign: list[Exception] = []
+    written = _written(source.blocks() if blocks is None else blocks, pixels, outline, len(source), progress, foreign)
+    with NewFile(path, overwrite=overwrite) as new:
+        try:
+            write(new.part, written, outline)
+        except BaseException as error:
+            if error in foreign:
+                raise
+            with errors_name(path, lambda: f"writing {limits.label}"):
+                raise
     return pixels.dropped
 
 
@@ -86,16 +95,34 @@ def check_limits(about: Outline, limits: formats.Limits) -> None:
         )
 
 
-def _written(blocks: Iterable[Events], pixels: Pixels, count: int, progress: Progress | None) -> Iterator[Events]:
-    """Yield the events as the format holds them, in blocks of at least one. ``count`` is the number of all events."""
+def _written(
+    blocks: Iterable[Events],
+    pixels: Pixels,
+    about: Outline,
+    count: int,
+    progress: Progress | None,
+    foreign: list[Exception],
+) -> Iterator[Events]:
+    """Yield the events as the format holds them, in blocks of at least one. ``count`` is the number of all events.
+
+    An exception that is not amiwarp's, of a caller's function or source, is noted in ``foreign``.
+    """
     done = 0
-    for block in blocks:
-        events = pixels(block)
-        if len(events):
-            yield events
-        done += len(block)
-        if progress is not None:
-            progress("writing events", done / count)
+    try:
+        for block in blocks:
+            events = pixels(block)
+            if len(events):
+                if events.whole_pixels:
+                    check_coordinates(events, about.width, about.height, where=str(about.path), first_index=done)
+                yield events
+            done += len(block)
+            if progress is not None:
+                progress("writing events", done / count)
+    except AmiwarpError:
+        raise
+    except Exception as error:
+        foreign.append(error)
+        raise
 
 
 class Pixels:
@@ -211,9 +238,10 @@ def convert(
     """Convert a recording to the native format or to another one, in constant memory.
 
     Only the native format holds the encoder, the camera, the prism, the ground truth, the IMU samples, the frames and
-    the metadata. All formats keep x, y, t and p of every event exactly, with two exceptions for compensated events:
-    text holds their coordinates to 1e-6 px, and formats of whole pixels need ``rounding``. From a ROS 2 bag to a ROS 2
-    bag, the messages of all other topics are copied.
+    the metadata. All formats keep x, y, t and p of every event exactly, with three exceptions. Of compensated events,
+    text holds the coordinates to 1e-6 px, and formats of whole pixels need ``rounding``. In a ROS 2 bag the times begin
+    at 0 if the last is later than 28 h, as are times since 1970: only the stamps of its messages hold those. From a
+    ROS 2 bag to a ROS 2 bag, the messages of all other topics are copied.
 
     Parameters
     ----------
@@ -497,21 +525,21 @@ def save_flow_mvsec(
     count = len(intervals) + 1
     with NewFile(path, overwrite=overwrite) as new, zipfile.ZipFile(new.part, "w", zipfile.ZIP_DEFLATED) as archive:
         seconds = np.asarray(frames.t, np.float64) * 1e-6
-        _write_array(archive, "timestamps", seconds.shape, seconds.dtype, iter([seconds]))
+        write_array(archive, "timestamps", seconds.shape, "<f8", [seconds.astype("<f8").tobytes()])
         height, width = frames[0].depth.shape
         for axis, name in enumerate(("x_flow_dist", "y_flow_dist")):
 
-            def maps(axis: int = axis) -> Iterator[NDArray[np.float32]]:
+            def maps(axis: int = axis) -> Iterator[bytes]:
                 for index in range(count):
                     moved, _ = _displacement(frames, index, with_prism=with_prism)
                     known = np.isfinite(moved).all(axis=2)
-                    yield np.where(known, moved[..., axis], 0.0).astype(np.float32)
+                    yield np.where(known, moved[..., axis], 0.0).astype("<f4").tobytes()
                     if progress is not None:
                         progress("writing flow", (axis + (index + 1) / count) / 2.0)
 
-            _write_array(archive, name, (count, height, width), np.dtype(np.float32), maps())
-        occlusion = (_displacement(frames, index, with_prism=with_prism)[1] for index in range(count))
-        _write_array(archive, "occlusion", (count, height, width), np.dtype(np.uint8), occlusion)
+            write_array(archive, name, (count, height, width), "<f4", maps())
+        found = (_displacement(frames, index, with_prism=with_prism)[1] for index in range(count))
+        write_array(archive, "occlusion", (count, height, width), "|u1", (part.tobytes() for part in found))
     return count
 
 
@@ -597,14 +625,3 @@ def encode_png16(picture: NDArray[np.uint16]) -> bytes:
 def _png_part(kind: bytes, data: bytes) -> bytes:
     """Return a chunk of a PNG file: length, kind, data and checksum."""
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-def _write_array(
-    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], parts: Iterator[NDArray[Any]]
-) -> None:
-    """Write an array to a .npz archive part by part."""
-    with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-        header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(file, header)
-        for part in parts:
-            file.write(np.ascontiguousarray(part, dtype).tobytes())

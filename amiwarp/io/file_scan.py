@@ -251,7 +251,7 @@ class FileEvents(EventSource):
                 break
             found.append(block[max(start - seen, 0) : max(stop - seen, 0)])
             seen += len(block)
-        return Events.concatenate([block for block in found if len(block)])
+        return _copied([block for block in found if len(block)])
 
     def find(self, t: int) -> int:
         """Return the index of the first event at or after ``t`` [us]."""
@@ -271,11 +271,11 @@ class FileEvents(EventSource):
             start, stop = np.searchsorted(block.t, [t_start, t_end])
             if stop > start:
                 found.append(block[start:stop])
-        return Events.concatenate(found)
+        return _copied(found)
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
         """Return all events in blocks, as :meth:`amiwarp.EventSource.blocks`."""
-        return regroup(self._all(), count=count, duration_us=duration_us)
+        return regroup((_copied([block]) for block in self._all()), count=count, duration_us=duration_us)
 
     def _all(self) -> Iterator[Events]:
         return iter(self._kept) if self._kept is not None else self._pass(PassCounts())
@@ -314,6 +314,14 @@ class FileEvents(EventSource):
             for name, values in (("x", x), ("y", y))
         )
         return Events(x, y, ordered, (p > 0).astype(np.uint8))
+
+
+def _copied(blocks: list[Events]) -> Events:
+    """Return the events of some blocks in new arrays, which a caller may change: the blocks may be those kept.
+
+    Read-only views would do without a copy, but PyTorch warns of them.
+    """
+    return Events.concatenate([Events.empty(), *blocks])
 
 
 # Pieces of a file, and times of a counter that wraps around.

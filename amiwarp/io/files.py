@@ -175,7 +175,7 @@ def errors_name(path: Path, place: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except AmiwarpError as error:
-        if printable(str(path))[:WORD_HEAD] in str(error):
+        if str(error).startswith(tuple(printable(f"{path}{end}")[:WORD_HEAD] for end in ":/\\")):
             raise
         raise AmiwarpError(f"{path}: {place()}: {error}") from error
     except (KeyboardInterrupt, SystemExit, GeneratorExit):

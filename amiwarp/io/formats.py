@@ -8,6 +8,7 @@ from __future__ import annotations
 import enum
 import importlib
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -179,9 +180,14 @@ def _is_evt(head: bytes) -> bool:
     return any(line.startswith((b"% evt ", b"% format EVT")) for line in lines)
 
 
+def holds_values(line: bytes) -> bool:
+    """Return whether a line of a text file is neither empty nor a comment."""
+    return line.lstrip()[:1] not in (b"", b"#")
+
+
 def _looks_like_text(head: bytes) -> bool:
     """Return whether the first line without a comment consists of two or four numbers."""
-    line = next((line for line in head.split(b"\n") if line.strip() and not line.lstrip().startswith(b"#")), b"")
+    line = next(filter(holds_values, head.split(b"\n")), b"")
     try:
         return len([float(word) for word in line.split()]) in (2, 4)
     except ValueError:
@@ -229,10 +235,15 @@ def open_recording(
     chosen = detect_format(path) if format is None else choice(Format, format, f"{path}: format")
     if format is not None and _folder_format(path) is not chosen:
         check_regular(path)
-    if topic is not None and chosen not in TOPICS:
-        raise AmiwarpError(f"{path}: holds one stream of events, no topics; leave the topic out")
+    check_topic(path, topic, chosen)
     recording: Recording = io_function(OPENERS[chosen])(path, *((topic,) if chosen in TOPICS else ()))
     return recording
+
+
+def check_topic(path: Path, topic: str | None, found: Format) -> None:
+    """Raise :class:`AmiwarpError` if a topic is given for a file of a format without topics."""
+    if topic is not None and found not in TOPICS:
+        raise AmiwarpError(f"{path}: holds one stream of events, no topics; leave the topic out")
 
 
 # Formats that are written.
@@ -488,6 +499,8 @@ def check_codec(path: Path, given: Codec | str, chosen: OutputFormat) -> Codec:
 FORMAT, VERSION = "amiwarp-dataset", 1
 """Values of the manifest's fields ``format`` and ``version``."""
 MANIFEST = "manifest.json"
+SPLIT_NAME = "[A-Za-z0-9_-]+"
+"""Regular expression of the names of splits, which become names of folders and files."""
 MOST_BYTES = 1 << 30
 """Largest manifest that is read [bytes]: about a million recordings."""
 
@@ -595,9 +608,11 @@ class RecordedDataset:
     def __getitem__(self, index: int) -> Any:
         """Return an item: the value that ``transform`` returns, or its events or tensor, and its labels.
 
-        Raises IndexError after the last item, and :class:`AmiwarpError` if the file is missing or is not the one that
-        the manifest describes.
+        Raises IndexError after the last item, and :class:`AmiwarpError` if the index is no whole number, or if the file
+        is missing or is not the one that the manifest describes.
         """
+        if not hasattr(index, "__index__"):
+            raise AmiwarpError(f"the index of an item is {shown(index)}; give a whole number, one for each item")
         item = self._items[index]
         if item.representation is not None:
             arrays = io_function("plain_files:read_tensors")(self.folder / item.file)
@@ -646,7 +661,12 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], list[ManifestItem]]:
             raise AmiwarpError(f"field version is {version}, newer than {VERSION}; update amiwarp")
         items = instance(data.get("items"), list, "field items")
         head = {name: value for name, value in data.items() if name != "items"}
-        return head, [_item(entry, f"items[{k}]") for k, entry in enumerate(items)]
+        found = [_item(entry, f"items[{k}]") for k, entry in enumerate(items)]
+        first: dict[PurePosixPath, int] = {}
+        for k, item in enumerate(found):
+            if (other := first.setdefault(PurePosixPath(item.file), k)) != k:
+                raise AmiwarpError(f"field items[{k}].file is {shown(item.file)}, as items[{other}].file; remove one")
+        return head, found
 
 
 def _item(entry: Any, where: str) -> ManifestItem:
@@ -656,11 +676,14 @@ def _item(entry: Any, where: str) -> ManifestItem:
     path = PurePosixPath(file)
     if path.is_absolute() or ".." in path.parts or "\\" in file or not path.parts:
         raise AmiwarpError(f"field {where}.file is {shown(file)}; expected a path below the folder of the manifest")
+    split = instance(fields.get("split"), str, f"field {where}.split")
+    if not re.fullmatch(SPLIT_NAME, split):
+        raise AmiwarpError(f"field {where}.split is {shown(split)}; use letters, digits, '-' and '_'")
     made = fields.get("representation")
     return ManifestItem(
         fields,
         file,
-        instance(fields.get("split"), str, f"field {where}.split"),
+        split,
         instance(fields.get("labels"), dict, f"field {where}.labels"),
         whole(fields.get("events"), f"field {where}.events", 0, 1 << 62),
         None if made is None else instance(made, str, f"field {where}.representation"),

@@ -36,6 +36,7 @@ from amiwarp.optics.camera import (
     CAMERA_NUMBERS,
     COEFFICIENTS,
     DISTORTIONS,
+    LARGEST_SIZE,
     Camera,
     Distortion,
     camera_to_json,
@@ -336,7 +337,7 @@ class ChunkFile:
         self._columns: dict[str, ChunkedColumn] = {}
         self._turns = threading.Condition()
         self._turn = 0
-        self._stopped = False
+        self._failed = math.inf  # the lowest turn whose work failed
         with contextlib.ExitStack() as undo:
             with interrupts_later():
                 self.output = _Output(path)
@@ -352,24 +353,27 @@ class ChunkFile:
         """Wait until all lower numbers, from 0 on, had their turn, and keep out other turns.
 
         Chunks get their places in turn, so the bytes of a file do not depend on the speed of the threads. Raises
-        :class:`AmiwarpError` if another thread failed.
+        :class:`AmiwarpError` if the work of a lower turn failed.
         """
         with self._turns:
-            self._turns.wait_for(lambda: self._turn == number or self._stopped)
-            if self._stopped:
-                raise AmiwarpError("another thread could not write its part")
+            self._turns.wait_for(lambda: self._turn == number or self._failed < number)
+            if self._failed < number:
+                raise AmiwarpError("an earlier part could not be written")
             yield
             self._turn += 1
             self._turns.notify_all()
 
     @contextlib.contextmanager
-    def stopping(self) -> Iterator[None]:
-        """If the work of a thread in the ``with`` block fails, end the waiting of the others."""
+    def stopping(self, turn: int) -> Iterator[None]:
+        """If the work for a turn in the ``with`` block fails, end the waiting of all later turns.
+
+        Earlier ones go on, so that the first error in order is that of the work which failed.
+        """
         try:
             yield
         except BaseException:
             with self._turns:
-                self._stopped = True
+                self._failed = min(self._failed, turn)
                 self._turns.notify_all()
             raise
 
@@ -769,10 +773,19 @@ def _attributes(file: Hdf5File, group: str) -> Mapping[str, Any]:
     return file.attributes(group) or {}
 
 
-def _needed(file: Hdf5File, name: str) -> Column:
+def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int, ...] | None = None) -> Column:
+    """Return a dataset; raise :class:`AmiwarpError` if the dataset is missing or does not have the expected shape.
+
+    ``count``: expected number of rows; ``row``: expected shape of a row. None accepts any.
+    """
     if name not in file.columns:
         raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
-    return file.columns[name]
+    column = file.columns[name]
+    shape = (len(column), *column.row)
+    expected = (len(column) if count is None else count, *(column.row if row is None else row))
+    if shape != expected:
+        raise AmiwarpError(f"dataset '{name}' has shape {shape}; expected {expected}; the file is damaged")
+    return column
 
 
 def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
@@ -791,7 +804,7 @@ def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
 
 def _read_samples(file: Hdf5File, name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
     """Return times [us] and angles [rad] of an encoder whose datasets begin with ``name``; None without samples."""
-    columns = [_needed(file, name + column) for column in ("t", "angle")]
+    columns = [_column(file, name + column) for column in ("t", "angle")]
     t, angle = (column.read(0, len(column)) for column in columns)
     t, angle = rounded_times(t), angle.astype(np.float64)
     if file.unfinished:
@@ -898,7 +911,7 @@ class NativeEvents(EventSource):
         """Open the events of a file. If the file is unfinished, these are the events that are complete now."""
         self.path = path
         self._file = file
-        self._columns = {name: _needed(file, f"events/{name}") for name in ("t", "p", "x", "y")}
+        self._columns = {name: _column(file, f"events/{name}") for name in ("t", "p", "x", "y")}
         for name in ("inside", "extrapolated"):
             if f"events/{name}" in file.columns:
                 self._columns[name] = file.columns[f"events/{name}"]
@@ -925,7 +938,9 @@ class NativeEvents(EventSource):
         for start in range(0, min(self._count, head_limit() or self._count), DEFAULT_BLOCK):
             for axis, name in enumerate(("x", "y")):
                 values = self._read(name, start, min(start + DEFAULT_BLOCK, self._count))
-                largest[axis] = max(largest[axis], int(values.max()))
+                if values.dtype.kind == "f":  # compensated events may lie far outside, or have no coordinates
+                    values = np.rint(values[(values >= 0) & (values < LARGEST_SIZE)])
+                largest[axis] = max(largest[axis], int(values.max(initial=0)))
         width, height = smallest_sensor(largest[0], largest[1])
         return max(width, DSEC_SIZE[0]), max(height, DSEC_SIZE[1])
 
@@ -1022,8 +1037,13 @@ class NativeEvents(EventSource):
         return {f"events/{n}": c for n, c in chunks.items() if c is not None and self._columns[n].dtype == dtypes[n]}
 
     def _pieces_in_order(self) -> Iterator[Events]:
+        start, last = 0, None
         with contextlib.closing(in_order(self.pieces(CHUNK))) as pieces:
-            yield from pieces
+            for piece in pieces:  # whose own order is checked
+                checks.check_events(piece[:1], *self._size, where=str(self.path), first_index=start, allow_nan=True,
+                                    after_t=last)  # fmt: skip
+                start, last = start + len(piece), int(piece.t[-1])
+                yield piece
 
     def _times(self, start: int, stop: int) -> NDArray[np.int64]:
         return self._since_zero(rounded_times(self._read("t", start, stop)))
@@ -1059,20 +1079,9 @@ def read_imu(path: Path, file: Hdf5File) -> ImuSamples | None:
         return None
     with errors_name(path, lambda: "imu"):
         count = len(file.columns["imu/t"])
-        values = [_rows(file, f"imu/{name}", count, (3,)) for name in ("angular_velocity", "acceleration")]
+        values = [_column(file, f"imu/{name}", count, (3,)) for name in ("angular_velocity", "acceleration")]
         t = rounded_times(file.columns["imu/t"].read(0, count))
         return ImuSamples(t, *(column.read(0, count).astype(np.float64, copy=False) for column in values))
-
-
-def _rows(file: Hdf5File, name: str, count: int, row: tuple[int, ...] | None) -> Column:
-    """Return a dataset of ``count`` rows of the shape ``row``, or of any shape if it is None."""
-    if name not in file.columns:
-        raise AmiwarpError(f"dataset '{name}' is missing; the file is incomplete")
-    column = file.columns[name]
-    if len(column) != count or column.row != (row or column.row):
-        shape = (len(column), *column.row)
-        raise AmiwarpError(f"dataset '{name}' has shape {shape}, its times are {count}; the file is damaged")
-    return column
 
 
 def read_frames(path: Path, file: Hdf5File) -> StoredImages | None:
@@ -1089,7 +1098,7 @@ class StoredImages:
     def __init__(self, path: Path, file: Hdf5File) -> None:
         self._path, self._file = path, file  # the columns hold only a weak reference to the file
         times = file.columns["frames/t"]
-        self._image = _rows(file, "frames/image", len(times), None)
+        self._image = _column(file, "frames/image", len(times))
         if self._image.dtype not in (np.uint8, np.uint16) or not all(self._image.row):
             raise AmiwarpError(f"frames are {self._image.dtype} of shape {self._image.row}; expected uint8 or uint16")
         self.t = rounded_times(times.read(0, len(times)))
@@ -1111,8 +1120,8 @@ class StoredImages:
 
 # Ground truth of native recordings. Events, instants and poses are read on demand.
 
-Read = Callable[[int, int], NDArray[Any]]
-"""Function that returns the rows of a dataset from ``start`` up to ``stop`` (excluded)."""
+Read = Callable[[int, int], Any]
+"""Function that returns rows from ``start`` up to ``stop`` (excluded)."""
 
 
 def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) -> Truth:
@@ -1131,33 +1140,33 @@ def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) ->
         stored_places=values["place"],
         labels=_labels(path, file),
         frames=_StoredFrames(path, file, size) if "truth/frames/t" in file.columns else None,
-        poses=_StoredPoses(path, file) if "truth/poses/t" in file.columns else None,
+        poses=_poses(path, file),
         known=_StoredMasks(path, file, size) if "truth/known/t" in file.columns else None,
     )
 
 
 class _StoredRows:
-    """Rows of a dataset, or of several datasets side by side, that are read on demand."""
+    """Rows of one or several datasets that are read on demand."""
 
     def __init__(self, path: Path, name: str, count: int, read: Read, file: Hdf5File) -> None:
         self._path, self._name, self._count, self._read = path, name, count, read
         self._file = file  # keeps the file open: the columns hold only a weak reference to the file
 
-    def __getitem__(self, which: slice, /) -> NDArray[Any]:
-        start, stop, _ = which.indices(self._count)
-        with errors_name(self._path, lambda: f"{self._name} {which.start} .. {which.stop}"):
-            return self._read(start, max(start, stop))
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, which: slice, /) -> Any:
+        with errors_name(self._path, lambda: self._name):
+            start, stop = checks.slice_bounds(which, self._count, "rows")
+        with errors_name(self._path, lambda: f"{self._name} {start} .. {stop}"):
+            return self._read(start, stop)
 
 
 def _points(path: Path, file: Hdf5File, count: int) -> _StoredRows | None:
     """Return the true points of the events, or None if they are not stored."""
     if "truth/x" not in file.columns:
         return None
-    x, y = (_column(file, f"truth/{name}") for name in ("x", "y"))
-    if len(x) != count or len(y) != count:
-        raise AmiwarpError(
-            f"{path}: truth/x and truth/y have {len(x)} and {len(y)} rows for {count} events; the file is damaged"
-        )
+    x, y = (_column(file, f"truth/{name}", count) for name in ("x", "y"))
     return _StoredRows(path, "truth", count, partial(_read_points, x, y), file)
 
 
@@ -1168,16 +1177,10 @@ def _read_points(x: Column, y: Column, start: int, stop: int) -> NDArray[np.floa
 
 def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> _StoredRows | None:
     """Return the values of the dataset ``truth/events/name``, or None if the dataset is missing."""
-    column = file.columns.get(f"truth/events/{name}")
-    if column is None:
+    stored, (dtype, row) = f"truth/events/{name}", EVENT_COLUMNS[name]
+    if stored not in file.columns:
         return None
-    dtype, row = EVENT_COLUMNS[name]
-    if len(column) != count or column.row != row:
-        shape = (len(column), *column.row)
-        raise AmiwarpError(
-            f"{path}: truth/events/{name} has shape {shape} for {count} events; expected {(count, *row)}"
-        )
-    return _StoredRows(path, f"truth/events/{name}", count, partial(_read_as, column, dtype), file)
+    return _StoredRows(path, stored, count, partial(_read_as, _column(file, stored, count, row), dtype), file)
 
 
 def _read_as(column: Column, dtype: Any, start: int, stop: int) -> NDArray[Any]:
@@ -1210,21 +1213,6 @@ def _names(file: Hdf5File, name: str) -> tuple[str, ...]:
     if column is None:
         return ()
     return tuple(bytes(text).decode("utf-8", "replace") for text in column.read(0, len(column)).tolist())
-
-
-def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int, ...] | None = None) -> Column:
-    """Return a dataset; raise :class:`AmiwarpError` if the dataset is missing or does not have the expected shape.
-
-    ``count``: expected number of rows; ``row``: expected shape of a row. None accepts any.
-    """
-    if name not in file.columns:
-        raise AmiwarpError(f"dataset '{name}' is missing; the file is incomplete")
-    column = file.columns[name]
-    shape = (len(column), *column.row)
-    expected = (len(column) if count is None else count, *(column.row if row is None else row))
-    if shape != expected:
-        raise AmiwarpError(f"dataset '{name}' has shape {shape}; expected {expected}; the file is damaged")
-    return column
 
 
 class _StoredFrames:
@@ -1278,37 +1266,32 @@ class _StoredMasks:
             return self._masks.read(at, at + 1)[0] != 0
 
 
-class _StoredPoses:
-    """Poses of camera, bodies and joints, read from a file on demand."""
+def _poses(path: Path, file: Hdf5File) -> _StoredRows | None:
+    """Return the poses of camera, bodies and joints, or None if they are not stored."""
+    if "truth/poses/t" not in file.columns:
+        return None
+    t = file.columns["truth/poses/t"]
+    camera = _column(file, "truth/poses/camera", len(t), (7,))
+    tables = {
+        what: (names, _column(file, table, len(t), (len(names), width)))
+        for what, names, table, width in (
+            ("bodies", _names(file, "truth/poses/body_names"), "truth/poses/bodies", 7),
+            ("joints", _names(file, "truth/joints/names"), "truth/joints/position", 3),
+        )
+        if names and table in file.columns
+    }
+    return _StoredRows(path, "truth/poses", len(t), partial(_read_poses, t, camera, tables), file)
 
-    def __init__(self, path: Path, file: Hdf5File) -> None:
-        self._path, self._file = path, file
-        self._t = file.columns["truth/poses/t"]
-        count = len(self._t)
-        self._camera = _column(file, "truth/poses/camera", count, (7,))
-        self._tables = {
-            what: (names, _column(file, table, count, (len(names), width)) if names and table in file.columns else None)
-            for what, names, table, width in (
-                ("bodies", _names(file, "truth/poses/body_names"), "truth/poses/bodies", 7),
-                ("joints", _names(file, "truth/joints/names"), "truth/joints/position", 3),
-            )
-        }
 
-    def __len__(self) -> int:
-        return len(self._t)
-
-    def __getitem__(self, which: slice, /) -> Poses:
-        start, stop, _ = which.indices(len(self))
-        stop = max(start, stop)
-        with errors_name(self._path, lambda: f"truth/poses {start} .. {stop}"):
-            tables = {
-                what: {} if column is None else dict(
-                    zip(names, np.moveaxis(_read_as(column, np.float64, start, stop), 1, 0), strict=True)
-                )
-                for what, (names, column) in self._tables.items()
-            }  # fmt: skip
-            camera = _read_as(self._camera, np.float64, start, stop)
-            return Poses(rounded_times(self._t.read(start, stop)), camera, **tables)
+def _read_poses(
+    t: Column, camera: Column, tables: Mapping[str, tuple[tuple[str, ...], Column]], start: int, stop: int
+) -> Poses:
+    """Return the poses of the camera, and those of the bodies and joints, whose ``tables`` have names."""
+    named = {
+        what: dict(zip(names, np.moveaxis(_read_as(column, np.float64, start, stop), 1, 0), strict=True))
+        for what, (names, column) in tables.items()
+    }
+    return Poses(rounded_times(t.read(start, stop)), _read_as(camera, np.float64, start, stop), **named)
 
 
 # Files of MVSEC and Prophesee, which hold one row per event. They are read from the beginning.

@@ -453,11 +453,7 @@ def _chunked_length(dataset: Any, name: str, chunks: list[Any], unfinished: bool
 
 def _chunks(dataset: _Dataset, name: str, about: _FileFacts) -> list[Any]:
     """Return all chunks of a dataset in order, after checking that each lies in the file."""
-    chunk_bytes = (dataset.chunks or (0,))[0] * row_bytes(dataset)
-    if chunk_bytes > CHUNK_BYTES:
-        raise AmiwarpError(
-            f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store the dataset in smaller chunks"
-        )
+    chunk_bytes = bytes_of_chunk(dataset, name)
     chunks: list[Any] = []
     dataset.id.chunk_iter(chunks.append)
     chunks.sort(key=lambda chunk: chunk.chunk_offset[0])
@@ -472,6 +468,14 @@ def _chunks(dataset: _Dataset, name: str, about: _FileFacts) -> list[Any]:
     ):
         raise _damaged_chunk(name)
     return chunks
+
+
+def bytes_of_chunk(dataset: Any, name: str) -> int:
+    """Return the size of a dataset's chunk in memory [bytes], after checking that it is not too large."""
+    size = math.prod(dataset.chunks) * int(dataset.dtype.itemsize)
+    if size > CHUNK_BYTES:
+        raise AmiwarpError(f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store it in smaller chunks")
+    return size
 
 
 def _damaged_chunk(name: str) -> AmiwarpError:
@@ -520,9 +524,6 @@ ECF = 0x8ECF
 PIECE = 1 << 17
 """Number of rows that are read at once."""
 
-LARGEST_CHUNK = 1 << 28
-"""Largest chunk that is read [bytes]."""
-
 MVSEC_SIZE = (346, 260)
 """Size of MVSEC's cameras [px]."""
 
@@ -567,7 +568,8 @@ def is_dataset(found: Any) -> bool:
 def _check_rows(dataset: Any, name: str, path: str) -> None:
     """Check that a dataset holds rows of events, and that all of it is in the file."""
     if not is_dataset(dataset):
-        raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
+        why = "only Prophesee's files hold triggers" if name.startswith("EXT_TRIGGER") else "the file is incomplete"
+        raise AmiwarpError(f"no dataset '{name}'; {why}")
     wanted = ("p", "t", "id") if name.startswith("EXT_TRIGGER") else ("x", "y", "p", "t")
     fields = dataset.dtype.fields
     if dataset.ndim == 1 and fields is not None:
@@ -594,8 +596,7 @@ def check_stored(dataset: Any, name: str, path: str) -> None:
     chunks = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
     if chunks != dataset.id.get_num_chunks():
         raise AmiwarpError(f"dataset '{name}' declares {dataset.shape[0]} rows, which it does not hold; it is damaged")
-    if math.prod(dataset.chunks) * dataset.dtype.itemsize > LARGEST_CHUNK:
-        raise AmiwarpError(f"dataset '{name}' has chunks of over {LARGEST_CHUNK >> 20} MiB; store it in smaller ones")
+    bytes_of_chunk(dataset, name)
 
 
 # Reader of the IMU samples and frames in MVSEC's HDF5 files. Runs in the reading process.

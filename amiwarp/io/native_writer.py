@@ -25,14 +25,14 @@ from amiwarp.events import recording as checks
 from amiwarp.events import truth as ground_truth
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, ImuSamples, MetadataValue, Recording, regroup
-from amiwarp.events.truth import EventTruth, FrameTruth, Poses, Truth, WorldLabels
+from amiwarp.events.truth import EventTruth, FrameTruth, Poses, WorldLabels
 from amiwarp.io import hdf5_files
 from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
 from amiwarp.io.hdf5_files import CHUNK, ChunkFile, EncodedChunk, camera_attributes, open_hdf5, prism_attributes
 from amiwarp.optics.camera import Camera, check_size
 from amiwarp.optics.prism import NominalPrism
-from amiwarp.tasks import Progress, in_order
+from amiwarp.tasks import Progress, Result, in_order
 from amiwarp.validation import as_times, choice, guarded, shown
 
 # Layout of the file: header, datasets, chunks and the millisecond index.
@@ -69,6 +69,18 @@ def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) 
     for first in range(first_ms, last_ms + 1, 1 << 20):
         ms = np.arange(first, min(first + (1 << 20), last_ms + 1), dtype=np.int64)
         yield np.searchsorted(t, ms * 1000 + t_offset) + before
+
+
+def filled(chunk: Columns, start: int, columns: Columns) -> Columns:
+    """Return a chunk with a copy of columns from element ``start`` on; a new chunk if this is its first element.
+
+    Callers may change their arrays before the chunk is written.
+    """
+    if not start:
+        chunk = {name: np.empty((CHUNK, *column.shape[1:]), column.dtype) for name, column in columns.items()}
+    for name, column in columns.items():
+        chunk[name][start : start + len(column)] = column
+    return chunk
 
 
 def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
@@ -124,17 +136,30 @@ ROWS = 1024
 
 
 class RecordWriter:
-    """Writer of all but the events into an open HDF5 file: ground truth, IMU samples and frames.
+    """Writer of an open HDF5 file through HDF5: ground truth, IMU samples, frames, and other small datasets.
 
     Datasets are created at their first rows. All instants must have the same joints. All tables of poses must have the
-    same bodies and joints.
+    same bodies and joints. Records that are refused leave the file as it was.
     """
 
     def __init__(self, file: Any, path: Path, size: tuple[int, int], codec: Codec) -> None:
         """Set up the writer; ``size`` is the width and height of the sensor [px]."""
         self._file, self._path, self._size, self._codec = file, path, size, codec
         self._datasets: dict[str, Any] = {}
-        self._names: dict[str, tuple[str, ...]] = {}
+        self._given: dict[str, tuple[str, ...]] = {}  # names that all calls must give: of datasets, bodies and joints
+
+    def dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = (), chunk_rows: int = CHUNK) -> Any:
+        """Return a dataset, which is created at the first call."""
+        if name not in self._datasets:
+            self._datasets[name] = hdf5_files.make_dataset(self._file, name, dtype, row, chunk_rows, self._codec)
+        return self._datasets[name]
+
+    def extend(self, name: str, values: NDArray[Any], chunk_rows: int = CHUNK) -> None:
+        """Append rows to a dataset."""
+        dataset = self.dataset(name, values.dtype, values.shape[1:], chunk_rows)
+        start = dataset.shape[0]
+        dataset.resize(start + len(values), axis=0)
+        dataset[start:] = values
 
     def write_truth_header(self, parameters: Mapping[str, float] | None, labels: WorldLabels | None) -> None:
         """Write the true parameters of a simulation, and the names of a world's instances and their classes."""
@@ -151,71 +176,44 @@ class RecordWriter:
     def append_frame(self, frame: FrameTruth) -> None:
         """Append the ground truth of an instant, which must be later than the previous instants."""
         width, height = self._size
-        rows: dict[str, NDArray[Any]] = {}
+        maps: Columns = {}
         for name, (dtype, tail) in ground_truth.MAPS.items():
-            rows[name] = np.asarray(getattr(frame, name), dtype)
-            if rows[name].shape != (height, width, *tail):
+            values = np.asarray(getattr(frame, name), dtype)
+            if values.shape != (height, width, *tail):
                 raise AmiwarpError(
-                    f"{self._path}: {name} of the instant {frame.t_us} us has shape {rows[name].shape}; "
+                    f"{self._path}: {name} of the instant {frame.t_us} us has shape {values.shape}; "
                     f"expected {(height, width, *tail)}"
                 )
-        self._check_later("truth/frames/t", frame.t_us)
-        self._append("truth/frames/t", np.array([frame.t_us], np.int64), ROWS)
-        self._append("truth/frames/pose", ground_truth.as_poses(frame.rotation, frame.position)[None], ROWS)
-        self._append_joints("truth/frames/joints", {name: at[None] for name, at in frame.joints.items()})
-        for name, values in rows.items():
-            self._append(f"truth/frames/{name}", values[None], 1)
+            maps[f"truth/frames/{name}"] = values[None]
+        pose = ground_truth.as_poses(frame.rotation, frame.position)[None]
+        rows = {"truth/frames/t": np.array([frame.t_us], np.int64), "truth/frames/pose": pose}
+        joints = {name: at[None] for name, at in frame.joints.items()}
+        self._append(rows, maps, {"truth/joints/names": ("truth/frames/joints", joints)})
 
     def append_poses(self, poses: Poses) -> None:
         """Append a table of poses, which must be later than the previous poses."""
-        if not len(poses):
-            return
-        self._check_later("truth/poses/t", int(poses.t[0]))
-        self._append("truth/poses/t", np.asarray(poses.t, np.int64), ROWS)
-        self._append("truth/poses/camera", np.asarray(poses.camera, np.float64), ROWS)
-        self._append_joints("truth/joints/position", poses.joints)
-        if poses.bodies:
-            self._keep_names("truth/poses/body_names", poses.bodies)
-            self._append("truth/poses/bodies", np.stack(list(poses.bodies.values()), axis=1), ROWS)
+        rows = {
+            "truth/poses/t": np.asarray(poses.t, np.int64),
+            "truth/poses/camera": np.asarray(poses.camera, np.float64),
+        }
+        named = {
+            "truth/joints/names": ("truth/joints/position", poses.joints),
+            "truth/poses/body_names": ("truth/poses/bodies", poses.bodies),
+        }
+        if len(poses):
+            self._append(rows, named=named)
 
     def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
         """Append a mask of known pixels, which holds from a time later than those before."""
         width, height = self._size
         if mask.shape != (height, width):
             raise AmiwarpError(f"{self._path}: mask at {t_us} us has shape {mask.shape}; expected {(height, width)}")
-        self._check_later("truth/known/t", t_us)
-        self._append("truth/known/t", np.array([t_us], np.int64), ROWS)
-        self._append("truth/known/mask", np.asarray(mask, np.uint8)[None], 1)
-
-    def _append_joints(self, name: str, joints: Mapping[str, NDArray[np.float64]]) -> None:
-        """Append the positions of joints [m], shape (k, 3) each, to the dataset ``name``."""
-        if joints:
-            self._keep_names("truth/joints/names", joints)
-            self._append(name, np.stack(list(joints.values()), axis=1).astype(np.float64), ROWS)
-
-    def _keep_names(self, name: str, given: Iterable[str]) -> None:
-        """Write the names at the first call, and check that later calls give the same names."""
-        names = tuple(given)
-        if name not in self._names:
-            self._names[name] = names
-            self._write_names(name, names)
-        elif self._names[name] != names:
-            raise AmiwarpError(f"{self._path}: {name} changed between calls; give the same names in the same order")
-
-    def _write_names(self, name: str, names: tuple[str, ...]) -> None:
-        """Write names to a dataset of UTF-8 strings."""
-        import h5py
-
-        encoded = [text.encode("utf-8", "replace") for text in names]
-        kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
-        self._file.create_dataset(name, data=np.array(encoded, kind))
+        rows = {"truth/known/t": np.array([t_us], np.int64)}
+        self._append(rows, {"truth/known/mask": np.asarray(mask, np.uint8)[None]})
 
     def append_imu(self, samples: ImuSamples) -> None:
         """Append samples, which must not be earlier than those before."""
-        if len(samples):
-            self._check_later("imu/t", int(samples.t[0]), equal=True)
-        for name in ("t", "angular_velocity", "acceleration"):
-            self._append(f"imu/{name}", getattr(samples, name), ROWS)
+        self._append({f"imu/{name}": getattr(samples, name) for name in ("t", "angular_velocity", "acceleration")})
 
     def append_image(self, t_us: int, image: NDArray[Any]) -> None:
         """Append a frame, which must not be earlier than the frame before."""
@@ -225,36 +223,63 @@ class RecordWriter:
             checks.check_image(image, shape, dtype)
         except AmiwarpError as error:
             raise AmiwarpError(f"{self._path}: {error}") from error
-        self._check_later("frames/t", t_us, equal=True)
-        self._append("frames/t", np.array([t_us], np.int64), ROWS)
-        self._append("frames/image", image[None], 1)
+        self._append({"frames/t": np.array([t_us], np.int64)}, {"frames/image": image[None]})
 
-    def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
-        """Append rows to a dataset, which is created at the first call with ``chunk_rows`` rows per chunk."""
-        if name.startswith("truth/"):
-            ground_truth.check_truth(name, values)
-        if name not in self._datasets:
-            self._datasets[name] = hdf5_files.make_dataset(
-                self._file, name, values.dtype, values.shape[1:], chunk_rows, self._codec
-            )
-        dataset = self._datasets[name]
-        if dataset.shape[1:] != values.shape[1:]:
-            raise AmiwarpError(
-                f"{self._path}: rows of {name} have shape {values.shape[1:]}; expected {dataset.shape[1:]}"
-            )
-        start = dataset.shape[0]
-        dataset.resize(start + len(values), axis=0)
-        dataset[start:] = values
+    def _append(
+        self,
+        rows: Columns,
+        images: Columns | None = None,
+        named: Mapping[str, tuple[str, Mapping[str, NDArray[np.float64]]]] | None = None,
+    ) -> None:
+        """Append records to their datasets, of which the first holds the times [us].
 
-    def _check_later(self, name: str, t: int, *, equal: bool = False) -> None:
-        """Raise :class:`AmiwarpError` if the time ``t`` [us] does not follow the last time in a dataset.
+        ``images`` are stored in chunks of one row. ``named`` are arrays by name, which are stored side by side in a
+        dataset, if there are any: by the dataset of the names, that of the values and the arrays.
+        """
+        times, *_ = rows
+        names: dict[str, tuple[str, ...]] = {}
+        for where, (name, arrays) in (named or {}).items():
+            if arrays:
+                names[where] = tuple(arrays)
+                rows[name] = np.stack(list(arrays.values()), axis=1).astype(np.float64)
+        columns = rows | (images or {})
+        self._check_later(times, rows[times])
+        given = {times: tuple(columns), **names}
+        for where, found in given.items():
+            before = self._given.get(where, found)
+            if found != before:
+                change = f"{where} comes with {shown(found)}, before with {shown(before)}"
+                raise AmiwarpError(f"{self._path}: {change}; append the same in each call")
+        for name, values in columns.items():
+            if name.startswith("truth/"):
+                ground_truth.check_truth(name, values)
+            row = self._datasets[name].shape[1:] if name in self._datasets else values.shape[1:]
+            if values.shape[1:] != row:
+                raise AmiwarpError(f"{self._path}: rows of {name} have shape {values.shape[1:]}; expected {row}")
+        for where, found in names.items():
+            if where not in self._given:
+                self._write_names(where, found)
+        self._given |= given
+        for name, values in columns.items():
+            self.extend(name, values, ROWS if name in rows else 1)
 
-        ``equal``: whether the same time is allowed too.
+    def _write_names(self, name: str, names: tuple[str, ...]) -> None:
+        """Write names to a dataset of UTF-8 strings."""
+        import h5py
+
+        encoded = [text.encode("utf-8", "replace") for text in names]
+        kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
+        self._file.create_dataset(name, data=np.array(encoded, kind))
+
+    def _check_later(self, name: str, t: NDArray[np.int64]) -> None:
+        """Raise :class:`AmiwarpError` if times [us] do not follow the last time in a dataset.
+
+        Only times of the ground truth must be later.
         """
         stored = self._datasets.get(name)
-        if stored is not None and len(stored) and (t < int(stored[-1]) or (t == int(stored[-1]) and not equal)):
+        if stored is not None and len(stored) and len(t) and t[0] < int(stored[-1]) + name.startswith("truth/"):
             raise AmiwarpError(
-                f"{self._path}: {name} {t} us does not follow {int(stored[-1])} us; append in order of time"
+                f"{self._path}: {name} {t[0]} us does not follow {int(stored[-1])} us; append in order of time"
             )
 
 
@@ -333,13 +358,11 @@ class RecordingWriter:
         self._metadata = dict(metadata or {})
         self._chunks: Any = None
         self._records: RecordWriter | None = None
-        self._file: Any = None
-        self._datasets: dict[str, Any] = {}
         self._turns = itertools.count()
         self._new: NewFile | None = None
-        self._pending: list[Columns] = []
+        self._pending: Columns = {}
         self._written = self._pending_count = 0
-        self._columns: dict[str, np.dtype[Any]] | None = None
+        self._columns: dict[str, np.dtype[Any]] = {}
         self._t_offset = self._next_ms = self._ms_count = 0
         self._t_last: int | None = None
         self._ms: list[NDArray[np.int64]] = []
@@ -352,9 +375,8 @@ class RecordingWriter:
         try:
             with errors_name(self.path, lambda: "making the file"):
                 self._chunks = ChunkFile(self._new.part)
-                self._file = self._chunks.hdf5
-                self._records = RecordWriter(self._file, self.path, self._size, self._codec)
-                write_header(self._file, self._size, self._camera, self._prism, self._metadata)
+                self._records = RecordWriter(self._chunks.hdf5, self.path, self._size, self._codec)
+                write_header(self._chunks.hdf5, self._size, self._camera, self._prism, self._metadata)
                 self._records.write_truth_header(self._truth_parameters, self._truth_labels)
         except BaseException:
             self._discard()
@@ -405,8 +427,7 @@ class RecordingWriter:
         AmiwarpError
             If events are unsorted or outside the frame, or the arrays differ from those of the first call.
         """
-        if self._file is None:
-            raise AmiwarpError(f"{self.path}: append() was called outside the writer's 'with' block; call it inside")
+        self._open_records()
         self._check(events, len(self), allow_nan=inside is not None, after_t=self._t_last)
         if not len(events):
             return
@@ -415,9 +436,7 @@ class RecordingWriter:
             columns = self._as_columns(events, known, {"inside": inside, "extrapolated": extrapolated})
             self._index(events.t, len(self))
             columns["events/t"] = events.t - self._t_offset
-            self._pending.append(columns)
-            self._pending_count += len(events)
-            self._flush(whole=self._pending_count - self._pending_count % CHUNK)
+            self._store(columns, len(events))
 
     def fill(
         self,
@@ -447,12 +466,13 @@ class RecordingWriter:
         AmiwarpError
             If other events were written before, or events are unsorted or outside the frame.
         """
-        if self._file is None or len(self) or count % CHUNK:
-            given = "fill() was called outside the writer's 'with' block, after append(), or for parts of chunks"
-            raise AmiwarpError(f"{self.path}: {given}; call it inside the block, before other events")
+        self._open_records()
+        if len(self) or count % CHUNK:
+            given = f"fill() was called after {len(self)} events, for pieces of {count}"
+            raise AmiwarpError(f"{self.path}: {given}; call it before append(), for a multiple of {CHUNK}")
         self._t_offset = t_first
         jobs = (partial(self._write_piece, piece, k * count, next(self._turns)) for k, piece in enumerate(pieces))
-        with contextlib.closing(in_order(jobs)) as written:
+        with self._results(jobs) as written:
             for events, inside in written:
                 with errors_name(self.path, lambda: f"after {len(self)} events"):
                     if self._written % count:
@@ -464,7 +484,7 @@ class RecordingWriter:
         self, piece: Callable[[], FlaggedEvents], start: int, turn: int
     ) -> tuple[Events, NDArray[np.uint8]]:
         """Compute, encode and write a piece whose first event is event ``start``. Runs in a thread."""
-        with self._chunks.stopping():
+        with self._chunks.stopping(turn):
             if not callable(piece):
                 raise AmiwarpError(f"{self.path}: a piece is {shown(piece)}; expected a function")
             events, inside, known = piece()
@@ -564,13 +584,23 @@ class RecordingWriter:
         """Name the file and the place in errors, and raise the error of a full disk."""
         with errors_name(self.path, place):
             yield
-            if self._chunks is not None:
-                self._chunks.check()
+            self._chunks.check()
 
     def _open_records(self) -> RecordWriter:
         if self._records is None:
-            raise AmiwarpError(f"{self.path}: append outside the writer's with block; call it inside")
+            given = "the writer is used outside its 'with' block, before or after it, or after it failed"
+            raise AmiwarpError(f"{self.path}: {given}; append inside the block of a new writer")
         return self._records
+
+    @contextlib.contextmanager
+    def _results(self, jobs: Iterable[Callable[[], Result]]) -> Iterator[Iterator[Result]]:
+        """Run jobs that write chunks, and give their results in order. After an error the writer cannot go on."""
+        try:
+            with contextlib.closing(in_order(jobs)) as results:
+                yield results
+        except BaseException:
+            self._records = None
+            raise
 
     def set_encoder(self, encoder: Encoder) -> None:
         """Set or replace the encoder, which is written at the end.
@@ -590,7 +620,7 @@ class RecordingWriter:
         columns |= event_columns(truth, len(events))
         check_lengths(columns, len(events))
         dtypes = {name: column.dtype for name, column in columns.items()}
-        if self._columns is None:
+        if not len(self):
             self._columns = dtypes
             self._t_offset = int(events.t[0])
         elif dtypes != self._columns:
@@ -612,65 +642,67 @@ class RecordingWriter:
 
     def _write_index(self, least: int) -> None:
         if self._ms_count >= least:
-            self._extend("ms_to_idx", np.concatenate(self._ms))
+            self._open_records().extend("ms_to_idx", np.concatenate(self._ms))
             self._ms, self._ms_count = [], 0
 
-    def _flush(self, whole: int) -> None:
-        """Write the first ``whole`` pending events. Each chunk is compressed once."""
-        if not whole:
-            return
-        joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
+    def _store(self, columns: Columns, count: int) -> None:
+        """Write the chunks that are full with new events, and keep the other events."""
+        full: list[Columns] = []
+        start = 0
+        while start < count:
+            stop = min(start + CHUNK - self._pending_count, count)
+            part = {name: column[start:stop] for name, column in columns.items()}
+            if stop - start < CHUNK:
+                part = self._pending = filled(self._pending, self._pending_count, part)
+            self._pending_count = (self._pending_count + stop - start) % CHUNK
+            full += [] if self._pending_count else [part]
+            start = stop
+        if full:
+            self._write(full)
+
+    def _write(self, chunks: Sequence[Columns]) -> None:
+        """Write chunks of events, of which only the last of a recording is not full. Each is compressed once."""
         jobs = (
-            partial(self._write_chunk, name, self._written + at, column[at : min(at + CHUNK, whole)], next(self._turns))
-            for name, column in joined.items()
-            for at in range(0, whole, CHUNK)
+            partial(self._write_chunk, name, self._written + k * CHUNK, chunk[name], next(self._turns))
+            for name in chunks[0]
+            for k, chunk in enumerate(chunks)
         )
-        with contextlib.closing(in_order(jobs)) as written:
+        with self._results(jobs) as written:
             deque(written, maxlen=0)
-        self._written += whole
-        self._pending_count -= whole
-        self._pending = [{name: column[whole:] for name, column in joined.items()}] if self._pending_count else []
+        self._written += sum(len(chunk["events/t"]) for chunk in chunks)
 
     def _write_chunk(self, name: str, start: int, values: NDArray[Any], turn: int) -> None:
         """Encode and write the values of a chunk that begins at element ``start``. Runs in a thread."""
-        with self._chunks.stopping():
+        with self._chunks.stopping(turn):
             chunks = EncodedChunk.of(name, start, values, hdf5_files.encode_parts(values, self._codec))
             self._chunks.write(turn, chunks, self._dataset_of)
 
     def _dataset_of(self, chunk: EncodedChunk) -> Any:
-        return self._dataset(chunk.name, chunk.values.dtype, chunk.values.shape[1:])
-
-    def _extend(self, name: str, values: NDArray[Any]) -> None:
-        """Append values to a small dataset through HDF5."""
-        dataset = self._dataset(name, values.dtype)
-        start = dataset.shape[0]
-        dataset.resize(start + values.size, axis=0)
-        dataset[start:] = values
-
-    def _dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = ()) -> Any:
-        if name not in self._datasets:
-            self._datasets[name] = hdf5_files.make_dataset(self._file, name, dtype, row, codec=self._codec)
-        return self._datasets[name]
+        return self._open_records().dataset(chunk.name, chunk.values.dtype, chunk.values.shape[1:])
 
     def _finish(self) -> None:
-        self._flush(whole=self._pending_count)
+        extend = self._open_records().extend
+        if self._pending_count:
+            self._write([{name: column[: self._pending_count] for name, column in self._pending.items()}])
+            self._pending_count = 0
         self._ms.append(np.array([len(self)], np.int64))
         self._write_index(0)
         for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.uint8)):
-            self._extend(f"events/{name}", np.zeros(0, (self._columns or {}).get(f"events/{name}", np.dtype(dtype))))
-        self._file["t_offset"] = np.int64(self._t_offset)
+            extend(f"events/{name}", np.zeros(0, self._columns.get(f"events/{name}", np.dtype(dtype))))
+        self._chunks.hdf5["t_offset"] = np.int64(self._t_offset)
         if self._encoder is not None:
-            group = self._file.create_group("encoder")
+            group = self._chunks.hdf5.create_group("encoder")
             group.attrs["clock_offset_us"] = float(self._encoder.clock_offset_us)
             for name in ("t", "angle", "index_t"):
                 values = getattr(self._encoder, name)
                 if values is not None:
-                    self._extend(f"encoder/{name}", values)
+                    extend(f"encoder/{name}", values)
             if self._encoder.second is not None:
                 for name in ("t", "angle"):
-                    self._extend(f"encoder/second_{name}", getattr(self._encoder.second, name))
+                    extend(f"encoder/second_{name}", getattr(self._encoder.second, name))
 
     def _close(self) -> None:
+        self._records = None
         if self._chunks is not None:
             self._chunks.close()
 
@@ -734,12 +766,16 @@ def write_recording(
         truth_parameters=parameters, truth_labels=labels,
     ) as writer:  # fmt: skip
         _copy_events(recording, writer, size, progress)
+        copy_records(recording, writer)
+        if recording.frames is not None:
+            for index, t in enumerate(recording.frames.t.tolist()):
+                writer.append_image(t, recording.frames[index])
 
 
 def _copy_events(
     recording: Recording, writer: RecordingWriter, size: tuple[int, int], progress: Progress | None
 ) -> None:
-    """Append all events of a recording to a writer, with their ground truth and flags, IMU samples and frames.
+    """Append all events of a recording to a writer, with their ground truth and flags.
 
     ``size`` is that of the image [px]. Flags that a source of compensated events does not have follow from it.
     """
@@ -756,17 +792,15 @@ def _copy_events(
         start = stop
         if progress is not None:
             progress("writing events", start / len(source))
-    if truth is not None:
-        _copy_world_truth(truth, writer)
+
+
+def copy_records(recording: Recording, writer: RecordingWriter) -> None:
+    """Append to a writer a recording's IMU samples, ground truth of instants, masks of known pixels, and poses."""
+    truth = recording.truth
     if recording.imu is not None:
         writer.append_imu(recording.imu)
-    if recording.frames is not None:
-        for index, t in enumerate(recording.frames.t.tolist()):
-            writer.append_image(t, recording.frames[index])
-
-
-def _copy_world_truth(truth: Truth, writer: RecordingWriter) -> None:
-    """Append to a writer the ground truth of instants, the masks of known pixels, and the poses."""
+    if truth is None:
+        return
     if truth.known is not None:
         for index, t in enumerate(truth.known.t.tolist()):
             writer.append_known(t, truth.known[index])
@@ -871,7 +905,7 @@ class LiveWriter:
         self._file: Any = None
         self._columns: dict[str, Any] = {}
         self._small: dict[str, _GrowingDataset] = {}
-        self._pending: list[Columns] = []
+        self._pending: Columns = {}
         self._pending_count = 0
         self._written = 0  # number of events in full chunks
         self._stored = 0  # number of events in the file, including those of the last, partial chunk
@@ -976,7 +1010,8 @@ class LiveWriter:
         for entries in ms_entries(t, self._t_offset, self._next_ms, len(self)):
             self._small["ms_to_idx"].add(entries)
             self._next_ms += entries.size
-        self._pending.append({**columns, "events/t": t - self._t_offset})
+        new = {**columns, "events/t": t - self._t_offset}
+        self._pending = filled(self._pending, self._pending_count, new)
         self._pending_count += t.size
         self._t_last = int(t[-1])
         if self._pending_count == CHUNK:
@@ -994,7 +1029,7 @@ class LiveWriter:
         self._check_open("append_encoder")
         name = self._names[second]
         offset = round(self._clock_offset_us)
-        t, angles = np.atleast_1d(as_times(t_us)) + offset, np.atleast_1d(np.asarray(angle, np.float64))
+        t, angles = np.atleast_1d(as_times(t_us)) + offset, np.atleast_1d(np.array(angle, np.float64))
         if t.shape != angles.shape or t.ndim != 1 or not np.isfinite(angles).all():
             shapes = f"t {t.shape}, angle {angles.shape}"
             raise AmiwarpError(
@@ -1090,17 +1125,14 @@ class LiveWriter:
     def _write(self) -> None:
         """Write the pending events of the current chunk. Start a new chunk if the chunk is full."""
         count = self._pending_count
-        joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
         with contextlib.closing(
-            in_order(partial(hdf5_files.encode, column[:count]) for column in joined.values())
+            in_order(partial(hdf5_files.encode, column[:count]) for column in self._pending.values())
         ) as encoded:
-            for name, stored in zip(joined, encoded, strict=True):
+            for name, stored in zip(self._pending, encoded, strict=True):
                 hdf5_files.append_chunk(self._columns[name], self._written, stored, count)
-        # One statement, so that Ctrl-C cannot interrupt it halfway.
-        if count == CHUNK:
-            self._written, self._pending, self._pending_count = self._written + count, [], 0
-        self._pending = [joined] if self._pending_count else []
-        self._stored = len(self)
+        self._stored = self._written + count
+        if count == CHUNK:  # one statement, so that Ctrl-C cannot interrupt it halfway
+            self._written, self._pending_count = self._stored, 0
 
     def _flush(self) -> None:
         if self._stored < len(self):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import shutil
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -20,7 +19,15 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording, regroup
 from amiwarp.io.file_scan import FileEvents, Packet, microseconds, read_pieces, whole_pixels
 from amiwarp.io.files import LONGEST_LINE, NewFile, errors_name, input_path, open_input, scratch_folder
-from amiwarp.io.formats import BIN_EVENT_BYTES, BIN_MARK_ROW, Outline, bin_columns, check_ending, looks_like_bin
+from amiwarp.io.formats import (
+    BIN_EVENT_BYTES,
+    BIN_MARK_ROW,
+    Outline,
+    bin_columns,
+    check_ending,
+    holds_values,
+    looks_like_bin,
+)
 from amiwarp.optics.camera import LARGEST_SIZE, Camera, RadialTangential
 from amiwarp.tasks import in_order
 
@@ -60,23 +67,27 @@ def read_calib(path: Path, width: int, height: int) -> Camera:
 def _read_size(path: Path, file: BinaryIO) -> tuple[tuple[int, int] | None, int]:
     """Return the sensor size from a first line of two numbers, and the number of lines read.
 
-    If the first line is an event, return None and 0.
+    Empty lines and comments may come before it. If the first line is an event, return None and 0.
     """
-    words = file.readline(LONGEST_LINE).split()
+    number, words = 0, list[bytes]()
+    while not words and (line := file.readline(LONGEST_LINE)).endswith(b"\n"):
+        number, words = number + 1, line.split() if holds_values(line) else []
     if len(words) != 2:
         file.seek(0)
         return None, 0
     if not (words[0].isdigit() and words[1].isdigit()):
         given = b" ".join(words)[:80].decode("ascii", "replace")
-        raise AmiwarpError(f"{path}: line 1 '{given}' is not a size in pixels; expected 'width height' or 't x y p'")
-    return (int(words[0]), int(words[1])), 1
+        raise AmiwarpError(
+            f"{path}: line {number} '{given}' is not a size in pixels; expected 'width height' or 't x y p'"
+        )
+    return (int(words[0]), int(words[1])), number
 
 
 def _last_time(path: Path, estimate: int) -> int | None:
     """Return the time of the last line [us], or None if it holds none."""
     with open_input(path) as file:
         file.seek(max(path.stat().st_size - 2 * LONGEST_LINE, 0))
-        lines = [line for line in file.read().split(b"\n")[1:] if line.strip() and not line.lstrip().startswith(b"#")]
+        lines = list(filter(holds_values, file.read().split(b"\n")[1:]))
     with contextlib.suppress(ValueError, IndexError, OverflowError):
         return round(float(lines[-1].split()[0]) * 1e6)
     return None
@@ -107,7 +118,7 @@ def _parse(path: Path, lines: list[bytes], line_number: int, fractional: bool | 
 
     ``line_number`` is the number of the line before them, ``fractional`` what the lines before have shown.
     """
-    kept = [line for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
+    kept = list(filter(holds_values, lines))
     if not kept:
         nothing = np.zeros(0, np.int64)
         return fractional, (nothing, nothing, nothing, nothing)
@@ -140,7 +151,7 @@ def _plausible(table: NDArray[np.float64], fractional: bool | None) -> NDArray[n
 def _first_bad_line(lines: list[bytes], line_number: int, fractional: bool | None) -> str:
     """Return a description of the first line that does not hold an event, for error messages."""
     for number, line in enumerate(lines, line_number + 1):
-        if not line.strip() or line.lstrip().startswith(b"#"):
+        if not holds_values(line):
             continue
         try:
             row = np.array([[float(word) for word in line.split()]])
@@ -512,16 +523,22 @@ def write_npz(part: Path, blocks: Iterable[Events], about: Outline) -> None:
                     files[name].write(np.ascontiguousarray(getattr(events, name), dtype).data)
         with zipfile.ZipFile(part, "x") as archive:
             for name, dtype in columns.items():
-                with (
-                    archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member,
-                    (folder / name).open("rb") as column,
-                ):
-                    header = {"descr": dtype, "fortran_order": False, "shape": (count,)}
-                    npy.write_array_header_1_0(member, header)
-                    shutil.copyfileobj(column, member, 1 << 20)
+                with (folder / name).open("rb") as column:
+                    write_array(archive, name, (count,), dtype, iter(partial(column.read, 1 << 20), b""))
             for name in ("width", "height"):
-                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w") as member:
-                    npy.write_array(member, np.array(getattr(about, name)))
+                write_array(archive, name, (), "<i8", [np.array([getattr(about, name)], "<i8").tobytes()])
+
+
+def write_array(
+    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: str, parts: Iterable[bytes]
+) -> None:
+    """Write an array to an archive part by part. Equal arrays give equal files."""
+    member = zipfile.ZipInfo(f"{name}.npy")
+    member.compress_type = archive.compression
+    with archive.open(member, "w", force_zip64=True) as file:
+        npy.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
+        for part in parts:
+            file.write(part)
 
 
 # Reader of the ``.bin`` files of N-MNIST and N-Caltech101: events of 5 bytes, without a header.

@@ -16,6 +16,7 @@ from amiwarp.io.file_scan import FileEvents, Packet, last_word, nearest, read_pi
 from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.formats import LONGEST_US, Outline
 from amiwarp.io.reading_process import Reply, faery_module, has_faery, noting_progress, packets, run
+from amiwarp.validation import TIME_LIMIT
 
 # Decoders of Prophesee's EVT words with NumPy: EVT 2.0, 2.1 and 3.0, for streams that arrive in pieces.
 #
@@ -68,8 +69,8 @@ class Evt2Decoder:
             self.high = int(highs[-1])
         events = known & (kind <= 1)
         trigger = known & (kind == TRIGGER)
-        value = (words.astype(np.uint64) if self.vectors else head)[trigger] & 1
-        triggers = head[trigger] >> 8 & 0x1F, np.zeros(value.size, np.int64), t[trigger], value.astype(np.int64)
+        edges = head[trigger]
+        triggers = edges >> 8 & 0x1F, np.zeros(edges.size, np.int64), t[trigger], edges & 1
         x, y, p = head[events] >> 11 & 0x7FF, head[events] & 0x7FF, kind[events]
         if not self.vectors:
             return (x, y, t[events], p), triggers
@@ -182,35 +183,60 @@ def _read_header(path: Path) -> tuple[dict[str, str], int]:
         return fields, offset
 
 
+@dataclass(frozen=True, slots=True)
+class EvtFile:
+    """Header of a RAW file."""
+
+    path: Path
+    fields: dict[str, str]
+    """Values by lower-case key."""
+    version: str
+    """Version of EVT, as the header names it."""
+    offset: int
+    """Position of the first word [bytes]."""
+    word: int
+    """Size of a word [bytes]."""
+    swapped: bool
+    """Whether the 32-bit halves of the words are swapped, see :func:`swap_halves`."""
+    origin: int
+    """Time that is added to those of the words [us]: ``t0`` of the header, which amiwarp and faery write."""
+
+    def words(self, data: bytes) -> NDArray[Any]:
+        """Return the whole words of some bytes of the file."""
+        words = words_of(data, VERSION_OF[self.word])
+        return swap_halves(words) if self.swapped else words
+
+
 def open_evt(path: Path) -> Recording:
     """Open a RAW file. The decoder raises each time to the largest so far, without reporting how often."""
-    fields, offset = _read_header(path)
-    version, word = _evt_version(path, fields)
-    swapped = word == 8 and _is_swapped(path, offset, fields.get("format", ""))
-    source = _evt_source(path, offset, word, swapped, False)
-    last = None if word == 2 else partial(_last_evt_time, path, offset, word, swapped)
-    events = FileEvents(path, source, size=_evt_size(fields), last_time=last)
-    truncated = (path.stat().st_size - offset) % word
+    about = _read_evt_header(path)
+    last = None if about.word == 2 else partial(_last_evt_time, about)
+    events = FileEvents(path, _evt_source(about, False), size=_evt_size(about.fields), last_time=last)
+    truncated = (path.stat().st_size - about.offset) % about.word
     noted = {"truncated_bytes": truncated} if truncated else {}
-    return Recording(events=events, metadata={"format": f"evt{version}", **noted, **events.metadata}, name=path.stem)
+    return Recording(
+        events=events, metadata={"format": f"evt{about.version}", **noted, **events.metadata}, name=path.stem
+    )
 
 
-def _evt_version(path: Path, fields: dict[str, str]) -> tuple[str, int]:
-    """Return the version of EVT in a header, and the size of its words [bytes]."""
+def _read_evt_header(path: Path) -> EvtFile:
+    fields, offset = _read_header(path)
     version = fields.get("evt") or fields.get("format", "").removeprefix("EVT").partition(";")[0]
     word = {"2.0": 4, "2": 4, "2.1": 8, "21": 8, "3.0": 2, "3": 2}.get(version)
     if word is None:
         raise AmiwarpError(f"{path}: EVT version in the header is '{version[:40]}'; expected 2.0, 2.1 or 3.0")
-    return "2.1" if word == 8 else version, word
+    origin = fields.get("t0", "0")
+    if not re.fullmatch(r"[0-9]{1,19}", origin) or int(origin) > TIME_LIMIT:
+        raise AmiwarpError(f"{path}: t0 in the header is '{origin[:40]}'; expected a time of 0 to {TIME_LIMIT} us")
+    swapped = word == 8 and _is_swapped(path, offset, fields.get("format", ""))
+    return EvtFile(path, fields, "2.1" if word == 8 else version, offset, word, swapped, int(origin))
 
 
-def _evt_source(
-    path: Path, offset: int, word: int, swapped: bool, triggers: bool
-) -> Callable[[dict[str, int]], Iterator[Packet]]:
+def _evt_source(about: EvtFile, triggers: bool) -> Callable[[dict[str, int]], Iterator[Packet]]:
     """Return the function that yields the events, or the triggers, of a RAW file: with faery if it can read them."""
-    if word == 8 or not has_faery():
-        return partial(_numpy_packets, path, offset, word, swapped, triggers)
-    return partial(packets, read_evt_packets, path.absolute(), triggers)
+    if about.word == 8 or not has_faery():
+        return partial(_numpy_packets, about, triggers)
+    return partial(packets, read_evt_packets, about.path.absolute(), triggers)
 
 
 def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
@@ -243,34 +269,27 @@ def read_evt_packets(notes: dict[str, int], path: str, triggers: bool) -> Iterat
 
 def trigger_packets(path: Path) -> Iterator[Packet]:
     """Yield the edges of the external triggers of a RAW file."""
-    fields, offset = _read_header(path)
-    _, word = _evt_version(path, fields)
-    swapped = word == 8 and _is_swapped(path, offset, fields.get("format", ""))
-    return _evt_source(path, offset, word, swapped, True)({})
+    return _evt_source(_read_evt_header(path), True)({})
 
 
-def _numpy_packets(
-    path: Path, offset: int, word: int, swapped: bool, triggers: bool, notes: dict[str, int]
-) -> Iterator[Packet]:
-    """Yield the events, or the triggers, of words of a size [bytes]."""
-    decoder = Evt3Decoder() if word == 2 else Evt2Decoder(vectors=word == 8)
-    for data in read_pieces(path, offset, word * EVT_BLOCK, notes):
-        words: NDArray[Any] = words_of(data, VERSION_OF[word])
-        if swapped:
-            words = swap_halves(words)
-        events, edges = decoder.decode(words)
+def _numpy_packets(about: EvtFile, triggers: bool, notes: dict[str, int]) -> Iterator[Packet]:
+    """Yield the events, or the triggers, of a RAW file."""
+    decoder = Evt3Decoder() if about.word == 2 else Evt2Decoder(vectors=about.word == 8)
+    for data in read_pieces(about.path, about.offset, about.word * EVT_BLOCK, notes):
+        events, edges = decoder.decode(about.words(data))
         notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
-        yield edges if triggers else events
+        x, y, t, p = edges if triggers else events
+        yield x, y, t + about.origin, p
 
 
-def _last_evt_time(path: Path, offset: int, word: int, swapped: bool, estimate: int) -> int | None:
+def _last_evt_time(about: EvtFile, estimate: int) -> int | None:
     """Return the time of the last event of a file of EVT 2.0 or 2.1 [us]. Times of EVT 3.0 wrap after 17 s."""
-    count = (path.stat().st_size - offset) // word
-    with open_input(path) as file:
-        file.seek(offset + max(count - EVT_BLOCK, 0) * word)
-        words = words_of(file.read(word * EVT_BLOCK), VERSION_OF[word])
-    t = Evt2Decoder(vectors=word == 8).decode(swap_halves(words) if swapped else words)[0][2]
-    return nearest(int(t[-1]), 34, estimate) if t.size else None
+    count = (about.path.stat().st_size - about.offset) // about.word
+    with open_input(about.path) as file:
+        file.seek(about.offset + max(count - EVT_BLOCK, 0) * about.word)
+        words = about.words(file.read(about.word * EVT_BLOCK))
+    t = Evt2Decoder(vectors=about.word == 8).decode(words)[0][2]
+    return nearest(int(t[-1]) + about.origin, 34, estimate) if t.size else None
 
 
 def _is_swapped(path: Path, offset: int, layout: str) -> bool:

@@ -92,8 +92,7 @@ class PacketDecoder:
         words = words_of(data, EVT[encoding])
         if encoding not in self._decoders:
             self._decoders[encoding] = Evt3Decoder() if encoding == "evt3" else Evt2Decoder(encoding == "evt21")
-        decoder = self._decoders[encoding]
-        events, edges = decoder.decode(swap_halves(words) if encoding == "evt21" else words)
+        events, edges = self._decoders[encoding].decode(swap_halves(words) if encoding == "evt21" else words)
         return events, edges
 
 
@@ -141,14 +140,13 @@ def _libcaer_cmp(base: int, data: NDArray[np.uint8]) -> Columns:
 
 def decode_array(raw: bytes | memoryview, *, ros1: bool) -> tuple[int, int, Columns]:
     """Return width, height and the events of a message of the types :data:`ARRAYS`."""
-    order, start = "<", 0
     if not ros1:
         if bytes(raw[:2]) != b"\0\1":
             raise AmiwarpError(f"has messages of the encapsulation {bytes(raw[:2]).hex()}; expected little-endian CDR")
         raw = raw[4:]
     # The header: in ROS 1 a sequence number, then in both the time and a string.
     at = 12 if ros1 else 8
-    (length,) = struct.unpack_from(f"{order}I", raw, at)
+    (length,) = struct.unpack_from("<I", raw, at)
     at += 4 + length
     at = at if ros1 else -(-at // 4) * 4
     height, width, count = struct.unpack_from("<III", raw, at)

@@ -267,9 +267,10 @@ def queue_keys(
 #
 # The kernels that simulate pixels write keys whose pixel counts through all cameras. They are converted to keys of
 # ``part | camera | time | pixel | reversed lag | polarity``. The part is 0 for events of the chunk, 1 for later ones,
-# and 2 for those of cameras that start anew, which are dropped.
+# and 2 for those of cameras that start anew, which are dropped. Only a row scan needs the lag; without one, it is left
+# out.
 
-CAMERA_LOW_BITS = wp.constant(wp.int64(20))  # lowest bits of a key: reversed lag (19) and polarity (1)
+CAMERA_LOW_BITS = wp.constant(wp.int64(20))  # lowest bits of a key with a lag: reversed lag (19) and polarity (1)
 
 
 @wp.struct
@@ -279,10 +280,17 @@ class CameraKeys:
     pixels: int  # number of pixels of a camera
     width: int  # width of a camera [px]
     shift: int  # bit position of the time in a key that counts through all pixels
+    pixel: int  # bit position of the pixel in a key that is sorted by camera
     time: int  # bit position of the time in a key that is sorted by camera
     camera: int  # bit position of the camera
     part: int  # bit position of the part
     length: wp.int64  # length of the chunk [us]
+
+
+@wp.func
+def low_mask(layout: CameraKeys) -> wp.int64:
+    """Return the mask of the bits below the pixel of a key that is sorted by camera."""
+    return (wp.int64(1) << wp.int64(layout.pixel)) - wp.int64(1)
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
@@ -295,8 +303,8 @@ def sort_by_camera(layout: CameraKeys, starts: wp.array(dtype=wp.uint8), keys: w
     camera = index / layout.pixels
     part = wp.where(starts[camera] != wp.uint8(0), 2, wp.where(t < layout.length, 0, 1))
     key = wp.int64(part) << wp.int64(layout.part) | wp.int64(camera) << wp.int64(layout.camera)
-    key = key | t << wp.int64(layout.time) | wp.int64(index - camera * layout.pixels) << CAMERA_LOW_BITS
-    keys[i] = key | wp.int64((low >> LAG_BIT) << 1 | (low & 1))
+    key = key | t << wp.int64(layout.time) | wp.int64(index - camera * layout.pixels) << wp.int64(layout.pixel)
+    keys[i] = key | (wp.int64((low >> LAG_BIT) << 1 | (low & 1)) & low_mask(layout))
 
 
 @wp.func
@@ -317,19 +325,19 @@ def time_of(layout: CameraKeys, key: wp.int64) -> wp.int64:
 @wp.func
 def pixel_of(layout: CameraKeys, key: wp.int64) -> int:
     """Return the pixel of a key that is sorted by camera, in its camera."""
-    bits = wp.int64(layout.time) - CAMERA_LOW_BITS
-    return int((key >> CAMERA_LOW_BITS) & ((wp.int64(1) << bits) - wp.int64(1)))
+    bits = wp.int64(layout.time - layout.pixel)
+    return int((key >> wp.int64(layout.pixel)) & ((wp.int64(1) << bits) - wp.int64(1)))
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
 def carry_over(layout: CameraKeys, keys: wp.array(dtype=wp.int64), start: int):
     """Convert keys that are sorted by camera to keys of the next chunk that count through the pixels of all cameras.
 
-    Counterpart of :func:`sort_by_camera`; the cause is lost.
+    Counterpart of :func:`sort_by_camera`; the cause is lost, and without a row scan the lag.
     """
     i = start + wp.tid()
     key = keys[i]
-    low = int(key & ((wp.int64(1) << CAMERA_LOW_BITS) - wp.int64(1)))
+    low = int(key & low_mask(layout))
     index = camera_of(layout, key) * layout.pixels + pixel_of(layout, key)
     t = time_of(layout, key) - layout.length
     kept = wp.int64((low >> 1) << LAG_BIT | (low & 1))
@@ -369,7 +377,10 @@ def unpack_cameras(
 
 @wp.kernel(module="unique", module_options=OPTIONS)
 def mark_first_of_pixel(keys: wp.array(dtype=wp.int64), start: int, kept: wp.array(dtype=int)):
-    """Mark the first of the successive keys with the same camera, time and pixel with 1, the others with 0."""
+    """Mark the first of the successive keys with the same camera, time and pixel with 1, the others with 0.
+
+    The keys have a lag.
+    """
     i = start + wp.tid()
     before = keys[wp.max(i - 1, 0)] >> CAMERA_LOW_BITS
     kept[i] = wp.where(i == 0 or before != keys[i] >> CAMERA_LOW_BITS, 1, 0)

@@ -386,10 +386,9 @@ def run_pixels_ahead(
 
 # Photoreceptors of the simulated pixels: first-order low-pass filters whose bandwidth is proportional to the light.
 #
-# These kernels replace those of :mod:`amiwarp.kernels.pixels` if the sensor's bandwidth is limited, or if its
-# leak has jitter. The level of a pixel is then the output of its photoreceptor. The input is linear in time between two
-# instants, and the filter's equation is solved exactly for it, so that the events hardly depend on the length of the
-# steps.
+# These kernels replace those above if the sensor's bandwidth is limited, or if its leak has jitter. The level of a
+# pixel is then the output of its photoreceptor. The input is linear in time between two instants, and the filter's
+# equation is solved exactly for it, so that the events hardly depend on the length of the steps.
 
 MOST_PIECES = wp.constant(16)  # largest number of pieces per step; divides the ticks of a step, a multiple of 16
 LARGEST_BEND = wp.constant(0.01)  # largest deviation of the level from a straight line within a piece [ON thresholds]
@@ -576,8 +575,8 @@ def run_world_pixels(
 ):
     """Simulate pixels over the steps of a chunk, and write the keys of their events to ``sink``.
 
-    Counterpart of :func:`amiwarp.kernels.pixels.run_pixels`, which uses maps. ``light``: luminance of each
-    pixel at the end of each step; axes: step, pixel.
+    Counterpart of :func:`run_pixels`, which uses maps. ``light``: luminance of each pixel at the end of each step;
+    axes: step, pixel.
     """
     i = start + wp.tid()
     p = pixels[i]

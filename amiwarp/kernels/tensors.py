@@ -635,7 +635,7 @@ def decay_times(
 ):  # fmt: skip
     """Compute the time surface: by exponential or linear decay of the latest times until the window's end."""
     i = start + wp.tid()
-    age = wp.float64(t_end[i / size] - latest[i]) / tau
+    age = wp.float64(wp.max(t_end[i / size] - latest[i], wp.int64(0))) / tau
     value = wp.where(linear == 1, wp.max(wp.float64(1.0) - age, wp.float64(0.0)), wp.exp(-age))
     out[i] = wp.where(latest[i] < EARLIEST, 0.0, float(value))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,7 @@ class Board:
         Parameters
         ----------
         square_px : int, optional
-            Side of a square [px].
+            Side of a square [px]; with markers, enough to show each of their cells.
 
         Returns
         -------
@@ -112,7 +113,11 @@ class Board:
             inner = np.kron((x + y) % 2 * 255, np.ones((square_px, square_px))).astype(np.uint8)
         else:
             size = ((self.columns + 1) * square_px, (self.rows + 1) * square_px)
-            inner = np.asarray(self._charuco().generateImage(size, marginSize=0), np.uint8)
+            board = self._charuco()
+            least = math.ceil((board.getDictionary().markerSize + 1.5) / MARKER_SHARE)  # OpenCV rounds the side
+            if square_px < least:
+                raise AmiwarpError(f"square_px is {square_px}, too few for markers of {self.charuco}; give {least}")
+            inner = np.asarray(board.generateImage(size, marginSize=0), np.uint8)
         return np.pad(inner, round(MARGIN * square_px), constant_values=255)
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
@@ -259,7 +264,8 @@ class Board:
             Whether there is another board.
         """
         cv2, picture = opencv(), _checked(picture)
-        instance(corners, Corners, "corners")
+        if not len(instance(corners, Corners, "corners").ids):
+            raise AmiwarpError("corners are empty; give those that find returned")
         hull = cv2.convexHull(corners.xy.astype(np.float32)).reshape(-1, 2)
         middle = hull.mean(axis=0)
         reach = 1.0 + 2.2 / min(self.columns, self.rows)  # the outer squares too

@@ -46,6 +46,7 @@ def still_poses(recordings: Sequence[Recording]) -> tuple[list[Pose], dict[str, 
 
     Raises :class:`AmiwarpError`, with the reason of the first recording, if none has any.
     """
+    recordings = _named_apart(recordings)
     spans, reasons = list[tuple[Recording, tuple[int, int]]](), dict[str, str]()
     for recording, found in zip(recordings, in_order(partial(_spans_of, one) for one in recordings), strict=True):
         if isinstance(found, AmiwarpError):
@@ -58,6 +59,18 @@ def still_poses(recordings: Sequence[Recording]) -> tuple[list[Pose], dict[str, 
         spans = [spans[k] for k in np.linspace(0, len(spans) - 1, MOST_POSES).round().astype(int)]
     several = {recording.name for recording in recordings if sum(one is recording for one, _ in spans) > 1}
     return [_pose(recording, *span, several=recording.name in several) for recording, span in spans], reasons
+
+
+def _named_apart(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the recordings with names of which no two are equal, because poses are known by them."""
+    found: dict[str, Recording] = {}
+    for recording in recordings:
+        name, count = recording.name, 1
+        while name in found:
+            count += 1
+            name = f"{recording.name} ({count})"
+        found[name] = replace(recording, name=name)
+    return list(found.values())
 
 
 def _pose(recording: Recording, start: int, stop: int, *, several: bool) -> Pose:

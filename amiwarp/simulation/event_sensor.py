@@ -15,13 +15,13 @@ from amiwarp.imaging.tensors import Windows
 from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.simulation.sensor_model import SensorModel
-from amiwarp.simulation.simulator import LATEST_US, KeyBuffer, bus_of, row_scan, sensor_params
+from amiwarp.simulation.simulator import LATEST_US, KeyBuffer, bus_of, row_scan, sensor_params, sort_keys
 from amiwarp.validation import TIME_LIMIT, array, guarded, instance, on_gpu, whole
 
 MOST_CAMERAS = 1 << 16
 """Largest number of cameras of an :class:`EventSensor`."""
-MOST_PIXELS = 1 << 26
-"""Largest number of pixels of all cameras of an :class:`EventSensor`."""
+MOST_PIXELS = 1 << 24
+"""Largest number of pixels of all cameras of an :class:`EventSensor`, whose steps then take up to 65 ms."""
 EVENTS_PER_PIXEL = 4
 """Initial capacity of the event buffer of a step [events per pixel]. The buffer grows if necessary."""
 LARGEST_LEVEL = 100.0
@@ -55,7 +55,8 @@ class EventSensor:
     Raises
     ------
     AmiwarpError
-        If a value is out of range, the seeds are not one for each camera, or all cameras have over 2**26 pixels.
+        If a value is out of range, the seeds are not one for each camera, or all cameras have over 2**24 pixels. With
+        ``row_us``, the number of cameras and that of pixels of each count as the next power of two.
 
     Examples
     --------
@@ -86,13 +87,16 @@ class EventSensor:
         )
         self._shape = (n, height, width)
         self._pixels = height * width
-        if n * self._pixels > MOST_PIXELS:
-            raise AmiwarpError(
-                f"{n} cameras of {width} x {height} have {n * self._pixels} pixels; the limit is {MOST_PIXELS}; "
-                "give fewer cameras at a time"
-            )
         self._model = instance(SensorModel() if model is None else model, SensorModel, "model")
         self._scan, self._bus = row_scan(self._model, width, height), bus_of(self._model)
+        scans = int(self._scan.row_ps) > 0
+        count = 1 << ((n - 1).bit_length() + (self._pixels - 1).bit_length()) if scans else n * self._pixels
+        if count > MOST_PIXELS:
+            have = "with row_us count as" if scans else "have"
+            raise AmiwarpError(
+                f"{n} cameras of {width} x {height} {have} {count} pixels; the limit is {MOST_PIXELS}; "
+                "give fewer cameras at a time"
+            )
         self._device = wp.get_device(device)
         self._cameras = pixels.Cameras()
         self._cameras.pixels = self._pixels
@@ -112,13 +116,15 @@ class EventSensor:
 
     def _key_layout(self) -> Any:
         """Return the layout of the keys of events."""
-        n = self._shape[0]
+        bits_of_camera = (self._shape[0] - 1).bit_length()
         layout = event_keys.CameraKeys()
         layout.pixels, layout.width = self._pixels, self._shape[2]
-        layout.shift = int(pixels.LOW_BITS) + (n * self._pixels - 1).bit_length()
-        layout.time = int(event_keys.CAMERA_LOW_BITS) + (self._pixels - 1).bit_length()
-        layout.part = 61  # two bits; the sign stays 0
-        layout.camera = int(layout.part) - (n - 1).bit_length()
+        layout.shift = int(pixels.LOW_BITS) + (self._shape[0] * self._pixels - 1).bit_length()
+        layout.pixel = int(event_keys.CAMERA_LOW_BITS) if int(self._scan.row_ps) else 1
+        layout.time = int(layout.pixel) + (self._pixels - 1).bit_length()
+        # the sign stays 0 in both kinds of keys; the part has two bits
+        layout.camera = int(layout.time) + min(63 - int(layout.shift), 61 - bits_of_camera - int(layout.time))
+        layout.part = int(layout.camera) + bits_of_camera
         return layout
 
     def step(self, images: Any, t_us: int) -> tuple[DeviceEvents, Windows]:
@@ -167,6 +173,8 @@ class EventSensor:
         """Start cameras anew at their next images, with the same random numbers as at first.
 
         Their events that have not been read out yet are dropped. If all cameras start anew, so do the times.
+        Otherwise a row scan goes on, so that these cameras may get other time stamps than at first, and lose other
+        events.
 
         Parameters
         ----------
@@ -263,7 +271,8 @@ class EventSensor:
             self._scan.origin, self._scan.shift = self._now_us - self._first_us, self._layout.shift
             self._launch(event_keys.stamp_rows, total - len(self._carry), [self._scan, keys])
         self._launch(event_keys.sort_by_camera, total, [self._layout, self._cameras.starts, keys])
-        self._sort(keys, total)
+        lowest = 0 if int(self._scan.row_ps) else int(self._layout.pixel)
+        sort_keys(keys, total, lowest, int(self._layout.part) + 2)
         found = wp.empty(n + 2, dtype=int, device=self._device)
         self._launch(event_keys.find_cameras, n + 2, [self._layout, keys, total, n], [found])
         edges = found.numpy().astype(np.int64)
@@ -271,16 +280,6 @@ class EventSensor:
         self._carry = wp.clone(keys[now:later]) if now < later else self._nothing
         self._launch(event_keys.carry_over, len(self._carry), [self._layout, self._carry])
         return keys[:now] if now else self._nothing, edges[: n + 1]
-
-    def _sort(self, keys: wp.array, total: int) -> None:
-        """Sort the first ``total`` keys."""
-        if self._device.is_cpu:
-            keys.numpy()[:total].sort()  # shares the memory of keys
-            return
-        # without a row scan, no two events of a pixel share a microsecond: bits below the pixel's need no sorting
-        lowest = 0 if int(self._scan.row_ps) else int(event_keys.CAMERA_LOW_BITS)
-        order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
-        wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=int(self._layout.part) + 2)
 
     def _read(self, keys: wp.array, edges: NDArray[np.int64]) -> tuple[DeviceEvents, NDArray[np.int64]]:
         """Return the events of sorted keys that the sensors read out, and the ranges of the cameras."""

@@ -67,6 +67,10 @@ def read_picture(path: str | Path) -> NDArray[np.float32]:
         what = " ".join(str(error).split()) or type(error).__name__
         raise AmiwarpError(f"{path} cannot be read as a picture ({what}); give a JPEG, PNG, TIFF ...") from error
     if pixels.dtype.kind == "i":  # Pillow returns 16-bit pictures as int32
+        if pixels.min() < 0 or pixels.max() > 0xFFFF:
+            raise AmiwarpError(
+                f"{path} has values from {pixels.min()} to {pixels.max()}; save it with 16 bits, 0 to 65535"
+            )
         pixels = pixels.astype(np.uint16)
     return linear_luminance(pixels, name=str(path))
 
@@ -78,6 +82,7 @@ def linear_luminance(pixels: NDArray[Any], *, name: str = "picture") -> NDArray[
     Raises :class:`AmiwarpError` for other shapes and types, and for values that are negative or not finite.
     """
     pixels = np.asarray(pixels)
+    pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     colours = pixels.shape[2] if pixels.ndim == 3 else 0
     if pixels.ndim not in (2, 3) or colours not in (0, 1, 3, 4) or min(pixels.shape[:2]) < 2:
         raise AmiwarpError(f"{name} has shape {pixels.shape}; expected (height, width) or (height, width, 3)")
@@ -462,7 +467,7 @@ def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
             text = file.read(MOST_TABLE_BYTES + 1)
         if len(text) > MOST_TABLE_BYTES:
             raise AmiwarpError(f"it is larger than {MOST_TABLE_BYTES >> 20} MiB")
-        rows = csv.DictReader(io.StringIO(text.decode("utf-8"), newline=""))
+        rows = csv.DictReader(io.StringIO(text.decode("utf-8-sig"), newline=""))
         files: list[Path] = []
         times = []
         for row in rows:

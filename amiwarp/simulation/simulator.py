@@ -42,7 +42,7 @@ from amiwarp.simulation.scenery import DeviceWorld, MapRing, WorldMapRing, World
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.tasks import Progress
-from amiwarp.validation import TIME_LIMIT, array, guarded, real, shown
+from amiwarp.validation import TIME_LIMIT, array, guarded, real, shown, whole
 
 # Ground truth of a simulated world at an instant: depth, normals, instances, optical flow and luminance.
 
@@ -336,7 +336,7 @@ def chosen_instants(
         raise AmiwarpError("truth_hz and truth_times_us are both given; give one of them")
     if truth_hz is not None:
         rate = real(truth_hz, "truth_hz", 1e-3, 1e6, " 1/s")
-        count = int(duration_us * 1e-6 * rate) + 1
+        count = int(duration_us * rate / 1e6 + 1e-9) + 1  # rounding must not lose the last instant
         if count > MOST_INSTANTS:
             raise AmiwarpError(
                 f"truth_hz {rate:g} gives {count} instants; the limit is {MOST_INSTANTS}; give a lower rate"
@@ -520,6 +520,18 @@ class KeyBuffer:
             return
         starts = range(0, self._pixels, CPU_RUN)
         list(launch.pool().map(run, starts, [min(start + CPU_RUN, self._pixels) for start in starts]))
+
+
+def sort_keys(keys: wp.array, total: int, lowest: int, top: int) -> None:
+    """Sort the first ``total`` keys by their bits from ``lowest`` to below ``top``.
+
+    Without a row scan, no two events of a pixel share a microsecond, so that bits below the pixel's need no sorting.
+    """
+    if keys.device.is_cpu:
+        keys.numpy()[:total].sort()  # shares the memory of keys
+        return
+    order = wp.empty(2 * total, dtype=wp.int32, device=keys.device)
+    wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=top)
 
 
 # Readout of the simulated sensor: sequential readout of rows, and a bus with a queue that limits the event rate.
@@ -726,8 +738,9 @@ class Engine:
             self._maps = MapRing(simulation, scenery.place_scene(simulation))
             if scene.frames.interval_us is not None:
                 longest_chunk = FRAMES_PER_CHUNK * scene.frames.interval_us
-        self._chunk_steps = self._steps_per_chunk(chunk_us, longest_chunk)
         self._margin = int(pixels.LARGEST_LAG) // (int(pixels.TICKS) * self._step) + 2
+        self._shift = int(pixels.LOW_BITS) + (self._pixels - 1).bit_length()
+        self._chunk_steps = self._steps_per_chunk(chunk_us, longest_chunk)
         self._axis = axis_rotation(*simulation.motion.tilt)
         self._sensor = sensor_params(simulation.sensor, self._step)
         self._view = scenery.prism_view_of(simulation, self._device)
@@ -747,8 +760,13 @@ class Engine:
 
         ``chunk_us``: length of a chunk [us], None for the default; ``longest``: upper bound of the length [us].
         """
-        span = chunk_us or CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
-        return max(1, int(min(span, longest)) // self._step)
+        if chunk_us is None:
+            span = CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
+        else:
+            span = whole(chunk_us, "chunk_us", 1, TIME_LIMIT, " us")
+        of_keys = 1 << (63 - self._shift)  # first time that a key cannot hold [us]
+        of_ticks = (1 << 31) // int(pixels.TICKS) - self._margin * self._step  # of DeviceBlock.arrays.ticks, an int32
+        return max(1, int(min(span, longest, min(of_keys, of_ticks) - LATEST_US)) // self._step)
 
     def prepare(self) -> None:
         """Load the kernels and read or render the first maps, which otherwise happens in the first chunk."""
@@ -766,7 +784,7 @@ class Engine:
             if first == 0:
                 self._start_pixels(steps)
             keys = self._generate_keys(steps, count)
-            block = self._unpack(keys, steps, first, count)
+            block = self._unpack(keys, steps, first)
             self.now_us = (first + count) * self._step
             yield block
 
@@ -793,7 +811,7 @@ class Engine:
         steps.angle, steps.turn = self._angles(angle)
         steps.second_angle, steps.second_turn = self._angles(second)
         steps.per_tick = 1.0 / (self._step * int(pixels.TICKS))
-        steps.shift = int(pixels.LOW_BITS) + (self._pixels - 1).bit_length()
+        steps.shift = self._shift
         steps.margin, steps.count, steps.ticks = margin, count, self._step * int(pixels.TICKS)
         return steps
 
@@ -886,20 +904,15 @@ class Engine:
 
     def _sort(self, keys: wp.array, total: int, limit: int, top: int) -> int:
         """Sort the first ``total`` keys by their lowest ``top`` bits; return the number of keys below ``limit``."""
+        sort_keys(keys, total, int(event_keys.LAG_BIT) if self._readout.scans_rows else int(pixels.LOW_BITS), top)
         if self._device.is_cpu:
-            values = keys.numpy()[:total]  # shares the memory of keys
-            values.sort()
-            return int(np.searchsorted(values, limit))
-        # without a row scan, no two events of a pixel share a microsecond: bits below the pixel's need no sorting
-        lowest = int(event_keys.LAG_BIT) if self._readout.scans_rows else int(pixels.LOW_BITS)
-        order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
-        wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=top)
+            return int(np.searchsorted(keys.numpy()[:total], limit))
         found = wp.empty(1, dtype=int, device=self._device)
         wp.launch(event_keys.find, dim=1, inputs=[keys, total, limit], outputs=[found], device=self._device)
         return int(found.numpy()[0])
 
-    def _unpack(self, keys: wp.array, steps: Any, first: int, count: int) -> DeviceBlock:
-        """Convert sorted keys of events to a block of events with ground truth."""
+    def _unpack(self, keys: wp.array, steps: Any, first: int) -> DeviceBlock:
+        """Convert sorted keys of events to a block of events with ground truth. ``first``: number of the first step."""
         keys, stamps = self._readout.read(keys, steps.shift, first * self._step)
         n = len(keys)
         block = event_keys.Block()
@@ -1117,7 +1130,8 @@ class Simulation(SimulationValues):
         Parameters
         ----------
         chunk_us : int, optional
-            Length of a span [us]. The default depends on the device. The events do not depend on it.
+            Length of a span [us], at least 1. The default depends on the device. The events do not depend on it. Spans
+            of over 134 s are divided; with more than 16,384 pixels, shorter ones too, at 1280x720 those of over 2 s.
         progress : Progress, optional
             Called with the finished share.
 
@@ -1138,7 +1152,8 @@ class Simulation(SimulationValues):
         Parameters
         ----------
         chunk_us : int, optional
-            Length of a span [us]. The default depends on the device. The events do not depend on it.
+            Length of a span [us], at least 1. The default depends on the device. The events do not depend on it. Spans
+            of over 134 s are divided; with more than 16,384 pixels, shorter ones too, at 1280x720 those of over 2 s.
         progress : Progress, optional
             Called with the finished share.
 

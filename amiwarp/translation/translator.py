@@ -396,21 +396,35 @@ def translator_input(
     """Open what is to be translated. Raises :class:`AmiwarpError` if it cannot be read."""
     pictures: Pictures | sources.MvsecPictures
     if dataset is DataSet.MVSEC:
+        _check_unused("mvsec, whose pictures have times", fps=fps)
         path = _path(source, "mvsec")
         pictures, events = sources.open_mvsec(path), path if events is None else events
         return _with_events(pictures, _recording(events), interpolation)
     if isinstance(source, Recording) or (isinstance(source, str | Path) and _is_recording(Path(source))):
         if events is not None:
             raise AmiwarpError(f"{source} is a recording, and events are given too; give one of them, or pictures")
+        _check_unused("a recording, which has no pictures", fps=fps, interpolation=interpolation)
         return _from_events(_recording(source), dataset, device, progress)
     if dataset is DataSet.N_CALTECH101:
+        _check_unused("a still picture of n-caltech101", events=events, fps=fps, interpolation=interpolation)
         return _from_picture(_path(source, "n-caltech101"))
-    pictures = source if isinstance(source, Pictures) else open_pictures(source, fps=fps)
+    if isinstance(source, Pictures):
+        _check_unused("opened pictures, which have times", fps=fps)
+        pictures = source
+    else:
+        pictures = open_pictures(source, fps=fps)
     if events is not None:
         return _with_events(pictures, _recording(events), interpolation)
     frames = MotionPictures(pictures, interpolation)
     about: dict[str, MetadataValue] = {"translated_from": "pictures", "interpolation": interpolation.value}
     return TranslatorInput(frames, pictures.duration_us, Camera.from_fov(*pictures.size, DEFAULT_FOV), about=about)
+
+
+def _check_unused(what: str, **settings: object) -> None:
+    """Raise :class:`AmiwarpError` for a setting that is given, but does not apply to ``what``."""
+    for name, value in settings.items():
+        if value is not None and value is not Interpolation.AUTO:
+            raise AmiwarpError(f"{name} is given, but does not apply to {what}; leave it out")
 
 
 def _is_recording(path: Path) -> bool:
@@ -569,9 +583,9 @@ def translate(
         Called with the stage and the finished share.
     **settings : dict
         Optional settings: ``interpolation`` (:class:`Interpolation`), ``fps`` (pictures per second, required for
-        stacks), ``fov`` (horizontal field of view of the pictures [rad]; pixels beyond it are unknown), ``camera``,
-        ``duration_s``, ``motion``, ``sensor``, ``encoder``, ``nominal_prism``, ``seed`` and ``device``, as for
-        :func:`simulate`. By default, the pictures are just large enough to cover everything that the camera sees
+        .npy stacks), ``fov`` (horizontal field of view of the pictures [rad]; pixels beyond it are unknown),
+        ``camera``, ``duration_s``, ``motion``, ``sensor``, ``encoder``, ``nominal_prism``, ``seed`` and ``device``, as
+        for :func:`simulate`. By default, the pictures are just large enough to cover everything that the camera sees
         through the turning prism. The camera has the size of the pictures, and the horizontal field of view of the
         recording's camera, or 60 degrees. The recording lasts as long as the source.
 
@@ -583,7 +597,8 @@ def translate(
     Raises
     ------
     AmiwarpError
-        If the source cannot be read, the pictures do not change as the events say, or a value is out of range.
+        If the source cannot be read, the pictures do not change as the events say, a value is out of range, or a
+        setting does not apply to the source.
 
     Notes
     -----

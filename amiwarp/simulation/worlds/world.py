@@ -17,7 +17,7 @@ from amiwarp.choices import Seeing
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import text_lines, write_text
 from amiwarp.io.formats import POSE_ENDINGS, check_ending
-from amiwarp.validation import array, choice, guarded, instance, one_of, real, shown, vector
+from amiwarp.validation import array, choice, guarded, instance, one_of, real, shown, vector, whole
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -238,7 +238,7 @@ class Trajectory:
         values = plain_array("d")
         for number, line in text_lines(path):
             words = line.split("#")[0].replace(",", " ").split()
-            if not words or (number == 1 and words[0].lower() in ("t", "time", "timestamp", "t_s")):
+            if not words or (not values and words[0].lower() in ("t", "time", "timestamp", "t_s")):
                 continue
             try:
                 row = [float(word) for word in words]
@@ -341,6 +341,8 @@ class Mesh:
                 values = array(getattr(self, name), f"mesh's {name}").astype(np.float64)
                 if values.shape != shape or not np.isfinite(values).all():
                     raise AmiwarpError(f"mesh's {name} has shape {values.shape}; give finite numbers of shape {shape}")
+                if name == "light" and not 0.0 <= values.min() <= values.max() <= 1.0:
+                    raise AmiwarpError(f"mesh's light is {values.min():g} .. {values.max():g}; give factors in 0 .. 1")
                 object.__setattr__(self, name, values)
 
     @cached_property
@@ -450,9 +452,10 @@ class Sky:
     luminance: float = 0.6
     """Luminance of an even sky, or factor by which the panorama is multiplied."""
     panorama: NDArray[Any] | None = None
-    """Linear luminance in all directions, shape (height, 2 height); None for an even sky.
+    """Linear luminance in all directions, shape (height, width); None for an even sky.
 
-    The picture is equirectangular with the elevation up. Its middle column shows the direction +x, its right half -y.
+    The picture is equirectangular with the elevation up: width and height cover 360 and 180 degrees, whatever their
+    ratio. Its middle column shows the direction +x, its right half -y.
     """
 
     def __post_init__(self) -> None:
@@ -465,7 +468,7 @@ class Sky:
                 or min(panorama.shape) < 2
                 or not (np.isfinite(panorama).all() and panorama.min() >= 0)
             ):
-                raise AmiwarpError(f"sky panorama has shape {panorama.shape}; give values >= 0, (height, 2 height)")
+                raise AmiwarpError(f"sky panorama has shape {panorama.shape}; give values >= 0, (height, width)")
             object.__setattr__(self, "panorama", panorama)
 
 
@@ -572,4 +575,6 @@ class WorldScene:
         object.__setattr__(self, "seeing", choice(Seeing, self.seeing, "seeing"))
         object.__setattr__(self, "motion_px", real(self.motion_px, "motion_px", 0.01, 2.0, " px"))
         if self.samples is not None:
-            one_of(shown(self.samples), [str(n) for n in SAMPLES], "samples")
+            samples = whole(self.samples, "samples", SAMPLES[0], SAMPLES[-1])
+            one_of(str(samples), [str(n) for n in SAMPLES], "samples")
+            object.__setattr__(self, "samples", samples)

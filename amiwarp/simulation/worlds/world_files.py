@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import io
 import urllib.parse
@@ -87,20 +88,41 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
         raise AmiwarpError(f"{path}: has an unknown mesh format {path.suffix!r}; give one of {', '.join(FORMATS)}")
     up = one_of(up or ("y" if kind in Y_UP else "z"), ("y", "z"), "axis that points up")
     turn = real(scale, "mesh scale", 1e-9, 1e9) * (TO_Z_UP if up == "y" else np.eye(3))
-    if importlib.util.find_spec("trimesh") is None:
-        raise AmiwarpError(f"{path}: mesh files need trimesh; run: pip install 'amiwarp[worlds]'")
+    _check_trimesh(path)
     with errors_name(path, lambda: "cannot be read as a mesh"):
-        process = borrow()
-        try:
-            found, arrays = process.call(f"{__name__}:read_parts", path, kind, turn.tolist())
-        finally:
-            give_back(process)
-        for file in found["files"]:
-            note_input(Path(file))
+        found, arrays = _called(path, kind, turn)
         parts = [_received(about, arrays) for about in found["parts"]]
     if not parts:
         raise AmiwarpError(f"{path}: holds no faces; give a file with triangles, not points or lines alone")
     return parts
+
+
+def mesh_files(path: Path) -> list[Path]:
+    """Return the files that a mesh file refers to; none for a file that cannot be read as a mesh."""
+    kind = path.suffix.lower().removeprefix(".")
+    if kind in FORMATS:
+        _check_trimesh(path)
+        with contextlib.suppress(AmiwarpError), errors_name(path, lambda: "cannot be read as a mesh"):
+            return [Path(file) for file in _called(path, kind, np.eye(3))[0]["files"]]
+    return []
+
+
+def _check_trimesh(path: Path) -> None:
+    """Raise :class:`AmiwarpError` if trimesh is not installed."""
+    if importlib.util.find_spec("trimesh") is None:
+        raise AmiwarpError(f"{path}: mesh files need trimesh; run: pip install 'amiwarp[worlds]'")
+
+
+def _called(path: Path, kind: str, turn: NDArray[np.float64]) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Return what :func:`read_parts` returns, and register the files as inputs."""
+    process = borrow()
+    try:
+        found, arrays = process.call(f"{__name__}:read_parts", path, kind, turn.tolist())
+    finally:
+        give_back(process)
+    for file in found["files"]:
+        note_input(Path(file))
+    return found, arrays
 
 
 def _received(about: dict[str, Any], arrays: list[NDArray[Any]]) -> LoadedMesh:

@@ -178,7 +178,10 @@ def _export(
 
     with scratch_folder(out) as scratch:
         if chosen is ExportFormat.WEBDATASET:
-            names = [name for split in splits for name in _write_tars(folder, scratch, split, opened(split), limit)]
+            keys = _names(items)
+            names = [
+                name for split in splits for name in _write_tars(folder, scratch, split, opened(split), keys, limit)
+            ]
         else:
             names = _write_parquet(scratch, list(splits), opened, items, limit)
             (scratch / "README.md").write_text(_card(head.get("name") or "Events", items), encoding="utf-8")
@@ -240,21 +243,37 @@ def _files_of_earlier(out: Path, overwrite: bool) -> set[str]:
     return {name for name in files or () if isinstance(name, str) and re.fullmatch(known, name)}
 
 
-def _name(item: ManifestItem) -> str:
-    """Return the name of a sample: the path of its recording without ending, as far as WebDataset allows it."""
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", PurePosixPath(item.file).with_suffix("").as_posix())
+def _names(items: Sequence[ManifestItem]) -> dict[str, str]:
+    """Return the names of the samples by file: its path without ending, as far as WebDataset allows it.
+
+    A hash of the file follows where several have the same name, because WebDataset joins members of one name.
+    """
+    plain = {
+        item.file: re.sub(r"[^A-Za-z0-9_-]+", "_", PurePosixPath(item.file).with_suffix("").as_posix())
+        for item in items
+    }
+    count = Counter(plain.values())
+    return {
+        file: name if count[name] == 1 else f"{name}-{hashlib.sha256(file.encode()).hexdigest()[:16]}"
+        for file, name in plain.items()
+    }
 
 
 # WebDataset: tar files in which the members of one sample have the same name up to the first dot.
 
 
 def _write_tars(
-    folder: Path, scratch: Path, split: str, opened: Iterator[tuple[ManifestItem, Any]], limit: int
+    folder: Path,
+    scratch: Path,
+    split: str,
+    opened: Iterator[tuple[ManifestItem, Any]],
+    keys: Mapping[str, str],
+    limit: int,
 ) -> Iterator[str]:
     """Write the recordings of a split as tar files of at least ``limit`` bytes. Yield the name of each.
 
     The data set lies in ``folder``, unfinished files in ``scratch``. Tensors are stored instead of recordings that are
-    None.
+    None. ``keys``: names of the samples by file.
     """
     count, archive = 0, None
     with contextlib.ExitStack() as stack:
@@ -274,9 +293,9 @@ def _write_tars(
                     codec=Codec.BLOSC, progress=None, overwrite=True,
                 )  # fmt: skip
             with open_input(arrays, noted=False) as file:
-                _add(archive, f"{_name(item)}.npz", file, arrays.stat().st_size)
+                _add(archive, f"{keys[item.file]}.npz", file, arrays.stat().st_size)
             text = json.dumps(item.entry).encode()
-            _add(archive, f"{_name(item)}.json", io.BytesIO(text), len(text))
+            _add(archive, f"{keys[item.file]}.json", io.BytesIO(text), len(text))
 
 
 def _add(archive: tarfile.TarFile, name: str, file: Any, size: int) -> None:
@@ -305,7 +324,7 @@ def _write_parquet(
     pa = require_pyarrow()
     if len({_hub_name(split) for split in splits}) < len(splits):
         raise AmiwarpError(f"splits are {', '.join(splits)}; the same with '_' for '-', so give one another name")
-    rows = pa.Table.from_pylist(flat_rows([item.entry for item in items]))
+    rows = _rows(pa, flat_rows([item.entry for item in items]))
     place = {item.file: k for k, item in enumerate(items)}
     (scratch / "data").mkdir()
     names = []
@@ -315,6 +334,21 @@ def _write_parquet(
             names.append(f"data/{_hub_name(split)}-{k:05}-of-{len(parts):05}.parquet")
             part.rename(scratch / names[-1])
     return names
+
+
+def _rows(pa: Any, rows: Sequence[Mapping[str, Any]]) -> Any:
+    """Return a table of the items. Raises :class:`AmiwarpError` for a field whose values are of several types."""
+    columns = {}
+    for name in dict.fromkeys(name for row in rows for name in row):
+        try:
+            columns[name] = pa.array([row.get(name) for row in rows])
+        except (pa.ArrowException, OverflowError) as error:
+            what = " ".join(str(error).split())
+            raise AmiwarpError(
+                f"{MANIFEST}: {name} of the items is no column of a table ({what}); give values of one type, or export "
+                "to webdataset"
+            ) from error
+    return pa.table(columns)
 
 
 def _parquet_parts(

@@ -19,7 +19,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -301,6 +301,10 @@ class Made:
     amiwarp: Annotated[str, partial(_of_pattern, "[A-Za-z0-9.+-]{1,64}")]
     """Version of amiwarp."""
 
+    def __post_init__(self) -> None:
+        if not Path(self.file).stem.endswith(self.key):  # the file may be moved or removed
+            raise AmiwarpError(f"file is {shown(self.file)}; expected a name with the key {self.key}")
+
 
 @dataclass(frozen=True)
 class Failed:
@@ -507,10 +511,27 @@ class Journal:
         self.made[made.key] = made
         append_line(self._path, asdict(made))
 
+    def move(self, item: Item) -> None:
+        """Move the recording of an item to the folder of its split, if it is in that of an earlier split."""
+        made = self.made[item.key]
+        if made.file != item.file:
+            make_folder((self._out / item.file).parent)
+            put_in_place(self._out / made.file, self._out / item.file, overwrite=True)
+            self.add(replace(made, file=item.file))
+
+    def drop(self, item: Item) -> None:
+        """Forget the recording of an item, which is made again, and remove it from the folder of an earlier split."""
+        made = self.made.pop(item.key, None)
+        if made is not None and made.file != item.file:
+            (self._out / made.file).unlink(missing_ok=True)
+
     def is_there(self, item: Item) -> bool:
-        """Return whether the recording of an item is in the journal, and its file has the size stated there."""
+        """Return whether the recording of an item is in the journal, and its file has the size stated there.
+
+        It may lie in the folder of an earlier split.
+        """
         made = self.made.get(item.key)
-        if made is None or made.file != item.file:
+        if made is None:
             return False
         path = self._out / made.file
         return path.is_file() and path.stat().st_size == made.bytes
@@ -790,6 +811,7 @@ def make_dataset(
 def missing(journal: Journal, items: Sequence[Item], progress: Progress) -> list[Item]:
     """Return the items without an undamaged recording, in an order that depends on their keys alone.
 
+    Undamaged recordings whose split has changed are moved to its folder.
     The order mixes long and short recordings, so that the speed so far predicts the rest. The files are read by several
     threads, to compare their checksums.
     """
@@ -802,9 +824,12 @@ def missing(journal: Journal, items: Sequence[Item], progress: Progress) -> list
                 item.key for item, good in zip(block, pool.map(journal.is_intact, block), strict=True) if good
             )
             progress("checking finished recordings", (first + len(block)) / len(there))
+    for item in there:
+        if item.key in intact:
+            journal.move(item)
     todo = [item for item in items if item.key not in intact]
     for item in todo:
-        journal.made.pop(item.key, None)
+        journal.drop(item)
     return sorted(todo, key=lambda item: item.key)
 
 

@@ -11,7 +11,8 @@ import itertools
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -20,12 +21,14 @@ from typing import Annotated, Any, Literal, TypeVar
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging import tensors
 from amiwarp.io.files import errors_name, open_input
+from amiwarp.io.formats import SPLIT_NAME
 from amiwarp.io.json_files import LARGEST_INTEGER, at_field, build, fields_of, read_json, read_toml
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.description import LONGEST_S, PrismMotion
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.named.catalogue import WORLDS
+from amiwarp.simulation.worlds.world_files import mesh_files
 from amiwarp.validation import one_of, real, shown, whole
 
 FORMAT, VERSION = "amiwarp-dataset-specification", 1
@@ -87,7 +90,7 @@ class OutputEntry:
         "event_count", "polarity_histogram", "voxel_grid", "stacked_histogram", "time_surface", "latest_times"
     ]
     """Name of the function."""
-    bins: Annotated[int, _from_one] | None = None
+    bins: Annotated[int, partial(whole, low=1, high=tensors.MOST_BINS)] | None = None
     end_bin: bool | None = None
     normalize: bool | None = None
     limit: Annotated[int, partial(whole, low=1, high=255)] | None = None
@@ -258,7 +261,7 @@ def _check(values: _Plain) -> None:
     if len(values.splits) > MOST_SPLITS:
         raise AmiwarpError(f"field splits has {len(values.splits):,} names; give at most {MOST_SPLITS}")
     for name, share in values.splits.items():
-        if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        if not re.fullmatch(SPLIT_NAME, name):
             raise AmiwarpError(f"field splits has the name {shown(name)}; use letters, digits, '-' and '_'")
         real(share, f"field splits.{name}", 0.0, 1.0)
     total = math.fsum(values.splits.values())
@@ -278,6 +281,10 @@ def _check_output(output: OutputEntry) -> None:
     both = [name for name in ("window_us", "window_events", "t_start", "t_end") if name in output.given]
     if output.windows and len(both) > 1:
         raise AmiwarpError(f"field output has {' and '.join(both)}; give one kind of windows, or t_start and t_end")
+    if output.t_start is not None and output.t_end is not None and output.t_end < output.t_start:
+        raise AmiwarpError(
+            f"field output.t_end is {output.t_end} us, before output.t_start, {output.t_start} us; give a later end"
+        )
 
 
 def _check_motion(sources: tuple[SourceGroup, ...]) -> None:
@@ -451,7 +458,7 @@ def _of_group(folder: Path, group: SourceGroup, where: str) -> Iterator[Source]:
             f"field {where}.{entry.kind} is {shown(pattern)}, which matches no file in {folder}; change it"
         )
     table = None if entry.label_table is None else _read_labels(folder / entry.label_table)
-    digest: Callable[[Path], str] = _world_digest if entry.kind == "world_files" else content_digest
+    digest: Callable[[Path], str] = partial(_world_digest, {}) if entry.kind == "world_files" else content_digest
     for name in names:
         path = folder / name
         yield Source(entry, Path(name).as_posix(), path, digest(path), _labels(group, path, table))
@@ -537,17 +544,26 @@ def _read_labels(path: Path) -> tuple[Path, dict[Path, dict[str, Any]]]:
             text = file.read(MOST_TABLE_BYTES + 1)
         if len(text) > MOST_TABLE_BYTES:
             raise AmiwarpError(f"is larger than {MOST_TABLE_BYTES >> 20} MiB; divide it among several sources")
-        reader = csv.DictReader(io.StringIO(text.decode("utf-8"), newline=""))
+        reader = csv.DictReader(io.StringIO(text.decode("utf-8-sig"), newline=""))
         names = [name for name in reader.fieldnames or () if name != "file"]
         if "file" not in (reader.fieldnames or ()) or not names:
             raise AmiwarpError("has no column 'file' or no other column; write a header such as file,class")
+        _check_once(reader.fieldnames or (), "column", "give each label one column")
         rows = list(reader)
         for k, row in enumerate(rows):
             if None in row or None in row.values():
                 raise AmiwarpError(f"row {k + 1} has more or fewer cells than the header; correct it")
         columns = {name: _column([row[name] for row in rows]) for name in names}
         files = [(path.parent / row["file"]).resolve() for row in rows]
+        _check_once(files, "file", "keep one row of it")
         return path, {file: {name: columns[name][k] for name in names} for k, file in enumerate(files)}
+
+
+def _check_once(values: Sequence[object], what: str, remedy: str) -> None:
+    """Raise :class:`AmiwarpError` for a column or a file of a table that is there twice."""
+    twice = [value for value, count in Counter(values).items() if count > 1]
+    if twice:
+        raise AmiwarpError(f"has the {what} {shown(str(twice[0]))} twice; {remedy}")
 
 
 def _column(values: list[str]) -> list[Any]:
@@ -574,11 +590,16 @@ def content_digest(path: Path, *, noted: bool = True) -> str:
             return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
-def _world_digest(path: Path) -> str:
-    """Return the SHA-256 of a world file and of the files that it names."""
+def _world_digest(known: dict[Path, str], path: Path) -> str:
+    """Return the SHA-256 of a world file, of the files that it names, and of those that its meshes name.
+
+    ``known`` holds the digests of named files so far, because worlds share large meshes.
+    """
     data = read_json(path, "a world") if path.suffix.lower() == ".json" else read_toml(path, "a world")
-    named = {path.parent / text for text in _texts(data)}
-    digests = [content_digest(file) for file in [path, *sorted(file for file in named if file.is_file())]]
+    named = {file for text in _texts(data) if (file := path.parent / text).is_file()}
+    for file in named - known.keys():
+        known[file] = "\n".join(content_digest(one) for one in [file, *sorted(set(mesh_files(file)))])
+    digests = [content_digest(path), *(known[file] for file in sorted(named))]
     return hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 

@@ -178,7 +178,7 @@ def build_desk(rng: np.random.Generator, duration_s: float) -> World:
         parts.solid("desk", top, parts.wood(rng, mean=0.4, boards=8, size=768), "desk"),
         parts.solid("wall", wall, parts.plaster(rng, 0.5, 0.4), "wall"),
         parts.solid("floor", floor, parts.tiles(rng), "floor"),
-        *_screen(rng), *_keyboard(rng), *_papers(rng), *_desk_books(rng), *_desk_things(rng), *_gauges(rng),
+        *_screen(rng), *_keyboard(rng), *_papers(rng), *_desk_books(rng), *_desk_things(rng), *_gauges(),
     ]  # fmt: skip
     lamps = (Lamp((-0.6, 0.1, 0.75), 0.45, shadows=True), Lamp((1.0, -1.2, 1.4), 0.9))
     return World("desk", tuple(bodies), ambient=0.3, lamps=lamps)
@@ -283,7 +283,7 @@ def _desk_things(rng: np.random.Generator) -> list[Body]:
     ]
 
 
-def _gauges(rng: np.random.Generator) -> list[Body]:
+def _gauges() -> list[Body]:
     """Return gratings, a Siemens star, a checkerboard card, a cube and a ruler."""
     cube = parts.moved(parts.standing_box((0.07, 0.07, 0.07)), (-0.36, 0.33, 0.0), turn_deg=30)
     ruler = parts.moved(parts.standing_box((0.3, 0.025, 0.003), tile_m=0.025), (0.02, -0.15, 0.0), turn_deg=4)
