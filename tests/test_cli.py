@@ -22,6 +22,7 @@ from typer.testing import CliRunner, Result
 from amiwarp import AmiwarpError, Calibration, PrismMotion, open_recording
 from amiwarp.cli.app import COMMANDS, app, function_of
 from amiwarp.cli.common import number
+from amiwarp.cli.simulation import RigOptions
 
 
 def test_help_and_info_load_only_what_they_need(made: tuple[Path, str]) -> None:
@@ -191,6 +192,16 @@ def test_simulate_takes_every_fault_of_sensor_and_encoder(place: Path) -> None:
     np.testing.assert_allclose(encoder.angle - turned, np.radians(0.3) * np.sin(turned), rtol=0, atol=5e-4)  # rad
 
 
+def test_the_second_prism_turns_backwards_by_default(tmp_path: Path) -> None:
+    """Also if the speed of the first one is a table."""
+    (tmp_path / "speed.csv").write_text("0,700\n0.1,740\n")
+    for speed in (tmp_path / "speed.csv", None):
+        motion = RigOptions(second_apex_deg=1.0, speed=speed).build_motion()
+        first, second = motion.angles([0.0, 5e4, 9e4]).T
+        assert first[2] > 5.0
+        np.testing.assert_array_equal(second, -first)
+
+
 def test_calibrate_finds_the_truth(place: Path) -> None:
     found = Calibration.load("calibration.json")
     assert np.degrees(found.parameters["apex"]) == pytest.approx(2.0, abs=0.1)
@@ -345,6 +356,7 @@ def _bad_files(place: Path) -> None:
     data["camera"]["width"] = 99
     (place / "narrow.json").write_text(json.dumps(data))
     (place / "notes.txt").write_text("no picture")
+    (place / "falling.csv").write_text("1,700\n0,700\n")
     _own_recording(place)
 
 
@@ -366,7 +378,26 @@ BAD = [
     (("simulate", "out.h5", "--picture", "notes.txt"), "notes.txt"),
     (("simulate", "out.h5", "--picture", "missing.jpg"), "missing.jpg"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--size", "big"), "640x480"),
-    (("simulate", "out.h5", "--picture", "photo.jpg", "--apex-deg", "45"), "apex"),
+    (
+        ("simulate", "out.h5", "--picture", "photo.jpg", "--apex-deg", "45"),
+        "--apex-deg = 45.0 is not",
+    ),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--fov-deg", "500"), "--fov-deg = 500.0"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--scene-fov-deg", "nan"), "--scene-fov-deg = nan"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--tilt-deg", "100,0"), "--tilt-deg = 100.0"),
+    (("simulate", "out.h5", "--world", "desk", "--optic", "plate", "--plate-tilt-deg", "200"), "--plate-tilt-deg"),
+    (("simulate", "out.h5", "--world", "desk", "--optic", "plate", "--thickness-mm", "300"), "0 .. 200 mm"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "vibration", "--amplitude-deg", "20"), "-deg = 20.0"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "mirror", "--mirror-deg", "-1,1"), "-deg = -1.0"),
+    (("convert", "recording.h5", "out.h5", "--nominal-apex-deg", "40"), "--nominal-apex-deg = 40.0"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "vibration", "--apex-deg", "5"), "applies to a wedge"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "vibration", "--speed", "no.csv"), "--optic wedge"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "vibration", "--rate-hz", "9"), "or a mirror; give"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "mirror", "--phase-deg", "40"), "--phase-deg applies"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--thickness-mm", "5"), "--thickness-mm applies to a plate"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--rpm", "9", "--speed", "no.csv"), "--rpm and --speed both"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--speed", "falling.csv"), "falling.csv: prism speed: the times"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--speed", "empty.raw"), "empty.raw: prism speed"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--mismatch", "7"), "mismatch"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--tilt-deg", "1"), "--tilt-deg"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--cylinder-deg", "1"), "--cylinder-deg"),
@@ -427,6 +458,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(place: Path, args: tuple[str, 
         ("calibrate", "recording.h5", "--sharpness", "loud"),
         ("compensate", "recording.h5", "out.h5"),
         ("simulate", "out.h5"),
+        ("translate", "photo.jpg", "out.h5", "--thickness-mm", "5"),
+        ("translate", "photo.jpg", "out.h5", "--optic", "plate"),
+        ("board", "board.pdf", "--square-mm", "nan"),
     ],
 )
 def test_wrong_usage_is_exit_2_and_one_line(place: Path, args: tuple[str, ...]) -> None:
