@@ -109,6 +109,11 @@ def calibrate(
             f"{recording.name}: has the angles of two motors, and names no optic; give model 'risley' (--model risley) "
             "for a pair of prisms, or model 'mirror' (--model mirror) for a mirror with two tilts"
         )
+    if settings.model == AUTO and best == ExactModel.NAME and getattr(recording.prism, "second", None) is not None:
+        raise AmiwarpError(
+            f"{recording.name}: has two prisms, but the angle of one; give the second angle to 'amiwarp convert' by "
+            "--second-encoder or --second-ratio, or leave the second prism out"
+        )
     if best != ExactModel.NAME:
         settings = replace(settings, model=best)
     if isinstance(recording.prism, Plate) or settings.model == PlateModel.NAME:

@@ -30,6 +30,7 @@ from amiwarp.cli.common import (
     complete,
     format_notes,
     interval,
+    microseconds,
     number,
     numbers,
     progress,
@@ -463,7 +464,7 @@ class IweOptions:
             return None
         from amiwarp.imaging.export import IweFiles
 
-        window_us = None if self.iwe_window_ms is None else max(1, round(self.iwe_window_ms * 1000.0))
+        window_us = None if self.iwe_window_ms is None else microseconds(self.iwe_window_ms, "ms", "--iwe-window-ms")
         return IweFiles(self.iwe, recording.events, window_us=window_us, layers=self.iwe_layers, device=device)
 
 
@@ -569,7 +570,7 @@ class WindowOptions:
     ] = None
     length: Annotated[float | None, _in_window(min=1e-6, help="Length of the window (s).")] = None
     turns: Annotated[
-        float | None, _in_window(min=0.01, help="Length of the window (turns of the prism), at least 0.25. Default: 1.")
+        float | None, _in_window(min=0.25, help="Length of the window (turns of the prism), at least 0.25. Default: 1.")
     ] = None
     fps: Annotated[
         float | None, _in_window(min=0.01, max=100_000.0, help="Frames per second of a video. Default: 25.")
@@ -591,8 +592,8 @@ class WindowOptions:
         from amiwarp.reconstruction.picture import window_span
 
         after = 0.0 if self.start is None and video else self.start
-        start = None if after is None else recording.events.t_first + round(after * 1e6)
-        length = None if self.length is None else max(1, round(self.length * 1e6))
+        start = None if after is None else recording.events.t_first + microseconds(after, "s", "--start")
+        length = None if self.length is None else microseconds(self.length, "s", "--length")
         return window_span(recording, turn_us, start, length, self.turns)
 
     def camera_rotation(self) -> CameraRotation | None:
@@ -897,8 +898,8 @@ def run_pixels(
             source,
             Calibration.load(calibration),
             sensor=None if refractory_us is None else SensorTiming(refractory_us=refractory_us),
-            start_us=None if start is None else first + round(start * 1e6),
-            length_us=None if length is None else max(1, round(length * 1e6)),
+            start_us=None if start is None else first + microseconds(start, "s", "--start"),
+            length_us=None if length is None else microseconds(length, "s", "--length"),
             device=device,
             progress=advance,
         )

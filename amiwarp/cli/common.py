@@ -204,7 +204,9 @@ class EncoderOptions:
             raise AmiwarpError("--second-encoder and --second-ratio need the first prism's encoder; give --encoder too")
         if self.second_ratio is not None:
             return first.with_second(self.second_ratio)
-        return first.with_second(cast("Encoder", replace(self, encoder=self.second_encoder)._first(source, topic)))
+        return first.with_second(
+            cast("Encoder", replace(self, encoder=self.second_encoder, encoder_from=None)._first(source, topic))
+        )
 
     def _first(self, source: Path, topic: str | None) -> Encoder | None:
         if self.encoder_from is not None:
@@ -254,6 +256,8 @@ Round = Annotated[
 """Option for the rounding of compensated events."""
 
 
+LONGEST_US = 10**15
+"""Longest time that an option takes [us]: 32 years."""
 SCALES = {
     "deg": math.pi / 180.0,
     "rad": 1.0,
@@ -364,9 +368,18 @@ def parse_size(text: str, name: str = "--size", example: str = "640x480") -> tup
     ``name`` is the option, and ``example`` a value of it, for the message.
     """
     width, x, height = text.partition("x")
-    if not (x and width.isdigit() and height.isdigit()):
+    if not (x and width.isdecimal() and height.isdecimal()):
         raise AmiwarpError(f"{name} {text!r} is not a size; write it like {example}")
     return int(width), int(height)
+
+
+def microseconds(value: float, unit: str, name: str) -> int:
+    """Convert the time that the option ``name`` gives in the unit ``s`` or ``ms`` to whole microseconds.
+
+    Raises :class:`AmiwarpError` for a time that is not finite, or longer than :data:`LONGEST_US`.
+    """
+    scale = {"ms": 1e3, "s": 1e6}[unit]
+    return round(real(value, name, -LONGEST_US / scale, LONGEST_US / scale, f" {unit}") * scale)
 
 
 def span(text: str, first: int, last: int) -> tuple[int, int]:
@@ -377,9 +390,9 @@ def span(text: str, first: int, last: int) -> tuple[int, int]:
     """
     start, colon, end = text.partition(":")
     try:
-        low = first + round(float(start) * 1e6) if start.strip() else first
-        high = first + round(float(end) * 1e6) if end.strip() else last + 1
-    except (ValueError, OverflowError):
+        low = first + microseconds(float(start), "s", "START") if start.strip() else first
+        high = first + microseconds(float(end), "s", "END") if end.strip() else last + 1
+    except ValueError:
         low, high = 0, 0
     if not colon or not low < high:
         raise AmiwarpError(f"--window {text!r} is not a time span; write START:END in seconds, for example 0.5:2")
