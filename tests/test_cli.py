@@ -356,6 +356,7 @@ def _bad_files(place: Path) -> None:
     data["camera"]["width"] = 99
     (place / "narrow.json").write_text(json.dumps(data))
     (place / "notes.txt").write_text("no picture")
+    Image.fromarray(np.full((48, 64), 99, np.uint8)).save(place / "grey.png")
     (place / "falling.csv").write_text("1,700\n0,700\n")
     _own_recording(place)
 
@@ -406,6 +407,7 @@ BAD = [
     (("simulate", "out.h5", "--picture", "photo.jpg", "--size", "4²x48"), "640x480"),
     (("translate", "missing.mp4", "out.h5"), "missing.mp4"),
     (("translate", "notes.txt", "out.h5"), "notes.txt"),
+    (("translate", "grey.png", "out.h5"), "grey.png: does not state its duration; give --duration"),
     (("calibrate", "missing.h5"), "missing.h5"),
     (("calibrate", "events.npz"), "camera"),
     (("calibrate", "recording.h5", "--model", "spiral"), "spiral"),
@@ -467,6 +469,12 @@ BAD = [
     ),
     (("pixels", "recording.h5", "calibration.json", "a.npz", "--length", "inf"), "--length = inf"),
     (("pixels", "recording.h5", "calibration.json", "a.npz", "--start", "1e30"), "--start = 1e+30"),
+    (("reconstruct", "recording.h5", "a.npy", "--calibration", "calibration.json", "--bits", "16"), "--bits and"),
+    (("reconstruct", "recording.h5", "a.npy", "--calibration", "calibration.json", "--tone", "linear"), "--bits and"),
+    (("reconstruct", "recording.h5", "a.png", "--calibration", "calibration.json", "--bins", "3"), "--bins and"),
+    (("reconstruct", "recording.h5", "a.png", "--network", "quarter-turn", "--multiple", "4"), "--bins and"),
+    (("truth", "recording.h5", "truth", "--poses", "tum", "--with-prism"), "give --flow too"),
+    (("depth", "recording.h5", "calibration.json", "a.npz"), "the calibration has the exact model"),
     (("convert", "recording.h5", "a.rrd", "--frame-ms", "inf"), "--frame-ms = inf"),
     (("calibrate", "recording.h5", "--window", "0:1e30"), "START:END"),
     (("calibrate", "recording.h5", "--second-apex-deg", "1"), "--second-ratio"),

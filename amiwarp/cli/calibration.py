@@ -691,6 +691,10 @@ def run_reconstruct(
     video = out.suffix.lower() == VIDEO
     if video and (picture.mask is not None or picture.bits != 8):
         raise AmiwarpError("--mask and --bits apply to a single picture; leave them out for a video")
+    if out.suffix.lower() == ".npy" and (picture.bits, picture.tone) != (8, Tone.MAPPED):
+        raise AmiwarpError(f"{out}: --bits and --tone apply to .png, .tif and .mp4; leave them out for .npy")
+    if str(by.network) in ("None", OWN_NETWORK) and replace(by, network=None) != NetworkOptions():
+        raise AmiwarpError("--bins and --multiple apply to a network in a file; give it by --network")
     if not video and window.fps is not None:
         raise AmiwarpError(f"{out}: --fps applies to a video; give a name that ends in {VIDEO}")
     device = choose_device(common.device)

@@ -538,6 +538,8 @@ def run_truth(
     began = time.perf_counter()
     if flow is None and poses is None:
         raise AmiwarpError("nothing is chosen to export; give --flow dsec, --flow mvsec or --poses tum")
+    if with_prism and flow is None:
+        raise AmiwarpError("--with-prism applies to the optical flow; give --flow too")
     source = open_recording(recording)
     truth = source.truth
     if truth is None or (truth.frames is None and truth.poses is None):

@@ -718,6 +718,8 @@ def run_translate(
         given = translator_input(
             source, events=events, dataset=name, interpolation=way, fps=fps, device=device, progress=advance
         )
+    if duration is None and not given.duration_us:
+        raise AmiwarpError(f"{source}: does not state its duration; give --duration")
     chosen = rig.size is None and rig.fov_deg is None and rig.camera is None
     simulation = translation(
         given,
