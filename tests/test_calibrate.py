@@ -304,7 +304,7 @@ def test_unknown_camera(recording: Recording) -> None:
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"free": ("apex", "focal")}, "focal"),
+        ({"free": ("apex", "focal")}, "'focal' is unknown; choose among .*, motion, off_ratio, leak"),
         ({"free": ("rpm", "apex")}, "encoder gives the rpm"),
         ({"start": {"rpm": 720.0}}, "encoder gives the rpm"),
         ({"start": {"deflection": 0.01}}, "deflection, which is no parameter of the exact model"),

@@ -20,6 +20,7 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from amiwarp import AmiwarpError, Calibration, PrismMotion, open_recording
+from amiwarp.calib.parameters import LINEAR_UNKNOWNS, units
 from amiwarp.cli.app import COMMANDS, app, function_of
 from amiwarp.cli.common import number
 from amiwarp.cli.simulation import RigOptions
@@ -107,6 +108,12 @@ def test_help_of_everything_shows_an_example() -> None:
         text = " ".join(result.stdout.split())
         assert f"Example: {command.example}" in text
         assert all(option in text for option in ("--json", "--device", "--seed"))
+
+
+def test_the_help_names_every_parameter() -> None:
+    text = run("calibrate", "--help").stdout
+    named = set(re.findall(r"\w+", re.sub(r"[│\n]", " ", text)))
+    assert set(units()) | {"motion", *LINEAR_UNKNOWNS} <= named
 
 
 def test_version() -> None:
@@ -410,6 +417,7 @@ BAD = [
     (("translate", "grey.png", "out.h5"), "grey.png: does not state its duration; give --duration"),
     (("calibrate", "missing.h5"), "missing.h5"),
     (("calibrate", "events.npz"), "camera"),
+    (("calibrate", "recording.h5", "--camera", "garbage.h5"), "or as .json or .yaml"),
     (("calibrate", "recording.h5", "--model", "spiral"), "spiral"),
     (("calibrate", "recording.h5", "--global-algorithm", "GN_GUESS"), "GN_GUESS"),
     (("calibrate", "recording.h5", "--local-algorithm", "LD_LBFGS"), "LD_LBFGS"),

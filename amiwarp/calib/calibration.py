@@ -30,12 +30,12 @@ from amiwarp.calib import checks, first_guess, plate
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
 from amiwarp.calib.model_choice import ModelChooser
-from amiwarp.calib.parameters import MOTION, RATES, ParameterSpace, best_model, make_space, nominal
+from amiwarp.calib.parameters import LINEAR_UNKNOWNS, MOTION, RATES, ParameterSpace, best_model, make_space, nominal
 from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
-from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, CalibrationOptions, Settings
+from amiwarp.calib.settings import AUTO, CalibrationOptions, Settings
 from amiwarp.calib.sharpness_search import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, check_prisms

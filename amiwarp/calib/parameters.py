@@ -47,6 +47,8 @@ CHANGES = ("change_x", "change_y", "change_z")
 """Angular acceleration of the camera about its x, y and z axes: names of the parameters."""
 MOTION = (*RATES, *CHANGES)
 """Names of all parameters of the camera's rotation."""
+LINEAR_UNKNOWNS = ("off_ratio", "leak")
+"""Free parameters that only the photometric stage has: unknowns of its linear equations."""
 _UNITS = {
     "clock_offset": "us",
     "rpm": "1/min",
@@ -516,7 +518,8 @@ def _ordered_names(kind: type[Model], free: tuple[str, ...]) -> tuple[str, ...]:
     wanted |= set(RATES if "motion" in free else ())
     unknown = wanted - set(units())
     if unknown:
-        raise AmiwarpError(f"free parameter {sorted(unknown)[0]!r} is unknown; choose among {', '.join(units())}")
+        known = ", ".join((*units(), "motion", *LINEAR_UNKNOWNS))
+        raise AmiwarpError(f"free parameter {sorted(unknown)[0]!r} is unknown; choose among {known}")
     if not wanted:
         raise AmiwarpError("no parameter is free; name at least one free parameter")
     foreign = sorted(wanted - set(_names_of(kind)))
