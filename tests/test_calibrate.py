@@ -304,10 +304,14 @@ def test_unknown_camera(recording: Recording) -> None:
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"free": ("apex", "focal")}, "focal"),
+        ({"free": ("apex", "focal")}, "'focal' is unknown; choose among .*, motion, off_ratio, leak"),
         ({"free": ("rpm", "apex")}, "encoder gives the rpm"),
         ({"start": {"rpm": 720.0}}, "encoder gives the rpm"),
         ({"start": {"deflection": 0.01}}, "deflection, which is no parameter of the exact model"),
+        (
+            {"start": {"apex": 0.2}},
+            r"start of apex = 0\.2 is not in 0 \.\. 0\.\d+ rad; give its bounds too \(--bound\)",
+        ),
         ({"bounds": {"index": (1.4, 1.6)}}, "given for index, which is not free"),
         ({"free": ()}, "no parameter is free"),
         ({"model": "circle", "free": ("deflection", "tilt_x")}, "tilt_x"),
@@ -327,6 +331,21 @@ def test_the_typed_options_are_the_settings() -> None:
     """A type checker knows every keyword argument of ``calibrate``, with the type of the field."""
     assert get_type_hints(CalibrationOptions) == get_type_hints(Settings)
     assert not CalibrationOptions.__required_keys__
+
+
+def test_a_phase_to_start_with_is_wrapped(recording: Recording) -> None:
+    """Unless bounds are given, which hold for it as given."""
+    assert recording.camera is not None
+
+    def started(start: float, **bounds: tuple[float, float]) -> float:
+        return make_space(
+            "circle", recording.camera, NOMINAL_PRISM, free=("deflection", "phase"), start={"phase": start},
+            bounds=bounds, rad_per_us=75e-6, duration_us=250e3,
+        ).start["phase"]  # fmt: skip
+
+    assert started(1.5 * np.pi) == pytest.approx(-0.5 * np.pi, abs=1e-12)
+    assert started(-1.25) == -1.25
+    assert started(5.0, phase=(4.0, 6.0)) == 5.0
 
 
 def test_a_drift_that_is_held_still_turns_the_angles(recording: Recording) -> None:

@@ -20,8 +20,10 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from amiwarp import AmiwarpError, Calibration, PrismMotion, open_recording
+from amiwarp.calib.parameters import LINEAR_UNKNOWNS, units
 from amiwarp.cli.app import COMMANDS, app, function_of
 from amiwarp.cli.common import number
+from amiwarp.cli.simulation import RigOptions
 
 
 def test_help_and_info_load_only_what_they_need(made: tuple[Path, str]) -> None:
@@ -108,6 +110,12 @@ def test_help_of_everything_shows_an_example() -> None:
         assert all(option in text for option in ("--json", "--device", "--seed"))
 
 
+def test_the_help_names_every_parameter() -> None:
+    text = run("calibrate", "--help").stdout
+    named = set(re.findall(r"\w+", re.sub(r"[│\n]", " ", text)))
+    assert set(units()) | {"motion", *LINEAR_UNKNOWNS} <= named
+
+
 def test_version() -> None:
     import amiwarp
 
@@ -189,6 +197,16 @@ def test_simulate_takes_every_fault_of_sensor_and_encoder(place: Path) -> None:
     assert encoder is not None
     turned = PrismMotion([[0.0, 700.0], [0.1, 740.0]]).angle(encoder.t)
     np.testing.assert_allclose(encoder.angle - turned, np.radians(0.3) * np.sin(turned), rtol=0, atol=5e-4)  # rad
+
+
+def test_the_second_prism_turns_backwards_by_default(tmp_path: Path) -> None:
+    """Also if the speed of the first one is a table."""
+    (tmp_path / "speed.csv").write_text("0,700\n0.1,740\n")
+    for speed in (tmp_path / "speed.csv", None):
+        motion = RigOptions(second_apex_deg=1.0, speed=speed).build_motion()
+        first, second = motion.angles([0.0, 5e4, 9e4]).T
+        assert first[2] > 5.0
+        np.testing.assert_array_equal(second, -first)
 
 
 def test_calibrate_finds_the_truth(place: Path) -> None:
@@ -345,6 +363,8 @@ def _bad_files(place: Path) -> None:
     data["camera"]["width"] = 99
     (place / "narrow.json").write_text(json.dumps(data))
     (place / "notes.txt").write_text("no picture")
+    Image.fromarray(np.full((48, 64), 99, np.uint8)).save(place / "grey.png")
+    (place / "falling.csv").write_text("1,700\n0,700\n")
     _own_recording(place)
 
 
@@ -366,16 +386,38 @@ BAD = [
     (("simulate", "out.h5", "--picture", "notes.txt"), "notes.txt"),
     (("simulate", "out.h5", "--picture", "missing.jpg"), "missing.jpg"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--size", "big"), "640x480"),
-    (("simulate", "out.h5", "--picture", "photo.jpg", "--apex-deg", "45"), "apex"),
+    (
+        ("simulate", "out.h5", "--picture", "photo.jpg", "--apex-deg", "45"),
+        "--apex-deg = 45.0 is not",
+    ),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--fov-deg", "500"), "--fov-deg = 500.0"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--scene-fov-deg", "nan"), "--scene-fov-deg = nan"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--tilt-deg", "100,0"), "--tilt-deg = 100.0"),
+    (("simulate", "out.h5", "--world", "desk", "--optic", "plate", "--plate-tilt-deg", "200"), "--plate-tilt-deg"),
+    (("simulate", "out.h5", "--world", "desk", "--optic", "plate", "--thickness-mm", "300"), "0 .. 200 mm"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "vibration", "--amplitude-deg", "20"), "-deg = 20.0"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "mirror", "--mirror-deg", "-1,1"), "-deg = -1.0"),
+    (("convert", "recording.h5", "out.h5", "--nominal-apex-deg", "40"), "--nominal-apex-deg = 40.0"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "vibration", "--apex-deg", "5"), "applies to a wedge"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "vibration", "--speed", "no.csv"), "--optic wedge"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "vibration", "--rate-hz", "9"), "or a mirror; give"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--optic", "mirror", "--phase-deg", "40"), "--phase-deg applies"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--thickness-mm", "5"), "--thickness-mm applies to a plate"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--rpm", "9", "--speed", "no.csv"), "--rpm and --speed both"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--speed", "falling.csv"), "falling.csv: prism speed: the times"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--speed", "empty.raw"), "empty.raw: prism speed"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--mismatch", "7"), "mismatch"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--tilt-deg", "1"), "--tilt-deg"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--cylinder-deg", "1"), "--cylinder-deg"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--encoder-error-deg", "1,2"), "--encoder-error-deg"),
     (("simulate", "nowhere/out.h5", "--picture", "photo.jpg", "--size", "64x48", "--duration", "0.01"), "nowhere"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--size", "4²x48"), "640x480"),
     (("translate", "missing.mp4", "out.h5"), "missing.mp4"),
     (("translate", "notes.txt", "out.h5"), "notes.txt"),
+    (("translate", "grey.png", "out.h5"), "grey.png: does not state its duration; give --duration"),
     (("calibrate", "missing.h5"), "missing.h5"),
     (("calibrate", "events.npz"), "camera"),
+    (("calibrate", "recording.h5", "--camera", "garbage.h5"), "or as .json or .yaml"),
     (("calibrate", "recording.h5", "--model", "spiral"), "spiral"),
     (("calibrate", "recording.h5", "--global-algorithm", "GN_GUESS"), "GN_GUESS"),
     (("calibrate", "recording.h5", "--local-algorithm", "LD_LBFGS"), "LD_LBFGS"),
@@ -400,6 +442,50 @@ BAD = [
     (("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--iwe", "iwe.bmp"), "iwe.bmp"),
     (("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--iwe-window-ms", "5"), "--iwe"),
     (("compensate", "recording.h5", "no/o.h5", "--calibration", "calibration.json", "--iwe", "i.npy"), "no/o.h5"),
+    (
+        (
+            "compensate",
+            "recording.h5",
+            "out.h5",
+            "--calibration",
+            "calibration.json",
+            "--iwe",
+            "i.npy",
+            "--iwe-window-ms",
+            "inf",
+        ),
+        "--iwe-window-ms = inf",
+    ),
+    (
+        (
+            "compensate",
+            "recording.h5",
+            "out.h5",
+            "--calibration",
+            "calibration.json",
+            "--iwe",
+            "i.npy",
+            "--iwe-window-ms",
+            "1e30",
+        ),
+        "--iwe-window-ms = 1e+30",
+    ),
+    (("reconstruct", "recording.h5", "a.png", "--calibration", "calibration.json", "--start", "nan"), "--start = nan"),
+    (
+        ("reconstruct", "recording.h5", "a.png", "--calibration", "calibration.json", "--length", "inf"),
+        "--length = inf",
+    ),
+    (("pixels", "recording.h5", "calibration.json", "a.npz", "--length", "inf"), "--length = inf"),
+    (("pixels", "recording.h5", "calibration.json", "a.npz", "--start", "1e30"), "--start = 1e+30"),
+    (("reconstruct", "recording.h5", "a.npy", "--calibration", "calibration.json", "--bits", "16"), "--bits and"),
+    (("reconstruct", "recording.h5", "a.npy", "--calibration", "calibration.json", "--tone", "linear"), "--bits and"),
+    (("reconstruct", "recording.h5", "a.png", "--calibration", "calibration.json", "--bins", "3"), "--bins and"),
+    (("reconstruct", "recording.h5", "a.png", "--network", "quarter-turn", "--multiple", "4"), "--bins and"),
+    (("truth", "recording.h5", "truth", "--poses", "tum", "--with-prism"), "give --flow too"),
+    (("depth", "recording.h5", "calibration.json", "a.npz"), "the calibration has the exact model"),
+    (("convert", "recording.h5", "a.rrd", "--frame-ms", "inf"), "--frame-ms = inf"),
+    (("calibrate", "recording.h5", "--window", "0:1e30"), "START:END"),
+    (("calibrate", "recording.h5", "--second-apex-deg", "1"), "--second-ratio"),
     (("demo", "--picture", "notes.txt", "--out", "demo"), "notes.txt"),
     (("demo", "--out", "notes.txt"), "notes.txt"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--device", "cuda:77"), "cuda:77"),
@@ -427,6 +513,10 @@ def test_bad_input_is_one_line_and_leaves_nothing(place: Path, args: tuple[str, 
         ("calibrate", "recording.h5", "--sharpness", "loud"),
         ("compensate", "recording.h5", "out.h5"),
         ("simulate", "out.h5"),
+        ("translate", "photo.jpg", "out.h5", "--thickness-mm", "5"),
+        ("translate", "photo.jpg", "out.h5", "--optic", "plate"),
+        ("board", "board.pdf", "--square-mm", "nan"),
+        ("reconstruct", "recording.h5", "a.png", "--calibration", "calibration.json", "--turns", "0.1"),
     ],
 )
 def test_wrong_usage_is_exit_2_and_one_line(place: Path, args: tuple[str, ...]) -> None:

@@ -144,6 +144,14 @@ def test_encoder_from_triggers(data_dir: Path, tmp_path: Path) -> None:
     steps = ("--counts-per-turn", "2", "--direction", "-1", "--force")
     run("convert", path, tmp_path / "out.h5", "--encoder-from", "triggers:6", *steps)
     assert open_recording(tmp_path / "out.h5").encoder.rpm == pytest.approx(-300.0)  # type: ignore[union-attr]
+    first, last = int(encoder.t[0]), int(encoder.t[-1])
+    (tmp_path / "second.csv").write_text(f"t_us,angle_deg\n{first},0\n{last},{(last - first) * 0.001}\n")
+    second = ("--second-encoder", tmp_path / "second.csv", "--force")
+    run("convert", path, tmp_path / "out.h5", "--encoder-from", "triggers:6", *second)
+    pair = open_recording(tmp_path / "out.h5").encoder
+    assert pair is not None
+    assert pair.second is not None
+    assert (pair.rpm, pair.second.rpm) == (pytest.approx(600.0), pytest.approx(1000.0 / 6.0))
 
 
 @pytest.mark.parametrize(

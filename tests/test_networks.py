@@ -406,8 +406,8 @@ SMALL_CALIBRATION = Calibration(
 
 
 def run(*arguments: str) -> Any:
-    given = ["reconstruct", "r.h5", *arguments, "--bins", str(BINS), "--device", "cpu", "--json"]
-    return CliRunner().invoke(app, given)
+    bins = ["--bins", str(BINS)] if any(Path(each).suffix in (".onnx", ".pt") for each in arguments) else []
+    return CliRunner().invoke(app, ["reconstruct", "r.h5", *arguments, *bins, "--device", "cpu", "--json"])
 
 
 @pytest.mark.parametrize("calibrated", [False, True])

@@ -413,6 +413,14 @@ def test_ellipse_of_the_other_models() -> None:
         assert distance(ellipse.compensate_points(xy, theta), model.compensate_points(xy, theta)).max() < 0.1
 
 
+@pytest.mark.parametrize("name", ["vibration", "mirror", "risley", "ellipse"])
+def test_ellipse_of_another_optic_is_refused(name: str) -> None:
+    pair = replace(prism(1.0), second=prism(0.5))
+    model = MODELS[name].from_values(camera(60.0, None, (16, 12)), pair, MODELS[name].start_values(pair))
+    with pytest.raises(AmiwarpError, match=f"the {name} model cannot be fitted by ellipses; give a model of one"):
+        EllipseModel.from_model(model)
+
+
 def test_ellipse_keeps_invalid_pixels_invalid_and_in_bounds(device: str) -> None:
     """If the lens folds inside the image, corners have no ray. No read beyond the tables happens there."""
     cam = camera(90.0, RadialTangential(k1=-0.4), (64, 48))

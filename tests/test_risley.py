@@ -185,6 +185,12 @@ def test_a_prism_at_rest_is_named(recording: amiwarp.Recording) -> None:
         amiwarp.calibrate(replace(recording, encoder=recording.encoder.with_second(1e-6)))
 
 
+def test_a_pair_with_one_angle_is_refused(recording: amiwarp.Recording) -> None:
+    one = None if recording.encoder is None else replace(recording.encoder, second=None)
+    with pytest.raises(AmiwarpError, match=r"has two prisms, but the angle of one; give .* --second-ratio"):
+        amiwarp.calibrate(replace(recording, encoder=one))
+
+
 def test_command_line(texture: NDArray[np.uint8], tmp_path: Path) -> None:
     from PIL import Image
 

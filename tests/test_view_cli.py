@@ -116,6 +116,10 @@ def test_a_picture_without_a_rotating_prism_shows_one_cloud(files: Path, tmp_pat
         (["--screenshot", "out.png", "--model", "sphere"], "choose among circle, exact, radial, ellipse"),
         (["--screenshot", "out.png", "--size", "9x9"], "--size"),
         (["--calibration", "none.json"], "none.json"),
+        (["--screenshot", "out.png", "--web"], "give one of them"),
+        (["--screenshot", "out.png", "--host", "0.0.0.0"], "give --web too"),
+        (["--screenshot", "out.png", "--port", "80"], "give --web too"),
+        (["--screenshot", "out.png", "--controller", "find"], "give --live too"),
     ],
     ids=lambda v: str(v)[:40],
 )

@@ -30,12 +30,12 @@ from amiwarp.calib import checks, first_guess, plate
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
 from amiwarp.calib.model_choice import ModelChooser
-from amiwarp.calib.parameters import MOTION, RATES, ParameterSpace, best_model, make_space, nominal
+from amiwarp.calib.parameters import LINEAR_UNKNOWNS, MOTION, RATES, ParameterSpace, best_model, make_space, nominal
 from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
-from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, CalibrationOptions, Settings
+from amiwarp.calib.settings import AUTO, CalibrationOptions, Settings
 from amiwarp.calib.sharpness_search import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, check_prisms
@@ -108,6 +108,11 @@ def calibrate(
         raise AmiwarpError(
             f"{recording.name}: has the angles of two motors, and names no optic; give model 'risley' (--model risley) "
             "for a pair of prisms, or model 'mirror' (--model mirror) for a mirror with two tilts"
+        )
+    if settings.model == AUTO and best == ExactModel.NAME and getattr(recording.prism, "second", None) is not None:
+        raise AmiwarpError(
+            f"{recording.name}: has two prisms, but the angle of one; give the second angle to 'amiwarp convert' by "
+            "--second-encoder or --second-ratio, or leave the second prism out"
         )
     if best != ExactModel.NAME:
         settings = replace(settings, model=best)

@@ -47,6 +47,8 @@ CHANGES = ("change_x", "change_y", "change_z")
 """Angular acceleration of the camera about its x, y and z axes: names of the parameters."""
 MOTION = (*RATES, *CHANGES)
 """Names of all parameters of the camera's rotation."""
+LINEAR_UNKNOWNS = ("off_ratio", "leak")
+"""Free parameters that only the photometric stage has: unknowns of its linear equations."""
 _UNITS = {
     "clock_offset": "us",
     "rpm": "1/min",
@@ -434,7 +436,7 @@ def make_space(
     free : tuple of str, or None
         Names of the free parameters; ``motion`` stands for all three rates. None: those that the model names.
     start : mapping of str to float
-        Start values, in the parameters' units.
+        Start values, in the parameters' units. Phases are wrapped, unless they have ``bounds``.
     bounds : mapping of str to (float, float)
         Lower and upper bound by name, in the parameters' units.
     rad_per_us : float
@@ -455,7 +457,7 @@ def make_space(
     ------
     AmiwarpError
         If a name is unknown, not part of the model or in conflict with another one, if the bounds are in the wrong
-        order, or if a free parameter moves no event.
+        order, if a start value is outside the default bounds, or if a free parameter moves no event.
     """
     kind = MODELS[model]
     names = _ordered_names(kind, kind.FREED if free is None else free)
@@ -468,7 +470,13 @@ def make_space(
         low[name], high[name] = bounds.get(name) or default
         if not low[name] < high[name]:
             raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower bound first")
-        values[name] = min(max(values[name], low[name]), high[name])
+        if name not in bounds and name in phase_names():
+            values[name] = math.remainder(values[name], math.tau)
+        nearest = min(max(values[name], low[name]), high[name])
+        if name in start and name not in bounds and nearest != values[name]:
+            span = f"{low[name]:.6g} .. {high[name]:.6g} {units()[name]}"
+            raise AmiwarpError(f"start of {name} = {values[name]:.6g} is not in {span}; give its bounds too (--bound)")
+        values[name] = nearest
     if pixels is None:
         pixels = _pixels_per_unit(
             model, camera, prism, names=names, values=values, rad_per_us=rad_per_us, duration_us=duration_us
@@ -510,7 +518,8 @@ def _ordered_names(kind: type[Model], free: tuple[str, ...]) -> tuple[str, ...]:
     wanted |= set(RATES if "motion" in free else ())
     unknown = wanted - set(units())
     if unknown:
-        raise AmiwarpError(f"free parameter {sorted(unknown)[0]!r} is unknown; choose among {', '.join(units())}")
+        known = ", ".join((*units(), "motion", *LINEAR_UNKNOWNS))
+        raise AmiwarpError(f"free parameter {sorted(unknown)[0]!r} is unknown; choose among {known}")
     if not wanted:
         raise AmiwarpError("no parameter is free; name at least one free parameter")
     foreign = sorted(wanted - set(_names_of(kind)))

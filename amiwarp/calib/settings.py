@@ -22,8 +22,6 @@ AUTO = "auto"
 """Name in the settings for the automatic choice of the model."""
 STAGES = ("sharpness", "photometric")
 """Names of the stages of a calibration, in order."""
-LINEAR_UNKNOWNS = ("off_ratio", "leak")
-"""Free parameters that only the photometric stage has: unknowns of its linear equations."""
 GAUSS_NEWTON = "gauss-newton"
 """Name of the Gauss-Newton method in the settings."""
 

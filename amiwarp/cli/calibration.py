@@ -30,6 +30,7 @@ from amiwarp.cli.common import (
     complete,
     format_notes,
     interval,
+    microseconds,
     number,
     numbers,
     progress,
@@ -177,7 +178,8 @@ class ParameterOptions:
         str | None,
         typer.Option(
             help="Parameters to estimate, separated by commas: apex (or deflection), phase, clock_offset, rpm, tilt_x, "
-            "tilt_y, cylinder_x, cylinder_y, wobble_x, wobble_y, index, focal_length; of a vibration amplitude, phase, "
+            "tilt_y, cylinder_x, cylinder_y, wobble_x, wobble_y, index, focal_length; of a pair of prisms also "
+            "second_apex, second_phase, ratio; of a plate phase, inverse_depth; of a vibration amplitude, phase, "
             "rpm, backward_x, backward_y, roll_x, roll_y, second_x, second_y, second_backward_x, second_backward_y; of "
             "a mirror amplitude, phase, direction, second_amplitude, second_phase, second_direction, fold, incidence; "
             "motion (or rate_x, rate_y, rate_z) and change_x, change_y, change_z for a rotating camera; off_ratio and "
@@ -463,7 +465,7 @@ class IweOptions:
             return None
         from amiwarp.imaging.export import IweFiles
 
-        window_us = None if self.iwe_window_ms is None else max(1, round(self.iwe_window_ms * 1000.0))
+        window_us = None if self.iwe_window_ms is None else microseconds(self.iwe_window_ms, "ms", "--iwe-window-ms")
         return IweFiles(self.iwe, recording.events, window_us=window_us, layers=self.iwe_layers, device=device)
 
 
@@ -569,7 +571,7 @@ class WindowOptions:
     ] = None
     length: Annotated[float | None, _in_window(min=1e-6, help="Length of the window (s).")] = None
     turns: Annotated[
-        float | None, _in_window(min=0.01, help="Length of the window (turns of the prism), at least 0.25. Default: 1.")
+        float | None, _in_window(min=0.25, help="Length of the window (turns of the prism), at least 0.25. Default: 1.")
     ] = None
     fps: Annotated[
         float | None, _in_window(min=0.01, max=100_000.0, help="Frames per second of a video. Default: 25.")
@@ -591,8 +593,8 @@ class WindowOptions:
         from amiwarp.reconstruction.picture import window_span
 
         after = 0.0 if self.start is None and video else self.start
-        start = None if after is None else recording.events.t_first + round(after * 1e6)
-        length = None if self.length is None else max(1, round(self.length * 1e6))
+        start = None if after is None else recording.events.t_first + microseconds(after, "s", "--start")
+        length = None if self.length is None else microseconds(self.length, "s", "--length")
         return window_span(recording, turn_us, start, length, self.turns)
 
     def camera_rotation(self) -> CameraRotation | None:
@@ -690,6 +692,10 @@ def run_reconstruct(
     video = out.suffix.lower() == VIDEO
     if video and (picture.mask is not None or picture.bits != 8):
         raise AmiwarpError("--mask and --bits apply to a single picture; leave them out for a video")
+    if out.suffix.lower() == ".npy" and (picture.bits, picture.tone) != (8, Tone.MAPPED):
+        raise AmiwarpError(f"{out}: --bits and --tone apply to .png, .tif and .mp4; leave them out for .npy")
+    if str(by.network) in ("None", OWN_NETWORK) and replace(by, network=None) != NetworkOptions():
+        raise AmiwarpError("--bins and --multiple apply to a network in a file; give it by --network")
     if not video and window.fps is not None:
         raise AmiwarpError(f"{out}: --fps applies to a video; give a name that ends in {VIDEO}")
     device = choose_device(common.device)
@@ -897,8 +903,8 @@ def run_pixels(
             source,
             Calibration.load(calibration),
             sensor=None if refractory_us is None else SensorTiming(refractory_us=refractory_us),
-            start_us=None if start is None else first + round(start * 1e6),
-            length_us=None if length is None else max(1, round(length * 1e6)),
+            start_us=None if start is None else first + microseconds(start, "s", "--start"),
+            length_us=None if length is None else microseconds(length, "s", "--length"),
             device=device,
             progress=advance,
         )

@@ -28,9 +28,20 @@ from amiwarp.io import read_encoder_csv, read_encoder_triggers
 from amiwarp.io.camera_files import load_camera
 from amiwarp.io.files import check_regular
 from amiwarp.io.formats import LIMITS, Codec, OutputFormat, Rounding
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import FlatSide, NominalPrism, Plate, Prism, UnsizedPrism
+from amiwarp.optics.camera import LEAST_FOV, Camera
+from amiwarp.optics.prism import (
+    LARGEST_APEX,
+    LARGEST_PHASE,
+    LARGEST_THICKNESS,
+    STEEPEST_TILT,
+    FlatSide,
+    NominalPrism,
+    Plate,
+    Prism,
+    UnsizedPrism,
+)
 from amiwarp.tasks import Progress
+from amiwarp.validation import real
 
 # Options that several commands use. A group of options is a dataclass.
 
@@ -70,7 +81,7 @@ class CameraOptions:
         if self.camera is not None and self.fov_deg is not None:
             raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
         if self.fov_deg is not None:
-            return Camera.from_fov(width, height, math.radians(self.fov_deg))
+            return Camera.from_fov(width, height, fov_from(self.fov_deg, "--fov-deg"))
         if self.camera is None:
             return None
         camera = load_camera(self.camera, (width, height))
@@ -108,13 +119,14 @@ class NominalPrismOptions:
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         prism = replace(known or UnsizedPrism(), **changes)
         if self.nominal_apex_deg is not None:
-            sized = UnsizedPrism(prism.index, prism.flat_side).with_apex(math.radians(self.nominal_apex_deg))
+            apex = apex_from(self.nominal_apex_deg, "--nominal-apex-deg")
+            sized = UnsizedPrism(prism.index, prism.flat_side).with_apex(apex)
             prism = replace(sized, second=prism.second) if isinstance(prism, Prism) else sized
             changes["apex"] = sized.apex
         if self.second_apex_deg is not None:
             if not isinstance(prism, Prism):
                 raise AmiwarpError("--second-apex-deg needs the apex of the first prism; give --nominal-apex-deg")
-            second = Prism(math.radians(self.second_apex_deg), prism.index, prism.flat_side)
+            second = Prism(apex_from(self.second_apex_deg, "--second-apex-deg"), prism.index, prism.flat_side)
             return replace(prism, second=second)
         return prism if changes else known
 
@@ -125,10 +137,10 @@ class NominalPrismOptions:
         thickness, tilt = self.thickness_mm, self.plate_tilt_deg
         if known is None and (thickness is None or tilt is None):
             raise AmiwarpError("a plate needs --thickness-mm and --plate-tilt-deg; give both")
-        plate = known or Plate((thickness or 0.0) * 1e-3, math.radians(tilt or 0.0))
+        plate = known or Plate(0.0, 0.0)
         return Plate(
-            plate.thickness if thickness is None else thickness * 1e-3,
-            plate.tilt if tilt is None else math.radians(tilt),
+            plate.thickness if thickness is None else thickness_from(thickness),
+            plate.tilt if tilt is None else plate_tilt_from(tilt),
             plate.index if self.index is None else self.index,
         )
 
@@ -192,7 +204,9 @@ class EncoderOptions:
             raise AmiwarpError("--second-encoder and --second-ratio need the first prism's encoder; give --encoder too")
         if self.second_ratio is not None:
             return first.with_second(self.second_ratio)
-        return first.with_second(cast("Encoder", replace(self, encoder=self.second_encoder)._first(source, topic)))
+        return first.with_second(
+            cast("Encoder", replace(self, encoder=self.second_encoder, encoder_from=None)._first(source, topic))
+        )
 
     def _first(self, source: Path, topic: str | None) -> Encoder | None:
         if self.encoder_from is not None:
@@ -242,6 +256,8 @@ Round = Annotated[
 """Option for the rounding of compensated events."""
 
 
+LONGEST_US = 10**15
+"""Longest time that an option takes [us]: 32 years."""
 SCALES = {
     "deg": math.pi / 180.0,
     "rad": 1.0,
@@ -313,15 +329,57 @@ def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
     return values
 
 
+def radians(degrees: float, name: str, low: float = -LARGEST_PHASE, high: float = LARGEST_PHASE) -> float:
+    """Convert the value of the option ``name`` to radians. Raises :class:`AmiwarpError` outside low .. high [rad]."""
+    return math.radians(real(degrees, name, math.degrees(low), math.degrees(high), " deg"))
+
+
+def angles(
+    text: str, count: int, name: str, high: float = LARGEST_PHASE, *, low: float | None = None
+) -> tuple[Any, ...]:
+    """Convert ``count`` angles [deg] separated by commas to radians, see :func:`radians`. ``low`` is ``-high``."""
+    low = -high if low is None else low
+    return tuple(radians(value, name, low, high) for value in numbers(text, count, name))
+
+
+def fov_from(degrees: float, name: str) -> float:
+    """Convert the field of view that the option ``name`` gives to radians."""
+    return radians(degrees, name, LEAST_FOV, math.pi)
+
+
+def apex_from(degrees: float, name: str) -> float:
+    """Convert the apex angle that the option ``name`` gives to radians."""
+    return radians(degrees, name, 0.0, LARGEST_APEX)
+
+
+def thickness_from(mm: float) -> float:
+    """Convert the value of ``--thickness-mm`` to metres."""
+    return real(mm, "--thickness-mm", 0.0, 1e3 * LARGEST_THICKNESS, " mm") * 1e-3
+
+
+def plate_tilt_from(degrees: float) -> float:
+    """Convert the value of ``--plate-tilt-deg`` to radians."""
+    return radians(degrees, "--plate-tilt-deg", 0.0, STEEPEST_TILT)
+
+
 def parse_size(text: str, name: str = "--size", example: str = "640x480") -> tuple[int, int]:
     """Convert a size such as ``640x480``. Raises :class:`AmiwarpError` if the text is not a size.
 
     ``name`` is the option, and ``example`` a value of it, for the message.
     """
     width, x, height = text.partition("x")
-    if not (x and width.isdigit() and height.isdigit()):
+    if not (x and width.isdecimal() and height.isdecimal()):
         raise AmiwarpError(f"{name} {text!r} is not a size; write it like {example}")
     return int(width), int(height)
+
+
+def microseconds(value: float, unit: str, name: str) -> int:
+    """Convert the time that the option ``name`` gives in the unit ``s`` or ``ms`` to whole microseconds.
+
+    Raises :class:`AmiwarpError` for a time that is not finite, or longer than :data:`LONGEST_US`.
+    """
+    scale = {"ms": 1e3, "s": 1e6}[unit]
+    return round(real(value, name, -LONGEST_US / scale, LONGEST_US / scale, f" {unit}") * scale)
 
 
 def span(text: str, first: int, last: int) -> tuple[int, int]:
@@ -332,9 +390,9 @@ def span(text: str, first: int, last: int) -> tuple[int, int]:
     """
     start, colon, end = text.partition(":")
     try:
-        low = first + round(float(start) * 1e6) if start.strip() else first
-        high = first + round(float(end) * 1e6) if end.strip() else last + 1
-    except (ValueError, OverflowError):
+        low = first + microseconds(float(start), "s", "START") if start.strip() else first
+        high = first + microseconds(float(end), "s", "END") if end.strip() else last + 1
+    except ValueError:
         low, high = 0, 0
     if not colon or not low < high:
         raise AmiwarpError(f"--window {text!r} is not a time span; write START:END in seconds, for example 0.5:2")

@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.cli.common import OUTPUT, Common, NominalPrismOptions, choose_device, parse_size, progress, report, table
+from amiwarp.cli.common import (
+    OUTPUT,
+    Common,
+    NominalPrismOptions,
+    choose_device,
+    fov_from,
+    parse_size,
+    progress,
+    report,
+    table,
+)
 from amiwarp.cli.rig import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
@@ -39,7 +49,9 @@ class BoardOptions:
             rich_help_panel=_BOARD,
         ),
     ] = "9x6"
-    square_mm: Annotated[float, typer.Option(help="Side of a square (mm).", rich_help_panel=_BOARD)] = 30.0
+    square_mm: Annotated[
+        float, typer.Option(min=0.1, max=1e5, help="Side of a square (mm).", rich_help_panel=_BOARD)
+    ] = 30.0
     charuco: Annotated[
         str | None,
         typer.Option(
@@ -117,7 +129,7 @@ def run_lens(
     if figure is not None:
         check_ending(figure, "figures are written", [".png", ".svg", ".pdf"])
     device, made = choose_device(common.device), board.build()
-    fov, messages = None if fov_deg is None else math.radians(fov_deg), dict[str, Any]()
+    fov, messages = None if fov_deg is None else fov_from(fov_deg, "--fov-deg"), dict[str, Any]()
     if live:
         if len(recordings) != 1:
             raise AmiwarpError(f"--live takes one source, and {len(recordings)} are given; see 'amiwarp live --help'")

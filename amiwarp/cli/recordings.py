@@ -26,6 +26,7 @@ from amiwarp.cli.common import (
     Topic,
     choose_device,
     format_notes,
+    microseconds,
     progress,
     report,
     table,
@@ -466,7 +467,7 @@ def _write_for_viewer(recording: Recording, out: Path, options: ViewerOptions, c
 
     device = choose_device(common.device)
     found = None if options.calibration is None else Calibration.load(options.calibration)
-    frame_us = FRAME_US if options.frame_ms is None else max(1, math.floor(1e3 * options.frame_ms + 0.5))
+    frame_us = FRAME_US if options.frame_ms is None else microseconds(options.frame_ms, "ms", "--frame-ms")
     with progress("writing frames") as advance:
         summary = save_for_viewer(
             recording, out, calibration=found, frame_us=frame_us, device=device, progress=advance
@@ -537,6 +538,8 @@ def run_truth(
     began = time.perf_counter()
     if flow is None and poses is None:
         raise AmiwarpError("nothing is chosen to export; give --flow dsec, --flow mvsec or --poses tum")
+    if with_prism and flow is None:
+        raise AmiwarpError("--with-prism applies to the optical flow; give --flow too")
     source = open_recording(recording)
     truth = source.truth
     if truth is None or (truth.frames is None and truth.poses is None):

@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from amiwarp.choices import Optic, Seeing
 from amiwarp.cli.common import (
     OUTPUT,
     Common,
+    angles,
+    apex_from,
     choose_device,
+    fov_from,
     in_camera,
     in_encoder,
     in_prism,
     numbers,
     parse_size,
+    plate_tilt_from,
     progress,
+    radians,
     report,
+    thickness_from,
 )
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
@@ -31,7 +39,9 @@ from amiwarp.io.files import text_lines
 from amiwarp.io.formats import check_ending
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.mirror import LARGEST_INCIDENCE, LARGEST_TILT
 from amiwarp.optics.prism import FlatSide, Plate, Prism
+from amiwarp.optics.vibration import LARGEST_AMPLITUDE
 from amiwarp.simulation.description import CameraMotion, EncoderModel, Mirror, Moved, PrismMotion, Scene, Vibration
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.world import WorldScene
@@ -65,47 +75,47 @@ class RigOptions:
     camera: Annotated[
         Path | None, in_camera(help="Camera intrinsics: JSON or YAML (including the size), or calib.txt.")
     ] = None
-    optic: Annotated[
-        Optic,
-        in_prism(
-            help="What moves the image: wedge, plate (tilted and plane-parallel; needs --world), mirror (with two "
-            "tilts), or vibration (the camera itself, without glass and encoder)."
-        ),
-    ] = Optic.WEDGE
-    thickness_mm: Annotated[float, in_prism(help="Thickness of the plate (mm).")] = 10.0
-    plate_tilt_deg: Annotated[
-        float, in_prism(help="Angle between the normal of the plate and the rotation axis (deg).")
-    ] = 45.0
-    apex_deg: Annotated[float, in_prism(help="True apex angle of the prism (deg).")] = 1.0
+    apex_deg: Annotated[float | None, in_prism(help="True apex angle of the prism (deg). Default: 1.")] = None
     nominal_apex_deg: Annotated[
         float | None, in_prism(help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.")
     ] = None
-    index: Annotated[float, in_prism(help="Refractive index of the prism.")] = 1.5168
-    flat_side: Annotated[FlatSide, in_prism(help="Side that the prism's flat face is on.")] = FlatSide.SCENE
-    rpm: Annotated[float, in_prism(help="Speed of the prism (turns/min); negative: backwards.")] = 720.0
+    index: Annotated[float | None, in_prism(help="Refractive index of the glass. Default: 1.5168.")] = None
+    flat_side: Annotated[FlatSide | None, in_prism(help="Side that the prism's flat face is on. Default: scene.")] = (
+        None
+    )
+    rpm: Annotated[
+        float | None, in_prism(help="Speed of the prism (turns/min); negative: backwards. Default: 720.")
+    ] = None
     speed: Annotated[
         Path | None, in_prism(help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.")
     ] = None
     phase_deg: Annotated[
-        float, in_prism(help="Azimuth of the prism at encoder angle 0, or phase of a vibration at the start (deg).")
-    ] = 0.0
+        float | None,
+        in_prism(
+            help="Azimuth of the prism at encoder angle 0, or phase of a vibration at the start (deg). Default: 0."
+        ),
+    ] = None
     tilt_deg: Annotated[
-        str, in_prism(help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).", metavar="X,Y")
-    ] = "0,0"
+        str | None,
+        in_prism(
+            help="Tilt of the prism's rotation axis about the camera's x and y axes (deg). Default: 0,0.", metavar="X,Y"
+        ),
+    ] = None
     cylinder_deg: Annotated[
-        str,
+        str | None,
         in_prism(
             help="Cylinder power of the prism's tilted face, along the wedge and at 45 deg to it (deg per unit of the "
-            "ray's tangent).",
+            "ray's tangent). Default: 0,0.",
             metavar="X,Y",
         ),
-    ] = "0,0"
+    ] = None
     wobble_deg: Annotated[
-        str,
+        str | None,
         in_prism(
-            help="Wobble of the prism about the rotation axis, along the wedge and across it (deg).", metavar="X,Y"
+            help="Wobble of the prism about the rotation axis, along the wedge and across it (deg). Default: 0,0.",
+            metavar="X,Y",
         ),
-    ] = "0,0"
+    ] = None
     second_apex_deg: Annotated[
         float | None, in_prism(help="Apex angle of a second prism behind the first, a Risley pair (deg).")
     ] = None
@@ -120,59 +130,98 @@ class RigOptions:
         """Return the camera. ``default`` is the size of its image [px] if no option gives one."""
         width, height = default if self.size is None else parse_size(self.size)
         if self.camera is None:
-            return Camera.from_fov(width, height, math.radians(60.0 if self.fov_deg is None else self.fov_deg))
+            fov = fov_from(60.0 if self.fov_deg is None else self.fov_deg, "--fov-deg")
+            return Camera.from_fov(width, height, fov)
         if self.fov_deg is not None:
             raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
         return load_camera(self.camera, (width, height))
 
     def build_prism(self) -> Prism:
         """Return the prism with its true parameters."""
-        if self.second_apex_deg is None:
-            if (self.second_rpm, self.second_phase_deg) != (None, None):
-                raise AmiwarpError(
-                    "--second-rpm and --second-phase-deg describe a second prism; give --second-apex-deg"
-                )
-            return Prism(math.radians(self.apex_deg), self.index, self.flat_side)
-        second = Prism(math.radians(self.second_apex_deg), self.index, self.flat_side)
-        return Prism(math.radians(self.apex_deg), self.index, self.flat_side, second)
-
-    def build_optic(self) -> Prism | Plate:
-        """Return the prism or the plate with its true parameters."""
-        if self.optic is Optic.WEDGE:
-            return self.build_prism()
-        return Plate(self.thickness_mm * 1e-3, math.radians(self.plate_tilt_deg), self.index)
+        apex = apex_from(1.0 if self.apex_deg is None else self.apex_deg, "--apex-deg")
+        given: dict[str, Any] = {"index": self.index, "flat_side": self.flat_side}
+        prism = Prism(apex, **{name: value for name, value in given.items() if value is not None})
+        if self.second_apex_deg is not None:
+            return replace(prism, second=replace(prism, apex=apex_from(self.second_apex_deg, "--second-apex-deg")))
+        if (self.second_rpm, self.second_phase_deg) != (None, None):
+            raise AmiwarpError("--second-rpm and --second-phase-deg describe a second prism; give --second-apex-deg")
+        return prism
 
     def build_nominal(self) -> Prism:
         """Return the nominal prism that is stored with the recording."""
-        nominal = self.apex_deg if self.nominal_apex_deg is None else self.nominal_apex_deg
-        return replace(self.build_prism(), apex=math.radians(nominal))
+        prism = self.build_prism()
+        if self.nominal_apex_deg is None:
+            return prism
+        return replace(prism, apex=apex_from(self.nominal_apex_deg, "--nominal-apex-deg"))
 
     def build_motion(self) -> PrismMotion:
         """Return the prism's motion: speed, phase, tilt, cylinder power and wobble."""
+        if self.rpm is not None and self.speed is not None:
+            raise AmiwarpError("--rpm and --speed both give the prism's speed; give one of them")
         tilt, cylinder, wobble = (
-            (math.radians(x), math.radians(y))
-            for x, y in (
-                numbers(self.tilt_deg, 2, "--tilt-deg"),
-                numbers(self.cylinder_deg, 2, "--cylinder-deg"),
-                numbers(self.wobble_deg, 2, "--wobble-deg"),
+            angles(given or "0,0", 2, name, math.pi / 2.0)
+            for given, name in (
+                (self.tilt_deg, "--tilt-deg"),
+                (self.cylinder_deg, "--cylinder-deg"),
+                (self.wobble_deg, "--wobble-deg"),
             )
         )
-        rpm: Any = self.rpm if self.speed is None else _read_speed(self.speed)
+        rpm = _read_speed(self.speed) if self.speed is not None else 720.0 if self.rpm is None else self.rpm
         second = None
         if self.second_apex_deg is not None:
-            backwards = -self.rpm if self.second_rpm is None else self.second_rpm
-            second = PrismMotion(backwards, math.radians(self.second_phase_deg or 0.0))
-        return PrismMotion(rpm, math.radians(self.phase_deg), tilt, cylinder, wobble, second)
+            backwards = -rpm if isinstance(rpm, float) else rpm * (1.0, -1.0)
+            second = PrismMotion(
+                backwards if self.second_rpm is None else self.second_rpm,
+                radians(self.second_phase_deg or 0.0, "--second-phase-deg"),
+            )
+        return PrismMotion(rpm, self.phase, tilt, cylinder, wobble, second)
+
+    @property
+    def phase(self) -> float:
+        """Azimuth of the prism at encoder angle 0, or phase of a vibration [rad]."""
+        return radians(self.phase_deg or 0.0, "--phase-deg")
 
 
-def _read_speed(path: Path) -> list[tuple[float, ...]]:
+def _read_speed(path: Path) -> NDArray[np.float64]:
+    """Return a table of speeds, with rows (time [s], speed [turns/min])."""
     rows = []
     for number, line in text_lines(path):
         if line.strip() and not line.startswith("#"):
             rows.append(numbers(line, 2, f"{path}: line {number}"))
         if len(rows) > MOST_SPEEDS:
             raise AmiwarpError(f"{path}: has over {MOST_SPEEDS} speeds; give fewer, which are interpolated")
-    return rows
+    table = np.array(rows)
+    try:
+        PrismMotion(table)
+    except AmiwarpError as error:
+        raise AmiwarpError(f"{path}: {error}") from error
+    return table
+
+
+@dataclass(frozen=True)
+class OpticOptions:
+    """Options for what moves the image, and for a plate."""
+
+    optic: Annotated[
+        Optic,
+        in_prism(
+            help="What moves the image: wedge, plate (tilted and plane-parallel; needs --world), mirror (with two "
+            "tilts), or vibration (the camera itself, without glass and encoder)."
+        ),
+    ] = Optic.WEDGE
+    thickness_mm: Annotated[float | None, in_prism(help="Thickness of the plate (mm). Default: 10.")] = None
+    plate_tilt_deg: Annotated[
+        float | None,
+        in_prism(help="Angle between the normal of the plate and the rotation axis (deg). Default: 45."),
+    ] = None
+
+    def build_plate(self, index: float | None) -> Plate:
+        """Return the plate with its true parameters."""
+        return Plate(
+            thickness_from(10.0 if self.thickness_mm is None else self.thickness_mm),
+            plate_tilt_from(45.0 if self.plate_tilt_deg is None else self.plate_tilt_deg),
+            *(() if index is None else (index,)),
+        )
 
 
 _in_optic = partial(typer.Option, rich_help_panel="Vibration")
@@ -211,13 +260,13 @@ class VibrationOptions:
 
     def build(self, rig: RigOptions) -> Vibration:
         """Return the vibration."""
-        backward = numbers(self.backward_deg or "0,0", 2, "--backward-deg")
-        roll = numbers(self.roll_deg or "0,0", 2, "--roll-deg")
-        second = numbers(self.second_deg or "0,0,0,0", 4, "--second-deg")
-        (bx, by), (rc, rs), (fx, fy, sx, sy) = (map(math.radians, each) for each in (backward, roll, second))
-        amplitude = math.radians(0.4 if self.amplitude_deg is None else self.amplitude_deg)
+        bx, by = angles(self.backward_deg or "0,0", 2, "--backward-deg", LARGEST_AMPLITUDE)
+        rc, rs = angles(self.roll_deg or "0,0", 2, "--roll-deg", LARGEST_AMPLITUDE)
+        fx, fy, sx, sy = angles(self.second_deg or "0,0,0,0", 4, "--second-deg", LARGEST_AMPLITUDE)
+        degrees = 0.4 if self.amplitude_deg is None else self.amplitude_deg
+        amplitude = radians(degrees, "--amplitude-deg", 0.0, LARGEST_AMPLITUDE)
         hz = 100.0 if self.hz is None else self.hz
-        return Vibration(hz, amplitude, math.radians(rig.phase_deg), (bx, by), (rc, rs), (fx, fy), (sx, sy))
+        return Vibration(hz, amplitude, rig.phase, (bx, by), (rc, rs), (fx, fy), (sx, sy))
 
 
 _in_mirror = partial(typer.Option, rich_help_panel="Mirror")
@@ -256,29 +305,16 @@ class MirrorOptions:
 
     def build(self) -> Mirror:
         """Return the mirror."""
-        pairs = {"mirror_deg": "0.5,0.5", "mirror_phase_deg": "0,0", "mirror_direction_deg": "0,90"}
-        amplitude, phase, direction = (
-            [math.radians(x) for x in numbers(getattr(self, name) or default, 2, f"--{name.replace('_', '-')}")]
-            for name, default in pairs.items()
-        )
+        amplitude = angles(self.mirror_deg or "0.5,0.5", 2, "--mirror-deg", LARGEST_TILT, low=0.0)
+        phase = angles(self.mirror_phase_deg or "0,0", 2, "--mirror-phase-deg")
+        direction = angles(self.mirror_direction_deg or "0,90", 2, "--mirror-direction-deg")
         first, second = numbers(self.mirror_hz or "60,77", 2, "--mirror-hz")
-        fold = math.radians(self.fold_deg or 0.0)
-        incidence = math.radians(45.0 if self.incidence_deg is None else self.incidence_deg)
-        return Mirror((first, second), (amplitude[0], amplitude[1]), (phase[0], phase[1]), (direction[0], direction[1]),
-                      fold, incidence)  # fmt: skip
-
-
-def build_optic(rig: RigOptions, vibration: VibrationOptions, mirror: MirrorOptions) -> Prism | Plate | Moved:
-    """Return what moves the image. Raises :class:`AmiwarpError` for options of another optic."""
-    for optic, options in ((Optic.VIBRATION, vibration), (Optic.MIRROR, mirror)):
-        given = [f"--{name.replace('_', '-')}" for name, value in vars(options).items() if value is not None]
-        if given and rig.optic is not optic:
-            raise AmiwarpError(
-                f"{given[0]} applies to a {optic.value}; give --optic {optic.value}, or remove {given[0]}"
-            )
-    if rig.optic is Optic.VIBRATION:
-        return vibration.build(rig)
-    return mirror.build() if rig.optic is Optic.MIRROR else rig.build_optic()
+        incidence = 45.0 if self.incidence_deg is None else self.incidence_deg
+        return Mirror(
+            (first, second), amplitude, phase, direction,
+            fold=radians(self.fold_deg or 0.0, "--fold-deg"),
+            incidence=radians(incidence, "--incidence-deg", 0.0, LARGEST_INCIDENCE),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -354,22 +390,56 @@ class EncoderModelOptions:
         float | None, in_encoder(help="Length of a drop-out, during which all samples are lost (us).")
     ] = None
     encoder_error_deg: Annotated[
-        str,
+        str | None,
         in_encoder(
             help="Error of the angle that repeats every turn: factors of its cosine and sine, and of those of twice "
-            "the angle (deg). An eccentric disc causes the first two.",
+            "the angle (deg). An eccentric disc causes the first two. Default: 0,0,0,0.",
             metavar="C1,S1,C2,S2",
         ),
-    ] = "0,0,0,0"
+    ] = None
 
     def build(self) -> EncoderModel:
         """Return the encoder model that the options describe."""
         given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
-        error = numbers(given.pop("encoder_error_deg"), 4, "--encoder-error-deg")
-        given["harmonics"] = tuple(map(math.radians, error))
+        error = given.pop("encoder_error_deg", "0,0,0,0")
+        given["harmonics"] = angles(error, 4, "--encoder-error-deg")
         if self.counts_per_turn == 0:
             given["counts_per_turn"] = None
         return EncoderModel(**given)
+
+
+def _names(group: type) -> list[str]:
+    return [field.name for field in fields(group)]
+
+
+_APPLY = {
+    **dict.fromkeys(_names(RigOptions), (Optic.WEDGE,)),
+    **dict.fromkeys(("index", "rpm", "speed"), (Optic.WEDGE, Optic.PLATE)),
+    "phase_deg": (Optic.WEDGE, Optic.PLATE, Optic.VIBRATION),
+    **dict.fromkeys(("size", "fov_deg", "camera", "optic"), tuple(Optic)),
+    **dict.fromkeys(("thickness_mm", "plate_tilt_deg"), (Optic.PLATE,)),
+    **dict.fromkeys(_names(VibrationOptions), (Optic.VIBRATION,)),
+    **dict.fromkeys(_names(MirrorOptions), (Optic.MIRROR,)),
+    **dict.fromkeys(_names(EncoderModelOptions), (Optic.WEDGE, Optic.PLATE, Optic.MIRROR)),
+}
+"""Optics that each option applies to."""
+
+
+def build_optic(
+    optic: OpticOptions, rig: RigOptions, vibration: VibrationOptions, mirror: MirrorOptions,
+    encoder: EncoderModelOptions,
+) -> Prism | Plate | Moved:  # fmt: skip
+    """Return what moves the image. Raises :class:`AmiwarpError` for options of another optic."""
+    for name, value in (pair for group in (optic, rig, vibration, mirror, encoder) for pair in vars(group).items()):
+        if value is not None and optic.optic not in (kinds := _APPLY[name]):
+            option = f"--{name.replace('_', '-')}"
+            which = " or ".join(f"a {kind.value}" for kind in kinds)
+            raise AmiwarpError(f"{option} applies to {which}; give --optic {kinds[0].value}, or remove {option}")
+    if optic.optic is Optic.VIBRATION:
+        return vibration.build(rig)
+    if optic.optic is Optic.MIRROR:
+        return mirror.build()
+    return rig.build_prism() if optic.optic is Optic.WEDGE else optic.build_plate(rig.index)
 
 
 # Options for simulated worlds: world, camera trajectory, and ground truth to record and draw.
@@ -499,7 +569,7 @@ class SceneOptions:
     @property
     def fov(self) -> float | None:
         """Horizontal angle that the picture spans [rad], or None for the default."""
-        return None if self.scene_fov_deg is None else math.radians(self.scene_fov_deg)
+        return None if self.scene_fov_deg is None else fov_from(self.scene_fov_deg, "--scene-fov-deg")
 
 
 def run_simulate(
@@ -511,6 +581,7 @@ def run_simulate(
     scene: SceneOptions,
     vibration: VibrationOptions,
     mirror: MirrorOptions,
+    optic: OpticOptions,
     rig: RigOptions,
     sensor: SensorOptions,
     pixels: Annotated[
@@ -534,14 +605,14 @@ def run_simulate(
     simulation = Simulation(
         _scene(picture, world, scene, duration, common.seed),
         rig.build_camera(),
-        build_optic(rig, vibration, mirror),
+        build_optic(optic, rig, vibration, mirror, encoder),
         duration,
         motion=rig.build_motion(),
         camera_motion=CameraMotion(scene.rates),
         sensor=sensor.build(),
         pixels=None if pixels is None else PixelMap.load(pixels),
         encoder_model=encoder.build(),
-        nominal_prism=rig.build_nominal() if rig.optic is Optic.WEDGE else None,
+        nominal_prism=rig.build_nominal() if optic.optic is Optic.WEDGE else None,
         seed=common.seed,
         device=device,
     )
@@ -647,11 +718,13 @@ def run_translate(
         given = translator_input(
             source, events=events, dataset=name, interpolation=way, fps=fps, device=device, progress=advance
         )
+    if duration is None and not given.duration_us:
+        raise AmiwarpError(f"{source}: does not state its duration; give --duration")
     chosen = rig.size is None and rig.fov_deg is None and rig.camera is None
     simulation = translation(
         given,
         rig.build_prism(),
-        fov=None if picture_fov_deg is None else math.radians(picture_fov_deg),
+        fov=None if picture_fov_deg is None else fov_from(picture_fov_deg, "--picture-fov-deg"),
         camera=None if chosen else rig.build_camera(given.frames.size),
         duration_s=duration,
         motion=rig.build_motion(),

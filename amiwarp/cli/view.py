@@ -138,6 +138,8 @@ class StreamOptions:
         Waits until the stream holds one turn of the prism. Without ``--live``, yields None.
         """
         if not self.live:
+            if self.controller is not None:
+                raise AmiwarpError("--controller applies to a live stream; give --live too")
             yield None
             return
         from amiwarp.live.stream.session import LiveSource, RecentEvents, followed
@@ -272,6 +274,10 @@ def run_view(
     """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
     from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector, Library
 
+    if look.screenshot is not None and page.web:
+        raise AmiwarpError("--screenshot and --web are both given; give one of them")
+    if not page.web and page != PageOptions():
+        raise AmiwarpError("--host and --port apply to the page; give --web too")
     device = choose_device(common.device)
     with stream.follow(str(recording)) as latest:
 

@@ -54,7 +54,8 @@ def open_text(path: Path) -> Recording:
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
     """Return the camera of a ``calib.txt``. Raises :class:`AmiwarpError` unless it holds nine finite numbers."""
-    with errors_name(path, lambda: "reading the calibration"):
+    wanted = "expected a camera as text (fx fy cx cy k1 k2 p1 p2 k3), or as .json or .yaml"
+    with errors_name(path, lambda: wanted):
         with open_input(path) as file:
             words = file.read(10_000).decode("utf-8").split()
         numbers = [float(word) for word in words]

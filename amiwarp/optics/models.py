@@ -1011,7 +1011,7 @@ class EllipseModel(Model):
         Parameters
         ----------
         model : Model
-            The model to approximate, which is no ellipse model.
+            The model to approximate: one of a single prism or plate, other than the ellipse model.
         device : str or warp.Device, default "cpu"
             The device that does the fit.
 
@@ -1019,7 +1019,14 @@ class EllipseModel(Model):
         -------
         EllipseModel
             The model. Its tables are NaN at pixels without a ray.
+
+        Raises
+        ------
+        AmiwarpError
+            If the model is of another optic, or an ellipse model.
         """
+        if model.ANGLES != 1 or not model.PRISM or isinstance(model, EllipseModel):
+            raise AmiwarpError(f"the {model.NAME} model cannot be fitted by ellipses; give a model of one prism")
         height, width = model.camera.height, model.camera.width
         table = wp.empty((height, width, 6), dtype=float, device=device)
         phi = math.tau * np.arange(HARMONIC_ANGLES) / HARMONIC_ANGLES

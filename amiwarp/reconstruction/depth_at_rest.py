@@ -60,8 +60,8 @@ def depth(
     Raises
     ------
     AmiwarpError
-        If the calibration is that of a wedge, the camera or the scene moves, the sensor sizes differ, or there are too
-        few events.
+        If the calibration is not that of a plate, the camera or the scene moves, the sensor sizes differ, or there are
+        too few events.
 
     Notes
     -----
@@ -73,13 +73,13 @@ def depth(
     >>> wedge = amiwarp.Calibration.load("calibration.json")  # doctest: +SKIP
     >>> amiwarp.depth(recording, wedge)  # doctest: +SKIP
     Traceback (most recent call last):
-    amiwarp.errors.AmiwarpError: the calibration is that of a wedge, which moves near and far points alike: ...
+    amiwarp.errors.AmiwarpError: the calibration has the exact model, which moves near and far points alike: ...
     """
     name, nearest = recording.name, real(nearest_m, "nearest_m", 1.0 / LARGEST_INVERSE_DEPTH, 100.0, " m")
     model = calibration.model
     if not isinstance(model, PlateModel):
         raise AmiwarpError(
-            f"{name}: the calibration is that of a wedge, which moves near and far points alike: depth is not "
+            f"{name}: the calibration has the {model.NAME} model, which moves near and far points alike: depth is not "
             "determined; record through a rotating tilted plate"
         )
     if not len(recording.events):

@@ -536,7 +536,7 @@ def translation(
         given = with_camera(given, camera)
     duration = given.duration_us * 1e-6 if duration_s is None else duration_s
     if not duration > 0.0:
-        raise AmiwarpError(f"{source} does not state its duration; give duration_s")
+        raise AmiwarpError("the source does not state its duration; give duration_s")
     return Simulation(
         Scene(given.frames, fov, blur=0.0),  # the camera that took the pictures has blurred them
         given.camera,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from amiwarp.brightness.solver import BrightnessMap, SensorTiming, Tiles, darkness, off_excess, set_lags
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import MOTION, ParameterSpace, like_size, units
+from amiwarp.calib.parameters import LINEAR_UNKNOWNS, MOTION, ParameterSpace, like_size, units
 from amiwarp.calib.photometric import causes, consistency
 from amiwarp.calib.photometric.cost import (
     GRID,
@@ -34,7 +34,7 @@ from amiwarp.calib.photometric.cost import (
     size_and_phase_directions,
 )
 from amiwarp.calib.result import PhotometricSummary, StageSummary
-from amiwarp.calib.settings import GAUSS_NEWTON, LINEAR_UNKNOWNS, PhotometricSettings
+from amiwarp.calib.settings import GAUSS_NEWTON, PhotometricSettings
 from amiwarp.calib.sharpness_search import LEAST_INSIDE_PX, Search
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import LENS, Camera
