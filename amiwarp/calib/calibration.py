@@ -30,7 +30,17 @@ from amiwarp.calib import checks, first_guess, plate
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
 from amiwarp.calib.model_choice import ModelChooser
-from amiwarp.calib.parameters import LINEAR_UNKNOWNS, MOTION, RATES, ParameterSpace, best_model, make_space, nominal
+from amiwarp.calib.parameters import (
+    LINEAR_UNKNOWNS,
+    MOTION,
+    RATES,
+    ParameterSpace,
+    best_model,
+    make_space,
+    nominal,
+    phase_names,
+    units,
+)
 from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
@@ -728,10 +738,15 @@ def _space(
         found = dict(zip(RATES, first_guess.estimate_rates(events, encoder, camera), strict=True))
         start |= {n: rate for n, rate in found.items() if "motion" in free or n in free}
     prism = nominal(recording.prism, MODELS[settings.model])
-    return make_space(
+    space = make_space(
         settings.model, camera, prism, free=free, start=start, bounds=settings.bounds,
         rad_per_us=turned / max(duration, 1), duration_us=float(duration), middle_us=middle_time(recording),
     )  # fmt: skip
+    for name in sorted(settings.start.keys() - settings.bounds.keys() - phase_names()):
+        if (given := start[name]) != space.start[name]:
+            span = f"{space.low[name]:.6g} .. {space.high[name]:.6g} {units()[name]}"
+            raise AmiwarpError(f"start of {name} = {given:.6g} is not in {span}; give its bounds too (--bound)")
+    return space
 
 
 def _calibration_events(

@@ -436,7 +436,7 @@ def make_space(
     free : tuple of str, or None
         Names of the free parameters; ``motion`` stands for all three rates. None: those that the model names.
     start : mapping of str to float
-        Start values, in the parameters' units. Phases are wrapped, unless they have ``bounds``.
+        Start values, in the parameters' units, moved into the bounds. Phases are wrapped, unless they have ``bounds``.
     bounds : mapping of str to (float, float)
         Lower and upper bound by name, in the parameters' units.
     rad_per_us : float
@@ -457,7 +457,7 @@ def make_space(
     ------
     AmiwarpError
         If a name is unknown, not part of the model or in conflict with another one, if the bounds are in the wrong
-        order, if a start value is outside the default bounds, or if a free parameter moves no event.
+        order, or if a free parameter moves no event.
     """
     kind = MODELS[model]
     names = _ordered_names(kind, kind.FREED if free is None else free)
@@ -472,11 +472,7 @@ def make_space(
             raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower bound first")
         if name not in bounds and name in phase_names():
             values[name] = math.remainder(values[name], math.tau)
-        nearest = min(max(values[name], low[name]), high[name])
-        if name in start and name not in bounds and nearest != values[name]:
-            span = f"{low[name]:.6g} .. {high[name]:.6g} {units()[name]}"
-            raise AmiwarpError(f"start of {name} = {values[name]:.6g} is not in {span}; give its bounds too (--bound)")
-        values[name] = nearest
+        values[name] = min(max(values[name], low[name]), high[name])
     if pixels is None:
         pixels = _pixels_per_unit(
             model, camera, prism, names=names, values=values, rad_per_us=rad_per_us, duration_us=duration_us

@@ -21,7 +21,17 @@ from rich.live import Live
 from rich.text import Text
 
 from amiwarp.cli import say
-from amiwarp.cli.common import NO_FILE, OUTPUT, CameraOptions, Common, NominalPrismOptions, choose_device, report, table
+from amiwarp.cli.common import (
+    NO_FILE,
+    OUTPUT,
+    CameraOptions,
+    Common,
+    NominalPrismOptions,
+    choose_device,
+    microseconds,
+    report,
+    table,
+)
 from amiwarp.errors import AmiwarpError, printable
 from amiwarp.events.encoder import LARGEST_RATIO
 from amiwarp.events.recording import Recording
@@ -472,8 +482,8 @@ def _session(
 
     return Session(
         source, found, link=link, second_ratio=second_ratio, raw=receivers.raw, out=receivers.out,
-        sinks=receivers.sinks, watch_s=options.watch_s or None, keeper=keeper, wait_us=round(1e3 * options.wait_ms),
-        policy=options.policy, device=device, say=say,
+        sinks=receivers.sinks, watch_s=options.watch_s or None, keeper=keeper,
+        wait_us=microseconds(options.wait_ms, "ms", "--wait-ms"), policy=options.policy, device=device, say=say,
     )  # fmt: skip
 
 
