@@ -413,9 +413,10 @@ def test_jobs_share_conditions() -> None:
     assert len({job.condition for job in jobs}) == len(jobs)
 
 
-def test_unknown_evaluation() -> None:
+def test_unknown_evaluation(tmp_path: Path) -> None:
     with pytest.raises(amiwarp.AmiwarpError, match="unknown evaluation 'nothing'; choose among texture"):
-        load("nothing")
+        amiwarp.evaluate(tmp_path / "out", only=["nothing"])
+    assert not list(tmp_path.iterdir())
 
 
 def test_distances_from_known_edges() -> None:

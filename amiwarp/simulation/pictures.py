@@ -457,7 +457,7 @@ def _open_folder(folder: Path, fps: float | None) -> PictureFolder:
 
 def _natural(file: Path) -> list[tuple[int, int, str]]:
     """Return a sort key by which picture 10 comes after picture 9."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", file.name) if part]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", file.name) if part]
 
 
 def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:

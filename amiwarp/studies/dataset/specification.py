@@ -596,7 +596,7 @@ def _world_digest(known: dict[Path, str], path: Path) -> str:
     ``known`` holds the digests of named files so far, because worlds share large meshes.
     """
     data = read_json(path, "a world") if path.suffix.lower() == ".json" else read_toml(path, "a world")
-    named = {file for text in _texts(data) if (file := path.parent / text).is_file()}
+    named = {file for text in _texts(data) if os.path.isfile(file := path.parent / text)}
     for file in named - known.keys():
         known[file] = "\n".join(content_digest(one) for one in [file, *sorted(set(mesh_files(file)))])
     digests = [content_digest(path), *(known[file] for file in sorted(named))]

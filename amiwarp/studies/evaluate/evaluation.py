@@ -647,13 +647,13 @@ def evaluate(
     settings = replace(settings, first_seed=settings.first_seed + seed, device=device)
     if seeds is not None:
         settings = replace(settings, seeds=whole(seeds, "seeds", 1, 10_000))
+    chosen = only or EVALUATIONS
+    jobs = plan(chosen, settings, [Path(r) for r in recordings], worlds=bool(only) or not recordings)
     folder = Path(out)
     make_folder(folder / "cells")
     earlier = any((folder / "cells").iterdir())  # an existing report was made from these cells and may be replaced
     for name in () if earlier else REPORT_FILES:
         check_output(folder / name)
-    chosen = only or EVALUATIONS
-    jobs = plan(chosen, settings, [Path(r) for r in recordings], worlds=bool(only) or not recordings)
     count = worker_count(workers, device, settings.width * settings.height * BYTES_PER_PIXEL)
     if scheduler is None:
         jobs = [replace(job, threads=max(1, cpu_threads() // count)) for job in jobs]
