@@ -368,6 +368,10 @@ def _bad_files(place: Path) -> None:
     _own_recording(place)
 
 
+IWE_WINDOW = (
+    *("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json"),
+    *("--iwe", "i.npy", "--iwe-window-ms"),
+)
 BAD = [
     (("info", "missing.h5"), "missing.h5"),
     (("info", "garbage.h5"), "garbage.h5"),
@@ -442,34 +446,8 @@ BAD = [
     (("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--iwe", "iwe.bmp"), "iwe.bmp"),
     (("compensate", "recording.h5", "out.h5", "--calibration", "calibration.json", "--iwe-window-ms", "5"), "--iwe"),
     (("compensate", "recording.h5", "no/o.h5", "--calibration", "calibration.json", "--iwe", "i.npy"), "no/o.h5"),
-    (
-        (
-            "compensate",
-            "recording.h5",
-            "out.h5",
-            "--calibration",
-            "calibration.json",
-            "--iwe",
-            "i.npy",
-            "--iwe-window-ms",
-            "inf",
-        ),
-        "--iwe-window-ms = inf",
-    ),
-    (
-        (
-            "compensate",
-            "recording.h5",
-            "out.h5",
-            "--calibration",
-            "calibration.json",
-            "--iwe",
-            "i.npy",
-            "--iwe-window-ms",
-            "1e30",
-        ),
-        "--iwe-window-ms = 1e+30",
-    ),
+    ((*IWE_WINDOW, "inf"), "--iwe-window-ms = inf"),
+    ((*IWE_WINDOW, "1e30"), "--iwe-window-ms = 1e+30"),
     (("reconstruct", "recording.h5", "a.png", "--calibration", "calibration.json", "--start", "nan"), "--start = nan"),
     (
         ("reconstruct", "recording.h5", "a.png", "--calibration", "calibration.json", "--length", "inf"),

@@ -908,7 +908,7 @@ def test_a_mesh_or_a_file_of_poses_that_changed_is_seen(place: Path) -> None:
 
 
 def test_what_a_mesh_names_is_part_of_its_world(place: Path) -> None:
-    """A changed texture of an OBJ file changes the recordings, and one that cannot be read stops only them."""
+    """A changed texture of an OBJ file changes the keys of its recordings. A missing one does not stop the planning."""
     (place / "spec.toml").write_text(BASE + '[[sources]]\nworld_files = "w.toml"\n')
     (place / "w.toml").write_text('bodies = [{mesh = "tile.obj"}]\n')
     (place / "tile.obj").write_text(
