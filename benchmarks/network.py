@@ -327,8 +327,10 @@ def train(options: argparse.Namespace) -> None:
                 f"{elapsed:.0f} s, {filled} samples, {steps} steps, {torch.stack(history[-100:]).mean():.4f}",
                 flush=True,
             )
-    # a trace holds the operators that it used only, so that other versions of PyTorch read it
-    torch.jit.trace(network.cpu().eval(), torch.zeros(1, INPUTS, 64, 96)).save(options.out)
+    # A trace holds the operators that it used only, so that other versions of PyTorch read it. It also holds whether
+    # they may round to 10 bits on CUDA (TF32), by which pictures would differ with the number of windows at a time.
+    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+        torch.jit.trace(network.cpu().eval(), torch.zeros(1, INPUTS, 64, 96)).save(options.out)
     print(f"{filled} samples, {steps} steps", flush=True)
 
 

@@ -174,10 +174,12 @@ def train(folder: Path, given: argparse.Namespace) -> None:
     dataset = amiwarp.RecordedDataset(folder, split="train", transform=cut)
     names = sorted({labels["class"] for labels in dataset.labels})
     size = dataset[0][2]
-    # One pass over the loader for all epochs, so that the workers go on reading from one epoch to the next.
+    # One pass over the loader for all epochs, so that the workers go on reading from one epoch to the next. One batch
+    # more is read while the network trains on the last one, so that the end of the workers is not measured.
     epoch = max(1, len(dataset) // given.batch)  # batches
+    steps = given.epochs * epoch
     torch.manual_seed(0)
-    order = torch.utils.data.RandomSampler(dataset, num_samples=given.epochs * epoch * given.batch)
+    order = torch.utils.data.RandomSampler(dataset, num_samples=(steps + 1) * given.batch)
     items = json.loads((folder / "manifest.json").read_text())["items"]
     most = given.batch * max(item["events"] for item in items)
     join = Join(2 * given.workers + 1, most, given.device)  # each worker reads two batches ahead
@@ -200,25 +202,25 @@ def train(folder: Path, given: argparse.Namespace) -> None:
     with torch.cuda.stream(torch.cuda.Stream(given.device) if given.device.startswith("cuda") else None):
         batches = on_device(loader, join, names, size, given.device)
         following = next(batches)
-        while following is not None:
+        for k in range(steps):
+            if k == epoch:
+                begun, windows = time.perf_counter(), 0
             batch = following  # its memory must not be used again before the network has finished
             loss = step(*batch)
-            following = next(batches, None)
+            following = next(batches)
             losses.append(loss.item())  # waits for the network
             windows += len(batch[0])
-            if len(losses) == epoch:
-                begun, windows = time.perf_counter(), 0
         total = time.perf_counter() - begun
-        steps = len(losses) - epoch
         begun = time.perf_counter()
-        for _ in range(steps):
+        for _ in range(steps - epoch):
             step(*batch).item()
         kept = time.perf_counter() - begun
     print(f"{sum(p.numel() for p in network.parameters()) / 1e6:.2f} million parameters, {size[0]}x{size[1]} px")
     first, last = (sum(part) / len(part) for part in (losses[:epoch], losses[-epoch:]))
     print(f"mean loss {first:.2f} in the first epoch, {last:.2f} in the last one")
     print(f"{windows} windows in {total:.2f} s on {given.device}, {windows / total:.3g} per second")
-    print(f"a batch takes {1e3 * total / steps:.2f} ms, one that is kept {1e3 * kept / steps:.2f} ms: "
+    took, alone = 1e3 * total / (steps - epoch), 1e3 * kept / (steps - epoch)
+    print(f"a batch takes {took:.2f} ms, one that is kept {alone:.2f} ms: "
           f"reading costs {1 - kept / total:.2%}")  # fmt: skip
 
 

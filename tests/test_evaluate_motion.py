@@ -37,6 +37,7 @@ from amiwarp.studies.evaluate.study import (
     CellResult,
     Condition,
     Frames,
+    Setup,
     Stream,
     Streams,
     Table,
@@ -238,6 +239,25 @@ def test_a_learned_reconstruction_is_judged_next_to_ours(streams: Streams, monke
     assert scores["perfect", Stream.TRUE] == pytest.approx(1.0, abs=1e-6)
     assert scores["own", Stream.TRUE] > scores["own", Stream.RAW]
     assert {events.x.dtype for events in given} == {np.dtype(np.float32), np.dtype(np.uint16)}
+
+
+def test_a_camera_that_sees_nothing_has_a_uniform_picture_without_a_score() -> None:
+    still = Streams(Condition(width=64, height=48, duration_s=0.1, trajectory="still"), setup=Setup(None, 200.0, 0.0))
+    (window,) = pictures.windows(still, pictures.STANDARD_TURNS, 1)
+    for stream in (Stream.PLAIN, Stream.RAW):
+        (picture,) = pictures.PictureMaker(still, stream).pictures([window])
+        assert np.ptp(picture) == 0.0
+        assert pictures.naturalness(picture) is None
+    (picture,) = pictures.PictureMaker(still, Stream.TRUE).pictures([window])
+    assert np.ptp(picture) > 1.0
+
+
+def test_the_best_window_is_chosen_among_pictures_that_have_a_score() -> None:
+    known = {"scene": "room", "stream": Stream.PLAIN}
+    rows = [{**known, "camera": camera, "seed": seed, "turns": turns, "niqe": niqe}
+            for camera, turns, niqe in (("still", 0.25, None), ("fast", 0.25, 6.0), ("fast", 0.5, 5.0))
+            for seed in (1, 2)]  # fmt: skip
+    assert [row["niqe"] for row in pictures._best_lengths(rows, "niqe")] == [5.0, 5.0]
 
 
 def test_pose_of_a_perfect_detector(streams: Streams) -> None:

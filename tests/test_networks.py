@@ -570,20 +570,13 @@ def test_own_network_makes_several_pictures_at_a_time(quarter: Any, device: str,
         np.testing.assert_allclose(picture, one, atol=1e-4)
 
 
-def test_own_network_does_not_round_on_cuda_and_leaves_pytorch_as_it_was(quarter: Any, monkeypatch: Any) -> None:
-    cudnn = pytest.importorskip("torch").backends.cudnn
-
-    def rounding() -> Any:
-        return cudnn.conv.fp32_precision if hasattr(cudnn, "conv") else cudnn.allow_tf32
-
-    simulation, _, optic, _ = quarter
-    recording, before, seen = simulation.run(), rounding(), []
-    run = Network._run_grids
-    monkeypatch.setattr(Network, "_run_grids", lambda *args: (seen.append(rounding()), run(*args))[1])
-    cut = windows(recording.events[:], encoder=optic["encoder"], turns=0.25)[:1]
-    list(Network.quarter_turn().over(recording, cut, **optic))
-    assert seen in (["ieee"], [False])
-    assert rounding() == before not in seen
+def test_own_network_keeps_all_bits_of_float32_on_cuda() -> None:
+    """Rounding to 10 bits (TF32), which a trace holds as the last input of a convolution, is off."""
+    pytest.importorskip("torch")
+    network: Any = Network.quarter_turn()
+    graph = network._file._module.inlined_graph
+    rounding = [list(node.inputs())[-1].toIValue() for node in graph.findAllNodes("aten::_convolution")]
+    assert rounding == [False] * 18
 
 
 def test_the_command_uses_the_own_network(quarter: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

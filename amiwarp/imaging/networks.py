@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import warnings
@@ -285,11 +284,6 @@ class Network:
 class _QuarterTurn(Network):
     """amiwarp's own network, which makes the pictures of several windows at a time."""
 
-    def _run_grids(self, grids: wp.array, states: Any) -> tuple[wp.array, Any]:
-        """Return the results without TF32. They depend on how many are computed at a time by rounding errors only."""
-        with _full_precision():
-            return super()._run_grids(grids, states)
-
     def _iterate(self, recording: Recording, windows: Windows, optic: dict[str, Any]) -> Iterator[Any]:
         size = recording.events.size
         for events, some in _in_lots(recording, windows, MOST_AT_ONCE):
@@ -297,25 +291,6 @@ class _QuarterTurn(Network):
             out, _ = self._run_grids(_as_array(sums, self._device, "the sums"), None)
             pictures = out if isinstance(events, DeviceEvents) else out.numpy()
             yield from (pictures[k] for k in range(len(some)))
-
-
-@contextlib.contextmanager
-def _full_precision() -> Iterator[None]:
-    """Let PyTorch's convolutions on CUDA keep all bits of float32.
-
-    By default they round their inputs to 10 bits (TF32), by which pictures differ with the number of windows.
-    """
-    import torch
-
-    cudnn: Any = torch.backends.cudnn
-    new = hasattr(cudnn, "conv")  # PyTorch 2.9
-    place, name, full = (cudnn.conv, "fp32_precision", "ieee") if new else (cudnn, "allow_tf32", False)
-    before = getattr(place, name)
-    setattr(place, name, full)
-    try:
-        yield
-    finally:
-        setattr(place, name, before)
 
 
 def _in_lots(recording: Recording, windows: Windows, most: int) -> Iterator[tuple[Any, Windows]]:

@@ -30,6 +30,9 @@ Reconstructor = Callable[[Events], NDArray[Any]]
 """Function that returns the picture of a window's events, shape (height, width), in any unit of log intensity. The
 events are compensated, with float32 coordinates, or those of a plain camera."""
 
+LEAST_CONTRAST = 1e-4
+"""Range of log intensity up to which our own picture is uniform: rounding leaves about 1e-8, a faint edge 0.01."""
+
 
 @dataclass(frozen=True, slots=True)
 class Window:
@@ -77,7 +80,11 @@ class PictureMaker:
         )
 
     def pictures(self, windows: Sequence[Window]) -> Iterator[NDArray[np.float64]]:
-        """Yield the picture of each window, shape (height, width); uniform before there are enough events."""
+        """Yield the picture of each window, shape (height, width).
+
+        It is 0 everywhere before there are enough events, or where they tell nothing of the scene, as without prism and
+        motion: what the solver then leaves is rounding, which scores must not take for a picture.
+        """
         last = None
         width, height = self.streams.size
         for window in windows:
@@ -88,7 +95,8 @@ class PictureMaker:
             if self._work is not None:
                 with contextlib.suppress(AmiwarpError):  # no pixel fires twice: the picture before stays
                     last = self._work.window(window.start_us, window.end_us - window.start_us, last=last)
-            yield np.zeros((height, width)) if last is None else last.log.astype(np.float64)
+            picture = np.zeros((height, width)) if last is None else last.log.astype(np.float64)
+            yield picture if np.ptp(picture) > LEAST_CONTRAST else np.zeros_like(picture)
 
 
 def own_inputs(streams: Streams, stream: Stream) -> tuple[Recording, Any, Encoder]:
@@ -126,7 +134,7 @@ DIFFERENCES = (
     "The paper uses the network E2VID, which is not part of amiwarp, and reports NIQE only, as curves, by statistics "
     "that its authors fitted to other pictures. Values of NIQE are therefore comparable between our streams only."
 )
-VERSION = 5
+VERSION = 6
 NEEDS_TRUTH = True
 
 STEP_US = 1000
@@ -293,13 +301,11 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
         limit = {"below": 0.0} if score == "niqe" else {"above": 0.0}
         return judge(number, text, found, what, unit=unit, **limit)
 
-    niqe = "(NIQE, the paper's measure, with statistics of our own)"
     return [
-        claim(4, f"Pictures are better at rest {niqe}.", False, "niqe"),
-        claim(4, f"Pictures are better in motion {niqe}.", True, "niqe"),
+        claim(4, "Pictures are better at rest (SSIM: an S-EV's are uniform there, which has no NIQE).", False, "ssim"),
+        claim(4, "Pictures are better in motion (NIQE with statistics of our own).", True, "niqe"),
         untestable(4, "Pictures of both cameras are satisfying in motion.",
                    "the paper states no NIQE from which on a picture is satisfying"),
-        claim(None, "Pictures are better at rest (SSIM).", False, "ssim"),
         claim(None, "Pictures are better in motion (SSIM).", True, "ssim"),
         claim(None, "Better in motion by PSNR.", True, "psnr", "dB"),
         *(claim(None, f"Better in motion if each has the window that is best for it ({score.upper()}).", True, score,
@@ -309,6 +315,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
 
 def _best_lengths(rows: Sequence[dict[str, Any]], score: str) -> list[dict[str, Any]]:
     """Return the rows of each stream's best length of the window, by the mean SSIM or NIQE over the seeds of a case."""
+    rows = [r for r in rows if r[score] is not None]
     names = ("scene", "camera", "stream", "turns")
     mean: dict[tuple[Any, ...], Any] = {row[:4]: row[5] for row in study.grouped(rows, names, [score])}
     choose = min if score == "niqe" else max
