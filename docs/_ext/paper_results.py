@@ -123,7 +123,8 @@ def make(app: Sphinx) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.png"):
         old.unlink()
-    files = sorted((source.parent / "benchmarks" / "results" / "evaluate").glob("*.json"))
+    files = (source.parent / "benchmarks" / "results" / "evaluate").glob("*.json")
+    files = sorted(files, key=lambda path: -path.stat().st_size)  # the one with most recordings first
     reports = {path.stem: json.loads(path.read_text()) for path in files}
     write_page(folder / "content.md", content(reports, folder))
 
