@@ -33,6 +33,7 @@ from amiwarp.kernels.native_code import (
     load_int64,
     load_uint8,
     load_uint16,
+    prefetch_events,
     prefetch_words,
     read_words,
     store_float,
@@ -45,6 +46,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BLOCK = wp.constant(64)  # number of events of a block
 RUN = wp.constant(8)  # number of blocks whose words a CPU thread adds
+AHEAD = wp.constant(256)  # number of events from a block to those that are fetched from memory meanwhile
 WHOLE = wp.constant(1 << 30)  # share of a whole event
 EARLIEST = wp.constant(wp.int64(-(2**62)))  # limit of the times of events [us]; without events, a pixel holds less
 LONGEST = wp.constant(wp.int64(1 << 31))  # time of a block from which it is not processed at once [us]
@@ -486,6 +488,7 @@ def store_interval_words(
 
     The sums and products are whole numbers below 2**53, so that a share is the same as from :func:`time_at`.
     """
+    prefetch_events(x, y, t, p, first + AHEAD)
     used = wp.where(group == own, part.spare, group)
     interval, t_first = group / grid.parts - window * grid.steps, t[first]
     start, span = wp.float64((t_first - windows[window, T_START]) * wp.int64(grid.rate)), windows[window, SPAN]
