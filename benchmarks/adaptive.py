@@ -40,9 +40,9 @@ from amiwarp import (
 )
 from amiwarp.io.files import write_text
 from amiwarp.kernels import prism_view as sight
+from amiwarp.kernels.camera import camera_params
 from amiwarp.kernels.launch import launch
 from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path
-from amiwarp.optics.camera import camera_params
 from amiwarp.plotting.figures import save
 from amiwarp.simulation.scenery import MapRing, place_scene, step_us
 from amiwarp.studies.cluster import machine, versions

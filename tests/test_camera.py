@@ -9,8 +9,7 @@ import pytest
 import warp as wp
 
 from amiwarp import AmiwarpError, Camera, Distortion, ExactModel, Fisheye, Prism, RadialTangential
-from amiwarp.kernels.camera import CameraParams, solve_ray
-from amiwarp.optics.camera import camera_params, fold_radius
+from amiwarp.kernels.camera import CameraParams, camera_params, fold_radius, solve_ray
 from reference import optics as oracle
 
 # as in the package's kernels; otherwise a GPU would fuse multiplications and additions in this module only

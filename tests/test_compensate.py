@@ -43,7 +43,6 @@ from amiwarp import (
     truth_model,
 )
 from amiwarp.cli.app import app
-from amiwarp.events.device_events import encoder_params
 from amiwarp.events.encoder import TWO_PI
 from amiwarp.events.recording import inside_image
 from amiwarp.io import read_encoder_csv
@@ -51,7 +50,7 @@ from amiwarp.io.hdf5_files import CHUNK
 from amiwarp.io.prophesee import Evt3Encoder
 from amiwarp.io.ros import PACKET_DEFINITION, opened_bag
 from amiwarp.kernels.launch import launch
-from amiwarp.kernels.prism_angle import EncoderParams, theta_u32_at
+from amiwarp.kernels.prism_angle import EncoderParams, encoder_params, theta_u32_at
 from amiwarp.optics.models import MODELS, rungs
 from reference import optics as oracle
 from reference.calibration_sample import exact_calibration

@@ -28,8 +28,14 @@ from amiwarp import (
     deflection_from_apex,
     predicted_error,
 )
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
-from amiwarp.optics.camera import camera_params, pinhole_params
+from amiwarp.kernels.camera import (
+    CameraParams,
+    CameraRotationParams,
+    PinholeParams,
+    camera_params,
+    pinhole_params,
+    undo_camera_rotation,
+)
 from amiwarp.optics.models import MODELS, compensate_by_each, rungs, wrap_angle
 from reference import optics as oracle
 

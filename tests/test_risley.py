@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 import amiwarp
 from amiwarp import AmiwarpError, Camera, Encoder, Fisheye, Prism, PrismMotion, RadialTangential, RisleyModel
 from amiwarp.cli.app import app
-from amiwarp.events.device_events import encoder_params
 from amiwarp.imaging.iwe import CanvasShape, Votes, upload_events
+from amiwarp.kernels.prism_angle import encoder_params
 from amiwarp.kernels.refraction import PairParams, advanced, state_of
 from reference import optics as reference
 from tests.conftest import COARSE

@@ -19,7 +19,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, encoder_params, join, time_span
+from amiwarp.events.device_events import DeviceEvents, join, time_span
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
 from amiwarp.kernels import conjugate_gradients as cg
@@ -27,9 +27,11 @@ from amiwarp.kernels import equations as eqs
 from amiwarp.kernels import equations_cpu, equations_cuda, multilevel
 from amiwarp.kernels import pairs as pair_kernels
 from amiwarp.kernels import slow_pixels as slow_kernels
+from amiwarp.kernels.camera import pinhole_params
 from amiwarp.kernels.launch import BLOCK_DIM, SMALLEST_SLICE, Program, RepeatedLaunches, launch, slice_count, start_read
 from amiwarp.kernels.map_positions import find_places, place_blocks, place_pairs, place_still
-from amiwarp.optics.camera import CameraRotation, pinhole_params
+from amiwarp.kernels.prism_angle import encoder_params
+from amiwarp.optics.camera import CameraRotation
 from amiwarp.optics.models import Model, model_camera
 from amiwarp.validation import guarded
 

@@ -43,7 +43,6 @@ from amiwarp.live.link.link import Link
 from amiwarp.live.link.protocol import FAULTS, STATES
 from amiwarp.live.queues import Policy
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
-from amiwarp.optics.camera import with_lens
 from amiwarp.validation import real
 
 if TYPE_CHECKING:
@@ -522,7 +521,7 @@ def _open_sink(
     from amiwarp.live.stream.packets import encode_hello
     from amiwarp.live.stream.sockets import open_sink
 
-    camera = with_lens(found.camera, found.parameters)
+    camera = found.model.camera
     hello = encode_hello(camera.width, camera.height, camera, _prism(found), encoders)
     sink = open_sink(address, hello, stop=stop, say=say)
     resources.push(sink)
@@ -562,7 +561,7 @@ def _writer(
     if compensated:
         metadata["compensated_with"] = found.model_name
     return LiveWriter(
-        path, width=width, height=height, camera=with_lens(found.camera, found.parameters),
+        path, width=width, height=height, camera=found.model.camera,
         prism=source.prism or _prism(found), metadata=metadata, compensated=compensated, encoders=encoders,
         clock_offset_us=offset_us,
     )  # fmt: skip

@@ -22,7 +22,6 @@ from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, EventSource, MetadataValue, Recording
-from amiwarp.imaging.positions import LaunchPlan
 from amiwarp.io import RecordingWriter
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.export import bag_of, export, left_out
@@ -30,10 +29,10 @@ from amiwarp.io.files import check_output
 from amiwarp.io.formats import Codec, OutputFormat, Rounding, check_codec, check_rounding, output_format
 from amiwarp.io.hdf5_files import CHUNK, NativeEvents, compile_checksums
 from amiwarp.io.native_writer import FlaggedEvents, copy_records
-from amiwarp.kernels.compensation import Columns
+from amiwarp.kernels.compensation import Columns, LaunchPlan
 from amiwarp.kernels.events import join_columns
 from amiwarp.kernels.launch import RecordedLaunch, launch, page_locked
-from amiwarp.optics.camera import with_lens
+from amiwarp.kernels.prism_angle import encoder_params
 from amiwarp.optics.models import Model, PlateModel
 from amiwarp.tasks import Progress, in_order
 from amiwarp.validation import guarded
@@ -168,7 +167,7 @@ class BlockCompensator:
         check_prisms(encoder, model.ANGLES)
         self._device = wp.get_device(device)
         self._plan = LaunchPlan(model, self._device)
-        self._encoder = device_events.encoder_params(encoder, t_first, t_last, str(self._device))
+        self._encoder = encoder_params(encoder, t_first, t_last, str(self._device))
         self._pieces = None if self._device.is_cpu else GpuPieces(self._plan, self._encoder, self._device)
 
     def __call__(self, events: Events, *, all_cores: bool = False) -> tuple[Events, NDArray[np.uint8]]:
@@ -385,9 +384,8 @@ def compensate(
         seconds = time.perf_counter() - began
         return CompensationSummary(done, outside, seconds, chosen, rounding, dropped, missing)
     parameters, labels = (None, None) if truth is None else (truth.parameters, truth.labels)
-    camera = with_lens(calibration.camera, calibration.parameters)
     with RecordingWriter(
-        out_path, width=width, height=height, camera=camera, prism=recording.prism, encoder=encoder,
+        out_path, width=width, height=height, camera=model.camera, prism=recording.prism, encoder=encoder,
         truth_parameters=parameters, truth_labels=labels, metadata=metadata, overwrite=overwrite, codec=codec,
     ) as writer:  # fmt: skip
         if compensator is not None:

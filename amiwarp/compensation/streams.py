@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_sensor, limits, wait
-from amiwarp.events.encoder import Encoder, EncoderStream, check_prisms, encoder_pieces, second_pieces
+from amiwarp.events.encoder import Encoder, EncoderStream, check_prisms
 from amiwarp.events.recording import Events, held_bytes
 from amiwarp.imaging.iwe import CanvasShape, Votes
-from amiwarp.imaging.positions import LaunchPlan
-from amiwarp.kernels.compensation import BLOCK, Columns
+from amiwarp.kernels.compensation import BLOCK, Columns, LaunchPlan
 from amiwarp.kernels.events import flag_events
 from amiwarp.kernels.launch import PageLockedPool, RecordedLaunch, background_worker, launch, pool
 from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
-from amiwarp.kernels.prism_angle import EncoderParams
+from amiwarp.kernels.prism_angle import EncoderParams, encoder_pieces, second_pieces
 from amiwarp.optics.models import Model
 from amiwarp.validation import TIME_LIMIT, guarded, whole
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -17,11 +16,9 @@ from numpy.typing import NDArray
 from amiwarp import validation
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import recording as checks
-from amiwarp.events.encoder import Encoder, encoder_pieces, second_pieces
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, described, regroup, slice_bounds
 from amiwarp.kernels import events as kernels
 from amiwarp.kernels.launch import launch
-from amiwarp.kernels.prism_angle import EncoderParams
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import TIME_LIMIT, as_times, guarded, instance, on_gpu, one_of, whole
 
@@ -131,52 +128,6 @@ def _checked(
     if fault:
         raise AmiwarpError(f"events' {what if isinstance(what, str) else what[fault]}")
     return out
-
-
-# Encoder parameters on a device, for kernels.
-
-
-@lru_cache(maxsize=4)
-def azimuths(device: str) -> wp.array:
-    """Return cosine and sine of 65,536 angles of a turn, interleaved, float32.
-
-    They are computed by NumPy in float64, so that every device has the same bits.
-    """
-    angle = np.arange(1 << 16) * (2.0 * math.pi / (1 << 16))
-    table = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
-    return wp.array(table.ravel(), dtype=float, device=device)
-
-
-def encoder_params(encoder: Encoder, t_first: int, t_last: int, device: Any) -> EncoderParams:
-    """Return the encoder's samples around a span of event times [us] for the device functions of
-    :mod:`amiwarp.kernels.prism_angle`.
-
-    Raises :class:`AmiwarpError` if the encoder does not cover that span.
-    """
-    encoder.angle_at(np.array([t_first, t_last], np.int64))
-    origin, start, angle, slope = encoder_pieces(encoder, t_first, t_last)
-    # a bucket of samples lasts 2**shift us, at most the mean interval between samples
-    shift = max(int(start[-1]) // start.size, 1).bit_length() - 1
-    p = EncoderParams()
-    p.origin, p.shift = origin, shift
-    p.first, p.start, p.angle, p.slope = _on_device(start, angle, slope, shift, device)
-    if encoder.second is None:
-        return p
-    start, angle, slope = second_pieces(encoder.second, t_first, t_last, p.origin)
-    p.second_first, p.second_start, p.second_angle, p.second_slope = _on_device(start, angle, slope, shift, device)
-    return p
-
-
-def _on_device(
-    start: NDArray[np.int64], angle: NDArray[np.uint64], slope: NDArray[np.uint64], shift: int, device: Any
-) -> tuple[wp.array, ...]:
-    """Return the arrays of :class:`EncoderParams` for pieces whose times are relative to its origin."""
-    edges = np.arange((max(int(start[-1]), 0) >> shift) + 1, dtype=np.int64) << shift
-    first = np.append(np.maximum(np.searchsorted(start, edges, side="right") - 1, 0), start.size - 1)
-    pieces = np.stack([start, angle.view(np.int64), slope.view(np.int64)])
-    rows = wp.array(pieces, dtype=wp.int64, device=device)  # one copy to the device instead of three
-    buckets = wp.array(first.astype(np.int32), dtype=int, device=device)
-    return buckets, rows[0], rows[1].view(wp.uint64), rows[2].view(wp.uint64)
 
 
 THREADS = 1 << 15

@@ -890,46 +890,6 @@ class Encoder:
         return elapsed, sampled, self.angle[start:stop]
 
 
-def encoder_pieces(
-    encoder: Encoder, t_first: int, t_last: int
-) -> tuple[int, NDArray[np.int64], NDArray[np.uint64], NDArray[np.uint64]]:
-    """Return an encoder's samples as the pieces of :class:`amiwarp.kernels.prism_angle.EncoderParams`.
-
-    The result is the origin, and the starts, angles and slopes. The encoder must cover the span of event times.
-    """
-    # The clock offset is split into its whole and its fractional part. A piece starts at the first whole event time
-    # at or after its sample.
-    whole = math.floor(encoder.clock_offset_us)
-    begins = encoder.t - whole
-    low = min(max(int(np.searchsorted(begins, t_first, side="right")) - 1, 0), begins.size - 2)
-    high = min(max(int(np.searchsorted(begins, t_last, side="right")), low + 1), begins.size - 1)
-    turns = encoder.angle[low : high + 1] / (2.0 * math.pi)
-    slope = np.diff(turns) / np.diff(encoder.t[low : high + 1])
-    origin = int(begins[low])
-    angle = _wrapped(turns[:-1] + slope * (encoder.clock_offset_us - whole))
-    return origin, begins[low:high] - origin, angle, _wrapped(slope)
-
-
-def second_pieces(
-    second: Encoder, t_first: int, t_last: int, origin: int
-) -> tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.uint64]]:
-    """Return the starts, angles and slopes of the pieces of a second encoder.
-
-    ``origin``: event time from which the starts count, that of the first encoder [us].
-    """
-    own, start, angle, slope = encoder_pieces(second, t_first, t_last)
-    start, behind = start + (own - origin), own - origin
-    if behind > 0:  # the first piece reaches back to the origin
-        start[:1], angle[:1] = 0, angle[:1] - slope[:1] * np.uint64(behind)
-    return start, angle, slope
-
-
-def _wrapped(turns: NDArray[np.float64]) -> NDArray[np.uint64]:
-    """Return turns without their whole part as uint64, in units of 2**-64 turn."""
-    part = np.maximum(turns - np.floor(turns + 0.5), -0.5)
-    return np.ldexp(part, 64).astype(np.int64).view(np.uint64)
-
-
 def _event_times(t: ArrayLike) -> NDArray[np.int64]:
     """Return event times as int64 [us]. Times of :class:`Events` were checked before; others are checked here."""
     return t if type(t) is np.ndarray and t.dtype == np.int64 else as_times(t)

@@ -15,19 +15,21 @@ from numpy.typing import NDArray
 from amiwarp.choices import Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
-from amiwarp.events.device_events import DeviceEvents, azimuths, cast, device_for, wait
+from amiwarp.events.device_events import DeviceEvents, cast, device_for, wait
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events
 from amiwarp.kernels import launch as launches
 from amiwarp.kernels import pixel_votes
 from amiwarp.kernels import tiles as kernels
 from amiwarp.kernels import votes as event_kernels
-from amiwarp.kernels.camera import CameraRotationParams
+from amiwarp.kernels.camera import CameraRotationParams, pinhole_params
+from amiwarp.kernels.compensation import azimuths
 from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_sums, add_totals, empty_words, read_sums, read_votes
 from amiwarp.kernels.launch import Program, RecordedLaunch, launch, page_locked, specialised
 from amiwarp.kernels.pixel_votes import BLOCK, CAPACITY
+from amiwarp.kernels.prism_angle import encoder_params
 from amiwarp.kernels.word_votes import TRASH, Cells, vote_events, vote_points, vote_quickly, vote_rotating_camera
-from amiwarp.optics.camera import LARGEST_SIZE, CameraRotation, pinhole_params
+from amiwarp.optics.camera import LARGEST_SIZE, CameraRotation
 from amiwarp.optics.models import Model, model_camera
 from amiwarp.tasks import cpu_threads
 from amiwarp.validation import choice, guarded, whole
@@ -283,7 +285,7 @@ def upload_events(
     else:
         e.turn = wp.zeros(padded, dtype=wp.uint16, device=device)
         if n:
-            encoder = device_events.encoder_params(angles, *device_events.time_span(events), device)
+            encoder = encoder_params(angles, *device_events.time_span(events), device)
             launch(event_kernels.turn_events, n, [encoder, t], [e.turn], device=device)
             if angles.second is not None:
                 e.second = wp.zeros(padded, dtype=wp.uint16, device=device)

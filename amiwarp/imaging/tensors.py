@@ -19,7 +19,6 @@ from amiwarp.events.device_events import (
     DeviceEvents,
     check_sensor,
     device_for,
-    encoder_params,
     find_indices,
     host_numbers,
     idle_numbers,
@@ -29,10 +28,11 @@ from amiwarp.events.device_events import (
 )
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, Recording, check_order
-from amiwarp.imaging.positions import LaunchPlan
 from amiwarp.kernels import tensors as kernels
+from amiwarp.kernels.compensation import LaunchPlan
 from amiwarp.kernels.events import NEVER
 from amiwarp.kernels.launch import launch, load, run_together, slices
+from amiwarp.kernels.prism_angle import encoder_params
 from amiwarp.kernels.tensors import BLOCK, RUN
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.models import Model

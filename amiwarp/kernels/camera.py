@@ -1,6 +1,14 @@
 """Camera on the device: pixel to unit bearing and back, with OpenCV's two distortion models."""
 
+import math
+from dataclasses import astuple
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
 import warp as wp
+
+from amiwarp.kernels.launch import launch
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -290,3 +298,62 @@ def rotate(r: wp.mat33, x: float, y: float, z: float):
     a = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z
     b = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z
     return a, b, r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
+
+
+# From a camera to its parameters, on the host.
+
+
+FEW_RAYS = 1 << 12
+"""Fewest rays of a camera's table that a thread of its own solves: each takes several steps of Newton's method."""
+
+
+@lru_cache(maxsize=16)
+def camera_params(camera: Any, device: str) -> CameraParams:
+    """Return the camera's parameters on ``device``, with a table of bearing vectors if the lens distorts."""
+    c = CameraParams()
+    c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
+    c.width, c.height = camera.width, camera.height
+    c.kind, c.limit = int(PINHOLE), 1.0e30
+    d = camera.distortion
+    if d is None:
+        c.rays = wp.empty((0, 0), dtype=wp.vec3, device=device)
+        return c
+    k = astuple(d)  # eight numbers, or four of a fisheye lens
+    if len(k) == 8:
+        below = (d.k4, d.k5, d.k6)
+        c.kind = int(RATIONAL if any(below) else RADIAL_TANGENTIAL)
+        c.limit = fold_radius(d.k1, d.k2, d.k3, below=below, largest=100.0)
+    else:
+        c.kind, c.limit = int(FISHEYE), fold_radius(d.k1, d.k2, d.k3, d.k4, largest=0.999 * math.pi / 2)
+    c.k = type(c.k)(*k, *(0.0,) * (8 - len(k)))
+    rays = wp.empty((camera.height, camera.width), dtype=wp.vec3, device=device)
+    launch(fill_rays, rays.size, [c], [rays], device=device, smallest=FEW_RAYS)
+    c.rays = rays
+    return c
+
+
+@lru_cache(maxsize=16)
+def pinhole_params(camera: Any) -> Any:
+    """Return the camera's parameters for kernels without a distortion branch, or None if the lens distorts."""
+    if camera.distortion is not None:
+        return None
+    c = PinholeParams()
+    c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
+    c.inverse_fx, c.inverse_fy = 1.0 / camera.fx, 1.0 / camera.fy
+    return c
+
+
+def fold_radius(*k: float, below: tuple[float, ...] = (), largest: float) -> float:
+    """Return the radius up to which the distorted radius r(1 + k1 r² + k2 r⁴ + …) increases with r.
+
+    ``below`` holds the coefficients of a denominator 1 + k4 r² + … It is the first root of the slope or of the
+    denominator, or ``largest`` if there is none below. The polynomials in 1/r² are monic, so a last coefficient of zero
+    causes no division by zero.
+    """
+    slope = np.array([1.0, *((2 * i + 3) * value for i, value in enumerate(k))])
+    if any(below):  # the numerator of the slope of r·n/d is n_slope·d − n·r·d′
+        d = np.array([1.0, *below])
+        slope = np.convolve(slope, d) - np.convolve([1.0, *k], 2.0 * np.arange(len(d)) * d)
+    roots = np.concatenate([np.roots(slope), np.roots([1.0, *below])])
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
+    return min(largest, 1.0 / math.sqrt(real.max())) if len(real) else largest

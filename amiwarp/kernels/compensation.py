@@ -1,9 +1,14 @@
 """Motion compensation of a recording's columns: prism angle, displacement and position of every event in one pass."""
 
+import math
+from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import warp as wp
 
+from amiwarp.kernels.camera import camera_params, pinhole_params
+from amiwarp.kernels.launch import launch, load, specialised
 from amiwarp.kernels.native_code import (
     load_float,
     load_int64,
@@ -52,6 +57,17 @@ def shared_piece(encoder: EncoderParams, t: wp.array(dtype=wp.int64), first: int
         high = wp.max(high, load_int64(t, first + k))
     piece = piece_at(encoder, low - encoder.origin)
     return wp.where(piece_at(encoder, high - encoder.origin) == piece, piece, -1)
+
+
+@lru_cache(maxsize=4)
+def azimuths(device: str) -> wp.array:
+    """Return cosine and sine of 65,536 angles of a turn, interleaved, float32.
+
+    They are computed by NumPy in float64, so that every device has the same bits.
+    """
+    angle = np.arange(1 << 16) * (2.0 * math.pi / (1 << 16))
+    table = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
+    return wp.array(table.ravel(), dtype=float, device=device)
 
 
 @wp.func
@@ -159,3 +175,62 @@ def compensate_events(
     w0, w1 = state_at_time(model, encoder, azimuths, columns.t[i])
     x, y = displace_event(model, camera, columns, w0, w1, i)
     store_position(size, columns, i, x, y)
+
+
+class LaunchPlan:
+    """Choice of the kernel that compensates events by one model on one device, and its launch arguments."""
+
+    def __init__(self, model: Any, device: Any) -> None:
+        """Load the kernel, so that threads that use the plan do not each try to. ``device``: a ``wp.Device``."""
+        name = str(device)
+        self.size = model.camera.width, model.camera.height
+        """Sensor width and height [px]."""
+        in_blocks = device.is_cpu and model.ANGLES == 1
+        self.kernel = compensate_blocks if in_blocks else compensate_events
+        self.block = int(BLOCK) if in_blocks else 1
+        """Number of events per thread of the kernel; columns are padded to a multiple of this number."""
+        self._camera = camera_params(model.camera, name)
+        self._pinhole = pinhole_params(model.camera) or self._camera
+        self._model, self._limits, self._azimuths = model.params(name), wp.vec2(*self.size), azimuths(name)
+        load(specialised(self.kernel, [self._model, self._pinhole]), device)
+
+    def padded(self, n: int) -> int:
+        """Return the padded length of a column of ``n`` events."""
+        return -(-n // self.block) * self.block
+
+    def any_outside(self, max_x: int, max_y: int) -> bool:
+        """Return whether any event can lie outside the sensor, given the largest coordinates of the events [px]."""
+        return max_x >= self.size[0] or max_y >= self.size[1]
+
+    def device_columns(self, events: Any) -> list[wp.array]:
+        """Return x, y and t of events on the device, padded, without a copy if they need no padding."""
+        columns: list[wp.array] = []
+        for values in (events.x, events.y, events.t):
+            padded = self.padded(len(events))
+            column = values if padded == len(events) else wp.zeros(padded, dtype=values.dtype, device=values.device)
+            if column is not values:
+                wp.copy(column, values)
+            columns.append(column)
+        return columns
+
+    def run(self, columns: list[wp.array], encoder: Any, max_x: int, max_y: int, *, all_cores: bool = True) -> Any:
+        """Compensate padded columns x, y, t, with these largest coordinates [px]; return new ``Columns``."""
+        padded, device = len(columns[0]), columns[0].device
+        c = Columns()
+        c.x, c.y, c.t = columns
+        c.out_x, c.out_y = (wp.empty(padded, dtype=float, device=device) for _ in range(2))
+        c.inside = wp.empty(padded, dtype=wp.uint8, device=device)
+        inputs = self.inputs(encoder, c, outside=self.any_outside(max_x, max_y))
+        blocks = padded // self.block
+        launch(self.kernel, blocks, inputs, [], device=device, smallest=512 if all_cores else blocks)
+        return c
+
+    def inputs(self, encoder: Any, columns: Any, *, outside: bool) -> list[Any]:
+        """Return the kernel's inputs, except the first block.
+
+        ``encoder``: ``EncoderParams``. ``columns``: ``Columns``. ``outside``: whether events may lie outside the
+        sensor. If none does and the lens has no distortion, the faster kernel for a pinhole camera is used, which reads
+        the ellipse model's per-pixel table without a bounds check.
+        """
+        camera = self._camera if outside else self._pinhole
+        return [self._model, camera, self._limits, encoder, self._azimuths, columns]

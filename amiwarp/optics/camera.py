@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass, fields, replace
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.validation import INT64, array, guarded, real, shown, vector, whole
-
-if TYPE_CHECKING:
-    from amiwarp.kernels import camera as kernels
-
 
 # Models of lens distortion.
 
@@ -375,7 +370,7 @@ def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) ->
         if rows.dtype is not given or rows.ndim != 1:
             raise AmiwarpError(f"array has type {rows.dtype} and shape {rows.shape}; give vec{sizes[0]} of shape (n,)")
         out = wp.empty(len(rows), dtype=wanted, device=rows.device)
-        params = camera_params(camera, str(rows.device))
+        params = kernels.camera_params(camera, str(rows.device))
         launch(getattr(kernels, kernel_name), len(rows), [params, rows], [out], device=rows.device)
         return out
     rows = array(rows, "array")
@@ -383,72 +378,6 @@ def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) ->
         raise AmiwarpError(f"array has shape {rows.shape}; give (n, {sizes[0]})")
     result = _run(kernel_name, camera, wp.array(rows.astype(np.float32), dtype=given, device="cpu"), sizes)
     return result.numpy().astype(rows.dtype if np.issubdtype(rows.dtype, np.floating) else np.float32, copy=False)
-
-
-# Camera parameters on a device, for kernels.
-
-
-FEW_RAYS = 1 << 12
-"""Fewest rays of a camera's table that a thread of its own solves: each takes several steps of Newton's method."""
-
-
-@lru_cache(maxsize=16)
-def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
-    """Return the camera's parameters on ``device``, with a table of bearing vectors if the lens distorts."""
-    import warp as wp
-
-    from amiwarp.kernels import camera as kernels
-    from amiwarp.kernels.launch import launch
-
-    c = kernels.CameraParams()
-    c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
-    c.width, c.height = camera.width, camera.height
-    c.kind, c.limit = int(kernels.PINHOLE), 1.0e30
-    d = camera.distortion
-    if d is None:
-        c.rays = wp.empty((0, 0), dtype=wp.vec3, device=device)
-        return c
-    if isinstance(d, RadialTangential):
-        below = (d.k4, d.k5, d.k6)
-        c.kind = int(kernels.RATIONAL if any(below) else kernels.RADIAL_TANGENTIAL)
-        c.limit = fold_radius(d.k1, d.k2, d.k3, below=below, largest=100.0)
-    elif isinstance(d, Fisheye):
-        c.kind, c.limit = int(kernels.FISHEYE), fold_radius(d.k1, d.k2, d.k3, d.k4, largest=0.999 * math.pi / 2)
-    k = astuple(d)
-    c.k = type(c.k)(*k, *(0.0,) * (8 - len(k)))
-    rays = wp.empty((camera.height, camera.width), dtype=wp.vec3, device=device)
-    launch(kernels.fill_rays, rays.size, [c], [rays], device=device, smallest=FEW_RAYS)
-    c.rays = rays
-    return c
-
-
-@lru_cache(maxsize=16)
-def pinhole_params(camera: Camera) -> kernels.PinholeParams | None:
-    """Return the camera's parameters for kernels without a distortion branch, or None if the lens distorts."""
-    from amiwarp.kernels import camera as kernels
-
-    if camera.distortion is not None:
-        return None
-    c = kernels.PinholeParams()
-    c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
-    c.inverse_fx, c.inverse_fy = 1.0 / camera.fx, 1.0 / camera.fy
-    return c
-
-
-def fold_radius(*k: float, below: tuple[float, ...] = (), largest: float) -> float:
-    """Return the radius up to which the distorted radius r(1 + k1 r² + k2 r⁴ + …) increases with r.
-
-    ``below`` holds the coefficients of a denominator 1 + k4 r² + … It is the first root of the slope or of the
-    denominator, or ``largest`` if there is none below. The polynomials in 1/r² are monic, so a last coefficient of zero
-    causes no division by zero.
-    """
-    slope = np.array([1.0, *((2 * i + 3) * value for i, value in enumerate(k))])
-    if any(below):  # the numerator of the slope of r·n/d is n_slope·d − n·r·d′
-        d = np.array([1.0, *below])
-        slope = np.convolve(slope, d) - np.convolve([1.0, *k], 2.0 * np.arange(len(d)) * d)
-    roots = np.concatenate([np.roots(slope), np.roots([1.0, *below])])
-    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
-    return min(largest, 1.0 / math.sqrt(real.max())) if len(real) else largest
 
 
 # Rotation of the camera itself during a time window, with an angular velocity that is constant or linear in time.

@@ -20,7 +20,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import plate as plate_kernels
 from amiwarp.kernels import refraction as kernels
 from amiwarp.kernels.launch import RecordedLaunch, launch
-from amiwarp.optics.camera import Camera, camera_params, with_lens
+from amiwarp.optics.camera import Camera, with_lens
 from amiwarp.optics.prism import (
     FlatSide,
     NominalPrism,
@@ -595,6 +595,8 @@ def wrap_angle(angle: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def model_camera(model: Model, device: Any) -> Any:
     """Return the parameters of the model's camera on ``device``, cached per camera."""
+    from amiwarp.kernels.camera import camera_params
+
     return camera_params(model.camera, str(device))
 
 

@@ -13,9 +13,10 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.sharpness import gaussian
 from amiwarp.kernels import prism_view, world_rays
 from amiwarp.kernels import world as kernels
+from amiwarp.kernels.camera import camera_params
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.plate import PlateParams
-from amiwarp.optics.camera import Camera, camera_params
+from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, Model, PlateModel
 from amiwarp.simulation.description import Mirror, Moved, Scene, SimulationValues
 from amiwarp.simulation.pictures import DARK, Placement, log_map, place_picture
