@@ -106,7 +106,10 @@ def whole(value: object, what: str, low: int, high: int, hint: str = "") -> int:
     """
     plain = _scalar(value)
     if isinstance(plain, bool) or not isinstance(plain, numbers.Integral) or not low <= int(plain) <= high:
-        raise AmiwarpError(f"{what} = {shown(plain)} is not {_range('a whole number', low, high)}{hint}")
+        if isinstance(plain, float) and plain.is_integer():
+            hint += ", but a float; give an int"
+        wanted = "a whole number" if (low, high) == INT64 else _range("a whole number", low, high)
+        raise AmiwarpError(f"{what} = {shown(plain)} is not {wanted}{hint}")
     return int(plain)
 
 
@@ -240,14 +243,20 @@ def _plain(number: float) -> str:
     return str(number) if isinstance(number, int) else f"{number:.6g}"
 
 
-_FILES = {
-    "Recording": "open it with amiwarp.open_recording",
-    "Calibration": "read it with amiwarp.Calibration.load",
-    "World": "read it with amiwarp.load_world",
-    "Trajectory": "read it with amiwarp.Trajectory.from_file",
-    "Scene": "read it with amiwarp.Scene.from_picture",
+_REMEDIES = {
+    ("path", "Recording"): "open it with amiwarp.open_recording",
+    ("path", "Calibration"): "read it with amiwarp.Calibration.load",
+    ("path", "World"): "read it with amiwarp.load_world",
+    ("path", "Trajectory"): "read it with amiwarp.Trajectory.from_file",
+    ("path", "Scene"): "read it with amiwarp.Scene.from_picture",
+    ("structured array", "Events"): "make events of it with amiwarp.Events.from_structured",
+    ("Recording", "Events"): "give its events, recording.events[:]; as a transform, amiwarp.ToTensor(function, ...)",
+    ("Compensated", "Events"): "give its events, packet.events",
+    ("Recording", "path"): "write it with amiwarp.save_recording, and give the file",
+    ("Events", "Recording"): "make one with amiwarp.Recording(amiwarp.MemoryEvents(events, width, height))",
+    ("Events", "EventSource"): "wrap them as amiwarp.MemoryEvents(events, width, height)",
 }
-"""What to do with a path where an object is expected, by the name of the object's class."""
+"""What to do with a value of one kind where an object of a class is expected."""
 
 _NUMBERS = frozenset(("int", "float", "None"))
 """Names in the annotation of one number."""
@@ -345,8 +354,13 @@ class _Parameter:
         else:
             unmet = _unmet("text" if self._text else kind, value)
         if unmet:
-            hints = _FILES.keys() & unmet.split() if isinstance(value, str | os.PathLike) else ()
-            hint = "".join(f"; {_FILES[name]}" for name in sorted(hints))
+            words, kinds = re.findall(r"\w+", unmet), {type(value).__name__}
+            if isinstance(value, str | os.PathLike):
+                kinds = {"path"}
+            elif isinstance(value, np.ndarray) and value.dtype.names is not None:
+                kinds = {"structured array"}
+            hints = [text for (given, wanted), text in _REMEDIES.items() if given in kinds and wanted in words]
+            hint = "".join(f"; {text}" for text in sorted(hints))
             raise AmiwarpError(f"{self._label}: {self._name} is {shown(value)}; expected {unmet}{hint}")
         if isinstance(value, bool | None) or type(value).__module__.startswith("amiwarp."):
             self.known.add(type(value))

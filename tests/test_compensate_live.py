@@ -84,7 +84,7 @@ def test_packets_are_those_of_offline_compensation(
 ) -> None:
     if kind == "file":
         save_recording(tmp_path / "a.h5", recording)
-        with compensate_live(str(tmp_path / "a.h5"), KNOWN, fast=True, device=device) as packets:
+        with compensate_live(tmp_path / "a.h5", KNOWN, fast=True, device=device) as packets:
             found = list(packets)
     else:
         with (
@@ -152,6 +152,7 @@ def test_what_cannot_be_compensated_is_refused(recording: Recording, tmp_path: P
         ("none", {}, "contains no encoder samples"),
         ("small", {}, "its sensor is 32x24"),
         ("none", {"wait_ms": -1.0}, "wait_ms"),
+        ("none", {"counts_per_turn": 4096}, "counts_per_turn is given without port"),
         ("small", {"policy": "newest"}, "32x24"),
     ):
         opened = compensate_live(str(tmp_path / f"{name}.h5"), KNOWN, **options)  # type: ignore[arg-type]

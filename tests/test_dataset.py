@@ -467,6 +467,13 @@ def test_tensors_are_those_of_the_recordings(place: Path, device: str) -> None:
     assert make_dataset(place / "grids.toml", place / "grids", workers=1, device=kind).kept == 6
 
 
+def test_windows_between_given_times_make_a_batch(place: Path) -> None:
+    output = 'output = {representation = "event_count", window_us = 9000, t_start = 0, t_end = 50000}\n'
+    (place / "counts.toml").write_text(HEAD + output + PLAIN)
+    assert make_dataset(place / "counts.toml", place / "counts", workers=1, device="cpu").failed == {}
+    assert {tensor.shape for tensor, _ in amiwarp.RecordedDataset(place / "counts")} == {(5, 18, 24)}
+
+
 MOVING = """
 format = "amiwarp-world"
 version = 1
@@ -626,7 +633,7 @@ def arrays_of(arrays: dict[str, np.ndarray], labels: dict[str, Any]) -> dict[str
         ('{representation = "stacked_histogram", bins = 3, limit = 300}', "field output.limit = 300 is not"),
         ('{representation = "time_surface", tau_us = 0.0}', r"field output.tau_us = 0\.0 is not"),
         ('{representation = "event_count", window_us = 9, window_events = 9}', "has window_us and window_events; give"),
-        ('{representation = "event_count", window_us = 9, t_end = 9}', "has window_us and t_end; give one kind of"),
+        ('{representation = "event_count", window_events = 9, t_end = 9}', "has window_events and t_end; give one"),
     ],
 )  # fmt: skip
 def test_a_wrong_output_is_named(place: Path, output: str, message: str) -> None:

@@ -454,6 +454,7 @@ def test_the_command_makes_a_video(files: Network) -> None:
 @pytest.mark.parametrize(("more", "said"), [
     ((), "--calibration is missing; give a calibration file, or a network"),
     (("--network", "n.onnx", "--fill", "edge"), "--mask, --fill and --omega apply to the solver"),
+    (("--network", "n.onnx", "--contrast", "0.5"), "--contrast applies to the solver and to the network quarter-turn"),
     (("--network", "two.onnx"), "two.onnx: makes 2 channels"),
     (("--network", "none.onnx"), "none.onnx: no such file"),
     (("--network", "n.onnx", "--start", "9"), "no events in"),

@@ -4,6 +4,7 @@ The oracles follow the definitions of the programs that they are named after, bu
 """
 
 import pickle
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -372,6 +373,59 @@ def test_windows_of_equal_duration(device: str) -> None:
     assert (lambda w: w.stop - w.start)(amiwarp.windows(events, duration_us=10, incomplete=True)).tolist() == [1, 1, 1]
 
 
+def test_windows_between_given_times(device: str) -> None:
+    """Their number does not depend on the events, also if there are none."""
+    t = np.array([7, 12, 25, 30, 31])
+    events = put(Events.from_arrays(t * 0, t * 0, t, t * 0), device)
+    for some in (events, put(Events.empty(), device)):
+        found = amiwarp.windows(some, duration_us=10, t_start=0, t_end=35)
+        assert (found.t_start.tolist(), found.t_end.tolist()) == ([0, 10, 20], [10, 20, 30])
+        assert found.stop.tolist() == ([1, 2, 3] if len(some) else [0, 0, 0])
+    rest = amiwarp.windows(events, duration_us=10, t_start=0, t_end=31, incomplete=True)
+    assert (rest.start[-1], rest.stop[-1], rest.t_end[-1]) == (3, 4, 40)  # the event at 31 us is not before the end
+    assert len(amiwarp.windows(events, duration_us=10, t_start=0, t_end=30, incomplete=True)) == 3
+    assert len(amiwarp.windows(events, duration_us=10, t_start=50)) == 0
+    assert amiwarp.windows(events, duration_us=10, t_start=10).start.tolist() == [1, 2]
+    with pytest.raises(AmiwarpError, match=r"\d+ windows of 1 us are too many; give longer ones"):
+        amiwarp.windows(events, duration_us=1, t_end=1 << 40)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"count": 5, "turns": 0.5}, "turns is given without encoder"),
+        ({"count": 5, "t_start": 0}, "t_start is given without duration_us"),
+        ({"ranges": [(0, 5)], "incomplete": True}, "incomplete is given for windows at given ranges"),
+        ({"duration_us": 10.0}, "duration_us = 10.0 is not a whole number, but a float; give an int"),
+    ],
+)
+def test_arguments_of_another_kind_of_windows_are_refused(given: dict[str, Any], said: str) -> None:
+    with pytest.raises(AmiwarpError, match=re.escape(said)):
+        amiwarp.windows(some_events(100), **given)
+
+
+def test_events_that_are_not_in_order_are_named(device: str) -> None:
+    """Reversed ones, and those of a batch, without its windows."""
+    back = some_events(100)[::-1]
+    joined = amiwarp.Events.concatenate([some_events(100), some_events(100)])
+    for events, at in ((back, 1), (joined, 100)):
+        given = put(events, device)
+        said = rf"event {at} .* sort by time, or give the windows of amiwarp\.collate"
+        for function in (partial(amiwarp.windows, duration_us=10), partial(amiwarp.event_count, width=9, height=9)):
+            with pytest.raises(AmiwarpError, match=said):
+                function(given)
+
+
+def test_times_are_carried_only_to_later_windows_of_one_recording() -> None:
+    events = some_events(100)
+    for function in (amiwarp.latest_times, partial(amiwarp.time_surface, tau_us=5.0)):
+        with pytest.raises(AmiwarpError, match="carry is given for 2 recordings"):
+            function([events, events], WIDTH, HEIGHT, carry=True)
+        cut = amiwarp.windows(events, count=10)[::-1]
+        with pytest.raises(AmiwarpError, match="not in order of time; sort them"):
+            function(events, WIDTH, HEIGHT, carry=True, windows=cut)
+
+
 def test_windows_of_equal_count() -> None:
     events = some_events(10)
     found = amiwarp.windows(events, count=4)
@@ -616,6 +670,37 @@ def test_transform_in_a_data_set(tmp_path: Path) -> None:
         assert labels == {"class": number}
         expected = amiwarp.voxel_grid(some_events(50, seed=number), WIDTH, HEIGHT, BINS)
         assert np.array_equal(grid, expected)
+
+
+def test_transform_takes_the_encoder_of_each_recording() -> None:
+    events, model, _ = behind_a_prism()
+    transform = amiwarp.ToTensor(amiwarp.voxel_grid, bins=3, model=model)
+    for rpm in (720.0, 1440.0):
+        encoder = Encoder.constant_speed(rpm, 6_900_000, 7_200_000)
+        recording = Recording(amiwarp.MemoryEvents(events, WIDTH, HEIGHT), None, encoder)
+        expected = amiwarp.voxel_grid(events, WIDTH, HEIGHT, 3, model=model, encoder=encoder)
+        assert np.array_equal(transform(recording), expected)
+
+
+def test_transform_names_what_is_missing_or_unknown() -> None:
+    events = some_events(50)
+    for options, said in (({"bins": 3}, "no width and no height"), ({"width": 9, "height": 9}, "no bins")):
+        with pytest.raises(AmiwarpError, match=f"ToTensor has {said}; give the options by name, or a recording"):
+            amiwarp.ToTensor(amiwarp.voxel_grid, **options)(events)
+    with pytest.raises(AmiwarpError, match=r"option nbins is unknown; did you mean bins\?"):
+        amiwarp.ToTensor(amiwarp.voxel_grid, width=9, height=9, bins=3)(events, nbins=4)
+    assert amiwarp.ToTensor(lambda events, **options: options, own=1)(events) == {"own": 1}
+
+
+def test_other_kinds_of_events_are_refused_with_the_remedy() -> None:
+    events = some_events(50)
+    recording = Recording(amiwarp.MemoryEvents(events, WIDTH, HEIGHT))
+    for given, remedy in ((structured(events, "txyp"), "Events.from_structured"), (recording, "recording.events[:]")):
+        with pytest.raises(AmiwarpError, match=re.escape(remedy)):
+            amiwarp.event_count(given, WIDTH, HEIGHT)
+    wrong: Any = events
+    with pytest.raises(AmiwarpError, match=r"wrap them as amiwarp\.MemoryEvents"):
+        Recording(wrong)
 
 
 # Refusals.

@@ -786,6 +786,8 @@ def _by_network(
 
     if picture.mask is not None or picture.fill is not Fill.SMOOTH or window.omega is not None:
         raise AmiwarpError("--mask, --fill and --omega apply to the solver; leave them out with --network")
+    if picture.contrast != CONTRAST and str(by.network) != OWN_NETWORK:
+        raise AmiwarpError(f"--contrast applies to the solver and to the network {OWN_NETWORK}; leave it out")
     events = recording.events
     if not len(events):
         raise AmiwarpError(f"{recording.name}: has no events; give a recording with events")

@@ -20,7 +20,7 @@ from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, describ
 from amiwarp.kernels import events as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import TIME_LIMIT, as_times, guarded, instance, on_gpu, one_of, whole
+from amiwarp.validation import TIME_LIMIT, as_times, guarded, instance, on_gpu, one_of, shown, whole
 
 # Arrays of any library as Warp arrays, through DLPack: without a copy if the type allows, else with a checked copy.
 
@@ -406,7 +406,8 @@ def device_for(events: Events | DeviceEvents, device: Any) -> Any:
     Raises :class:`AmiwarpError` if events are on another device than ``device``.
     """
     if not isinstance(events, DeviceEvents):
-        instance(events, Events, "events")
+        if not isinstance(events, Events):
+            raise AmiwarpError(f"events is {shown(events)}; expected Events or DeviceEvents")
         return wp.get_device("cpu" if device is None else device)
     if device is not None and wp.get_device(device) != events.device:
         raise AmiwarpError(f"events are on {events.device}, device is {device}; leave device out")

@@ -269,7 +269,10 @@ class Network:
         except AmiwarpError:
             raise
         except Exception as error:  # both libraries raise many kinds of errors
-            hint = "check the bins of the input and multiple, and call reset() before images of another size"
+            hint = (
+                "check the bins and the type of the input, and multiple; give states=[...] if it takes no None at"
+                " first, and call reset() before images of another size"
+            )
             raise AmiwarpError(f"{self._file.path}: fails for input {padded.shape}: {_cause(error)}; {hint}") from error
         if out.ndim != 4 or out.shape[0] != n or out.shape[2:] != (rows, columns):
             raise AmiwarpError(

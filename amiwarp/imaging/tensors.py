@@ -37,8 +37,8 @@ from amiwarp.kernels.tensors import BLOCK, RUN
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.models import Model
 from amiwarp.tasks import cpu_threads
+from amiwarp.validation import TIME_LIMIT, check_names, guarded, instance, real, shown, whole
 from amiwarp.validation import array as as_numbers
-from amiwarp.validation import check_names, guarded, instance, real, shown, whole
 
 # Windows of events.
 
@@ -105,7 +105,9 @@ def windows(
     count: int | None = None,
     ranges: ArrayLike | None = None,
     encoder: Encoder | None = None,
-    turns: float = 1.0,
+    turns: float | None = None,
+    t_start: int | None = None,
+    t_end: int | None = None,
     incomplete: bool = False,
 ) -> Windows:
     """Cut events into windows: of equal duration, of equal count, at given indices, or of turns of the prism.
@@ -117,7 +119,8 @@ def windows(
     events : Events or DeviceEvents
         Events, sorted by time.
     duration_us : int, optional
-        Length of a window [us]. Windows start at the first event. They hold the events with ``t_start <= t < t_end``.
+        Length of a window [us]. Windows start at the first event, and the last one ends at the last event or before.
+        They hold the events with ``t_start <= t < t_end``.
     count : int, optional
         Number of events in a window. It starts at the time of its first event and ends at that of its last one.
     ranges : array_like, optional
@@ -126,11 +129,14 @@ def windows(
     encoder : Encoder, optional
         Encoder that covers the events. Windows start at the first event. Each lasts until the angle of the prism
         differs by ``turns``, in either direction, from that at its start.
-    turns : float, default 1.0
-        Turns of the prism in a window, with ``encoder``.
+    turns : float, optional
+        Turns of the prism in a window, with ``encoder``; 1 by default.
+    t_start, t_end : int, optional
+        Start of the first window and latest end of the last one, with ``duration_us`` [us], instead of the times of the
+        first and last event. The number of windows then does not depend on the events.
     incomplete : bool, default False
         Keep the last window if it is shorter than the others. Its end is then that of a whole window for a duration,
-        else the last event's time.
+        else the last event's time. Not for ``ranges``.
 
     Returns
     -------
@@ -140,7 +146,8 @@ def windows(
     Raises
     ------
     AmiwarpError
-        If not exactly one way to cut is given, a range lies outside the events, or the encoder does not cover them.
+        If not exactly one way to cut is given, an argument belongs to another way, a range lies outside the events, the
+        events are not sorted by time, or the encoder does not cover them.
 
     Examples
     --------
@@ -152,8 +159,14 @@ def windows(
     given = {"duration_us": duration_us, "count": count, "ranges": ranges, "encoder": encoder}
     if sum(value is not None for value in given.values()) != 1:
         raise AmiwarpError("windows are cut in one way: give one of duration_us, count, ranges and encoder")
+    for name, value, way in (("turns", turns, "encoder"), ("t_start", t_start, "duration_us"),
+                             ("t_end", t_end, "duration_us")):  # fmt: skip
+        if value is not None and given[way] is None:
+            raise AmiwarpError(f"{name} is given without {way}; give {way} too, or leave {name} out")
     n = len(events)
     if ranges is not None:
+        if incomplete:
+            raise AmiwarpError("incomplete is given for windows at given ranges; leave it out")
         pairs = as_numbers(ranges, "ranges", "iu").astype(np.int64)
         if pairs.size and (pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.min() < 0 or pairs.max() > n):
             raise AmiwarpError(f"ranges have shape {pairs.shape}; expected (n, 2), with indices in 0 .. {n}")
@@ -163,19 +176,43 @@ def windows(
         count = whole(count, "count", 1, 1 << 62, " events in a window")
         edges = np.arange(0, n + count if incomplete and n % count else n + 1, count, dtype=np.int64)
         return _at_indices(events, edges[:-1], np.minimum(edges[1:], n))
-    if not n:
+    if not n and (t_start is None or t_end is None):
         return _at_indices(events, np.zeros(0, np.int64), np.zeros(0, np.int64))
-    first, last = times_at(events, np.array([0, n - 1]))
+    _check_order(events)
+    first, last = times_at(events, np.array([0, n - 1])) if n else (0, 0)
     if duration_us is not None:
         duration_us = whole(duration_us, "duration_us", 1, 1 << 62, " us in a window")
-        number = (last - first) // duration_us + (1 if incomplete else 0)
+        first = first if t_start is None else whole(t_start, "t_start", -TIME_LIMIT, TIME_LIMIT, " us")
+        end = last if t_end is None else whole(t_end, "t_end", -TIME_LIMIT, TIME_LIMIT, " us")
+        number, rest = divmod(max(end - first, 0), duration_us)
+        # an event at the very end, the last one, is in no whole window
+        number += 1 if incomplete and (rest or (t_end is None and end >= first)) else 0
+        if number > MOST_WINDOWS:
+            raise AmiwarpError(f"{number} windows of {duration_us} us are too many; give longer ones")
         edges = first + np.arange(number + 1, dtype=np.int64) * duration_us
     else:
-        edges = _turn_edges(encoder, first, last, real(turns, "turns", 1e-6), incomplete)
-    found = find_indices(events, edges)
-    if incomplete:
+        turns = 1.0 if turns is None else real(turns, "turns", 1e-6)
+        edges = _turn_edges(encoder, first, last, turns, incomplete)
+    found = find_indices(events, edges if t_end is None else np.minimum(edges, end)) if n else 0 * edges
+    if incomplete and t_end is None and len(found) > 1:
         found[-1] = n
     return Windows(found[:-1], found[1:], edges[:-1], edges[1:])
+
+
+MOST_WINDOWS = 1 << 27
+"""Largest number of windows of equal duration."""
+
+
+def _check_order(events: Events | DeviceEvents, first_index: int = 0) -> None:
+    """Raise :class:`AmiwarpError` if an event is earlier than the one before. ``first_index``: of the first event."""
+    if isinstance(events, DeviceEvents):
+        if not len(events) or not limits(events)[5]:
+            return
+        events = events.to_host()
+    try:
+        check_order(events, where="events", first_index=first_index)
+    except AmiwarpError as error:
+        raise AmiwarpError(f"{error}, or give the windows of amiwarp.collate, if it joined the events") from None
 
 
 def _turn_edges(encoder: Any, first: int, last: int, turns: float, incomplete: bool) -> NDArray[np.int64]:
@@ -331,7 +368,7 @@ class _Batch:
         if self.unsorted.numpy()[0]:
             host = self.events.to_host()
             for start, stop in zip(self.windows.start.tolist(), self.windows.stop.tolist(), strict=True):
-                check_order(host[start:stop], where="events", first_index=start)
+                _check_order(host[start:stop], start)
         else:
             idle_numbers[self.device.is_cpu, wp.int32].append(self.unsorted)
         found = out.numpy() if self.on_host else out
@@ -376,7 +413,10 @@ def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | Non
     if high < low:
         if t_start is not None and t_end is not None:
             raise AmiwarpError(f"t_end is {t_end} us, before t_start, {t_start} us; give t_start <= t_end")
-        low = high = t_start if t_end is None else t_end
+        if t_start is None and t_end is None:  # not in order, which the kernels find
+            low, high = high, low
+        else:
+            low = high = t_start if t_end is None else t_end
     start, stop = 0, len(events)
     if t_start is not None or t_end is not None:
         start, stop = find_indices(events, np.array([low, high + 1])).tolist() if len(events) else (0, 0)
@@ -553,6 +593,14 @@ def _latest(batch: _Batch, grid: _Grid, *, carry: bool) -> Iterator[tuple[int, i
             launch(kernels.carry_latest, size, [images, number, size, before or images], [], device=batch.device)
             before = wp.clone(images[(number - 1) * size : number * size])
         yield first, number, images
+
+
+def _check_carry(events: Any, cut: Windows) -> None:
+    """Raise :class:`AmiwarpError` if times cannot be carried from each window to the next."""
+    if isinstance(events, list | tuple) and len(events) > 1:
+        raise AmiwarpError(f"carry is given for {len(events)} recordings; call the function for each of them")
+    if (np.diff(cut.start) < 0).any() or (np.diff(cut.t_end) < 0).any():
+        raise AmiwarpError("carry is given for windows that are not in order of time; sort them, or leave carry out")
 
 
 def _shares(batch: _Batch, grid: _Grid, bins: int) -> wp.array:
@@ -993,6 +1041,8 @@ def time_surface(
     grid = _grid(width, height, layers=2 if per_polarity else 1)
     size = grid.layers * height * width
     out = batch.empty((grid.layers, height, width), wp.float32)
+    if carry:
+        _check_carry(events, batch.windows)
     for first, number, images in _latest(batch, grid, carry=carry):
         part = _part(out, first, number)
         ends = wp.array(batch.windows.t_end[first : first + number], dtype=wp.int64, device=batch.device)
@@ -1061,6 +1111,8 @@ def latest_times(
     batch = _batch(events, windows, t_start, t_end, model, encoder, device)
     grid = _grid(width, height, layers=2 if per_polarity else 1)
     out = batch.empty((grid.layers, height, width), wp.int64)
+    if carry:
+        _check_carry(events, batch.windows)
     for first, number, images in _latest(batch, grid, carry=carry):
         size = number * grid.layers * height * width
         wp.copy(_part(out, first, number), images, count=size)
@@ -1081,13 +1133,14 @@ class ToTensor:
     representation : callable
         Function such as :func:`voxel_grid`.
     **options : object
-        Arguments of the function by name. ``width`` and ``height`` may be left out for recordings. ``windows`` may also
-        be a function that is called with the events, such as ``functools.partial(amiwarp.windows, count=10_000)``.
+        Arguments of the function by name. ``width`` and ``height`` may be left out for recordings, which also have the
+        ``encoder`` that a ``model`` needs. ``windows`` may also be a function that is called with the events, such as
+        ``functools.partial(amiwarp.windows, count=10_000)``.
 
     Raises
     ------
     AmiwarpError
-        If the function has no parameter of that name.
+        If the function has no parameter of that name; in a call, if it has one that is not given.
 
     Examples
     --------
@@ -1102,19 +1155,33 @@ class ToTensor:
     def __init__(self, representation: Callable[..., Any], **options: Any) -> None:
         if not callable(representation):
             raise AmiwarpError(f"representation is {shown(representation)}; give a function, such as voxel_grid")
-        check_names(options, inspect.signature(representation).parameters, "option ")
         self.representation = representation
         self.options = options
+        self._check(options)
+
+    def _check(self, options: dict[str, Any]) -> tuple[str, ...]:
+        """Return the names that the function needs besides the events. Raises :class:`AmiwarpError` for others."""
+        _, *known = inspect.signature(self.representation).parameters.values()
+        if not any(p.kind is p.VAR_KEYWORD for p in known):
+            check_names(options, [p.name for p in known], "option ")
+        variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        return tuple(p.name for p in known if p.default is p.empty and p.kind not in variable)
 
     def __call__(self, events: Any, labels: Any = None, **more: Any) -> Any:
         """Return the tensor of events, or the tensor of a recording's events and the labels. ``more``: options."""
         options = self.options | more
+        needed = self._check(more)
         if isinstance(events, Recording):
             source = events.events
             options = dict(zip(("width", "height"), source.size, strict=True)) | options
+            if options.get("model") is not None:
+                options.setdefault("encoder", events.encoder)
             events = source.slice(0, len(source))
         elif isinstance(events, np.ndarray) and events.dtype.names is not None:
             events = Events.from_structured(events)
+        missing = [name for name in needed if name not in options]
+        if missing:
+            raise AmiwarpError(f"ToTensor has no {' and no '.join(missing)}; give the options by name, or a recording")
         if callable(options.get("windows")):
             options["windows"] = options["windows"](events)
         found = self.representation(events, **options)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import queue
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from amiwarp.calib.result import Calibration
@@ -28,7 +30,7 @@ STEP_S = 0.1
 @contextlib.contextmanager
 @guarded
 def compensate_live(
-    source: str,
+    source: str | Path,
     calibration: Calibration,
     *,
     port: str | None = None,
@@ -49,7 +51,7 @@ def compensate_live(
 
     Parameters
     ----------
-    source : str
+    source : str or Path
         Source: ``camera:``, ``dv``, ``prophesee``, ``tcp:HOST:PORT``, ``unix:PATH``, ``-`` for standard input, or a
         file to replay.
     calibration : Calibration
@@ -103,11 +105,13 @@ def compensate_live(
     wait_us = round(1e3 * real(wait_ms, "wait_ms", 0.0, 1e6, " ms"))
     watch_s = real(watch_s, "watch_s", 0.0, 1e9, " s")
     wait_s = real(wait_for_source_s, "wait_for_source_s", 0.0, 1e9, " s")
+    if counts_per_turn is not None and port is None:
+        raise AmiwarpError("counts_per_turn is given without port; give the controller's port, or leave it out")
     with contextlib.ExitStack() as resources:
         link = None
         if port is not None:
             link = resources.enter_context(Link(None if port == "find" else port, counts_per_turn=counts_per_turn))
-        opened = open_source(source, pace=None if fast else 1.0, wait_s=wait_s, say=say)
+        opened = open_source(os.fspath(source), pace=None if fast else 1.0, wait_s=wait_s, say=say)
         try:
             if not encoder_count(opened, link):
                 raise AmiwarpError(f"{opened.name}: contains no encoder samples; give the controller's port")

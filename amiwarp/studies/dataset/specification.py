@@ -118,13 +118,15 @@ class OutputEntry:
     @property
     def options(self) -> dict[str, Any]:
         """Arguments of the function that are given."""
-        other = ("representation", "window_us", "window_events")
+        other = ("representation", "window_us", "window_events", *(("t_start", "t_end") if self.window_us else ()))
         return {name: value for name, value in self.given.items() if name not in other}
 
     @property
     def windows(self) -> dict[str, Any]:
         """Arguments of :func:`amiwarp.windows`; none for one tensor of all events."""
-        found = {"duration_us": self.window_us, "count": self.window_events}
+        found: dict[str, int | None] = {"duration_us": self.window_us, "count": self.window_events}
+        if self.window_us is not None:
+            found |= {"t_start": self.t_start, "t_end": self.t_end}
         return {name: value for name, value in found.items() if value is not None}
 
 
@@ -278,7 +280,8 @@ def _check_output(output: OutputEntry) -> None:
     for name, parameter in known.items():
         if parameter.default is parameter.empty and name not in ("events", "width", "height", *output.options):
             raise AmiwarpError(f"field output.{name} is missing; {output.representation} needs it")
-    both = [name for name in ("window_us", "window_events", "t_start", "t_end") if name in output.given]
+    times = () if output.window_us is not None else ("t_start", "t_end")
+    both = [name for name in ("window_us", "window_events", *times) if name in output.given]
     if output.windows and len(both) > 1:
         raise AmiwarpError(f"field output has {' and '.join(both)}; give one kind of windows, or t_start and t_end")
     if output.t_start is not None and output.t_end is not None and output.t_end < output.t_start:
