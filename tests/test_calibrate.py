@@ -26,6 +26,7 @@ from amiwarp import (
     SensorModel,
     Settings,
     Sharpness,
+    compensate_events,
     model_error,
     open_recording,
     predicted_error,
@@ -196,6 +197,12 @@ def test_speed_is_found_without_an_encoder(texture: np.ndarray, rpm: float) -> N
     assert error_px(recording, c.model) < 0.2
     encoder = c.encoder_for(None, recording.events.t_first, recording.events.t_last)
     assert encoder.rpm == pytest.approx(c.parameters["rpm"])
+    with pytest.raises(AmiwarpError, match="the calibration was made without one, so its phase holds for its own"):
+        c.encoder_for(encoder, recording.events.t_first, recording.events.t_last)
+    x, y = compensate_events(recording.events[:], c.model, encoder).T
+    moved = Events(x.copy(), y.copy(), recording.events[:].t, recording.events[:].p)
+    with pytest.raises(AmiwarpError, match="already compensated; give events from a sensor"):
+        calibrate(replace(recording, events=MemoryEvents(moved, 160, 120)))
 
 
 @pytest.mark.parametrize("given", [None, 717.0])

@@ -387,6 +387,10 @@ BAD = [
     (("convert", "recording.h5", "out.h5", "--camera", "nocamera.json"), "height"),
     (("convert", "recording.h5", "out.h5", "--camera", "narrow.json"), "99x120"),
     (("convert", "recording.h5", "out.h5", "--camera", "narrow.json", "--fov-deg", "60"), "give one of them"),
+    (
+        ("simulate", "out.h5", "--picture", "photo.jpg", "--camera", "narrow.json", "--size", "99x120"),
+        "leave --size out",
+    ),
     (("simulate", "out.h5", "--picture", "notes.txt"), "notes.txt"),
     (("simulate", "out.h5", "--picture", "missing.jpg"), "missing.jpg"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--size", "big"), "640x480"),

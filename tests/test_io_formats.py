@@ -11,6 +11,7 @@ import sqlite3
 import struct
 import tarfile
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -23,6 +24,7 @@ from amiwarp import (
     Camera,
     Events,
     MemoryEvents,
+    OutputFormat,
     RadialTangential,
     Recording,
     convert,
@@ -31,6 +33,7 @@ from amiwarp import (
 )
 from amiwarp.io import file_scan as scan
 from amiwarp.io import read_encoder_triggers
+from amiwarp.io.export import left_out
 from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, _halves_are_swapped, words_of
 from amiwarp.io.ros import _types_of, read_packets
 from reference.io_samples import make_events, refusal, to_faery, write_aedat4
@@ -200,6 +203,10 @@ def test_triggers_of_a_dvs128(tmp_path):
     recording = open_recording(tmp_path / "a.aedat")
     assert_equal(recording.events.slice(0, 999), events)
     assert recording.metadata["triggers"] == 2
+    assert left_out(recording, OutputFormat.NATIVE) == ("triggers",)
+    assert "triggers" in left_out(recording, OutputFormat.EVT3)
+    used = replace(recording, encoder=read_encoder_triggers(tmp_path / "a.aedat"))
+    assert left_out(used, OutputFormat.NATIVE) == ()
     assert np.diff(read_encoder_triggers(tmp_path / "a.aedat").t).tolist() == [2000]
 
 

@@ -93,6 +93,8 @@ def test_the_file_keeps_the_path(
     np.testing.assert_array_equal(moved[0], moved[1])
     with pytest.raises(AmiwarpError, match=r"one recording only, from -.* calibrate this recording itself"):
         loaded.encoder_for(None, span[0], 10_000_000)
+    with pytest.raises(AmiwarpError, match="the calibration was made without one"):
+        loaded.encoder_for(loaded.path, *span)
 
 
 def test_the_inspector_shows_the_path(spun_up: tuple[Recording, PrismMotion], calibrated: Calibration) -> None:

@@ -416,6 +416,18 @@ def test_command_refuses(recording: Recording, tmp_path: Path) -> None:
         assert {p.name for p in tmp_path.iterdir()} == before
 
 
+def test_a_picture_that_no_event_determines_is_not_written(recording: Recording, tmp_path: Path) -> None:
+    """As with the calibration of another recording."""
+    save_recording(tmp_path / "r.h5", recording)
+    other = {"apex": PRISM.apex, "phase": PHASE + math.pi}
+    exact_calibration(CAMERA, PRISM, other).save(tmp_path / "c.json")
+    args = ["reconstruct", "r.h5", "p.png", "--calibration", "c.json", "--device", "cpu"]
+    result = CliRunner().invoke(app, [str(tmp_path / a) if "." in a else a for a in args])
+    assert result.exit_code == 1
+    assert "the events determine 0.0 % of the picture; calibrate this recording" in result.stderr
+    assert not (tmp_path / "p.png").exists()
+
+
 def test_what_cannot_be(recording: Recording, picture: Picture, tmp_path: Path) -> None:
     with pytest.raises(AmiwarpError, match="no events in"):
         reconstruct(recording, model=MODEL, start_us=10_000_000)
@@ -430,6 +442,10 @@ def test_what_cannot_be(recording: Recording, picture: Picture, tmp_path: Path) 
         reconstruct(recording)
     with pytest.raises(AmiwarpError, match="has no events"):
         reconstruct(with_events(recording, Events.empty()), model=MODEL)
+    some = recording.events[:100]
+    moved = Events(some.x.astype(np.float32), some.y.astype(np.float32), some.t, some.p)
+    with pytest.raises(AmiwarpError, match="already compensated; give events from a sensor"):
+        reconstruct(with_events(recording, moved), model=MODEL, start_us=int(some.t[0]), length_us=10_000)
     with pytest.raises(AmiwarpError, match="no picture to write"):
         save_video([], tmp_path / "v.mp4", fps=25.0)
     with pytest.raises(AmiwarpError, match="is a folder"):

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,23 @@ def test_a_watch_sees_that_the_phase_has_moved(recording: Recording) -> None:
     assert len(said) == 1
     assert re.search(r"moved by \+(3\.[5-9]|4\.[0-5]) deg", said[0])
     watch.close()
+
+
+def test_a_watch_compares_with_the_calibration_by_sharpness(recording: Recording) -> None:
+    """Which has the same bias. Beyond the search, the difference is at least that large."""
+    plain, said = known(recording, 1.0), list[str]()
+    found = []
+    for bias_deg in (0.0, 3.0, -40.0):
+        biased = known(recording, 1.0)
+        sharp = {"phase": plain.parameters["phase"] + math.radians(bias_deg)}
+        object.__setattr__(biased, "photometric", SimpleNamespace(sharpness_parameters=sharp))
+        watch = PhaseCheck(biased, 0.0, said.append)
+        watch.put(recording.events.slice(0, len(recording.events)))
+        found.append(looked(watch, streamed(recording)))
+        watch.close()
+    assert found[0] - found[1] == pytest.approx(3.0, abs=0.3)
+    assert found[2] == pytest.approx(20.0, abs=0.2)
+    assert said == ["the phase differs from the calibrated one by at least +20.0 deg: calibrate again"]
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, join, time_span
+from amiwarp.events.device_events import DeviceEvents, check_sensor, join, time_span
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
 from amiwarp.kernels import conjugate_gradients as cg
@@ -235,6 +235,8 @@ class EventTable:
         if isinstance(tile_of, np.ndarray):
             tile_of = wp.array(tile_of, dtype=int, device=device)
         self.tile_of, self.spans = tile_of, [span for span in spans if len(span)]
+        for span in [joined] if joined else self.spans:
+            check_sensor(span)
         self.arrays = pair_kernels.Sorted()
         self.arrays.columns = tile_of.shape[1]
         self.arrays.pixels = tile_of.shape[0] * tile_of.shape[1]

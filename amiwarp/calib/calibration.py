@@ -48,6 +48,7 @@ from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, 
 from amiwarp.calib.settings import AUTO, CalibrationOptions, Settings
 from amiwarp.calib.sharpness_search import Search
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import check_sensor
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.optics.camera import LENS, Camera, with_lens
@@ -372,6 +373,7 @@ class Calibrator:
         if found.path is None or self.path is not None:
             return found
         said = f"the prism's speed is not constant: it {speed_in_words(found.path)}"
+        said += "; if the camera or the scene moved, which looks the same, hold it still, or use an encoder"
         return _warning(found, f"{said}; the path that was found holds for this recording only")
 
     def without_bad_pixels(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
@@ -674,7 +676,7 @@ def _search_on(path: Encoder, search: Search) -> Search:
 
 def _camera(recording: Recording) -> Camera:
     if recording.camera is None:
-        raise AmiwarpError(f"{recording.name}: the camera is unknown; give its intrinsics or its field of view")
+        raise AmiwarpError(f"{recording.name}: the camera is unknown; give --camera or --fov-deg (camera=)")
     return recording.camera
 
 
@@ -684,6 +686,7 @@ def _encoders(recording: Recording, settings: Settings, path: Encoder | None) ->
     Without an encoder these are the known path, or constant speeds: the given one, or the one found in the events with
     either sign. If the events show that the speed varies much, they are paths with either sense of rotation.
     """
+    check_sensor(recording.events[:1])
     kind, encoder = MODELS[settings.model], recording.encoder
     free = kind.freed(None if encoder is None else encoder.ratio) if settings.free is None else settings.free
     free = tuple(n for n in free if n not in LINEAR_UNKNOWNS)

@@ -726,6 +726,12 @@ def run_reconstruct(
 def _still(found: Picture, out: Path, options: PictureOptions) -> dict[str, Any]:
     from amiwarp.reconstruction.picture import save_mask, save_picture
 
+    known = float(found.known.mean())
+    if known < LEAST_KNOWN:
+        raise AmiwarpError(
+            f"{out}: the events determine {100.0 * known:.1f} % of the picture; calibrate this recording, if the "
+            "calibration is that of another one, or give a longer --length"
+        )
     save_picture(found, out, tone=options.tone, bits=options.bits, contrast=options.contrast)
     if options.mask is not None:
         save_mask(found, options.mask)
@@ -769,6 +775,8 @@ def _reconstructed_line(d: dict[str, Any]) -> str:
 
 OWN_NETWORK = "quarter-turn"
 """Value of ``--network`` for amiwarp's own network."""
+LEAST_KNOWN = 0.005
+"""Share of a picture that events must determine for it to be written."""
 EARLIER_WINDOWS = 24
 """Largest number of windows before a picture's from which a network has its states."""
 

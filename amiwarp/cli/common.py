@@ -569,6 +569,6 @@ def format_notes(d: dict[str, Any]) -> list[str]:
         lines.append(f"note: rounded to whole pixels ({d['rounding']}); {d['dropped']:,} events outside are dropped")
     if d["left_out"]:
         native = d["format"] is OutputFormat.NATIVE
-        who = "a compensated recording" if native else f"{LIMITS[d['format']].label} does not hold, and"
+        who = "the new file" if native else f"{LIMITS[d['format']].label} does not hold, and"
         lines.append(f"note: {who} leaves out: {', '.join(d['left_out'])}")
     return lines

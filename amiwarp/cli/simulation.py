@@ -134,6 +134,8 @@ class RigOptions:
             return Camera.from_fov(width, height, fov)
         if self.fov_deg is not None:
             raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
+        if self.size is not None:
+            raise AmiwarpError("--size and --camera both give the size of the image; leave --size out")
         return load_camera(self.camera, (width, height))
 
     def build_prism(self) -> Prism:

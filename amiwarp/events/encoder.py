@@ -878,7 +878,8 @@ class Encoder:
         if not self.covers(low, high):
             first, last = self.coverage
             raise AmiwarpError(
-                f"events at {low} .. {high} us lie outside the encoder's {first} .. {last} us; drop these events"
+                f"events at {low} .. {high} us lie outside the encoder's {first} .. {last} us; give samples that cover "
+                "them, or a window inside"
             )
         start = int(np.searchsorted(self.t, math.floor(low + self.clock_offset_us))) - 1
         start = min(max(start, 0), self.t.size - 2)

@@ -342,7 +342,7 @@ def _summary(
         encoder_gaps=() if encoder is None else _gaps(encoder),
         index_slip=float(np.abs(slip).max()) if slip.size else None,
         format=chosen,
-        left_out=() if chosen is OutputFormat.NATIVE else left_out(recording, chosen),
+        left_out=left_out(recording, chosen),
         rounding=rounding,
         dropped=dropped,
     )
@@ -357,7 +357,9 @@ def bag_of(recording: Recording) -> Bag | None:
 
 
 def left_out(recording: Recording, chosen: OutputFormat) -> tuple[str, ...]:
-    """Return what a recording has in addition to its events and a format other than the native one does not hold."""
+    """Return what a recording has in addition to its events and a format does not hold."""
+    if chosen is OutputFormat.NATIVE:
+        return ("triggers",) if recording.metadata.get("triggers") and recording.encoder is None else ()
     known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {}), "other_topics"}
     from_bag = str(recording.metadata.get("format")).startswith("rosbag")
     copied = chosen is OutputFormat.ROS2 and bag_of(recording) is not None
@@ -371,7 +373,7 @@ def left_out(recording: Recording, chosen: OutputFormat) -> tuple[str, ...]:
         "ground truth": recording.truth is not None,
         "IMU samples": recording.imu is not None and not copied,
         "frames": recording.frames is not None and not copied,
-        "triggers": copied and bool(recording.metadata.get("triggers")),
+        "triggers": bool(recording.metadata.get("triggers")),
         "other topics": bool(recording.metadata.get("other_topics")) and from_bag and not copied,
         "metadata": not set(recording.metadata) <= known,
     }

@@ -568,7 +568,8 @@ def is_dataset(found: Any) -> bool:
 def _check_rows(dataset: Any, name: str, path: str) -> None:
     """Check that a dataset holds rows of events, and that all of it is in the file."""
     if not is_dataset(dataset):
-        why = "only Prophesee's files hold triggers" if name.startswith("EXT_TRIGGER") else "the file is incomplete"
+        trigger = name.startswith("EXT_TRIGGER")
+        why = "only Prophesee's files hold triggers; give the original file" if trigger else "the file is incomplete"
         raise AmiwarpError(f"no dataset '{name}'; {why}")
     wanted = ("p", "t", "id") if name.startswith("EXT_TRIGGER") else ("x", "y", "p", "t")
     fields = dataset.dtype.fields

@@ -234,7 +234,7 @@ class _PixelPicture:
                     raise AmiwarpError(
                         f"{self.work.recording.name}: the events do not show one picture, the brightness equations are "
                         f"off by {residual():.2f} thresholds; calibrate again, or give a time in which the scene is "
-                        "still (start_us, length_us)"
+                        "still (--start and --length, start_us and length_us in Python)"
                     )
             r = self.solver.residuals.values.numpy()[:n].astype(np.float64)
             # ΔL = ±C: what the residual lacks of the assumed threshold, relative to that of the polarity

@@ -42,7 +42,7 @@ CHANGE_RAD, OFFSET_RAD = math.radians(1.5), math.radians(5.0)
 """Smallest reported change of the phase since the first estimate, and smallest reported offset from the calibrated
 phase [rad].
 
-The bias of the estimate is up to 3 deg.
+The bias of the estimate, beyond that in the calibration, is up to 3 deg.
 """
 FEWEST_EVENTS = 20_000
 """Smallest number of events for an estimate of the phase. The events must also cover half a turn."""
@@ -70,8 +70,8 @@ class PhaseCheck:
     """Estimates the prism's phase repeatedly by sharpness, on the CPU in a background thread.
 
     For a pair of prisms and for a mirror, both phases are estimated together. The check needs the events that the
-    compensator gets. The sharpness has a bias that depends on the sensor. Therefore the change since the first estimate
-    is judged.
+    compensator gets. The sharpness has a bias that depends on sensor and scene. Therefore the estimate is compared with
+    that by sharpness in the calibration, if it has one, and the change since the first estimate is judged.
     """
 
     def __init__(self, calibration: Calibration, every_s: float, say: Callable[[str], None]) -> None:
@@ -89,6 +89,9 @@ class PhaseCheck:
         """Memory of the latest events that are kept for an estimate [bytes]."""
         self._thread: threading.Thread | None = None  # a daemon: the process may end while an estimate runs
         self._names = PHASES[: calibration.model.ANGLES]
+        photometric = calibration.photometric
+        sharp = {} if photometric is None else photometric.sharpness_parameters
+        self._usual = {name: sharp.get(name, calibration.parameters[name]) for name in self._names}
         self._estimated: list[PhaseEstimate] = []
         self._first_estimate: list[PhaseEstimate] = []
         self._offset: float | None = None
@@ -116,7 +119,8 @@ class PhaseCheck:
             self._reported[estimate.name] = reported
         elif abs(estimate.offset) > OFFSET_RAD:
             self._reported[estimate.name] = estimate.offset
-            offset = f"{math.degrees(estimate.offset):+.1f} deg"
+            least = "at least " if abs(estimate.offset) > 0.99 * SEARCH_RAD else ""
+            offset = f"{least}{math.degrees(estimate.offset):+.1f} deg"
             self._say(f"the {phase} differs from the calibrated one by {offset}: calibrate again")
         elif abs(changed) > max(CHANGE_RAD, 4.0 * math.hypot(estimate.std, first.std)):
             self._reported[estimate.name] = estimate.offset
@@ -175,10 +179,10 @@ class PhaseCheck:
     def _estimate(self, events: Events, encoder: Encoder) -> None:
         """Estimate the phases by a calibration in which all other parameters are fixed."""
         known, names = self._calibration, self._names
-        bounds = {n: (known.parameters[n] - SEARCH_RAD, known.parameters[n] + SEARCH_RAD) for n in names}
+        bounds = {n: (self._usual[n] - SEARCH_RAD, self._usual[n] + SEARCH_RAD) for n in names}
         recording = Recording(MemoryEvents(events, known.camera.width, known.camera.height), known.camera, encoder,
                               known.prism, name="the stream")  # fmt: skip
-        start = {n: x for n, x in known.parameters.items() if n not in ("clock_offset", "rpm")}
+        start = {n: x for n, x in {**known.parameters, **self._usual}.items() if n not in ("clock_offset", "rpm")}
         try:
             found = self._calibrate(
                 recording, model=known.model_name, free=names, start=start, stages=("sharpness",), events=100_000,
@@ -186,9 +190,7 @@ class PhaseCheck:
             )  # fmt: skip
         except AmiwarpError:
             return  # for example without texture: a later estimate may succeed
-        self._estimated = [
-            PhaseEstimate(n, found.parameters[n] - known.parameters[n], found.uncertainty[n]) for n in names
-        ]
+        self._estimated = [PhaseEstimate(n, found.parameters[n] - self._usual[n], found.uncertainty[n]) for n in names]
 
 
 # Consumers of a session's data: files and servers, each served by a background thread.
@@ -426,6 +428,8 @@ class Session:
         self.status = SessionStatus()
         # A source's own samples are already shifted by its file's clock offset; the calibrated offset is more accurate.
         own = clock_offset(source, link)
+        if calibration is not None:
+            calibration.check_encoder()
         known = {} if calibration is None else calibration.parameters
         harmonics = None if calibration is None else calibration.harmonics
         offset = known.get("clock_offset", own) - own
