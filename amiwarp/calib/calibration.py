@@ -167,6 +167,8 @@ and than one turn of four does that is no longer whole at the corrected speed.""
 LEAST_LONGER = 1.5
 """Length of a recording from which on its ends can confirm the answer of its middle, as a multiple of the length of a
 calm span: they are half a turn apart then."""
+QUADRATURE, NEAR_QUADRATURE = (0.25, 0.5, 2.0, 4.0), 0.03
+"""Scales of a quadrature encoder of which other edges are counted than stated, and how near a found one must be."""
 LEAST_SCALE_ERROR = 0.003
 """Smallest relative error of an encoder's scale that is reported. Three turns measure the scale to about 0.001."""
 
@@ -432,7 +434,8 @@ class Calibrator:
         assert encoder is not None
         turns = [-1.0]
         with contextlib.suppress(AmiwarpError):  # the events do not repeat: the scene or the camera moves
-            turns.append(first_guess.encoder_turns_per_period(self.recording, encoder))
+            found = first_guess.encoder_turns_per_period(self.recording, encoder)
+            turns += [*(q for q in QUADRATURE if abs(found / q - 1.0) < NEAR_QUADRATURE), found]
         for each in turns:
             if abs(each - 1.0) < LEAST_SCALE_ERROR:
                 continue

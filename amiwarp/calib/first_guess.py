@@ -26,6 +26,8 @@ MOST_BINS = 5000
 """Largest number of time bins."""
 LEAST_CORRELATION = 0.1
 """Smallest autocorrelation of event counts at which the events are considered to repeat."""
+UNLIKE = 0.2
+"""Correlation below which the events of two angles are not alike."""
 ANGLE_BINS, MOST_TURNS = 96, 24
 """Angle bins per turn and largest number of turns for the check of an encoder's scale."""
 
@@ -62,7 +64,10 @@ def encoder_turns_per_period(recording: Recording, encoder: Encoder) -> float:
         return (np.abs(encoder.angle_at(t) - begin) * (ANGLE_BINS / math.tau)).astype(np.int64)
 
     counts = _signed_counts(recording, first, last, bin_of)
-    return _period(autocorrelation(counts), recording.name) / ANGLE_BINS
+    correlation = autocorrelation(counts)
+    # if the encoder counts too much, many bins are like their neighbours: these are no period
+    correlation[: int(np.argmax(correlation < UNLIKE))] = -1.0
+    return _period(correlation, recording.name) / ANGLE_BINS
 
 
 def signed_counts(recording: Recording, bin_us: int) -> NDArray[np.float32]:
