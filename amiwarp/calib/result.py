@@ -354,7 +354,7 @@ class Calibration:
             rest = constant_speed(0.0, t_first, t_last, t_first)
             return rest if kind.ANGLES == 1 else rest.with_second(1.0)
         if encoder is not None:
-            self.check_encoder()
+            check_made_with_encoder(self)
             encoder = encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
             return encoder if self.harmonics is None else encoder.with_harmonics(self.harmonics)
         if self.path is not None:
@@ -370,14 +370,6 @@ class Calibration:
                 "the recording has no encoder and the calibration has no rpm; calibrate this recording itself"
             )
         return constant_speed(self.parameters["rpm"], t_first, t_last, self.zero_us)
-
-    def check_encoder(self) -> None:
-        """Raise :class:`AmiwarpError` if the angle 0 of an encoder is another one than that of this calibration."""
-        if self.path is not None or "rpm" in self.parameters:
-            raise AmiwarpError(
-                "the recording has an encoder, and the calibration was made without one, so its phase holds for its own"
-                " recording only; calibrate a recording with the encoder"
-            )
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of the JSON file.
@@ -495,6 +487,15 @@ class Calibration:
         )
         _ = replace(result, model_name=MODELS[model].closed_form().NAME).model
         return result
+
+
+def check_made_with_encoder(calibration: Calibration) -> None:
+    """Raise :class:`AmiwarpError` for a calibration without an encoder: the angle 0 of an encoder is another one."""
+    if calibration.path is not None or "rpm" in calibration.parameters:
+        raise AmiwarpError(
+            "the recording has an encoder, and the calibration was made without one, so its phase holds for its own"
+            " recording only; calibrate a recording with the encoder"
+        )
 
 
 def prism_to_json(prism: Prism | Plate) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.result import Calibration
+from amiwarp.calib.result import Calibration, check_made_with_encoder
 from amiwarp.choices import Sharpness
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.errors import AmiwarpError
@@ -429,7 +429,7 @@ class Session:
         # A source's own samples are already shifted by its file's clock offset; the calibrated offset is more accurate.
         own = clock_offset(source, link)
         if calibration is not None:
-            calibration.check_encoder()
+            check_made_with_encoder(calibration)
         known = {} if calibration is None else calibration.parameters
         harmonics = None if calibration is None else calibration.harmonics
         offset = known.get("clock_offset", own) - own
