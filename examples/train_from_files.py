@@ -220,7 +220,7 @@ def train(folder: Path, given: argparse.Namespace) -> None:
     print(f"mean loss {first:.2f} in the first epoch, {last:.2f} in the last one")
     print(f"{windows} windows in {total:.2f} s on {given.device}, {windows / total:.3g} per second")
     took, alone = 1e3 * total / (steps - epoch), 1e3 * kept / (steps - epoch)
-    print(f"a batch takes {took:.2f} ms, one that is kept {alone:.2f} ms: "
+    print(f"a batch takes {took:.2f} ms, one that stays on the device {alone:.2f} ms: "
           f"reading costs {1 - kept / total:.2%}")  # fmt: skip
 
 

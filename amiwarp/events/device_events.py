@@ -333,12 +333,12 @@ def limits(events: DeviceEvents) -> list[int]:
     return events._limits
 
 
-def check_order(events: Events | DeviceEvents) -> None:
-    """Raise :class:`AmiwarpError` if an event is earlier than the one before."""
+def check_order(events: Events | DeviceEvents, first_index: int = 0) -> None:
+    """Raise :class:`AmiwarpError` if an event is earlier than the one before. ``first_index``: of the first event."""
     if isinstance(events, Events):
-        checks.check_order(events, where="events")
+        checks.check_order(events, where="events", first_index=first_index)
     elif len(events) and limits(events)[5]:
-        checks.check_order(events.to_host(), where="events")  # it names the event
+        check_order(events.to_host(), first_index)  # it names the event
 
 
 def check_sensor(events: Events | DeviceEvents) -> None:

@@ -27,7 +27,7 @@ from amiwarp.events.device_events import (
     wait,
 )
 from amiwarp.events.encoder import Encoder, check_prisms
-from amiwarp.events.recording import Events, Recording, check_order
+from amiwarp.events.recording import Events, Recording
 from amiwarp.kernels import tensors as kernels
 from amiwarp.kernels.compensation import LaunchPlan
 from amiwarp.kernels.events import NEVER
@@ -204,13 +204,9 @@ MOST_WINDOWS = 1 << 27
 
 
 def _check_order(events: Events | DeviceEvents, first_index: int = 0) -> None:
-    """Raise :class:`AmiwarpError` if an event is earlier than the one before. ``first_index``: of the first event."""
-    if isinstance(events, DeviceEvents):
-        if not len(events) or not limits(events)[5]:
-            return
-        events = events.to_host()
+    """Raise :class:`AmiwarpError` with both remedies if an event is earlier than the one before."""
     try:
-        check_order(events, where="events", first_index=first_index)
+        device_events.check_order(events, first_index)
     except AmiwarpError as error:
         raise AmiwarpError(f"{error}, or give the windows of amiwarp.collate, if it joined the events") from None
 
@@ -1140,7 +1136,7 @@ class ToTensor:
     Raises
     ------
     AmiwarpError
-        If the function has no parameter of that name; in a call, if it has one that is not given.
+        If the function has no parameter of a given name, or if a call lacks an option that the function needs.
 
     Examples
     --------
@@ -1157,7 +1153,7 @@ class ToTensor:
             raise AmiwarpError(f"representation is {shown(representation)}; give a function, such as voxel_grid")
         self.representation = representation
         self.options = options
-        self._check(options)
+        self._needed = self._check(options)
 
     def _check(self, options: dict[str, Any]) -> tuple[str, ...]:
         """Return the names that the function needs besides the events. Raises :class:`AmiwarpError` for others."""
@@ -1170,7 +1166,8 @@ class ToTensor:
     def __call__(self, events: Any, labels: Any = None, **more: Any) -> Any:
         """Return the tensor of events, or the tensor of a recording's events and the labels. ``more``: options."""
         options = self.options | more
-        needed = self._check(more)
+        if more:
+            self._check(more)
         if isinstance(events, Recording):
             source = events.events
             options = dict(zip(("width", "height"), source.size, strict=True)) | options
@@ -1179,7 +1176,7 @@ class ToTensor:
             events = source.slice(0, len(source))
         elif isinstance(events, np.ndarray) and events.dtype.names is not None:
             events = Events.from_structured(events)
-        missing = [name for name in needed if name not in options]
+        missing = [name for name in self._needed if name not in options]
         if missing:
             raise AmiwarpError(f"ToTensor has no {' and no '.join(missing)}; give the options by name, or a recording")
         if callable(options.get("windows")):
