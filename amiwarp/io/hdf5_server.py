@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.file_scan import microseconds, whole_pixels
-from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32, FORMAT
+from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32
+from amiwarp.io.native_format import FORMAT
 from amiwarp.io.prophesee import Columns
 from amiwarp.io.reading_process import Reply, forget, keep, kept
 

@@ -1,6 +1,6 @@
-"""Writers of native HDF5 recordings: of a whole file or none, and of live recordings, readable at any time.
+"""amiwarp's native recording format: reader, and writers of whole files and of live recordings.
 
-The format is described in ``docs/reference/recording-format.md``.
+The format is described in ``docs/reference/recording-format.md``. DSEC and M3ED store events alike, and are read here.
 """
 
 from __future__ import annotations
@@ -24,22 +24,631 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events import recording as checks
 from amiwarp.events import truth as ground_truth
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import Events, ImuSamples, MetadataValue, Recording, regroup
-from amiwarp.events.truth import EventTruth, FrameTruth, Poses, WorldLabels
-from amiwarp.io import hdf5_files
-from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place
+from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, ImuSamples, MetadataValue, Recording, regroup
+from amiwarp.events.truth import EVENT_COLUMNS, MAPS, EventTruth, FrameTruth, Poses, Truth, WorldLabels, check_truth
+from amiwarp.io.file_scan import head_limit, smallest_sensor
+from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place, register_reader
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
-from amiwarp.io.hdf5_files import CHUNK, ChunkFile, EncodedChunk, camera_attributes, open_hdf5, prism_attributes
-from amiwarp.optics.camera import Camera, check_size
-from amiwarp.optics.prism import NominalPrism
+from amiwarp.io.hdf5_files import (
+    CHUNK,
+    ChunkFile,
+    Column,
+    EncodedChunk,
+    Hdf5File,
+    append_chunk,
+    append_values,
+    encode,
+    encode_parts,
+    make_dataset,
+    open_rows,
+)
+from amiwarp.io.json_files import LARGEST_INTEGER
+from amiwarp.optics.camera import (
+    CAMERA_NUMBERS,
+    COEFFICIENTS,
+    DISTORTIONS,
+    LARGEST_SIZE,
+    Camera,
+    Distortion,
+    camera_to_json,
+    check_size,
+)
+from amiwarp.optics.prism import FlatSide, NominalPrism, Plate, Prism, UnsizedPrism, as_wedge
 from amiwarp.tasks import Progress, Result, in_order
-from amiwarp.validation import as_times, choice, guarded, shown
+from amiwarp.validation import array as as_numbers
+from amiwarp.validation import as_times, choice, guarded, instance, one_of, real, rounded_times, shown, whole
 
-# Layout of the file: header, datasets, chunks and the millisecond index.
+# Layout of the file.
 
+FORMAT = "amiwarp-recording"
+"""Value of the attribute ``format`` of native recordings."""
+
+FORMAT_VERSION = 1
+"""Newest version of the format that is read, and the version that is written."""
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """Arrays of a block of events, by the names of their datasets in the file."""
+
+
+# Camera and prism as attributes of an HDF5 group, or of a JSON object in a stream.
+
+
+def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[Any], default: Any = None) -> Any:
+    """Return an attribute as type ``kind``; raise :class:`AmiwarpError` if it is missing or of another type."""
+    if name not in attributes and default is None:
+        raise AmiwarpError(f"{where} has no attribute '{name}'; add this attribute")
+    value = attributes.get(name, default)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    what = f"{where} attribute '{name}'"
+    if kind is int:
+        return whole(value, what, -LARGEST_INTEGER, LARGEST_INTEGER)
+    if kind is float:
+        return real(value, what)
+    try:
+        text = value.decode() if isinstance(value, bytes) else value
+    except UnicodeDecodeError:
+        text = value
+    return instance(text, kind, what)
+
+
+def camera_attributes(camera: Camera) -> dict[str, Any]:
+    """Return a camera as attributes of an HDF5 group, by name."""
+    attributes = camera_to_json(camera)
+    lens = attributes.pop("distortion", {"kind": "none"})
+    attributes["distortion_model"] = lens.pop("kind")
+    if lens:
+        attributes["distortion"] = [float(value) for value in lens.values()]
+    return attributes
+
+
+def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
+    """Return the camera stored in the attributes of a file or stream.
+
+    Raises :class:`AmiwarpError` if an attribute is missing or unusable.
+    """
+    model = one_of(attribute(attributes, where, "distortion_model", str, "none"), (*DISTORTIONS, "none"),
+                   f"{where} attribute 'distortion_model'")  # fmt: skip
+    distortion: Distortion | None = None
+    if model in DISTORTIONS:
+        lens, lengths = DISTORTIONS[model], COEFFICIENTS[model]
+        k = as_numbers(attributes.get("distortion", ()), f"{where} attribute 'distortion'")
+        if k.ndim != 1 or len(k) not in lengths:
+            expected = " or ".join(map(str, lengths))
+            raise AmiwarpError(f"camera distortion is {shown(k)}; expected {expected} numbers for {model}")
+        distortion = lens(*k.tolist())
+    kinds = dict(zip(CAMERA_NUMBERS, (int, int, float, float, float, float), strict=True))
+    numbers = {name: attribute(attributes, where, name, kind) for name, kind in kinds.items()}
+    return Camera(**numbers, distortion=distortion)
+
+
+def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
+    """Return the attributes of a nominal prism, without ``apex`` if that is unknown, or those of a plate."""
+    if isinstance(prism, Plate):
+        return {"thickness": prism.thickness, "tilt": prism.tilt, "index": prism.index}
+    known: dict[str, float | str] = {"apex": prism.apex} if isinstance(prism, Prism) else {}
+    known |= {"index": prism.index, "flat_side": prism.flat_side.value}
+    if isinstance(prism, Prism) and prism.second is not None:
+        known |= {f"second_{name}": value for name, value in prism_attributes(prism.second).items()}
+    return known
+
+
+def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
+    """Return the nominal prism stored in attributes. The apex angle is unknown if ``apex`` is missing.
+
+    A plate has a ``thickness``.
+    """
+    if "thickness" in attributes:
+        return Plate(*(attribute(attributes, where, name, float) for name in ("thickness", "tilt", "index")))
+    side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
+    prism = UnsizedPrism(attribute(attributes, where, "index", float), side)
+    if "apex" not in attributes:
+        return prism
+    second = {name: attributes[f"second_{name}"] for name in ("apex", "index", "flat_side")
+              if f"second_{name}" in attributes}  # fmt: skip
+    behind = as_wedge(read_prism(second, f"{where} second prism")) if second else None
+    if isinstance(behind, UnsizedPrism):
+        raise AmiwarpError(f"{where} has a second prism without 'second_apex'; add this attribute")
+    return dataclasses.replace(prism.with_apex(attribute(attributes, where, "apex", float)), second=behind)
+
+
+# Opening of a recording.
+
+
+def open_hdf5(path: Path, topic: str | None = None) -> Recording:
+    """Open a native recording, or a file of another layout. ``topic`` chooses among several cameras.
+
+    Raises :class:`AmiwarpError` for other files.
+    """
+    with errors_name(path, lambda: "opening HDF5"):
+        file = Hdf5File(path, topic)
+        try:
+            if file.layout in ("mvsec", "ecf"):
+                file.close()
+                return open_rows(path, file.layout, file.group)
+            return _read_recording(path, file)
+        except BaseException:
+            file.close()
+            raise
+
+
+def _read_recording(path: Path, file: Hdf5File) -> Recording:
+    root = _attributes(file, "/")
+    version = attribute(root, f"{path}: /", "format_version", int, FORMAT_VERSION)
+    if version > FORMAT_VERSION:
+        raise AmiwarpError(f"{path}: format_version {version} is newer than {FORMAT_VERSION}; update amiwarp")
+    events = NativeEvents(path, file)
+    metadata: dict[str, MetadataValue] = {
+        name: value if isinstance(value, (str, int, float, bool)) else str(value)
+        for name, value in _attributes(file, "metadata").items()
+    }
+    metadata["format"] = "native" if attribute(root, f"{path}: /", "format", str, "") == FORMAT else "dsec"
+    if file.layout == "m3ed":
+        metadata |= {"format": "m3ed", "topic": file.group}
+    camera, prism = file.attributes("camera"), file.attributes("prism")
+    found = None if camera is None else read_camera(camera, f"{path}: /camera")
+    if found is not None and (found.width, found.height) != events.size:
+        raise AmiwarpError(
+            f"{path}: camera is {found.width}x{found.height}, events are {events.size}; both must have the same size"
+        )
+    return Recording(
+        events=events,
+        camera=found,
+        encoder=None if file.attributes("encoder") is None else _read_encoder(path, file),
+        prism=None if prism is None else read_prism(prism, f"{path}: /prism"),
+        truth=None if file.attributes("truth") is None else read_truth(path, file, len(events), events.size),
+        metadata=metadata,
+        name=path.stem,
+        imu=read_imu(path, file),
+        frames=read_frames(path, file),
+    )
+
+
+def _attributes(file: Hdf5File, group: str) -> Mapping[str, Any]:
+    return file.attributes(group) or {}
+
+
+def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int, ...] | None = None) -> Column:
+    """Return a dataset; raise :class:`AmiwarpError` if the dataset is missing or does not have the expected shape.
+
+    ``count``: expected number of rows; ``row``: expected shape of a row. None accepts any.
+    """
+    if name not in file.columns:
+        raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
+    column = file.columns[name]
+    shape = (len(column), *column.row)
+    expected = (len(column) if count is None else count, *(column.row if row is None else row))
+    if shape != expected:
+        raise AmiwarpError(f"dataset '{name}' has shape {shape}; expected {expected}; the file is damaged")
+    return column
+
+
+def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
+    samples = _read_samples(file, "encoder/")
+    if samples is None:
+        return None
+    t, angle = samples
+    pulses = file.columns.get("encoder/index_t")
+    index_t = None if pulses is None else rounded_times(pulses.read(0, len(pulses)))
+    if file.unfinished and index_t is not None:
+        index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])]
+    second = _read_samples(file, "encoder/second_") if "encoder/second_t" in file.columns else None
+    offset = attribute(_attributes(file, "encoder"), f"{path}: /encoder", "clock_offset_us", float, 0.0)
+    return Encoder(t, angle, offset, index_t, None if second is None else Encoder(*second))
+
+
+def _read_samples(file: Hdf5File, name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+    """Return times [us] and angles [rad] of an encoder whose datasets begin with ``name``; None without samples."""
+    columns = [_column(file, name + column) for column in ("t", "angle")]
+    t, angle = (column.read(0, len(column)) for column in columns)
+    t, angle = rounded_times(t), angle.astype(np.float64)
+    if file.unfinished:
+        count = min(t.size, angle.size)
+        t, angle = t[:count], angle[:count]
+    # A live recording has datasets for an encoder before it is known whether an encoder is connected.
+    if t.size < 2 and (file.unfinished or t.size == angle.size == 0):
+        return None
+    return t, angle
+
+
+# Events of native recordings and of files of DSEC and M3ED, whose layouts are alike.
+
+DSEC_SIZE = (640, 480)
+"""Size of DSEC's sensors [px], which its files do not store."""
+
+
+class NativeEvents(EventSource):
+    """Events of an HDF5 recording, read on demand. Raises :class:`AmiwarpError` for a damaged file."""
+
+    def __init__(self, path: Path, file: Hdf5File) -> None:
+        """Open the events of a file. If the file is unfinished, these are the events that are complete now."""
+        self.path = path
+        self._file = file
+        self._columns = {name: _column(file, f"events/{name}") for name in ("t", "p", "x", "y")}
+        for name in ("inside", "extrapolated"):
+            if f"events/{name}" in file.columns:
+                self._columns[name] = file.columns[f"events/{name}"]
+        lengths = {name: len(column) for name, column in self._columns.items()}
+        if len(set(lengths.values())) != 1 and not file.unfinished:
+            raise AmiwarpError(f"{path}: datasets of events differ in length: {lengths}; the file is damaged")
+        self._count = min(lengths.values())
+        offset = file.columns.get("t_offset")
+        self._offset = 0 if offset is None else rounded_times(offset.read(0, 1)).item()
+        # The index of an unfinished file may be incomplete. Bisection is used instead.
+        self._ms_to_idx = None if file.unfinished else file.columns.get("ms_to_idx")
+        self._size = self._find_size()
+        self._ends = [self.slice(at, at + 1).t for at in (0, self._count - 1)] if self._count else []
+        register_reader(self, self.path)
+
+    def _find_size(self) -> tuple[int, int]:
+        """Return the stored sensor size, or else the smallest known sensor that holds all events [px]."""
+        attributes = self._file.attributes("/") or {}
+        if "width" in attributes and "height" in attributes:
+            width, height = (attribute(attributes, f"{self.path}: /", name, int) for name in ("width", "height"))
+            check_size(width, height, self.path)
+            return width, height
+        largest = [0, 0]
+        for start in range(0, min(self._count, head_limit() or self._count), DEFAULT_BLOCK):
+            for axis, name in enumerate(("x", "y")):
+                values = self._read(name, start, min(start + DEFAULT_BLOCK, self._count))
+                if values.dtype.kind == "f":  # compensated events may lie far outside, or have no coordinates
+                    values = np.rint(values[(values >= 0) & (values < LARGEST_SIZE)])
+                largest[axis] = max(largest[axis], int(values.max(initial=0)))
+        width, height = smallest_sensor(largest[0], largest[1])
+        return max(width, DSEC_SIZE[0]), max(height, DSEC_SIZE[1])
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def t_first(self) -> int:
+        """Time of the first event [us]."""
+        return self._end(0)
+
+    @property
+    def t_last(self) -> int:
+        """Time of the last event [us]."""
+        return self._end(-1)
+
+    def _end(self, which: int) -> int:
+        if not self._ends:
+            raise AmiwarpError(f"{self.path}: holds no events, so it has no first or last time")
+        return int(self._ends[which][0])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Sensor size (width, height) [px]."""
+        return self._size
+
+    def slice(self, start: int, stop: int) -> Events:
+        """Return the events with ``start <= index < stop``, and check them. Threads may call it in parallel."""
+        start, stop = max(start, 0), min(max(stop, start, 0), self._count)
+        with errors_name(self.path, lambda: f"events {start} .. {stop}"):
+            x, y, p = (self._read(name, start, stop) for name in ("x", "y", "p"))
+            t = self._read("t", start, stop)
+            # check_events finds times beyond the limit among sorted int64, also if adding the offset overflows.
+            t = self._since_zero(t if t.dtype == np.int64 else rounded_times(t))
+            events = Events(checks.as_coordinate("x", x), checks.as_coordinate("y", y), t, checks.as_polarity(p))
+            nan = "inside" in self._columns
+            checks.check_events(events, *self._size, where=str(self.path), first_index=start, allow_nan=nan)
+        return events
+
+    def inside(self, start: int, stop: int) -> NDArray[np.bool_] | None:
+        """Return whether each compensated event lies inside the image, shape ``(n,)``; None if this is not stored."""
+        return self._flags("inside", start, stop)
+
+    def extrapolated(self, start: int, stop: int) -> NDArray[np.bool_] | None:
+        """Return whether each event's angle was extrapolated, shape ``(n,)``; None if the file does not store it."""
+        return self._flags("extrapolated", start, stop)
+
+    def _flags(self, name: str, start: int, stop: int) -> NDArray[np.bool_] | None:
+        if name not in self._columns:
+            return None
+        with errors_name(self.path, lambda: f"events/{name} {start} .. {stop}"):
+            return np.asarray(self._read(name, max(start, 0), min(max(stop, 0), self._count)), np.bool_)
+
+    def find(self, t: int) -> int:
+        """Return the index of the first event at or after ``t`` [us], found with the file's millisecond index."""
+        if not self._count or t <= self.t_first:
+            return 0
+        if t > self.t_last:
+            return self._count
+        low, high = self._bracket(t)
+        at = low + int(np.searchsorted(self._times(low, high), t))
+        around = self._times(at - 1, at + 1) if 0 < at < self._count else np.zeros(0, np.int64)
+        if around.size != 2 or not around[0] < t <= around[1]:
+            raise AmiwarpError(
+                f"{self.path}: events/t is not sorted near {t} us, or ms_to_idx disagrees with it; the file is damaged"
+            )
+        return at
+
+    def between(self, t_start: int, t_end: int) -> Events:
+        """Return the events with ``t_start <= t < t_end`` [us], found with the file's millisecond index."""
+        with errors_name(self.path, lambda: f"events between {t_start} and {t_end} us"):
+            return self.slice(self.find(t_start), self.find(t_end))
+
+    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+        """Return all events in blocks, as :meth:`amiwarp.EventSource.blocks`."""
+        return regroup(self._pieces_in_order(), count=count, duration_us=duration_us)
+
+    def pieces(self, count: int) -> Iterator[Callable[[], Events]]:
+        """Yield functions that read ``count`` events each, in any thread. Whole chunks are read fastest."""
+        for start in range(0, self._count, count):
+            yield partial(self.slice, start, start + count)
+
+    def encoded_times_and_polarities(self, start: int, stop: int) -> dict[str, list[bytes]]:
+        """Return the stored chunks of times and polarities with ``start <= index < stop``, by name of the dataset.
+
+        A recording of the same events from the first one on holds the same chunks. ``start`` begins a chunk. Empty for
+        files of other formats, unfinished files, and times that do not start at the first event.
+        """
+        root = self._file.attributes("/") or {}
+        if root.get("format") != FORMAT or self._file.unfinished or self._offset != self.t_first:
+            return {}
+        chunks = {n: self._columns[n].encoded(start, min(stop, self._count)) for n in ("t", "p")}
+        dtypes = {"t": np.dtype(np.int64), "p": np.dtype(np.uint8)}
+        return {f"events/{n}": c for n, c in chunks.items() if c is not None and self._columns[n].dtype == dtypes[n]}
+
+    def _pieces_in_order(self) -> Iterator[Events]:
+        start, last = 0, None
+        with contextlib.closing(in_order(self.pieces(CHUNK))) as pieces:
+            for piece in pieces:  # whose own order is checked
+                checks.check_events(piece[:1], *self._size, where=str(self.path), first_index=start, allow_nan=True,
+                                    after_t=last)  # fmt: skip
+                start, last = start + len(piece), int(piece.t[-1])
+                yield piece
+
+    def _times(self, start: int, stop: int) -> NDArray[np.int64]:
+        return self._since_zero(rounded_times(self._read("t", start, stop)))
+
+    def _since_zero(self, t: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Add the file's offset to times, in the same array if it can be written."""
+        return np.add(t, self._offset, out=t if t.flags.writeable else None) if self._offset else t
+
+    def _read(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        return self._columns[name].read(start, stop)
+
+    def _bracket(self, t: int) -> tuple[int, int]:
+        """Return a short range of event indices around time ``t`` [us], from the millisecond index or by bisection."""
+        ms = (t - self._offset) // 1000
+        if self._ms_to_idx is not None and 0 <= ms < len(self._ms_to_idx):
+            ends = self._ms_to_idx.read(ms, min(ms + 2, len(self._ms_to_idx))).tolist()
+            return max(0, min(ends[0], self._count)), max(
+                0, min(ends[1] if len(ends) > 1 else self._count, self._count)
+            )
+        low, high = 0, self._count
+        while high - low > 1024:
+            middle = (low + high) // 2
+            low, high = (middle, high) if int(self._times(middle, middle + 1)[0]) < t else (low, middle)
+        return low, high
+
+
+# IMU samples and frames of native recordings. Frames are read on demand.
+
+
+def read_imu(path: Path, file: Hdf5File) -> ImuSamples | None:
+    """Return the IMU samples of a file, or None if it has none."""
+    if "imu/t" not in file.columns:
+        return None
+    with errors_name(path, lambda: "imu"):
+        count = len(file.columns["imu/t"])
+        values = [_column(file, f"imu/{name}", count, (3,)) for name in ("angular_velocity", "acceleration")]
+        t = rounded_times(file.columns["imu/t"].read(0, count))
+        return ImuSamples(t, *(column.read(0, count).astype(np.float64, copy=False) for column in values))
+
+
+def read_frames(path: Path, file: Hdf5File) -> StoredImages | None:
+    """Return the frames of a file, or None if it has none."""
+    if "frames/t" not in file.columns:
+        return None
+    with errors_name(path, lambda: "frames"):
+        return StoredImages(path, file)
+
+
+class StoredImages:
+    """Frames of a native recording, read on demand."""
+
+    def __init__(self, path: Path, file: Hdf5File) -> None:
+        self._path, self._file = path, file  # the columns hold only a weak reference to the file
+        times = file.columns["frames/t"]
+        self._image = _column(file, "frames/image", len(times))
+        if self._image.dtype not in (np.uint8, np.uint16) or not all(self._image.row):
+            raise AmiwarpError(f"frames are {self._image.dtype} of shape {self._image.row}; expected uint8 or uint16")
+        self.t = rounded_times(times.read(0, len(times)))
+        """Times of the frames [us], shape ``(k,)``."""
+        if (self.t[1:] < self.t[:-1]).any():
+            raise AmiwarpError("frames/t decreases; the file is damaged")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Size (width, height) of the frames [px]."""
+        height, width = self._image.row
+        return width, height
+
+    def __getitem__(self, index: int, /) -> NDArray[Any]:
+        at = range(len(self.t))[index]
+        with errors_name(self._path, lambda: f"frames {index}"):
+            return self._image.read(at, at + 1)[0]
+
+
+# Ground truth of native recordings. Events, instants and poses are read on demand.
+
+Read = Callable[[int, int], Any]
+"""Function that returns rows from ``start`` up to ``stop`` (excluded)."""
+
+
+def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) -> Truth:
+    """Return the ground truth of a file with ``count`` events.
+
+    ``size``: width and height of the sensor [px].
+    """
+    attributes = file.attributes("truth") or {}
+    values = {name: _event_values(path, file, name, count) for name in EVENT_COLUMNS}
+    return Truth(
+        {name: attribute(attributes, f"{path}: /truth", name, float) for name in attributes},
+        stored_points=_points(path, file, count),
+        stored_causes=values["cause"],
+        stored_instances=values["instance"],
+        stored_depths=values["depth"],
+        stored_places=values["place"],
+        labels=_labels(path, file),
+        frames=_StoredFrames(path, file, size) if "truth/frames/t" in file.columns else None,
+        poses=_poses(path, file),
+        known=_StoredMasks(path, file, size) if "truth/known/t" in file.columns else None,
+    )
+
+
+class _StoredRows:
+    """Rows of one or several datasets that are read on demand."""
+
+    def __init__(self, path: Path, name: str, count: int, read: Read, file: Hdf5File) -> None:
+        self._path, self._name, self._count, self._read = path, name, count, read
+        self._file = file  # keeps the file open: the columns hold only a weak reference to the file
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, which: slice, /) -> Any:
+        with errors_name(self._path, lambda: self._name):
+            start, stop = checks.slice_bounds(which, self._count, "rows")
+        with errors_name(self._path, lambda: f"{self._name} {start} .. {stop}"):
+            return self._read(start, stop)
+
+
+def _points(path: Path, file: Hdf5File, count: int) -> _StoredRows | None:
+    """Return the true points of the events, or None if they are not stored."""
+    if "truth/x" not in file.columns:
+        return None
+    x, y = (_column(file, f"truth/{name}", count) for name in ("x", "y"))
+    return _StoredRows(path, "truth", count, partial(_read_points, x, y), file)
+
+
+def _read_points(x: Column, y: Column, start: int, stop: int) -> NDArray[np.float32]:
+    """Return rows of two datasets as points [px], shape (n, 2)."""
+    return np.stack([_read_as(column, np.float32, start, stop) for column in (x, y)], axis=1)
+
+
+def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> _StoredRows | None:
+    """Return the values of the dataset ``truth/events/name``, or None if the dataset is missing."""
+    stored, (dtype, row) = f"truth/events/{name}", EVENT_COLUMNS[name]
+    if stored not in file.columns:
+        return None
+    return _StoredRows(path, stored, count, partial(_read_as, _column(file, stored, count, row), dtype), file)
+
+
+def _read_as(column: Column, dtype: Any, start: int, stop: int) -> NDArray[Any]:
+    """Read rows of a dataset as ``dtype``.
+
+    Raises :class:`AmiwarpError` for integers that do not fit, and for values without meaning.
+    """
+    values = column.read(start, stop)
+    check_truth(column.name, values)
+    if values.dtype.kind in "iu" and values.size and not np.can_cast(values.dtype, dtype):
+        limits = np.iinfo(dtype)
+        if values.min() < limits.min or values.max() > limits.max:
+            raise AmiwarpError(f"holds numbers outside of {limits.min} .. {limits.max}; the file is damaged")
+    return values.astype(dtype, copy=False)
+
+
+def _labels(path: Path, file: Hdf5File) -> WorldLabels | None:
+    """Return the names and classes of the instances, or None if they are not stored."""
+    if "truth/world/instances" not in file.columns:
+        return None
+    name = attribute(file.attributes("truth/world") or {}, f"{path}: /truth/world", "name", str, "")
+    instances, categories = (_names(file, f"truth/world/{what}") for what in ("instances", "categories"))
+    with errors_name(path, lambda: "truth/world"):
+        return WorldLabels(name, instances, categories or ("",) * len(instances))
+
+
+def _names(file: Hdf5File, name: str) -> tuple[str, ...]:
+    """Return the names in a dataset; an empty tuple if the dataset is missing."""
+    column = file.columns.get(name)
+    if column is None:
+        return ()
+    return tuple(bytes(text).decode("utf-8", "replace") for text in column.read(0, len(column)).tolist())
+
+
+class _StoredFrames:
+    """Ground truth of all pixels at several instants, read from a file on demand."""
+
+    def __init__(self, path: Path, file: Hdf5File, size: tuple[int, int]) -> None:
+        self._path, self._file = path, file
+        self.t = _rising_times(path, file, "truth/frames/t")
+        """Times of the instants [us], shape ``(k,)``."""
+        count, (width, height) = len(self.t), size
+        self._maps = {
+            name: _column(file, f"truth/frames/{name}", count, (height, width, *tail))
+            for name, (_, tail) in MAPS.items()
+        }
+        self._pose = _column(file, "truth/frames/pose", count, (7,))
+        self._joint_names = _names(file, "truth/joints/names")
+        self._joints = (
+            _column(file, "truth/frames/joints", count, (len(self._joint_names), 3)) if self._joint_names else None
+        )
+
+    def __getitem__(self, index: int, /) -> FrameTruth:
+        at = range(len(self.t))[index]
+        with errors_name(self._path, lambda: f"truth/frames {index}"):
+            maps = {name: _read_as(self._maps[name], dtype, at, at + 1)[0] for name, (dtype, _) in MAPS.items()}
+            pose = _read_as(self._pose, np.float64, at, at + 1)[0]
+            joints = np.zeros((0, 3)) if self._joints is None else _read_as(self._joints, np.float64, at, at + 1)[0]
+            named = dict(zip(self._joint_names, joints, strict=True))
+            rotation = ground_truth.rotation_of(pose)
+            return FrameTruth(t_us=int(self.t[at]), **maps, rotation=rotation, position=pose[:3], joints=named)
+
+
+def _rising_times(path: Path, file: Hdf5File, name: str) -> NDArray[np.int64]:
+    """Return the times of a dataset [us]. Raises :class:`AmiwarpError` if they do not rise."""
+    times = rounded_times(file.columns[name].read(0, len(file.columns[name])))
+    if (np.diff(times) <= 0).any():
+        raise AmiwarpError(f"{path}: {name} does not increase; the file is damaged")
+    return times
+
+
+class _StoredMasks:
+    """Masks of known pixels, read on demand."""
+
+    def __init__(self, path: Path, file: Hdf5File, size: tuple[int, int]) -> None:
+        self._path, self._file = path, file
+        self.t = _rising_times(path, file, "truth/known/t")
+        """Times from which the masks hold [us], shape ``(k,)``."""
+        self._masks = _column(file, "truth/known/mask", len(self.t), size[::-1])
+
+    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
+        at = range(len(self.t))[index]
+        with errors_name(self._path, lambda: f"truth/known {index}"):
+            return self._masks.read(at, at + 1)[0] != 0
+
+
+def _poses(path: Path, file: Hdf5File) -> _StoredRows | None:
+    """Return the poses of camera, bodies and joints, or None if they are not stored."""
+    if "truth/poses/t" not in file.columns:
+        return None
+    t = file.columns["truth/poses/t"]
+    camera = _column(file, "truth/poses/camera", len(t), (7,))
+    tables = {
+        what: (names, _column(file, table, len(t), (len(names), width)))
+        for what, names, table, width in (
+            ("bodies", _names(file, "truth/poses/body_names"), "truth/poses/bodies", 7),
+            ("joints", _names(file, "truth/joints/names"), "truth/joints/position", 3),
+        )
+        if names and table in file.columns
+    }
+    return _StoredRows(path, "truth/poses", len(t), partial(_read_poses, t, camera, tables), file)
+
+
+def _read_poses(
+    t: Column, camera: Column, tables: Mapping[str, tuple[tuple[str, ...], Column]], start: int, stop: int
+) -> Poses:
+    """Return the poses of the camera, and those of the bodies and joints, whose ``tables`` have names."""
+    named = {
+        what: dict(zip(names, np.moveaxis(_read_as(column, np.float64, start, stop), 1, 0), strict=True))
+        for what, (names, column) in tables.items()
+    }
+    return Poses(rounded_times(t.read(start, stop)), _read_as(camera, np.float64, start, stop), **named)
+
+
+# Header, columns and millisecond index of a file that is written.
 
 
 def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> None:
@@ -96,8 +705,8 @@ def write_header(
     metadata: Mapping[str, MetadataValue],
 ) -> None:
     """Write the parts of a file that are known before the first event: format, size, camera, prism and metadata."""
-    file.attrs["format"] = hdf5_files.FORMAT
-    file.attrs["format_version"] = hdf5_files.FORMAT_VERSION
+    file.attrs["format"] = FORMAT
+    file.attrs["format_version"] = FORMAT_VERSION
     file.attrs["width"], file.attrs["height"] = size
     if camera is not None:
         file.create_group("camera").attrs.update(camera_attributes(camera))
@@ -119,7 +728,7 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
         if points.shape != (count, 2):
             raise AmiwarpError(f"truth points have shape {points.shape}; expected ({count}, 2)")
         columns["truth/x"], columns["truth/y"] = points[:, 0], points[:, 1]
-    for name, (dtype, row) in ground_truth.EVENT_COLUMNS.items():
+    for name, (dtype, row) in EVENT_COLUMNS.items():
         given = getattr(truth, name)
         if given is not None:
             values = np.asarray(given, dtype)
@@ -127,7 +736,7 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
                 raise AmiwarpError(f"truth of {name} has shape {values.shape}; expected {(count, *row)}")
             columns[f"truth/events/{name}"] = values
     for name, values in columns.items():
-        ground_truth.check_truth(name, values)
+        check_truth(name, values)
     return columns
 
 
@@ -151,7 +760,7 @@ class RecordWriter:
     def dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = (), chunk_rows: int = CHUNK) -> Any:
         """Return a dataset, which is created at the first call."""
         if name not in self._datasets:
-            self._datasets[name] = hdf5_files.make_dataset(self._file, name, dtype, row, chunk_rows, self._codec)
+            self._datasets[name] = make_dataset(self._file, name, dtype, row, chunk_rows, self._codec)
         return self._datasets[name]
 
     def extend(self, name: str, values: NDArray[Any], chunk_rows: int = CHUNK) -> None:
@@ -177,7 +786,7 @@ class RecordWriter:
         """Append the ground truth of an instant, which must be later than the previous instants."""
         width, height = self._size
         maps: Columns = {}
-        for name, (dtype, tail) in ground_truth.MAPS.items():
+        for name, (dtype, tail) in MAPS.items():
             values = np.asarray(getattr(frame, name), dtype)
             if values.shape != (height, width, *tail):
                 raise AmiwarpError(
@@ -252,7 +861,7 @@ class RecordWriter:
                 raise AmiwarpError(f"{self._path}: {change}; append the same in each call")
         for name, values in columns.items():
             if name.startswith("truth/"):
-                ground_truth.check_truth(name, values)
+                check_truth(name, values)
             row = self._datasets[name].shape[1:] if name in self._datasets else values.shape[1:]
             if values.shape[1:] != row:
                 raise AmiwarpError(f"{self._path}: rows of {name} have shape {values.shape[1:]}; expected {row}")
@@ -499,7 +1108,7 @@ class RecordingWriter:
                 for name, column in columns.items():
                     stored: Sequence[Sequence[bytes]] = [(part,) for part in known.get(name, ())]
                     if len(stored) * CHUNK < len(column):
-                        stored = hdf5_files.encode_parts(column, self._codec)
+                        stored = encode_parts(column, self._codec)
                     chunks += EncodedChunk.of(name, start, column, stored)
                 self._chunks.write(turn, chunks, self._dataset_of, lambda: self._follow(events, start))
         return events, inside
@@ -674,7 +1283,7 @@ class RecordingWriter:
     def _write_chunk(self, name: str, start: int, values: NDArray[Any], turn: int) -> None:
         """Encode and write the values of a chunk that begins at element ``start``. Runs in a thread."""
         with self._chunks.stopping(turn):
-            chunks = EncodedChunk.of(name, start, values, hdf5_files.encode_parts(values, self._codec))
+            chunks = EncodedChunk.of(name, start, values, encode_parts(values, self._codec))
             self._chunks.write(turn, chunks, self._dataset_of)
 
     def _dataset_of(self, chunk: EncodedChunk) -> Any:
@@ -728,7 +1337,7 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
         file = chunks.hdf5
         file.attrs["width"], file.attrs["height"] = about.width, about.height
         file["t_offset"] = np.int64(about.t_first)
-        create = partial(hdf5_files.make_dataset, file, codec=about.codec)
+        create = partial(make_dataset, file, codec=about.codec)
         datasets = {name: create(f"events/{name}", dtype) for name, dtype in COLUMNS.items()}
         index = [np.zeros(0, np.int64)]
         written = ms = 0
@@ -738,13 +1347,13 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
                 ms += entries.size
             columns = {"x": events.x, "y": events.y, "t": events.t - about.t_first, "p": events.p}
             for name, dtype in COLUMNS.items():
-                hdf5_files.append_values(datasets[name], written, columns[name].astype(dtype), about.codec)
+                append_values(datasets[name], written, columns[name].astype(dtype), about.codec)
             written += len(events)
             chunks.check()
         stored = create("ms_to_idx", np.uint64)
         found = np.concatenate(index).astype(np.uint64)
         for start in range(0, ms, CHUNK):
-            hdf5_files.append_values(stored, start, found[start : start + CHUNK], about.codec)
+            append_values(stored, start, found[start : start + CHUNK], about.codec)
 
 
 # Copy of a recording into a native file.
@@ -966,7 +1575,7 @@ class LiveWriter:
         if self._compensated:
             dtypes |= {"inside": np.uint8, "extrapolated": np.uint8}
         self._columns = {
-            f"events/{name}": hdf5_files.make_dataset(file, f"events/{name}", dtype) for name, dtype in dtypes.items()
+            f"events/{name}": make_dataset(file, f"events/{name}", dtype) for name, dtype in dtypes.items()
         }
         file["t_offset"] = np.int64(0)
         small: dict[str, Any] = {"ms_to_idx": np.int64, "encoder/index_t": np.int64}
@@ -1126,10 +1735,10 @@ class LiveWriter:
         """Write the pending events of the current chunk. Start a new chunk if the chunk is full."""
         count = self._pending_count
         with contextlib.closing(
-            in_order(partial(hdf5_files.encode, column[:count]) for column in self._pending.values())
+            in_order(partial(encode, column[:count]) for column in self._pending.values())
         ) as encoded:
             for name, stored in zip(self._pending, encoded, strict=True):
-                hdf5_files.append_chunk(self._columns[name], self._written, stored, count)
+                append_chunk(self._columns[name], self._written, stored, count)
         self._stored = self._written + count
         if count == CHUNK:  # one statement, so that Ctrl-C cannot interrupt it halfway
             self._written, self._pending_count = self._stored, 0
