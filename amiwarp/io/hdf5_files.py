@@ -554,18 +554,14 @@ class Hdf5File:
                 self.close()
                 raise
         about, at_once = found
-        self._attributes = about["attributes"]
+        self.attributes: Mapping[str, Mapping[str, Any]] = about["attributes"]
+        """Attributes of the groups that the file has, by the name of the group."""
         self.layout, self.group = str(about["layout"]), str(about["group"])
         """Layout of the file (native, m3ed, mvsec or ecf), and the group of its events."""
         self.unfinished = bool(about["unfinished"])
         """Whether the file is still being written, or the program that wrote it was interrupted."""
         self.columns = {name: Column(self, handle, name, column, at_once) for name, column in about["columns"].items()}
         """Datasets of the file by name. They refer to the file weakly, so a reader must keep the file."""
-
-    def attributes(self, group: str) -> Mapping[str, Any] | None:
-        """Return the attributes of a group, or None if the file has no such group."""
-        found: Mapping[str, Any] | None = self._attributes.get(group)
-        return found
 
     def ask(self, function: str, *arguments: Any) -> list[NDArray[Any]]:
         """Call a function in the reading process, which is restarted after Ctrl-C and in a fork of this process."""
@@ -694,16 +690,11 @@ def open_rows(path: Path, layout: str, group: str) -> Recording:
     """Open the events of a group, which :func:`amiwarp.io.hdf5_server.find_layout` has found."""
     source = path.absolute()
     about = run(f"{SERVER}:read_head", source, group)
-    events = FileEvents(
-        path, partial(packets, f"{SERVER}:read_rows", source, f"{group}/events"), size=_size_of(about["size"])
-    )
+    size = about["size"] and tuple(about["size"])
+    events = FileEvents(path, partial(packets, f"{SERVER}:read_rows", source, f"{group}/events"), size=size)
     imu, frames, notes = read_sensors(path, about["counts"], SERVER, group)
     metadata = {"format": layout, "topic": group, **about["counts"], **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
-
-
-def _size_of(given: list[int] | None) -> tuple[int, int] | None:
-    return None if given is None else (given[0], given[1])
 
 
 def trigger_packets(path: Path) -> Iterator[Packet]:

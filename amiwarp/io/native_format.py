@@ -66,6 +66,12 @@ FORMAT = "amiwarp-recording"
 FORMAT_VERSION = 1
 """Newest version of the format that is read, and the version that is written."""
 
+POSE_TABLES = {
+    "joints": ("truth/joints/names", "truth/joints/position", 3),
+    "bodies": ("truth/poses/body_names", "truth/poses/bodies", 7),
+}
+"""Datasets of the names and of the values of what moves, and the length of a value."""
+
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """Arrays of a block of events, by the names of their datasets in the file."""
 
@@ -173,19 +179,19 @@ def open_hdf5(path: Path, topic: str | None = None) -> Recording:
 
 
 def _read_recording(path: Path, file: Hdf5File) -> Recording:
-    root = _attributes(file, "/")
+    root = file.attributes.get("/", {})
     version = attribute(root, f"{path}: /", "format_version", int, FORMAT_VERSION)
     if version > FORMAT_VERSION:
         raise AmiwarpError(f"{path}: format_version {version} is newer than {FORMAT_VERSION}; update amiwarp")
     events = NativeEvents(path, file)
     metadata: dict[str, MetadataValue] = {
         name: value if isinstance(value, (str, int, float, bool)) else str(value)
-        for name, value in _attributes(file, "metadata").items()
+        for name, value in file.attributes.get("metadata", {}).items()
     }
     metadata["format"] = "native" if attribute(root, f"{path}: /", "format", str, "") == FORMAT else "dsec"
     if file.layout == "m3ed":
         metadata |= {"format": "m3ed", "topic": file.group}
-    camera, prism = file.attributes("camera"), file.attributes("prism")
+    camera, prism = file.attributes.get("camera"), file.attributes.get("prism")
     found = None if camera is None else read_camera(camera, f"{path}: /camera")
     if found is not None and (found.width, found.height) != events.size:
         raise AmiwarpError(
@@ -194,18 +200,14 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
     return Recording(
         events=events,
         camera=found,
-        encoder=None if file.attributes("encoder") is None else _read_encoder(path, file),
+        encoder=_read_encoder(path, file) if "encoder" in file.attributes else None,
         prism=None if prism is None else read_prism(prism, f"{path}: /prism"),
-        truth=None if file.attributes("truth") is None else read_truth(path, file, len(events), events.size),
+        truth=read_truth(path, file, len(events), events.size) if "truth" in file.attributes else None,
         metadata=metadata,
         name=path.stem,
         imu=read_imu(path, file),
         frames=read_frames(path, file),
     )
-
-
-def _attributes(file: Hdf5File, group: str) -> Mapping[str, Any]:
-    return file.attributes(group) or {}
 
 
 def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int, ...] | None = None) -> Column:
@@ -233,7 +235,7 @@ def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
     if file.unfinished and index_t is not None:
         index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])]
     second = _read_samples(file, "encoder/second_") if "encoder/second_t" in file.columns else None
-    offset = attribute(_attributes(file, "encoder"), f"{path}: /encoder", "clock_offset_us", float, 0.0)
+    offset = attribute(file.attributes["encoder"], f"{path}: /encoder", "clock_offset_us", float, 0.0)
     return Encoder(t, angle, offset, index_t, None if second is None else Encoder(*second))
 
 
@@ -282,7 +284,7 @@ class NativeEvents(EventSource):
 
     def _find_size(self) -> tuple[int, int]:
         """Return the stored sensor size, or else the smallest known sensor that holds all events [px]."""
-        attributes = self._file.attributes("/") or {}
+        attributes = self._file.attributes.get("/", {})
         if "width" in attributes and "height" in attributes:
             width, height = (attribute(attributes, f"{self.path}: /", name, int) for name in ("width", "height"))
             check_size(width, height, self.path)
@@ -382,7 +384,7 @@ class NativeEvents(EventSource):
         A recording of the same events from the first one on holds the same chunks. ``start`` begins a chunk. Empty for
         files of other formats, unfinished files, and times that do not start at the first event.
         """
-        root = self._file.attributes("/") or {}
+        root = self._file.attributes.get("/", {})
         if root.get("format") != FORMAT or self._file.unfinished or self._offset != self.t_first:
             return {}
         chunks = {n: self._columns[n].encoded(start, min(stop, self._count)) for n in ("t", "p")}
@@ -423,7 +425,45 @@ class NativeEvents(EventSource):
         return low, high
 
 
-# IMU samples and frames of native recordings. Frames are read on demand.
+# Rows and images that are read on demand. The columns refer to their file weakly, so these objects keep it.
+
+
+class _StoredRows:
+    """Rows of one or several datasets that are read on demand."""
+
+    def __init__(self, path: Path, name: str, count: int, read: Callable[[int, int], Any], file: Hdf5File) -> None:
+        self._path, self._name, self._count, self._read, self._file = path, name, count, read, file
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, which: slice, /) -> Any:
+        with errors_name(self._path, lambda: self._name):
+            start, stop = checks.slice_bounds(which, self._count, "rows")
+        with errors_name(self._path, lambda: f"{self._name} {start} .. {stop}"):
+            return self._read(start, stop)
+
+
+class _StoredImages:
+    """Images at several times, or all that is known of these, read on demand."""
+
+    def __init__(
+        self, path: Path, name: str, t: NDArray[np.int64], size: tuple[int, int], read: Callable[[int], Any],
+        file: Hdf5File,
+    ) -> None:  # fmt: skip
+        self._path, self._name, self._read, self._file = path, name, read, file
+        self.t = t
+        """Times of the images [us], shape ``(k,)``."""
+        self.size = size
+        """Size (width, height) of the images [px]."""
+
+    def __getitem__(self, index: int, /) -> Any:
+        at = range(len(self.t))[index]
+        with errors_name(self._path, lambda: f"{self._name} {index}"):
+            return self._read(at)
+
+
+# IMU samples and frames of native recordings.
 
 
 def read_imu(path: Path, file: Hdf5File) -> ImuSamples | None:
@@ -437,44 +477,23 @@ def read_imu(path: Path, file: Hdf5File) -> ImuSamples | None:
         return ImuSamples(t, *(column.read(0, count).astype(np.float64, copy=False) for column in values))
 
 
-def read_frames(path: Path, file: Hdf5File) -> StoredImages | None:
+def read_frames(path: Path, file: Hdf5File) -> _StoredImages | None:
     """Return the frames of a file, or None if it has none."""
     if "frames/t" not in file.columns:
         return None
     with errors_name(path, lambda: "frames"):
-        return StoredImages(path, file)
-
-
-class StoredImages:
-    """Frames of a native recording, read on demand."""
-
-    def __init__(self, path: Path, file: Hdf5File) -> None:
-        self._path, self._file = path, file  # the columns hold only a weak reference to the file
         times = file.columns["frames/t"]
-        self._image = _column(file, "frames/image", len(times))
-        if self._image.dtype not in (np.uint8, np.uint16) or not all(self._image.row):
-            raise AmiwarpError(f"frames are {self._image.dtype} of shape {self._image.row}; expected uint8 or uint16")
-        self.t = rounded_times(times.read(0, len(times)))
-        """Times of the frames [us], shape ``(k,)``."""
-        if (self.t[1:] < self.t[:-1]).any():
+        image = _column(file, "frames/image", len(times))
+        if image.dtype not in (np.uint8, np.uint16) or not all(image.row):
+            raise AmiwarpError(f"frames are {image.dtype} of shape {image.row}; expected uint8 or uint16")
+        t = rounded_times(times.read(0, len(times)))
+        if (t[1:] < t[:-1]).any():
             raise AmiwarpError("frames/t decreases; the file is damaged")
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Size (width, height) of the frames [px]."""
-        height, width = self._image.row
-        return width, height
-
-    def __getitem__(self, index: int, /) -> NDArray[Any]:
-        at = range(len(self.t))[index]
-        with errors_name(self._path, lambda: f"frames {index}"):
-            return self._image.read(at, at + 1)[0]
+        height, width = image.row
+        return _StoredImages(path, "frames", t, (width, height), lambda at: image.read(at, at + 1)[0], file)
 
 
-# Ground truth of native recordings. Events, instants and poses are read on demand.
-
-Read = Callable[[int, int], Any]
-"""Function that returns rows from ``start`` up to ``stop`` (excluded)."""
+# Ground truth of native recordings.
 
 
 def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) -> Truth:
@@ -482,7 +501,7 @@ def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) ->
 
     ``size``: width and height of the sensor [px].
     """
-    attributes = file.attributes("truth") or {}
+    attributes = file.attributes["truth"]
     values = {name: _event_values(path, file, name, count) for name in EVENT_COLUMNS}
     return Truth(
         {name: attribute(attributes, f"{path}: /truth", name, float) for name in attributes},
@@ -492,40 +511,22 @@ def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) ->
         stored_depths=values["depth"],
         stored_places=values["place"],
         labels=_labels(path, file),
-        frames=_StoredFrames(path, file, size) if "truth/frames/t" in file.columns else None,
+        frames=_frames(path, file, size),
         poses=_poses(path, file),
-        known=_StoredMasks(path, file, size) if "truth/known/t" in file.columns else None,
+        known=_masks(path, file, size),
     )
-
-
-class _StoredRows:
-    """Rows of one or several datasets that are read on demand."""
-
-    def __init__(self, path: Path, name: str, count: int, read: Read, file: Hdf5File) -> None:
-        self._path, self._name, self._count, self._read = path, name, count, read
-        self._file = file  # keeps the file open: the columns hold only a weak reference to the file
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, which: slice, /) -> Any:
-        with errors_name(self._path, lambda: self._name):
-            start, stop = checks.slice_bounds(which, self._count, "rows")
-        with errors_name(self._path, lambda: f"{self._name} {start} .. {stop}"):
-            return self._read(start, stop)
 
 
 def _points(path: Path, file: Hdf5File, count: int) -> _StoredRows | None:
     """Return the true points of the events, or None if they are not stored."""
     if "truth/x" not in file.columns:
         return None
-    x, y = (_column(file, f"truth/{name}", count) for name in ("x", "y"))
-    return _StoredRows(path, "truth", count, partial(_read_points, x, y), file)
+    columns = [_column(file, f"truth/{name}", count) for name in ("x", "y")]
 
+    def read(start: int, stop: int) -> NDArray[np.float32]:
+        return np.stack([_read_as(column, np.float32, start, stop) for column in columns], axis=1)
 
-def _read_points(x: Column, y: Column, start: int, stop: int) -> NDArray[np.float32]:
-    """Return rows of two datasets as points [px], shape (n, 2)."""
-    return np.stack([_read_as(column, np.float32, start, stop) for column in (x, y)], axis=1)
+    return _StoredRows(path, "truth", count, read, file)
 
 
 def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> _StoredRows | None:
@@ -554,7 +555,7 @@ def _labels(path: Path, file: Hdf5File) -> WorldLabels | None:
     """Return the names and classes of the instances, or None if they are not stored."""
     if "truth/world/instances" not in file.columns:
         return None
-    name = attribute(file.attributes("truth/world") or {}, f"{path}: /truth/world", "name", str, "")
+    name = attribute(file.attributes.get("truth/world", {}), f"{path}: /truth/world", "name", str, "")
     instances, categories = (_names(file, f"truth/world/{what}") for what in ("instances", "categories"))
     with errors_name(path, lambda: "truth/world"):
         return WorldLabels(name, instances, categories or ("",) * len(instances))
@@ -568,35 +569,6 @@ def _names(file: Hdf5File, name: str) -> tuple[str, ...]:
     return tuple(bytes(text).decode("utf-8", "replace") for text in column.read(0, len(column)).tolist())
 
 
-class _StoredFrames:
-    """Ground truth of all pixels at several instants, read from a file on demand."""
-
-    def __init__(self, path: Path, file: Hdf5File, size: tuple[int, int]) -> None:
-        self._path, self._file = path, file
-        self.t = _rising_times(path, file, "truth/frames/t")
-        """Times of the instants [us], shape ``(k,)``."""
-        count, (width, height) = len(self.t), size
-        self._maps = {
-            name: _column(file, f"truth/frames/{name}", count, (height, width, *tail))
-            for name, (_, tail) in MAPS.items()
-        }
-        self._pose = _column(file, "truth/frames/pose", count, (7,))
-        self._joint_names = _names(file, "truth/joints/names")
-        self._joints = (
-            _column(file, "truth/frames/joints", count, (len(self._joint_names), 3)) if self._joint_names else None
-        )
-
-    def __getitem__(self, index: int, /) -> FrameTruth:
-        at = range(len(self.t))[index]
-        with errors_name(self._path, lambda: f"truth/frames {index}"):
-            maps = {name: _read_as(self._maps[name], dtype, at, at + 1)[0] for name, (dtype, _) in MAPS.items()}
-            pose = _read_as(self._pose, np.float64, at, at + 1)[0]
-            joints = np.zeros((0, 3)) if self._joints is None else _read_as(self._joints, np.float64, at, at + 1)[0]
-            named = dict(zip(self._joint_names, joints, strict=True))
-            rotation = ground_truth.rotation_of(pose)
-            return FrameTruth(t_us=int(self.t[at]), **maps, rotation=rotation, position=pose[:3], joints=named)
-
-
 def _rising_times(path: Path, file: Hdf5File, name: str) -> NDArray[np.int64]:
     """Return the times of a dataset [us]. Raises :class:`AmiwarpError` if they do not rise."""
     times = rounded_times(file.columns[name].read(0, len(file.columns[name])))
@@ -605,19 +577,35 @@ def _rising_times(path: Path, file: Hdf5File, name: str) -> NDArray[np.int64]:
     return times
 
 
-class _StoredMasks:
-    """Masks of known pixels, read on demand."""
+def _frames(path: Path, file: Hdf5File, size: tuple[int, int]) -> _StoredImages | None:
+    """Return the ground truth of all pixels at several instants, or None if it is not stored."""
+    if "truth/frames/t" not in file.columns:
+        return None
+    t = _rising_times(path, file, "truth/frames/t")
+    maps = {
+        name: _column(file, f"truth/frames/{name}", len(t), (*size[::-1], *tail)) for name, (_, tail) in MAPS.items()
+    }
+    poses = _column(file, "truth/frames/pose", len(t), (7,))
+    names = _names(file, "truth/joints/names")
+    joints = _column(file, "truth/frames/joints", len(t), (len(names), 3)) if names else None
 
-    def __init__(self, path: Path, file: Hdf5File, size: tuple[int, int]) -> None:
-        self._path, self._file = path, file
-        self.t = _rising_times(path, file, "truth/known/t")
-        """Times from which the masks hold [us], shape ``(k,)``."""
-        self._masks = _column(file, "truth/known/mask", len(self.t), size[::-1])
+    def read(at: int) -> FrameTruth:
+        found = {name: _read_as(maps[name], dtype, at, at + 1)[0] for name, (dtype, _) in MAPS.items()}
+        pose = _read_as(poses, np.float64, at, at + 1)[0]
+        places = np.zeros((0, 3)) if joints is None else _read_as(joints, np.float64, at, at + 1)[0]
+        found |= {"rotation": ground_truth.rotation_of(pose), "position": pose[:3]}
+        return FrameTruth(t_us=int(t[at]), **found, joints=dict(zip(names, places, strict=True)))
 
-    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
-        at = range(len(self.t))[index]
-        with errors_name(self._path, lambda: f"truth/known {index}"):
-            return self._masks.read(at, at + 1)[0] != 0
+    return _StoredImages(path, "truth/frames", t, size, read, file)
+
+
+def _masks(path: Path, file: Hdf5File, size: tuple[int, int]) -> _StoredImages | None:
+    """Return the masks of known pixels, or None if they are not stored."""
+    if "truth/known/t" not in file.columns:
+        return None
+    t = _rising_times(path, file, "truth/known/t")
+    masks = _column(file, "truth/known/mask", len(t), size[::-1])
+    return _StoredImages(path, "truth/known", t, size, lambda at: masks.read(at, at + 1)[0] != 0, file)
 
 
 def _poses(path: Path, file: Hdf5File) -> _StoredRows | None:
@@ -626,26 +614,20 @@ def _poses(path: Path, file: Hdf5File) -> _StoredRows | None:
         return None
     t = file.columns["truth/poses/t"]
     camera = _column(file, "truth/poses/camera", len(t), (7,))
-    tables = {
-        what: (names, _column(file, table, len(t), (len(names), width)))
-        for what, names, table, width in (
-            ("bodies", _names(file, "truth/poses/body_names"), "truth/poses/bodies", 7),
-            ("joints", _names(file, "truth/joints/names"), "truth/joints/position", 3),
-        )
-        if names and table in file.columns
-    }
-    return _StoredRows(path, "truth/poses", len(t), partial(_read_poses, t, camera, tables), file)
+    tables = {}
+    for what, (listed, table, width) in POSE_TABLES.items():
+        names = _names(file, listed)
+        if names and table in file.columns:
+            tables[what] = names, _column(file, table, len(t), (len(names), width))
 
+    def read(start: int, stop: int) -> Poses:
+        named = {
+            what: dict(zip(names, np.moveaxis(_read_as(column, np.float64, start, stop), 1, 0), strict=True))
+            for what, (names, column) in tables.items()
+        }
+        return Poses(rounded_times(t.read(start, stop)), _read_as(camera, np.float64, start, stop), **named)
 
-def _read_poses(
-    t: Column, camera: Column, tables: Mapping[str, tuple[tuple[str, ...], Column]], start: int, stop: int
-) -> Poses:
-    """Return the poses of the camera, and those of the bodies and joints, whose ``tables`` have names."""
-    named = {
-        what: dict(zip(names, np.moveaxis(_read_as(column, np.float64, start, stop), 1, 0), strict=True))
-        for what, (names, column) in tables.items()
-    }
-    return Poses(rounded_times(t.read(start, stop)), _read_as(camera, np.float64, start, stop), **named)
+    return _StoredRows(path, "truth/poses", len(t), read, file)
 
 
 # Header, columns and millisecond index of a file that is written.
@@ -805,10 +787,7 @@ class RecordWriter:
             "truth/poses/t": np.asarray(poses.t, np.int64),
             "truth/poses/camera": np.asarray(poses.camera, np.float64),
         }
-        named = {
-            "truth/joints/names": ("truth/joints/position", poses.joints),
-            "truth/poses/body_names": ("truth/poses/bodies", poses.bodies),
-        }
+        named = {listed: (table, getattr(poses, what)) for what, (listed, table, _) in POSE_TABLES.items()}
         if len(poses):
             self._append(rows, named=named)
 
