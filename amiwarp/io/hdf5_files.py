@@ -312,7 +312,7 @@ class ChunkFile:
         """Create the file. ``libver`` are h5py's bounds of the format. Raises OSError if the file exists."""
         import h5py
 
-        self._columns: dict[str, ChunkedColumn] = {}
+        self._datasets: dict[str, Any] = {}
         self._turns = threading.Condition()
         self._turn = 0
         self._failed = math.inf  # the lowest turn whose work failed
@@ -368,14 +368,28 @@ class ChunkFile:
         with self.turn(turn):
             before()
             for chunk in chunks:
-                if chunk.name not in self._columns:
-                    self._columns[chunk.name] = ChunkedColumn(self, dataset_of(chunk))
-                column = self._columns[chunk.name]
-                placed.append((column.place(chunk.start, chunk.parts, rows[chunk.name]), chunk.parts))
+                if chunk.name not in self._datasets:
+                    self._datasets[chunk.name] = dataset_of(chunk)
+                placed.append((self._place(chunk, rows[chunk.name]), chunk.parts))
         for at, parts in placed:
             if at is not None:
                 self.output.write_at(parts, at)
         self.check()
+
+    def _place(self, chunk: EncodedChunk, rows: int) -> int | None:
+        """Return the place of a chunk in the file [bytes]. A dataset of fewer than ``rows`` elements grows to these.
+
+        If the place cannot be found, the chunk is written at once and None is returned. Called in turn.
+        """
+        dataset = self._datasets[chunk.name]
+        held, *row = dataset.shape
+        if held < rows:
+            dataset.id.set_extent((rows, *row))
+        write = partial(dataset.id.write_direct_chunk, (chunk.start, *(0 for _ in row)))
+        at = self.output.place_of(sum(map(len, chunk.parts)), write)
+        if at is None:
+            write(b"".join(chunk.parts))
+        return at
 
     def check(self) -> None:
         """Raise the error of the first write of HDF5 that failed, such as OSError for a full disk."""
@@ -389,30 +403,6 @@ class ChunkFile:
         finally:
             self.output.close()
         self.check()
-
-
-class ChunkedColumn:
-    """Dataset of a :class:`ChunkFile`, whose chunks are written in any order."""
-
-    def __init__(self, file: ChunkFile, dataset: Any) -> None:
-        self._output, self._id = file.output, dataset.id
-        self._rows, *self._row = dataset.shape
-
-    def place(self, start: int, stored: Sequence[bytes], rows: int) -> int | None:
-        """Return the place in the file [bytes] of an encoded chunk from element ``start`` on.
-
-        ``stored`` are the bytes of the chunk, in one or several parts. A dataset of fewer than ``rows`` elements grows
-        to this number. If the place cannot be found, the chunk is written at once and None is returned. Call this
-        method in turn.
-        """
-        size, offset = sum(map(len, stored)), (start, *(0 for _ in self._row))
-        if self._rows < rows:
-            self._rows = rows
-            self._id.set_extent((self._rows, *self._row))
-        at = self._output.place_of(size, partial(self._id.write_direct_chunk, offset))
-        if at is None:
-            self._id.write_direct_chunk(offset, b"".join(stored))
-        return at
 
 
 class _Output(io.RawIOBase):

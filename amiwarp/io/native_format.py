@@ -66,6 +66,15 @@ FORMAT = "amiwarp-recording"
 FORMAT_VERSION = 1
 """Newest version of the format that is read, and the version that is written."""
 
+EVENTS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.uint8}
+"""Types of the datasets of events. Coordinates of compensated events are float32."""
+
+FLAGS = ("inside", "extrapolated")
+"""Names of the flags of compensated events, uint8."""
+
+ENCODERS = ("encoder/", "encoder/second_")
+"""Beginnings of the names of the datasets of an encoder, and of those of the second encoder."""
+
 POSE_TABLES = {
     "joints": ("truth/joints/names", "truth/joints/position", 3),
     "bodies": ("truth/poses/body_names", "truth/poses/bodies", 7),
@@ -226,7 +235,7 @@ def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int,
 
 
 def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
-    samples = _read_samples(file, "encoder/")
+    samples = _read_samples(file, ENCODERS[0])
     if samples is None:
         return None
     t, angle = samples
@@ -234,7 +243,7 @@ def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
     index_t = None if pulses is None else rounded_times(pulses.read(0, len(pulses)))
     if file.unfinished and index_t is not None:
         index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])]
-    second = _read_samples(file, "encoder/second_") if "encoder/second_t" in file.columns else None
+    second = _read_samples(file, ENCODERS[1]) if "encoder/second_t" in file.columns else None
     offset = attribute(file.attributes["encoder"], f"{path}: /encoder", "clock_offset_us", float, 0.0)
     return Encoder(t, angle, offset, index_t, None if second is None else Encoder(*second))
 
@@ -267,7 +276,7 @@ class NativeEvents(EventSource):
         self.path = path
         self._file = file
         self._columns = {name: _column(file, f"events/{name}") for name in ("t", "p", "x", "y")}
-        for name in ("inside", "extrapolated"):
+        for name in FLAGS:
             if f"events/{name}" in file.columns:
                 self._columns[name] = file.columns[f"events/{name}"]
         lengths = {name: len(column) for name, column in self._columns.items()}
@@ -388,8 +397,7 @@ class NativeEvents(EventSource):
         if root.get("format") != FORMAT or self._file.unfinished or self._offset != self.t_first:
             return {}
         chunks = {n: self._columns[n].encoded(start, min(stop, self._count)) for n in ("t", "p")}
-        dtypes = {"t": np.dtype(np.int64), "p": np.dtype(np.uint8)}
-        return {f"events/{n}": c for n, c in chunks.items() if c is not None and self._columns[n].dtype == dtypes[n]}
+        return {f"events/{n}": c for n, c in chunks.items() if c is not None and self._columns[n].dtype == EVENTS[n]}
 
     def _pieces_in_order(self) -> Iterator[Events]:
         start, last = 0, None
@@ -641,13 +649,6 @@ def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> N
         raise AmiwarpError(f"{path}: {given}; give both the same size")
 
 
-def check_lengths(columns: Columns, count: int) -> None:
-    """Raise :class:`AmiwarpError` for a column whose number of elements or rows differs from the number of events."""
-    for name, column in columns.items():
-        if column.shape[:1] != (count,) or (column.ndim > 1 and not name.startswith("truth/")):
-            raise AmiwarpError(f"{name} has shape {column.shape}; expected ({count},)")
-
-
 def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) -> Iterator[NDArray[np.int64]]:
     """Yield entries of the millisecond index ms_to_idx from entry ``first_ms`` on.
 
@@ -699,12 +700,25 @@ def write_header(
         group.attrs[name] = item
 
 
-def event_columns(truth: EventTruth, count: int) -> Columns:
-    """Return the ground truth of ``count`` events as datasets.
+def encoder_columns(encoder: Encoder) -> Columns:
+    """Return times [us], angles [rad] and index pulses [us] of an encoder and of its second one as datasets."""
+    columns = {f"{ENCODERS[0]}{name}": getattr(encoder, name) for name in ("t", "angle", "index_t")}
+    if encoder.second is not None:
+        columns |= {f"{ENCODERS[1]}{name}": getattr(encoder.second, name) for name in ("t", "angle")}
+    return {name: values for name, values in columns.items() if values is not None}
+
+
+def event_columns(events: Events, truth: EventTruth, **flags: ArrayLike | None) -> Columns:
+    """Return events, their flags and their ground truth as datasets, without the times.
 
     Raises :class:`AmiwarpError` for arrays of another length or shape, and for values without meaning.
     """
-    columns: Columns = {}
+    count = len(events)
+    columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
+    columns |= {f"events/{name}": np.asarray(flag).astype(np.uint8) for name, flag in flags.items() if flag is not None}
+    for name, column in columns.items():
+        if column.shape != (count,):
+            raise AmiwarpError(f"{name} has shape {column.shape}; expected ({count},)")
     if truth.points is not None:
         points = np.asarray(truth.points, np.float32)
         if points.shape != (count, 2):
@@ -718,157 +732,13 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
                 raise AmiwarpError(f"truth of {name} has shape {values.shape}; expected {(count, *row)}")
             columns[f"truth/events/{name}"] = values
     for name, values in columns.items():
-        check_truth(name, values)
+        if name.startswith("truth/"):
+            check_truth(name, values)
     return columns
 
 
 ROWS = 1024
 """Number of rows per HDF5 chunk in datasets of small rows, such as poses."""
-
-
-class RecordWriter:
-    """Writer of an open HDF5 file through HDF5: ground truth, IMU samples, frames, and other small datasets.
-
-    Datasets are created at their first rows. All instants must have the same joints. All tables of poses must have the
-    same bodies and joints. Records that are refused leave the file as it was.
-    """
-
-    def __init__(self, file: Any, path: Path, size: tuple[int, int], codec: Codec) -> None:
-        """Set up the writer; ``size`` is the width and height of the sensor [px]."""
-        self._file, self._path, self._size, self._codec = file, path, size, codec
-        self._datasets: dict[str, Any] = {}
-        self._given: dict[str, tuple[str, ...]] = {}  # names that all calls must give: of datasets, bodies and joints
-
-    def dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = (), chunk_rows: int = CHUNK) -> Any:
-        """Return a dataset, which is created at the first call."""
-        if name not in self._datasets:
-            self._datasets[name] = make_dataset(self._file, name, dtype, row, chunk_rows, self._codec)
-        return self._datasets[name]
-
-    def extend(self, name: str, values: NDArray[Any], chunk_rows: int = CHUNK) -> None:
-        """Append rows to a dataset."""
-        dataset = self.dataset(name, values.dtype, values.shape[1:], chunk_rows)
-        start = dataset.shape[0]
-        dataset.resize(start + len(values), axis=0)
-        dataset[start:] = values
-
-    def write_truth_header(self, parameters: Mapping[str, float] | None, labels: WorldLabels | None) -> None:
-        """Write the true parameters of a simulation, and the names of a world's instances and their classes."""
-        if parameters is not None:
-            group = self._file.create_group("truth")
-            for name, value in parameters.items():
-                group.attrs[name] = float(value)
-        if labels is None:
-            return
-        self._file.require_group("truth/world").attrs["name"] = labels.name
-        self._write_names("truth/world/instances", labels.instances)
-        self._write_names("truth/world/categories", labels.categories)
-
-    def append_frame(self, frame: FrameTruth) -> None:
-        """Append the ground truth of an instant, which must be later than the previous instants."""
-        width, height = self._size
-        maps: Columns = {}
-        for name, (dtype, tail) in MAPS.items():
-            values = np.asarray(getattr(frame, name), dtype)
-            if values.shape != (height, width, *tail):
-                raise AmiwarpError(
-                    f"{self._path}: {name} of the instant {frame.t_us} us has shape {values.shape}; "
-                    f"expected {(height, width, *tail)}"
-                )
-            maps[f"truth/frames/{name}"] = values[None]
-        pose = ground_truth.as_poses(frame.rotation, frame.position)[None]
-        rows = {"truth/frames/t": np.array([frame.t_us], np.int64), "truth/frames/pose": pose}
-        joints = {name: at[None] for name, at in frame.joints.items()}
-        self._append(rows, maps, {"truth/joints/names": ("truth/frames/joints", joints)})
-
-    def append_poses(self, poses: Poses) -> None:
-        """Append a table of poses, which must be later than the previous poses."""
-        rows = {
-            "truth/poses/t": np.asarray(poses.t, np.int64),
-            "truth/poses/camera": np.asarray(poses.camera, np.float64),
-        }
-        named = {listed: (table, getattr(poses, what)) for what, (listed, table, _) in POSE_TABLES.items()}
-        if len(poses):
-            self._append(rows, named=named)
-
-    def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
-        """Append a mask of known pixels, which holds from a time later than those before."""
-        width, height = self._size
-        if mask.shape != (height, width):
-            raise AmiwarpError(f"{self._path}: mask at {t_us} us has shape {mask.shape}; expected {(height, width)}")
-        rows = {"truth/known/t": np.array([t_us], np.int64)}
-        self._append(rows, {"truth/known/mask": np.asarray(mask, np.uint8)[None]})
-
-    def append_imu(self, samples: ImuSamples) -> None:
-        """Append samples, which must not be earlier than those before."""
-        self._append({f"imu/{name}": getattr(samples, name) for name in ("t", "angular_velocity", "acceleration")})
-
-    def append_image(self, t_us: int, image: NDArray[Any]) -> None:
-        """Append a frame, which must not be earlier than the frame before."""
-        stored = self._datasets.get("frames/image")
-        shape, dtype = (image.shape, image.dtype) if stored is None else (stored.shape[1:], stored.dtype)
-        try:
-            checks.check_image(image, shape, dtype)
-        except AmiwarpError as error:
-            raise AmiwarpError(f"{self._path}: {error}") from error
-        self._append({"frames/t": np.array([t_us], np.int64)}, {"frames/image": image[None]})
-
-    def _append(
-        self,
-        rows: Columns,
-        images: Columns | None = None,
-        named: Mapping[str, tuple[str, Mapping[str, NDArray[np.float64]]]] | None = None,
-    ) -> None:
-        """Append records to their datasets, of which the first holds the times [us].
-
-        ``images`` are stored in chunks of one row. ``named`` are arrays by name, which are stored side by side in a
-        dataset, if there are any: by the dataset of the names, that of the values and the arrays.
-        """
-        times, *_ = rows
-        names: dict[str, tuple[str, ...]] = {}
-        for where, (name, arrays) in (named or {}).items():
-            if arrays:
-                names[where] = tuple(arrays)
-                rows[name] = np.stack(list(arrays.values()), axis=1).astype(np.float64)
-        columns = rows | (images or {})
-        self._check_later(times, rows[times])
-        given = {times: tuple(columns), **names}
-        for where, found in given.items():
-            before = self._given.get(where, found)
-            if found != before:
-                change = f"{where} comes with {shown(found)}, before with {shown(before)}"
-                raise AmiwarpError(f"{self._path}: {change}; append the same in each call")
-        for name, values in columns.items():
-            if name.startswith("truth/"):
-                check_truth(name, values)
-            row = self._datasets[name].shape[1:] if name in self._datasets else values.shape[1:]
-            if values.shape[1:] != row:
-                raise AmiwarpError(f"{self._path}: rows of {name} have shape {values.shape[1:]}; expected {row}")
-        for where, found in names.items():
-            if where not in self._given:
-                self._write_names(where, found)
-        self._given |= given
-        for name, values in columns.items():
-            self.extend(name, values, ROWS if name in rows else 1)
-
-    def _write_names(self, name: str, names: tuple[str, ...]) -> None:
-        """Write names to a dataset of UTF-8 strings."""
-        import h5py
-
-        encoded = [text.encode("utf-8", "replace") for text in names]
-        kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
-        self._file.create_dataset(name, data=np.array(encoded, kind))
-
-    def _check_later(self, name: str, t: NDArray[np.int64]) -> None:
-        """Raise :class:`AmiwarpError` if times [us] do not follow the last time in a dataset.
-
-        Only times of the ground truth must be later.
-        """
-        stored = self._datasets.get(name)
-        if stored is not None and len(stored) and len(t) and t[0] < int(stored[-1]) + name.startswith("truth/"):
-            raise AmiwarpError(
-                f"{self._path}: {name} {t[0]} us does not follow {int(stored[-1])} us; append in order of time"
-            )
 
 
 FlaggedEvents: TypeAlias = tuple[Events, NDArray[np.uint8], Mapping[str, Sequence[bytes]]]
@@ -945,7 +815,9 @@ class RecordingWriter:
         self._truth_parameters, self._truth_labels = truth_parameters, truth_labels
         self._metadata = dict(metadata or {})
         self._chunks: Any = None
-        self._records: RecordWriter | None = None
+        self._open = False
+        self._datasets: dict[str, Any] = {}
+        self._given: dict[str, tuple[str, ...]] = {}  # names that all calls must give: of datasets, bodies and joints
         self._turns = itertools.count()
         self._new: NewFile | None = None
         self._pending: Columns = {}
@@ -963,9 +835,9 @@ class RecordingWriter:
         try:
             with errors_name(self.path, lambda: "making the file"):
                 self._chunks = ChunkFile(self._new.part)
-                self._records = RecordWriter(self._chunks.hdf5, self.path, self._size, self._codec)
+                self._open = True
                 write_header(self._chunks.hdf5, self._size, self._camera, self._prism, self._metadata)
-                self._records.write_truth_header(self._truth_parameters, self._truth_labels)
+                self._write_truth_header()
         except BaseException:
             self._discard()
             raise
@@ -1015,13 +887,20 @@ class RecordingWriter:
         AmiwarpError
             If events are unsorted or outside the frame, or the arrays differ from those of the first call.
         """
-        self._open_records()
+        self._check_open()
         self._check(events, len(self), allow_nan=inside is not None, after_t=self._t_last)
         if not len(events):
             return
         with errors_name(self.path, lambda: f"after {len(self)} events"):
             known = truth or EventTruth(points=None if truth_points is None else np.asarray(truth_points, np.float32))
-            columns = self._as_columns(events, known, {"inside": inside, "extrapolated": extrapolated})
+            columns = event_columns(events, known, inside=inside, extrapolated=extrapolated)
+            dtypes = {name: column.dtype for name, column in columns.items()}
+            if not len(self):
+                self._columns = dtypes
+                self._t_offset = int(events.t[0])
+            elif dtypes != self._columns:
+                given, before = (describe_columns(each) for each in (dtypes, self._columns))
+                raise AmiwarpError(f"events come with {given}, those before with {before}; give the same arrays")
             self._index(events.t, len(self))
             columns["events/t"] = events.t - self._t_offset
             self._store(columns, len(events))
@@ -1054,7 +933,7 @@ class RecordingWriter:
         AmiwarpError
             If other events were written before, or events are unsorted or outside the frame.
         """
-        self._open_records()
+        self._check_open()
         if len(self) or count % CHUNK:
             given = f"fill() was called after {len(self)} events, for pieces of {count}"
             raise AmiwarpError(f"{self.path}: {given}; call it before append(), for a multiple of {CHUNK}")
@@ -1114,10 +993,20 @@ class RecordingWriter:
         Parameters
         ----------
         frame : FrameTruth
-            Ground truth of all pixels, at a later time than the frame before.
+            Ground truth of all pixels, at a later time than the frame before. All frames have the same joints.
         """
         with self._appending(lambda: f"truth of the instant {frame.t_us} us"):
-            self._open_records().append_frame(frame)
+            maps: Columns = {}
+            for name, (dtype, tail) in MAPS.items():
+                values, expected = np.asarray(getattr(frame, name), dtype), (*self._size[::-1], *tail)
+                if values.shape != expected:
+                    what = f"{name} of the instant {frame.t_us} us has shape {values.shape}"
+                    raise AmiwarpError(f"{self.path}: {what}; expected {expected}")
+                maps[f"truth/frames/{name}"] = values[None]
+            pose = ground_truth.as_poses(frame.rotation, frame.position)[None]
+            rows = {"truth/frames/t": np.array([frame.t_us], np.int64), "truth/frames/pose": pose}
+            joints = {name: at[None] for name, at in frame.joints.items()}
+            self._append(rows, maps, {"truth/joints/names": ("truth/frames/joints", joints)})
 
     def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
         """Append a mask of the pixels whose scene is known.
@@ -1130,7 +1019,11 @@ class RecordingWriter:
             Whether the scene at each pixel without the prism is known, shape ``(height, width)``.
         """
         with self._appending(lambda: f"mask at {t_us} us"):
-            self._open_records().append_known(t_us, mask)
+            if mask.shape != self._size[::-1]:
+                what = f"mask at {t_us} us has shape {mask.shape}"
+                raise AmiwarpError(f"{self.path}: {what}; expected {self._size[::-1]}")
+            rows = {"truth/known/t": np.array([t_us], np.int64)}
+            self._append(rows, {"truth/known/mask": np.asarray(mask, np.uint8)[None]})
 
     def append_poses(self, poses: Poses) -> None:
         """Append true poses of camera, bodies and joints.
@@ -1138,10 +1031,14 @@ class RecordingWriter:
         Parameters
         ----------
         poses : Poses
-            Poses at later times than those before.
+            Poses at later times than those before, of the same bodies and joints.
         """
         with self._appending(lambda: "true poses"):
-            self._open_records().append_poses(poses)
+            rows = {"truth/poses/t": np.asarray(poses.t, np.int64)}
+            rows["truth/poses/camera"] = np.asarray(poses.camera, np.float64)
+            named = {listed: (table, getattr(poses, what)) for what, (listed, table, _) in POSE_TABLES.items()}
+            if len(poses):
+                self._append(rows, named=named)
 
     def append_imu(self, samples: ImuSamples) -> None:
         """Append samples of an inertial measurement unit.
@@ -1152,7 +1049,7 @@ class RecordingWriter:
             Samples, not earlier than those before.
         """
         with self._appending(lambda: "IMU samples"):
-            self._open_records().append_imu(samples)
+            self._append({f"imu/{name}": getattr(samples, name) for name in ("t", "angular_velocity", "acceleration")})
 
     def append_image(self, t_us: int, image: NDArray[Any]) -> None:
         """Append a frame.
@@ -1165,20 +1062,108 @@ class RecordingWriter:
             Grey levels, uint8 or uint16, shape ``(height, width)``, as those of the frames before.
         """
         with self._appending(lambda: f"frame at {t_us} us"):
-            self._open_records().append_image(t_us, image)
+            stored = self._datasets.get("frames/image")
+            shape, dtype = (image.shape, image.dtype) if stored is None else (stored.shape[1:], stored.dtype)
+            try:
+                checks.check_image(image, shape, dtype)
+            except AmiwarpError as error:
+                raise AmiwarpError(f"{self.path}: {error}") from error
+            self._append({"frames/t": np.array([t_us], np.int64)}, {"frames/image": image[None]})
 
     @contextlib.contextmanager
     def _appending(self, place: Callable[[], str]) -> Iterator[None]:
-        """Name the file and the place in errors, and raise the error of a full disk."""
+        """Name the file and the place in errors, also in that of a writer that is not open and that of a full disk."""
         with errors_name(self.path, place):
+            self._check_open()
             yield
             self._chunks.check()
 
-    def _open_records(self) -> RecordWriter:
-        if self._records is None:
+    def _append(
+        self,
+        rows: Columns,
+        images: Columns | None = None,
+        named: Mapping[str, tuple[str, Mapping[str, NDArray[np.float64]]]] | None = None,
+    ) -> None:
+        """Append records to their datasets, of which the first holds the times [us].
+
+        ``images`` are stored in chunks of one row. ``named`` are arrays by name, which are stored side by side in a
+        dataset, if there are any: by the dataset of the names, that of the values and the arrays. Records that are
+        refused leave the file as it was.
+        """
+        times, *_ = rows
+        names: dict[str, tuple[str, ...]] = {}
+        for where, (name, arrays) in (named or {}).items():
+            if arrays:
+                names[where] = tuple(arrays)
+                rows[name] = np.stack(list(arrays.values()), axis=1).astype(np.float64)
+        columns = rows | (images or {})
+        self._check_later(times, rows[times])
+        given = {times: tuple(columns), **names}
+        for where, found in given.items():
+            before = self._given.get(where, found)
+            if found != before:
+                change = f"{where} comes with {shown(found)}, before with {shown(before)}"
+                raise AmiwarpError(f"{self.path}: {change}; append the same in each call")
+        for name, values in columns.items():
+            if name.startswith("truth/"):
+                check_truth(name, values)
+            row = self._datasets[name].shape[1:] if name in self._datasets else values.shape[1:]
+            if values.shape[1:] != row:
+                raise AmiwarpError(f"{self.path}: rows of {name} have shape {values.shape[1:]}; expected {row}")
+        for where, found in names.items():
+            if where not in self._given:
+                self._write_names(where, found)
+        self._given |= given
+        for name, values in columns.items():
+            self._extend(name, values, ROWS if name in rows else 1)
+
+    def _check_later(self, name: str, t: NDArray[np.int64]) -> None:
+        """Raise :class:`AmiwarpError` if times [us] do not follow the last time in a dataset.
+
+        Only times of the ground truth must be later.
+        """
+        stored = self._datasets.get(name)
+        if stored is not None and len(stored) and len(t) and t[0] < int(stored[-1]) + name.startswith("truth/"):
+            raise AmiwarpError(
+                f"{self.path}: {name} {t[0]} us does not follow {int(stored[-1])} us; append in order of time"
+            )
+
+    def _write_names(self, name: str, names: tuple[str, ...]) -> None:
+        """Write names to a dataset of UTF-8 strings."""
+        import h5py
+
+        encoded = [text.encode("utf-8", "replace") for text in names]
+        kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
+        self._chunks.hdf5.create_dataset(name, data=np.array(encoded, kind))
+
+    def _write_truth_header(self) -> None:
+        """Write the true parameters of a simulation, and the names of a world's instances and their classes."""
+        if self._truth_parameters is not None:
+            group = self._chunks.hdf5.create_group("truth")
+            for name, value in self._truth_parameters.items():
+                group.attrs[name] = float(value)
+        if self._truth_labels is not None:
+            self._chunks.hdf5.require_group("truth/world").attrs["name"] = self._truth_labels.name
+            for what in ("instances", "categories"):
+                self._write_names(f"truth/world/{what}", getattr(self._truth_labels, what))
+
+    def _dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = (), chunk_rows: int = CHUNK) -> Any:
+        """Return a dataset, which is created at the first call."""
+        if name not in self._datasets:
+            self._datasets[name] = make_dataset(self._chunks.hdf5, name, dtype, row, chunk_rows, self._codec)
+        return self._datasets[name]
+
+    def _extend(self, name: str, values: NDArray[Any], chunk_rows: int = CHUNK) -> None:
+        """Append rows to a dataset through HDF5."""
+        dataset = self._dataset(name, values.dtype, values.shape[1:], chunk_rows)
+        start = dataset.shape[0]
+        dataset.resize(start + len(values), axis=0)
+        dataset[start:] = values
+
+    def _check_open(self) -> None:
+        if not self._open:
             given = "the writer is used outside its 'with' block, before or after it, or after it failed"
             raise AmiwarpError(f"{self.path}: {given}; append inside the block of a new writer")
-        return self._records
 
     @contextlib.contextmanager
     def _results(self, jobs: Iterable[Callable[[], Result]]) -> Iterator[Iterator[Result]]:
@@ -1187,7 +1172,7 @@ class RecordingWriter:
             with contextlib.closing(in_order(jobs)) as results:
                 yield results
         except BaseException:
-            self._records = None
+            self._open = False
             raise
 
     def set_encoder(self, encoder: Encoder) -> None:
@@ -1199,22 +1184,6 @@ class RecordingWriter:
             The encoder.
         """
         self._encoder = encoder
-
-    def _as_columns(self, events: Events, truth: EventTruth, flags: Mapping[str, ArrayLike | None]) -> Columns:
-        columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
-        for name, flag in flags.items():
-            if flag is not None:
-                columns[f"events/{name}"] = np.asarray(flag).astype(np.uint8)
-        columns |= event_columns(truth, len(events))
-        check_lengths(columns, len(events))
-        dtypes = {name: column.dtype for name, column in columns.items()}
-        if not len(self):
-            self._columns = dtypes
-            self._t_offset = int(events.t[0])
-        elif dtypes != self._columns:
-            given = f"events come with {describe_columns(dtypes)}"
-            raise AmiwarpError(f"{given}, those before with {describe_columns(self._columns)}; give the same arrays")
-        return columns
 
     def _index(self, t: NDArray[np.int64], start: int) -> None:
         """Extend the index ms_to_idx by the events from event ``start`` on.
@@ -1230,7 +1199,7 @@ class RecordingWriter:
 
     def _write_index(self, least: int) -> None:
         if self._ms_count >= least:
-            self._open_records().extend("ms_to_idx", np.concatenate(self._ms))
+            self._extend("ms_to_idx", np.concatenate(self._ms))
             self._ms, self._ms_count = [], 0
 
     def _store(self, columns: Columns, count: int) -> None:
@@ -1266,31 +1235,26 @@ class RecordingWriter:
             self._chunks.write(turn, chunks, self._dataset_of)
 
     def _dataset_of(self, chunk: EncodedChunk) -> Any:
-        return self._open_records().dataset(chunk.name, chunk.values.dtype, chunk.values.shape[1:])
+        return self._dataset(chunk.name, chunk.values.dtype, chunk.values.shape[1:])
 
     def _finish(self) -> None:
-        extend = self._open_records().extend
+        self._check_open()
         if self._pending_count:
             self._write([{name: column[: self._pending_count] for name, column in self._pending.items()}])
             self._pending_count = 0
         self._ms.append(np.array([len(self)], np.int64))
         self._write_index(0)
-        for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.uint8)):
-            extend(f"events/{name}", np.zeros(0, self._columns.get(f"events/{name}", np.dtype(dtype))))
+        for name, dtype in EVENTS.items():
+            self._extend(f"events/{name}", np.zeros(0, self._columns.get(f"events/{name}", np.dtype(dtype))))
         self._chunks.hdf5["t_offset"] = np.int64(self._t_offset)
         if self._encoder is not None:
             group = self._chunks.hdf5.create_group("encoder")
             group.attrs["clock_offset_us"] = float(self._encoder.clock_offset_us)
-            for name in ("t", "angle", "index_t"):
-                values = getattr(self._encoder, name)
-                if values is not None:
-                    extend(f"encoder/{name}", values)
-            if self._encoder.second is not None:
-                for name in ("t", "angle"):
-                    extend(f"encoder/second_{name}", getattr(self._encoder.second, name))
+            for name, values in encoder_columns(self._encoder).items():
+                self._extend(name, values)
 
     def _close(self) -> None:
-        self._records = None
+        self._open, self._datasets, self._given = False, {}, {}
         if self._chunks is not None:
             self._chunks.close()
 
@@ -1306,7 +1270,7 @@ class RecordingWriter:
 #
 # DSEC's files do not hold the sensor size. It is added as attributes, which DSEC's programs ignore.
 
-COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.uint32, "p": np.uint8}
+DSEC = EVENTS | {"t": np.uint32}
 """Types of DSEC's datasets."""
 
 
@@ -1317,7 +1281,7 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
         file.attrs["width"], file.attrs["height"] = about.width, about.height
         file["t_offset"] = np.int64(about.t_first)
         create = partial(make_dataset, file, codec=about.codec)
-        datasets = {name: create(f"events/{name}", dtype) for name, dtype in COLUMNS.items()}
+        datasets = {name: create(f"events/{name}", dtype) for name, dtype in DSEC.items()}
         index = [np.zeros(0, np.int64)]
         written = ms = 0
         for events in regroup(blocks, count=CHUNK):
@@ -1325,7 +1289,7 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
                 index.append(entries)
                 ms += entries.size
             columns = {"x": events.x, "y": events.y, "t": events.t - about.t_first, "p": events.p}
-            for name, dtype in COLUMNS.items():
+            for name, dtype in DSEC.items():
                 append_values(datasets[name], written, columns[name].astype(dtype), about.codec)
             written += len(events)
             chunks.check()
@@ -1368,7 +1332,7 @@ def _copy_events(
     ``size`` is that of the image [px]. Flags that a source of compensated events does not have follow from it.
     """
     source, truth = recording.events, recording.truth
-    flags = {name: getattr(source, name, None) for name in ("inside", "extrapolated")}
+    flags = {name: getattr(source, name, None) for name in FLAGS}
     start = 0
     for block in source.blocks():
         stop = start + len(block)
@@ -1502,7 +1466,7 @@ class LiveWriter:
         self._t_offset = 0
         self._t_last: int | None = None
         self._next_ms = 0
-        self._names = ("encoder/", "encoder/second_")[:encoders]  # beginnings of the names of an encoder's datasets
+        self._names = ENCODERS[:encoders]
         self._spans: dict[str, tuple[int, int]] = {}  # times of the first and the last sample of each encoder [us]
         self._pulses = np.zeros(0, np.int64)  # index pulses later than the last encoder sample
         self._encoder: Encoder | None = None
@@ -1548,11 +1512,11 @@ class LiveWriter:
 
     def _create_datasets(self) -> None:
         """Create all datasets, because none can be added in single-writer mode."""
-        file, coordinate = self._file, np.float32 if self._compensated else np.uint16
+        file = self._file
         write_header(file, self._size, self._camera, self._prism, self._metadata)
-        dtypes = {"x": coordinate, "y": coordinate, "p": np.uint8, "t": np.int64}
+        dtypes: dict[str, Any] = {name: EVENTS[name] for name in "xypt"}
         if self._compensated:
-            dtypes |= {"inside": np.uint8, "extrapolated": np.uint8}
+            dtypes |= dict.fromkeys("xy", np.float32) | dict.fromkeys(FLAGS, np.uint8)
         self._columns = {
             f"events/{name}": make_dataset(file, f"events/{name}", dtype) for name, dtype in dtypes.items()
         }
@@ -1673,13 +1637,9 @@ class LiveWriter:
             raise AmiwarpError(
                 f"{self.path}: compensated events need the flags inside, events from a sensor take no flags"
             )
-        columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
-        if self._compensated:
-            columns["events/inside"] = np.asarray(inside).astype(np.uint8)
-            flags = np.zeros(len(events)) if extrapolated is None else np.asarray(extrapolated)
-            columns["events/extrapolated"] = flags.astype(np.uint8)
-        check_lengths(columns, len(events))
-        return columns
+        if self._compensated and extrapolated is None:
+            extrapolated = np.zeros(len(events))
+        return event_columns(events, EventTruth(), inside=inside, extrapolated=extrapolated)
 
     def _to_finish(self) -> int:
         """Return the space that finishing the file may take [bytes]: one whole chunk and the waiting samples."""
@@ -1759,14 +1719,11 @@ class LiveWriter:
             put_in_place(self.part, self.path, overwrite=self._overwrite)
 
     def _replace_encoder(self, encoder: Encoder) -> None:
-        both = (encoder,) if encoder.second is None else (encoder, encoder.second)
-        self._reserve(2 * sum(each.t.nbytes + each.angle.nbytes for each in both))
+        columns = {"encoder/index_t": np.zeros(0, np.int64), **encoder_columns(encoder)}
+        self._reserve(2 * sum(values.nbytes for values in columns.values()))
         self._file["encoder"].attrs["clock_offset_us"] = float(encoder.clock_offset_us)
-        pulses = encoder.index_t
-        self._small["encoder/index_t"].replace(np.zeros(0, np.int64) if pulses is None else pulses)
-        for name, each in zip(self._names, both, strict=True):
-            for column in ("t", "angle"):
-                self._small[name + column].replace(getattr(each, column))
+        for name, values in columns.items():
+            self._small[name].replace(values)
 
     def _close(self) -> None:
         file, self._file = self._file, None
