@@ -87,7 +87,7 @@ def test_the_speed_of_threads_does_not_change_a_file(tmp_path, monkeypatch):
 
     def write(path, delays):
         monkeypatch.setattr(
-            "amiwarp.io.native_format.encode_parts", lambda *a: (time.sleep(next(delays)), encode_parts(*a))[1]
+            "amiwarp.io.hdf5_files.encode_parts", lambda *a: (time.sleep(next(delays)), encode_parts(*a))[1]
         )
         monkeypatch.setattr("amiwarp.tasks.cpu_threads", lambda: 4)
         with RecordingWriter(path.with_suffix(".filled.h5"), width=99, height=99) as writer:

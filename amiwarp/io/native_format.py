@@ -26,22 +26,11 @@ from amiwarp.events import truth as ground_truth
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, ImuSamples, MetadataValue, Recording, regroup
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS, EventTruth, FrameTruth, Poses, Truth, WorldLabels, check_truth
+from amiwarp.io import hdf5_files
 from amiwarp.io.file_scan import head_limit, smallest_sensor
 from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place, register_reader
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
-from amiwarp.io.hdf5_files import (
-    CHUNK,
-    ChunkFile,
-    Column,
-    EncodedChunk,
-    Hdf5File,
-    append_chunk,
-    append_values,
-    encode,
-    encode_parts,
-    make_dataset,
-    open_rows,
-)
+from amiwarp.io.hdf5_files import CHUNK, ChunkFile, Column, EncodedChunk, Hdf5File
 from amiwarp.io.json_files import LARGEST_INTEGER
 from amiwarp.optics.camera import (
     CAMERA_NUMBERS,
@@ -49,7 +38,6 @@ from amiwarp.optics.camera import (
     DISTORTIONS,
     LARGEST_SIZE,
     Camera,
-    Distortion,
     camera_to_json,
     check_size,
 )
@@ -124,7 +112,7 @@ def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
     """
     model = one_of(attribute(attributes, where, "distortion_model", str, "none"), (*DISTORTIONS, "none"),
                    f"{where} attribute 'distortion_model'")  # fmt: skip
-    distortion: Distortion | None = None
+    distortion = None
     if model in DISTORTIONS:
         lens, lengths = DISTORTIONS[model], COEFFICIENTS[model]
         k = as_numbers(attributes.get("distortion", ()), f"{where} attribute 'distortion'")
@@ -180,7 +168,7 @@ def open_hdf5(path: Path, topic: str | None = None) -> Recording:
         try:
             if file.layout in ("mvsec", "ecf"):
                 file.close()
-                return open_rows(path, file.layout, file.group)
+                return hdf5_files.open_rows(path, file.layout, file.group)
             return _read_recording(path, file)
         except BaseException:
             file.close()
@@ -675,11 +663,6 @@ def filled(chunk: Columns, start: int, columns: Columns) -> Columns:
     return chunk
 
 
-def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
-    """Return names and data types of columns as text for messages."""
-    return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
-
-
 def write_header(
     file: Any,
     size: tuple[int, int],
@@ -899,7 +882,7 @@ class RecordingWriter:
                 self._columns = dtypes
                 self._t_offset = int(events.t[0])
             elif dtypes != self._columns:
-                given, before = (describe_columns(each) for each in (dtypes, self._columns))
+                given, before = (", ".join(f"{n} {dtype}" for n, dtype in c.items()) for c in (dtypes, self._columns))
                 raise AmiwarpError(f"events come with {given}, those before with {before}; give the same arrays")
             self._index(events.t, len(self))
             columns["events/t"] = events.t - self._t_offset
@@ -966,7 +949,7 @@ class RecordingWriter:
                 for name, column in columns.items():
                     stored: Sequence[Sequence[bytes]] = [(part,) for part in known.get(name, ())]
                     if len(stored) * CHUNK < len(column):
-                        stored = encode_parts(column, self._codec)
+                        stored = hdf5_files.encode_parts(column, self._codec)
                     chunks += EncodedChunk.of(name, start, column, stored)
                 self._chunks.write(turn, chunks, self._dataset_of, lambda: self._follow(events, start))
         return events, inside
@@ -1150,7 +1133,7 @@ class RecordingWriter:
     def _dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = (), chunk_rows: int = CHUNK) -> Any:
         """Return a dataset, which is created at the first call."""
         if name not in self._datasets:
-            self._datasets[name] = make_dataset(self._chunks.hdf5, name, dtype, row, chunk_rows, self._codec)
+            self._datasets[name] = hdf5_files.make_dataset(self._chunks.hdf5, name, dtype, row, chunk_rows, self._codec)
         return self._datasets[name]
 
     def _extend(self, name: str, values: NDArray[Any], chunk_rows: int = CHUNK) -> None:
@@ -1231,7 +1214,7 @@ class RecordingWriter:
     def _write_chunk(self, name: str, start: int, values: NDArray[Any], turn: int) -> None:
         """Encode and write the values of a chunk that begins at element ``start``. Runs in a thread."""
         with self._chunks.stopping(turn):
-            chunks = EncodedChunk.of(name, start, values, encode_parts(values, self._codec))
+            chunks = EncodedChunk.of(name, start, values, hdf5_files.encode_parts(values, self._codec))
             self._chunks.write(turn, chunks, self._dataset_of)
 
     def _dataset_of(self, chunk: EncodedChunk) -> Any:
@@ -1280,7 +1263,7 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
         file = chunks.hdf5
         file.attrs["width"], file.attrs["height"] = about.width, about.height
         file["t_offset"] = np.int64(about.t_first)
-        create = partial(make_dataset, file, codec=about.codec)
+        create = partial(hdf5_files.make_dataset, file, codec=about.codec)
         datasets = {name: create(f"events/{name}", dtype) for name, dtype in DSEC.items()}
         index = [np.zeros(0, np.int64)]
         written = ms = 0
@@ -1290,13 +1273,13 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
                 ms += entries.size
             columns = {"x": events.x, "y": events.y, "t": events.t - about.t_first, "p": events.p}
             for name, dtype in DSEC.items():
-                append_values(datasets[name], written, columns[name].astype(dtype), about.codec)
+                hdf5_files.append_values(datasets[name], written, columns[name].astype(dtype), about.codec)
             written += len(events)
             chunks.check()
         stored = create("ms_to_idx", np.uint64)
         found = np.concatenate(index).astype(np.uint64)
         for start in range(0, ms, CHUNK):
-            append_values(stored, start, found[start : start + CHUNK], about.codec)
+            hdf5_files.append_values(stored, start, found[start : start + CHUNK], about.codec)
 
 
 # Copy of a recording into a native file.
@@ -1518,7 +1501,7 @@ class LiveWriter:
         if self._compensated:
             dtypes |= dict.fromkeys("xy", np.float32) | dict.fromkeys(FLAGS, np.uint8)
         self._columns = {
-            f"events/{name}": make_dataset(file, f"events/{name}", dtype) for name, dtype in dtypes.items()
+            f"events/{name}": hdf5_files.make_dataset(file, f"events/{name}", dtype) for name, dtype in dtypes.items()
         }
         file["t_offset"] = np.int64(0)
         small: dict[str, Any] = {"ms_to_idx": np.int64, "encoder/index_t": np.int64}
@@ -1603,7 +1586,7 @@ class LiveWriter:
             pulses = np.append(self._pulses, as_times(index_t_us) + offset)
             self._small["encoder/index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
             self._pulses = pulses[pulses > last][-MOST_PULSES:]
-        if sum(small.waiting_bytes for small in self._small.values()) > MOST_WAITING:
+        if self._waiting_bytes() > MOST_WAITING:
             with errors_name(self.path, lambda: f"after {len(self)} events"):
                 self._flush()
         self.tick()
@@ -1644,12 +1627,10 @@ class LiveWriter:
     def _to_finish(self) -> int:
         """Return the space that finishing the file may take [bytes]: one whole chunk and the waiting samples."""
         event = 19 if self._compensated else 13
-        return (
-            FINISH_BYTES
-            + event * CHUNK
-            + event * CHUNK // 64
-            + sum(small.waiting_bytes for small in self._small.values())
-        )
+        return FINISH_BYTES + event * CHUNK + event * CHUNK // 64 + self._waiting_bytes()
+
+    def _waiting_bytes(self) -> int:
+        return sum(small.waiting_bytes for small in self._small.values())
 
     def _reserve(self, extra: int = 0) -> None:
         """Reserve disk space to finish the file, and ``extra`` bytes.
@@ -1674,10 +1655,10 @@ class LiveWriter:
         """Write the pending events of the current chunk. Start a new chunk if the chunk is full."""
         count = self._pending_count
         with contextlib.closing(
-            in_order(partial(encode, column[:count]) for column in self._pending.values())
+            in_order(partial(hdf5_files.encode, column[:count]) for column in self._pending.values())
         ) as encoded:
             for name, stored in zip(self._pending, encoded, strict=True):
-                append_chunk(self._columns[name], self._written, stored, count)
+                hdf5_files.append_chunk(self._columns[name], self._written, stored, count)
         self._stored = self._written + count
         if count == CHUNK:  # one statement, so that Ctrl-C cannot interrupt it halfway
             self._written, self._pending_count = self._stored, 0
