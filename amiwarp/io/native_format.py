@@ -441,7 +441,7 @@ class _StoredRows:
 
 
 class _StoredImages:
-    """Images at several times, or all that is known of these, read on demand."""
+    """Images, or ground truth of all pixels, at several times, read on demand."""
 
     def __init__(
         self, path: Path, name: str, t: NDArray[np.int64], size: tuple[int, int], read: Callable[[int], Any],
@@ -720,9 +720,10 @@ def event_columns(events: Events, truth: EventTruth, **flags: ArrayLike | None) 
     return columns
 
 
+# Writer of a whole recording or none.
+
 ROWS = 1024
 """Number of rows per HDF5 chunk in datasets of small rows, such as poses."""
-
 
 FlaggedEvents: TypeAlias = tuple[Events, NDArray[np.uint8], Mapping[str, Sequence[bytes]]]
 """Compensated events with flags of shape ``(n,)``: 1 if the event lies inside the image; and chunks of their columns
