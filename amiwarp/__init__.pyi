@@ -83,8 +83,8 @@ from .io.formats import OutputFormat as OutputFormat
 from .io.formats import RecordedDataset as RecordedDataset
 from .io.formats import Rounding as Rounding
 from .io.formats import open_recording as open_recording
-from .io.native_writer import RecordingWriter as RecordingWriter
-from .io.native_writer import save_recording as save_recording
+from .io.native_format import RecordingWriter as RecordingWriter
+from .io.native_format import save_recording as save_recording
 from .io.pixel_map import PixelMap as PixelMap
 from .lens.board import Board as Board
 from .lens.board import Corners as Corners

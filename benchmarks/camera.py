@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from amiwarp import open_recording
-from amiwarp.io.native_writer import LiveWriter
+from amiwarp.io.native_format import LiveWriter
 from amiwarp.live.stream.session import Session
 from amiwarp.live.stream.sources import CameraSource
 from amiwarp.studies.cluster import machine

@@ -33,7 +33,8 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.io.hdf5_files import CHUNK, StoredColumn, camera_attributes, checksum, decode, encode, read_camera
+from amiwarp.io.hdf5_files import CHUNK, StoredColumn, checksum, decode, encode
+from amiwarp.io.native_format import camera_attributes, read_camera
 from amiwarp.kernels.checksum import Checksums
 from amiwarp.kernels.launch import run_together
 from amiwarp.tasks import cores, cpu_threads, in_order

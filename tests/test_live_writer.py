@@ -27,7 +27,7 @@ from amiwarp import (
     open_recording,
 )
 from amiwarp.io.hdf5_files import CHUNK
-from amiwarp.io.native_writer import MAX_WASTE_BYTES, LiveWriter
+from amiwarp.io.native_format import MAX_WASTE_BYTES, LiveWriter
 from reference.io_samples import refusal
 
 SIZE = (320, 240)
@@ -173,7 +173,7 @@ KILLED = """
 import sys, time
 import numpy as np
 from amiwarp.events.recording import Events
-from amiwarp.io.native_writer import LiveWriter
+from amiwarp.io.native_format import LiveWriter
 n, zeros = int(sys.argv[2]), np.zeros(int(sys.argv[2]), np.uint16)
 with LiveWriter(sys.argv[1], width=320, height=240, flush_s=0.05) as writer:
     while True:
@@ -225,7 +225,7 @@ from pathlib import Path
 import h5py, hdf5plugin
 from amiwarp.io import open_recording
 from amiwarp.io.files import NewFile, remove_abandoned
-from amiwarp.io.native_writer import LiveWriter
+from amiwarp.io.native_format import LiveWriter
 here, part = Path.cwd(), Path("a.part.h5")
 opened = absent = 0
 LiveWriter("a.h5", width=320, height=240).__enter__()  # imports all that is needed
@@ -281,7 +281,7 @@ import resource, sys
 import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events
-from amiwarp.io.native_writer import LiveWriter
+from amiwarp.io.native_format import LiveWriter
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
 rng, n = np.random.default_rng(0), 10_000
 writer = LiveWriter(sys.argv[1], width=320, height=240, flush_s=float(sys.argv[3]))
@@ -324,7 +324,7 @@ def test_an_interrupt_during_the_start_leaves_no_file(tmp_path, monkeypatch, mom
         assert list(tmp_path.glob(".a.part.h5.*.part"))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(f"amiwarp.io.native_writer.{moment}", interrupt)
+    monkeypatch.setattr(f"amiwarp.io.native_format.{moment}", interrupt)
     with pytest.raises(KeyboardInterrupt), live(tmp_path / "a.h5"):
         pass
     assert os.listdir(tmp_path) == []

@@ -53,7 +53,7 @@ from amiwarp.imaging.export import IweFiles
 from amiwarp.io import files as output
 from amiwarp.io.files import NewFile, check_output, own_folder, remove_abandoned, write_text
 from amiwarp.io.json_files import read_json
-from amiwarp.io.native_writer import LiveWriter
+from amiwarp.io.native_format import LiveWriter
 from reference.calibration_sample import exact_calibration
 from tests.networks import write_network
 

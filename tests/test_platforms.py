@@ -20,7 +20,7 @@ from amiwarp import (
     save_recording,
 )
 from amiwarp.io import files, reading_process
-from amiwarp.io.native_writer import LiveWriter
+from amiwarp.io.native_format import LiveWriter
 from amiwarp.live.stream.sockets import PipeSink
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.simulation.pictures import open_pictures

@@ -31,7 +31,7 @@ from amiwarp import (
 )
 from amiwarp.events.encoder import LARGEST_ANGLE
 from amiwarp.events.recording import check_events
-from amiwarp.io.native_writer import LiveWriter
+from amiwarp.io.native_format import LiveWriter
 from amiwarp.optics.camera import LARGEST_FOCAL
 from amiwarp.validation import TIME_LIMIT, shown
 from tests.public_calls import CAMERA, RECORDING, REFUSED, PublicCall, public_calls, write_files

@@ -32,7 +32,7 @@ from amiwarp import (
     save_recording,
 )
 from amiwarp.compensation.streams import EXTRAPOLATED, OUTSIDE
-from amiwarp.io.native_writer import LiveWriter
+from amiwarp.io.native_format import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.queues import BackgroundWorker, Policy
 from amiwarp.live.stream import session as session_module

@@ -242,7 +242,7 @@ OPENED_OTHERWISE = {
     # Unfinished files of this process, or of a child of it.
     "amiwarp.imaging.export: open(part, 'r+b')": "own file",
     "amiwarp.io.files: open(path, 'r+b')": "lock file",
-    "amiwarp.io.native_writer: open(self.part, 'r+b')": "own file",
+    "amiwarp.io.native_format: open(self.part, 'r+b')": "own file",
     "amiwarp.io.plain_files: (folder / name).open('rb')": "own file",
     # What is no file.
     "amiwarp.io.hdf5_server: h5py.h5a.open(group, attribute.encode())": "attribute",

@@ -26,7 +26,7 @@ from amiwarp import (
 )
 from amiwarp.cli.app import app
 from amiwarp.cli.common import NominalPrismOptions
-from amiwarp.io.hdf5_files import prism_attributes, read_prism
+from amiwarp.io.native_format import prism_attributes, read_prism
 from amiwarp.viewer.inspector import Inspector
 
 APEX, INDEX = math.radians(1.0), 1.55

@@ -36,7 +36,7 @@ from amiwarp.errors import AmiwarpError, printable
 from amiwarp.events.encoder import LARGEST_RATIO
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
-from amiwarp.io.native_writer import LiveWriter
+from amiwarp.io.native_format import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.link.emulator import Controller, EmulatedFault, Motor, Played, PseudoTerminal, Rotor
 from amiwarp.live.link.link import Link

@@ -27,8 +27,8 @@ from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.export import bag_of, export, left_out
 from amiwarp.io.files import check_output
 from amiwarp.io.formats import Codec, OutputFormat, Rounding, check_codec, check_rounding, output_format
-from amiwarp.io.hdf5_files import CHUNK, NativeEvents, compile_checksums
-from amiwarp.io.native_writer import FlaggedEvents, copy_records
+from amiwarp.io.hdf5_files import CHUNK, compile_checksums
+from amiwarp.io.native_format import FlaggedEvents, NativeEvents, copy_records
 from amiwarp.kernels.compensation import Columns, LaunchPlan
 from amiwarp.kernels.events import join_columns
 from amiwarp.kernels.launch import RecordedLaunch, launch, page_locked

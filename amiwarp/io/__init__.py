@@ -6,7 +6,7 @@
 from amiwarp.io.encoder_files import read_encoder_csv, read_encoder_triggers
 from amiwarp.io.export import ConversionSummary, convert
 from amiwarp.io.formats import Format, detect_format, open_recording
-from amiwarp.io.native_writer import RecordingWriter, save_recording
+from amiwarp.io.native_format import RecordingWriter, save_recording
 
 __all__ = [
     "ConversionSummary",

@@ -25,7 +25,7 @@ from amiwarp.io import formats
 from amiwarp.io.file_scan import RECORDS, FileEvents
 from amiwarp.io.files import NewFile, check_output, errors_name
 from amiwarp.io.formats import LIMITS, Bag, Codec, Outline, OutputFormat, Rounding, open_recording
-from amiwarp.io.native_writer import write_recording
+from amiwarp.io.native_format import write_recording
 from amiwarp.io.plain_files import write_array
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import NominalPrism

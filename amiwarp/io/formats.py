@@ -75,7 +75,7 @@ FOLDERS = (("metadata.yaml", Format.ROSBAG), ("dataset_events_t.npy", Format.EVI
 
 
 OPENERS = {
-    Format.HDF5: "hdf5_files:open_hdf5",
+    Format.HDF5: "native_format:open_hdf5",
     Format.EVT: "prophesee:open_evt",
     Format.DAT: "prophesee:open_dat",
     Format.AEDAT4: "aedat:open_aedat4",
@@ -400,7 +400,7 @@ LIMITS = {
 """Limits of the formats other than the native one."""
 
 WRITERS = {
-    OutputFormat.DSEC: "native_writer:write_dsec",
+    OutputFormat.DSEC: "native_format:write_dsec",
     OutputFormat.EVT3: "prophesee:write_evt3",
     OutputFormat.AEDAT4: "aedat:write_aedat4",
     OutputFormat.NPZ: "plain_files:write_npz",

@@ -1,7 +1,4 @@
-"""HDF5 recordings: the chunks of native ones, and the reader of these and of DSEC, M3ED, MVSEC and Prophesee.
-
-The native format is described in ``docs/reference/recording-format.md``.
-"""
+"""HDF5 files of any layout: their chunks, access to their datasets, and events in rows as of MVSEC and Prophesee."""
 
 from __future__ import annotations
 
@@ -14,7 +11,6 @@ import time
 import weakref
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -23,31 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import recording as checks
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, ImuSamples, MetadataValue, Recording, regroup
-from amiwarp.events.truth import EVENT_COLUMNS, MAPS, FrameTruth, Poses, Truth, WorldLabels, check_truth, rotation_of
-from amiwarp.io.file_scan import FileEvents, Packet, head_limit, read_sensors, smallest_sensor
-from amiwarp.io.files import errors_name, input_path, interrupts_later, read_at, register_reader, write_at
+from amiwarp.events.recording import Recording
+from amiwarp.io.file_scan import FileEvents, Packet, read_sensors
+from amiwarp.io.files import input_path, interrupts_later, read_at, write_at
 from amiwarp.io.formats import Codec
-from amiwarp.io.json_files import LARGEST_INTEGER
 from amiwarp.io.reading_process import ReadingProcess, borrow, give_back, packets, run
-from amiwarp.optics.camera import (
-    CAMERA_NUMBERS,
-    COEFFICIENTS,
-    DISTORTIONS,
-    LARGEST_SIZE,
-    Camera,
-    Distortion,
-    camera_to_json,
-    check_size,
-)
-from amiwarp.optics.prism import FlatSide, NominalPrism, Plate, Prism, UnsizedPrism, as_wedge
-from amiwarp.tasks import in_order
-from amiwarp.validation import array as as_numbers
-from amiwarp.validation import instance, one_of, real, rounded_times, shown, whole
 
-# Chunks of native recordings, which parallel threads encode, decode, read and write. HDF5 itself uses one thread.
+# Chunks of amiwarp's files, which parallel threads encode, decode, read and write. HDF5 itself uses one thread.
 #
 # A stored chunk is a Blosc frame (version 1, as written by HDF5's filter 32001) or deflated bytes, followed by its
 # Fletcher-32 checksum. HDF5 itself reads the deflated chunks of :attr:`Codec.GZIP`.
@@ -334,7 +312,7 @@ class ChunkFile:
         """Create the file. ``libver`` are h5py's bounds of the format. Raises OSError if the file exists."""
         import h5py
 
-        self._columns: dict[str, ChunkedColumn] = {}
+        self._datasets: dict[str, Any] = {}
         self._turns = threading.Condition()
         self._turn = 0
         self._failed = math.inf  # the lowest turn whose work failed
@@ -390,14 +368,28 @@ class ChunkFile:
         with self.turn(turn):
             before()
             for chunk in chunks:
-                if chunk.name not in self._columns:
-                    self._columns[chunk.name] = ChunkedColumn(self, dataset_of(chunk))
-                column = self._columns[chunk.name]
-                placed.append((column.place(chunk.start, chunk.parts, rows[chunk.name]), chunk.parts))
+                if chunk.name not in self._datasets:
+                    self._datasets[chunk.name] = dataset_of(chunk)
+                placed.append((self._place(chunk, rows[chunk.name]), chunk.parts))
         for at, parts in placed:
             if at is not None:
                 self.output.write_at(parts, at)
         self.check()
+
+    def _place(self, chunk: EncodedChunk, rows: int) -> int | None:
+        """Return the place of a chunk in the file [bytes]. A dataset of fewer than ``rows`` elements grows to these.
+
+        If the place cannot be found, the chunk is written at once and None is returned. Called in turn.
+        """
+        dataset = self._datasets[chunk.name]
+        held, *row = dataset.shape
+        if held < rows:
+            dataset.id.set_extent((rows, *row))
+        write = partial(dataset.id.write_direct_chunk, (chunk.start, *(0 for _ in row)))
+        at = self.output.place_of(sum(map(len, chunk.parts)), write)
+        if at is None:
+            write(b"".join(chunk.parts))
+        return at
 
     def check(self) -> None:
         """Raise the error of the first write of HDF5 that failed, such as OSError for a full disk."""
@@ -411,30 +403,6 @@ class ChunkFile:
         finally:
             self.output.close()
         self.check()
-
-
-class ChunkedColumn:
-    """Dataset of a :class:`ChunkFile`, whose chunks are written in any order."""
-
-    def __init__(self, file: ChunkFile, dataset: Any) -> None:
-        self._output, self._id = file.output, dataset.id
-        self._rows, *self._row = dataset.shape
-
-    def place(self, start: int, stored: Sequence[bytes], rows: int) -> int | None:
-        """Return the place in the file [bytes] of an encoded chunk from element ``start`` on.
-
-        ``stored`` are the bytes of the chunk, in one or several parts. A dataset of fewer than ``rows`` elements grows
-        to this number. If the place cannot be found, the chunk is written at once and None is returned. Call this
-        method in turn.
-        """
-        size, offset = sum(map(len, stored)), (start, *(0 for _ in self._row))
-        if self._rows < rows:
-            self._rows = rows
-            self._id.set_extent((self._rows, *self._row))
-        at = self._output.place_of(size, partial(self._id.write_direct_chunk, offset))
-        if at is None:
-            self._id.write_direct_chunk(offset, b"".join(stored))
-        return at
 
 
 class _Output(io.RawIOBase):
@@ -533,14 +501,6 @@ class _Output(io.RawIOBase):
         super().close()
 
 
-FORMAT = "amiwarp-recording"
-"""Value of the attribute ``format`` of native recordings."""
-
-
-FORMAT_VERSION = 1
-"""Newest version of the format that is read, and the version that is written."""
-
-
 # Access to the file, which a separate process opens.
 #
 # Files of amiwarp have a checksum on each chunk. Their chunks are read and decoded in this process, on all cores. HDF5
@@ -584,18 +544,14 @@ class Hdf5File:
                 self.close()
                 raise
         about, at_once = found
-        self._attributes = about["attributes"]
+        self.attributes: Mapping[str, Mapping[str, Any]] = about["attributes"]
+        """Attributes of the groups that the file has, by the name of the group."""
         self.layout, self.group = str(about["layout"]), str(about["group"])
         """Layout of the file (native, m3ed, mvsec or ecf), and the group of its events."""
         self.unfinished = bool(about["unfinished"])
         """Whether the file is still being written, or the program that wrote it was interrupted."""
         self.columns = {name: Column(self, handle, name, column, at_once) for name, column in about["columns"].items()}
         """Datasets of the file by name. They refer to the file weakly, so a reader must keep the file."""
-
-    def attributes(self, group: str) -> Mapping[str, Any] | None:
-        """Return the attributes of a group, or None if the file has no such group."""
-        found: Mapping[str, Any] | None = self._attributes.get(group)
-        return found
 
     def ask(self, function: str, *arguments: Any) -> list[NDArray[Any]]:
         """Call a function in the reading process, which is restarted after Ctrl-C and in a fork of this process."""
@@ -717,583 +673,6 @@ def _give_back(process: list[ReadingProcess]) -> None:
         give_back(process.pop())
 
 
-# Opening of a recording.
-
-
-def open_hdf5(path: Path, topic: str | None = None) -> Recording:
-    """Open a native recording, or a file of another layout. ``topic`` chooses among several cameras.
-
-    Raises :class:`AmiwarpError` for other files.
-    """
-    with errors_name(path, lambda: "opening HDF5"):
-        file = Hdf5File(path, topic)
-        try:
-            if file.layout in ("mvsec", "ecf"):
-                file.close()
-                return open_rows(path, file.layout, file.group)
-            return _read_recording(path, file)
-        except BaseException:
-            file.close()
-            raise
-
-
-def _read_recording(path: Path, file: Hdf5File) -> Recording:
-    root = _attributes(file, "/")
-    version = attribute(root, f"{path}: /", "format_version", int, FORMAT_VERSION)
-    if version > FORMAT_VERSION:
-        raise AmiwarpError(f"{path}: format_version {version} is newer than {FORMAT_VERSION}; update amiwarp")
-    events = NativeEvents(path, file)
-    metadata: dict[str, MetadataValue] = {
-        name: value if isinstance(value, (str, int, float, bool)) else str(value)
-        for name, value in _attributes(file, "metadata").items()
-    }
-    metadata["format"] = "native" if attribute(root, f"{path}: /", "format", str, "") == FORMAT else "dsec"
-    if file.layout == "m3ed":
-        metadata |= {"format": "m3ed", "topic": file.group}
-    camera, prism = file.attributes("camera"), file.attributes("prism")
-    found = None if camera is None else read_camera(camera, f"{path}: /camera")
-    if found is not None and (found.width, found.height) != events.size:
-        raise AmiwarpError(
-            f"{path}: camera is {found.width}x{found.height}, events are {events.size}; both must have the same size"
-        )
-    return Recording(
-        events=events,
-        camera=found,
-        encoder=None if file.attributes("encoder") is None else _read_encoder(path, file),
-        prism=None if prism is None else read_prism(prism, f"{path}: /prism"),
-        truth=None if file.attributes("truth") is None else read_truth(path, file, len(events), events.size),
-        metadata=metadata,
-        name=path.stem,
-        imu=read_imu(path, file),
-        frames=read_frames(path, file),
-    )
-
-
-def _attributes(file: Hdf5File, group: str) -> Mapping[str, Any]:
-    return file.attributes(group) or {}
-
-
-def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int, ...] | None = None) -> Column:
-    """Return a dataset; raise :class:`AmiwarpError` if the dataset is missing or does not have the expected shape.
-
-    ``count``: expected number of rows; ``row``: expected shape of a row. None accepts any.
-    """
-    if name not in file.columns:
-        raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
-    column = file.columns[name]
-    shape = (len(column), *column.row)
-    expected = (len(column) if count is None else count, *(column.row if row is None else row))
-    if shape != expected:
-        raise AmiwarpError(f"dataset '{name}' has shape {shape}; expected {expected}; the file is damaged")
-    return column
-
-
-def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
-    samples = _read_samples(file, "encoder/")
-    if samples is None:
-        return None
-    t, angle = samples
-    pulses = file.columns.get("encoder/index_t")
-    index_t = None if pulses is None else rounded_times(pulses.read(0, len(pulses)))
-    if file.unfinished and index_t is not None:
-        index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])]
-    second = _read_samples(file, "encoder/second_") if "encoder/second_t" in file.columns else None
-    offset = attribute(_attributes(file, "encoder"), f"{path}: /encoder", "clock_offset_us", float, 0.0)
-    return Encoder(t, angle, offset, index_t, None if second is None else Encoder(*second))
-
-
-def _read_samples(file: Hdf5File, name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-    """Return times [us] and angles [rad] of an encoder whose datasets begin with ``name``; None without samples."""
-    columns = [_column(file, name + column) for column in ("t", "angle")]
-    t, angle = (column.read(0, len(column)) for column in columns)
-    t, angle = rounded_times(t), angle.astype(np.float64)
-    if file.unfinished:
-        count = min(t.size, angle.size)
-        t, angle = t[:count], angle[:count]
-    # A live recording has datasets for an encoder before it is known whether an encoder is connected.
-    if t.size < 2 and (file.unfinished or t.size == angle.size == 0):
-        return None
-    return t, angle
-
-
-# Camera and prism as attributes of an HDF5 group, or of a JSON object in a stream.
-
-
-def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[Any], default: Any = None) -> Any:
-    """Return an attribute as type ``kind``; raise :class:`AmiwarpError` if it is missing or of another type."""
-    if name not in attributes and default is None:
-        raise AmiwarpError(f"{where} has no attribute '{name}'; add this attribute")
-    value = attributes.get(name, default)
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.item()
-    what = f"{where} attribute '{name}'"
-    if kind is int:
-        return whole(value, what, -LARGEST_INTEGER, LARGEST_INTEGER)
-    if kind is float:
-        return real(value, what)
-    try:
-        text = value.decode() if isinstance(value, bytes) else value
-    except UnicodeDecodeError:
-        text = value
-    return instance(text, kind, what)
-
-
-def camera_attributes(camera: Camera) -> dict[str, Any]:
-    """Return a camera as attributes of an HDF5 group, by name."""
-    attributes = camera_to_json(camera)
-    lens = attributes.pop("distortion", {"kind": "none"})
-    attributes["distortion_model"] = lens.pop("kind")
-    if lens:
-        attributes["distortion"] = [float(value) for value in lens.values()]
-    return attributes
-
-
-def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
-    """Return the camera stored in the attributes of a file or stream.
-
-    Raises :class:`AmiwarpError` if an attribute is missing or unusable.
-    """
-    model = one_of(attribute(attributes, where, "distortion_model", str, "none"), (*DISTORTIONS, "none"),
-                   f"{where} attribute 'distortion_model'")  # fmt: skip
-    distortion: Distortion | None = None
-    if model in DISTORTIONS:
-        lens, lengths = DISTORTIONS[model], COEFFICIENTS[model]
-        k = as_numbers(attributes.get("distortion", ()), f"{where} attribute 'distortion'")
-        if k.ndim != 1 or len(k) not in lengths:
-            expected = " or ".join(map(str, lengths))
-            raise AmiwarpError(f"camera distortion is {shown(k)}; expected {expected} numbers for {model}")
-        distortion = lens(*k.tolist())
-    kinds = dict(zip(CAMERA_NUMBERS, (int, int, float, float, float, float), strict=True))
-    numbers = {name: attribute(attributes, where, name, kind) for name, kind in kinds.items()}
-    return Camera(**numbers, distortion=distortion)
-
-
-def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
-    """Return the attributes of a nominal prism, without ``apex`` if that is unknown, or those of a plate."""
-    if isinstance(prism, Plate):
-        return {"thickness": prism.thickness, "tilt": prism.tilt, "index": prism.index}
-    known: dict[str, float | str] = {"apex": prism.apex} if isinstance(prism, Prism) else {}
-    known |= {"index": prism.index, "flat_side": prism.flat_side.value}
-    if isinstance(prism, Prism) and prism.second is not None:
-        known |= {f"second_{name}": value for name, value in prism_attributes(prism.second).items()}
-    return known
-
-
-def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
-    """Return the nominal prism stored in attributes. The apex angle is unknown if ``apex`` is missing.
-
-    A plate has a ``thickness``.
-    """
-    if "thickness" in attributes:
-        return Plate(*(attribute(attributes, where, name, float) for name in ("thickness", "tilt", "index")))
-    side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
-    prism = UnsizedPrism(attribute(attributes, where, "index", float), side)
-    if "apex" not in attributes:
-        return prism
-    second = {name: attributes[f"second_{name}"] for name in ("apex", "index", "flat_side")
-              if f"second_{name}" in attributes}  # fmt: skip
-    behind = as_wedge(read_prism(second, f"{where} second prism")) if second else None
-    if isinstance(behind, UnsizedPrism):
-        raise AmiwarpError(f"{where} has a second prism without 'second_apex'; add this attribute")
-    return replace(prism.with_apex(attribute(attributes, where, "apex", float)), second=behind)
-
-
-# Events of native recordings and of files of DSEC and M3ED, whose layouts are alike.
-
-DSEC_SIZE = (640, 480)
-"""Size of DSEC's sensors [px], which its files do not store."""
-
-
-class NativeEvents(EventSource):
-    """Events of an HDF5 recording, read on demand. Raises :class:`AmiwarpError` for a damaged file."""
-
-    def __init__(self, path: Path, file: Hdf5File) -> None:
-        """Open the events of a file. If the file is unfinished, these are the events that are complete now."""
-        self.path = path
-        self._file = file
-        self._columns = {name: _column(file, f"events/{name}") for name in ("t", "p", "x", "y")}
-        for name in ("inside", "extrapolated"):
-            if f"events/{name}" in file.columns:
-                self._columns[name] = file.columns[f"events/{name}"]
-        lengths = {name: len(column) for name, column in self._columns.items()}
-        if len(set(lengths.values())) != 1 and not file.unfinished:
-            raise AmiwarpError(f"{path}: datasets of events differ in length: {lengths}; the file is damaged")
-        self._count = min(lengths.values())
-        offset = file.columns.get("t_offset")
-        self._offset = 0 if offset is None else rounded_times(offset.read(0, 1)).item()
-        # The index of an unfinished file may be incomplete. Bisection is used instead.
-        self._ms_to_idx = None if file.unfinished else file.columns.get("ms_to_idx")
-        self._size = self._find_size()
-        self._ends = [self.slice(at, at + 1).t for at in (0, self._count - 1)] if self._count else []
-        register_reader(self, self.path)
-
-    def _find_size(self) -> tuple[int, int]:
-        """Return the stored sensor size, or else the smallest known sensor that holds all events [px]."""
-        attributes = self._file.attributes("/") or {}
-        if "width" in attributes and "height" in attributes:
-            width, height = (attribute(attributes, f"{self.path}: /", name, int) for name in ("width", "height"))
-            check_size(width, height, self.path)
-            return width, height
-        largest = [0, 0]
-        for start in range(0, min(self._count, head_limit() or self._count), DEFAULT_BLOCK):
-            for axis, name in enumerate(("x", "y")):
-                values = self._read(name, start, min(start + DEFAULT_BLOCK, self._count))
-                if values.dtype.kind == "f":  # compensated events may lie far outside, or have no coordinates
-                    values = np.rint(values[(values >= 0) & (values < LARGEST_SIZE)])
-                largest[axis] = max(largest[axis], int(values.max(initial=0)))
-        width, height = smallest_sensor(largest[0], largest[1])
-        return max(width, DSEC_SIZE[0]), max(height, DSEC_SIZE[1])
-
-    def __len__(self) -> int:
-        return self._count
-
-    @property
-    def t_first(self) -> int:
-        """Time of the first event [us]."""
-        return self._end(0)
-
-    @property
-    def t_last(self) -> int:
-        """Time of the last event [us]."""
-        return self._end(-1)
-
-    def _end(self, which: int) -> int:
-        if not self._ends:
-            raise AmiwarpError(f"{self.path}: holds no events, so it has no first or last time")
-        return int(self._ends[which][0])
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Sensor size (width, height) [px]."""
-        return self._size
-
-    def slice(self, start: int, stop: int) -> Events:
-        """Return the events with ``start <= index < stop``, and check them. Threads may call it in parallel."""
-        start, stop = max(start, 0), min(max(stop, start, 0), self._count)
-        with errors_name(self.path, lambda: f"events {start} .. {stop}"):
-            x, y, p = (self._read(name, start, stop) for name in ("x", "y", "p"))
-            t = self._read("t", start, stop)
-            # check_events finds times beyond the limit among sorted int64, also if adding the offset overflows.
-            t = self._since_zero(t if t.dtype == np.int64 else rounded_times(t))
-            events = Events(checks.as_coordinate("x", x), checks.as_coordinate("y", y), t, checks.as_polarity(p))
-            nan = "inside" in self._columns
-            checks.check_events(events, *self._size, where=str(self.path), first_index=start, allow_nan=nan)
-        return events
-
-    def inside(self, start: int, stop: int) -> NDArray[np.bool_] | None:
-        """Return whether each compensated event lies inside the image, shape ``(n,)``; None if this is not stored."""
-        return self._flags("inside", start, stop)
-
-    def extrapolated(self, start: int, stop: int) -> NDArray[np.bool_] | None:
-        """Return whether each event's angle was extrapolated, shape ``(n,)``; None if the file does not store it."""
-        return self._flags("extrapolated", start, stop)
-
-    def _flags(self, name: str, start: int, stop: int) -> NDArray[np.bool_] | None:
-        if name not in self._columns:
-            return None
-        with errors_name(self.path, lambda: f"events/{name} {start} .. {stop}"):
-            return np.asarray(self._read(name, max(start, 0), min(max(stop, 0), self._count)), np.bool_)
-
-    def find(self, t: int) -> int:
-        """Return the index of the first event at or after ``t`` [us], found with the file's millisecond index."""
-        if not self._count or t <= self.t_first:
-            return 0
-        if t > self.t_last:
-            return self._count
-        low, high = self._bracket(t)
-        at = low + int(np.searchsorted(self._times(low, high), t))
-        around = self._times(at - 1, at + 1) if 0 < at < self._count else np.zeros(0, np.int64)
-        if around.size != 2 or not around[0] < t <= around[1]:
-            raise AmiwarpError(
-                f"{self.path}: events/t is not sorted near {t} us, or ms_to_idx disagrees with it; the file is damaged"
-            )
-        return at
-
-    def between(self, t_start: int, t_end: int) -> Events:
-        """Return the events with ``t_start <= t < t_end`` [us], found with the file's millisecond index."""
-        with errors_name(self.path, lambda: f"events between {t_start} and {t_end} us"):
-            return self.slice(self.find(t_start), self.find(t_end))
-
-    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        """Return all events in blocks, as :meth:`amiwarp.EventSource.blocks`."""
-        return regroup(self._pieces_in_order(), count=count, duration_us=duration_us)
-
-    def pieces(self, count: int) -> Iterator[Callable[[], Events]]:
-        """Yield functions that read ``count`` events each, in any thread. Whole chunks are read fastest."""
-        for start in range(0, self._count, count):
-            yield partial(self.slice, start, start + count)
-
-    def encoded_times_and_polarities(self, start: int, stop: int) -> dict[str, list[bytes]]:
-        """Return the stored chunks of times and polarities with ``start <= index < stop``, by name of the dataset.
-
-        A recording of the same events from the first one on holds the same chunks. ``start`` begins a chunk. Empty for
-        files of other formats, unfinished files, and times that do not start at the first event.
-        """
-        root = self._file.attributes("/") or {}
-        if root.get("format") != FORMAT or self._file.unfinished or self._offset != self.t_first:
-            return {}
-        chunks = {n: self._columns[n].encoded(start, min(stop, self._count)) for n in ("t", "p")}
-        dtypes = {"t": np.dtype(np.int64), "p": np.dtype(np.uint8)}
-        return {f"events/{n}": c for n, c in chunks.items() if c is not None and self._columns[n].dtype == dtypes[n]}
-
-    def _pieces_in_order(self) -> Iterator[Events]:
-        start, last = 0, None
-        with contextlib.closing(in_order(self.pieces(CHUNK))) as pieces:
-            for piece in pieces:  # whose own order is checked
-                checks.check_events(piece[:1], *self._size, where=str(self.path), first_index=start, allow_nan=True,
-                                    after_t=last)  # fmt: skip
-                start, last = start + len(piece), int(piece.t[-1])
-                yield piece
-
-    def _times(self, start: int, stop: int) -> NDArray[np.int64]:
-        return self._since_zero(rounded_times(self._read("t", start, stop)))
-
-    def _since_zero(self, t: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Add the file's offset to times, in the same array if it can be written."""
-        return np.add(t, self._offset, out=t if t.flags.writeable else None) if self._offset else t
-
-    def _read(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        return self._columns[name].read(start, stop)
-
-    def _bracket(self, t: int) -> tuple[int, int]:
-        """Return a short range of event indices around time ``t`` [us], from the millisecond index or by bisection."""
-        ms = (t - self._offset) // 1000
-        if self._ms_to_idx is not None and 0 <= ms < len(self._ms_to_idx):
-            ends = self._ms_to_idx.read(ms, min(ms + 2, len(self._ms_to_idx))).tolist()
-            return max(0, min(ends[0], self._count)), max(
-                0, min(ends[1] if len(ends) > 1 else self._count, self._count)
-            )
-        low, high = 0, self._count
-        while high - low > 1024:
-            middle = (low + high) // 2
-            low, high = (middle, high) if int(self._times(middle, middle + 1)[0]) < t else (low, middle)
-        return low, high
-
-
-# IMU samples and frames of native recordings. Frames are read on demand.
-
-
-def read_imu(path: Path, file: Hdf5File) -> ImuSamples | None:
-    """Return the IMU samples of a file, or None if it has none."""
-    if "imu/t" not in file.columns:
-        return None
-    with errors_name(path, lambda: "imu"):
-        count = len(file.columns["imu/t"])
-        values = [_column(file, f"imu/{name}", count, (3,)) for name in ("angular_velocity", "acceleration")]
-        t = rounded_times(file.columns["imu/t"].read(0, count))
-        return ImuSamples(t, *(column.read(0, count).astype(np.float64, copy=False) for column in values))
-
-
-def read_frames(path: Path, file: Hdf5File) -> StoredImages | None:
-    """Return the frames of a file, or None if it has none."""
-    if "frames/t" not in file.columns:
-        return None
-    with errors_name(path, lambda: "frames"):
-        return StoredImages(path, file)
-
-
-class StoredImages:
-    """Frames of a native recording, read on demand."""
-
-    def __init__(self, path: Path, file: Hdf5File) -> None:
-        self._path, self._file = path, file  # the columns hold only a weak reference to the file
-        times = file.columns["frames/t"]
-        self._image = _column(file, "frames/image", len(times))
-        if self._image.dtype not in (np.uint8, np.uint16) or not all(self._image.row):
-            raise AmiwarpError(f"frames are {self._image.dtype} of shape {self._image.row}; expected uint8 or uint16")
-        self.t = rounded_times(times.read(0, len(times)))
-        """Times of the frames [us], shape ``(k,)``."""
-        if (self.t[1:] < self.t[:-1]).any():
-            raise AmiwarpError("frames/t decreases; the file is damaged")
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Size (width, height) of the frames [px]."""
-        height, width = self._image.row
-        return width, height
-
-    def __getitem__(self, index: int, /) -> NDArray[Any]:
-        at = range(len(self.t))[index]
-        with errors_name(self._path, lambda: f"frames {index}"):
-            return self._image.read(at, at + 1)[0]
-
-
-# Ground truth of native recordings. Events, instants and poses are read on demand.
-
-Read = Callable[[int, int], Any]
-"""Function that returns rows from ``start`` up to ``stop`` (excluded)."""
-
-
-def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) -> Truth:
-    """Return the ground truth of a file with ``count`` events.
-
-    ``size``: width and height of the sensor [px].
-    """
-    attributes = file.attributes("truth") or {}
-    values = {name: _event_values(path, file, name, count) for name in EVENT_COLUMNS}
-    return Truth(
-        {name: attribute(attributes, f"{path}: /truth", name, float) for name in attributes},
-        stored_points=_points(path, file, count),
-        stored_causes=values["cause"],
-        stored_instances=values["instance"],
-        stored_depths=values["depth"],
-        stored_places=values["place"],
-        labels=_labels(path, file),
-        frames=_StoredFrames(path, file, size) if "truth/frames/t" in file.columns else None,
-        poses=_poses(path, file),
-        known=_StoredMasks(path, file, size) if "truth/known/t" in file.columns else None,
-    )
-
-
-class _StoredRows:
-    """Rows of one or several datasets that are read on demand."""
-
-    def __init__(self, path: Path, name: str, count: int, read: Read, file: Hdf5File) -> None:
-        self._path, self._name, self._count, self._read = path, name, count, read
-        self._file = file  # keeps the file open: the columns hold only a weak reference to the file
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, which: slice, /) -> Any:
-        with errors_name(self._path, lambda: self._name):
-            start, stop = checks.slice_bounds(which, self._count, "rows")
-        with errors_name(self._path, lambda: f"{self._name} {start} .. {stop}"):
-            return self._read(start, stop)
-
-
-def _points(path: Path, file: Hdf5File, count: int) -> _StoredRows | None:
-    """Return the true points of the events, or None if they are not stored."""
-    if "truth/x" not in file.columns:
-        return None
-    x, y = (_column(file, f"truth/{name}", count) for name in ("x", "y"))
-    return _StoredRows(path, "truth", count, partial(_read_points, x, y), file)
-
-
-def _read_points(x: Column, y: Column, start: int, stop: int) -> NDArray[np.float32]:
-    """Return rows of two datasets as points [px], shape (n, 2)."""
-    return np.stack([_read_as(column, np.float32, start, stop) for column in (x, y)], axis=1)
-
-
-def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> _StoredRows | None:
-    """Return the values of the dataset ``truth/events/name``, or None if the dataset is missing."""
-    stored, (dtype, row) = f"truth/events/{name}", EVENT_COLUMNS[name]
-    if stored not in file.columns:
-        return None
-    return _StoredRows(path, stored, count, partial(_read_as, _column(file, stored, count, row), dtype), file)
-
-
-def _read_as(column: Column, dtype: Any, start: int, stop: int) -> NDArray[Any]:
-    """Read rows of a dataset as ``dtype``.
-
-    Raises :class:`AmiwarpError` for integers that do not fit, and for values without meaning.
-    """
-    values = column.read(start, stop)
-    check_truth(column.name, values)
-    if values.dtype.kind in "iu" and values.size and not np.can_cast(values.dtype, dtype):
-        limits = np.iinfo(dtype)
-        if values.min() < limits.min or values.max() > limits.max:
-            raise AmiwarpError(f"holds numbers outside of {limits.min} .. {limits.max}; the file is damaged")
-    return values.astype(dtype, copy=False)
-
-
-def _labels(path: Path, file: Hdf5File) -> WorldLabels | None:
-    """Return the names and classes of the instances, or None if they are not stored."""
-    if "truth/world/instances" not in file.columns:
-        return None
-    name = attribute(file.attributes("truth/world") or {}, f"{path}: /truth/world", "name", str, "")
-    instances, categories = (_names(file, f"truth/world/{what}") for what in ("instances", "categories"))
-    with errors_name(path, lambda: "truth/world"):
-        return WorldLabels(name, instances, categories or ("",) * len(instances))
-
-
-def _names(file: Hdf5File, name: str) -> tuple[str, ...]:
-    """Return the names in a dataset; an empty tuple if the dataset is missing."""
-    column = file.columns.get(name)
-    if column is None:
-        return ()
-    return tuple(bytes(text).decode("utf-8", "replace") for text in column.read(0, len(column)).tolist())
-
-
-class _StoredFrames:
-    """Ground truth of all pixels at several instants, read from a file on demand."""
-
-    def __init__(self, path: Path, file: Hdf5File, size: tuple[int, int]) -> None:
-        self._path, self._file = path, file
-        self.t = _rising_times(path, file, "truth/frames/t")
-        """Times of the instants [us], shape ``(k,)``."""
-        count, (width, height) = len(self.t), size
-        self._maps = {
-            name: _column(file, f"truth/frames/{name}", count, (height, width, *tail))
-            for name, (_, tail) in MAPS.items()
-        }
-        self._pose = _column(file, "truth/frames/pose", count, (7,))
-        self._joint_names = _names(file, "truth/joints/names")
-        self._joints = (
-            _column(file, "truth/frames/joints", count, (len(self._joint_names), 3)) if self._joint_names else None
-        )
-
-    def __getitem__(self, index: int, /) -> FrameTruth:
-        at = range(len(self.t))[index]
-        with errors_name(self._path, lambda: f"truth/frames {index}"):
-            maps = {name: _read_as(self._maps[name], dtype, at, at + 1)[0] for name, (dtype, _) in MAPS.items()}
-            pose = _read_as(self._pose, np.float64, at, at + 1)[0]
-            joints = np.zeros((0, 3)) if self._joints is None else _read_as(self._joints, np.float64, at, at + 1)[0]
-            named = dict(zip(self._joint_names, joints, strict=True))
-            return FrameTruth(t_us=int(self.t[at]), **maps, rotation=rotation_of(pose), position=pose[:3], joints=named)
-
-
-def _rising_times(path: Path, file: Hdf5File, name: str) -> NDArray[np.int64]:
-    """Return the times of a dataset [us]. Raises :class:`AmiwarpError` if they do not rise."""
-    times = rounded_times(file.columns[name].read(0, len(file.columns[name])))
-    if (np.diff(times) <= 0).any():
-        raise AmiwarpError(f"{path}: {name} does not increase; the file is damaged")
-    return times
-
-
-class _StoredMasks:
-    """Masks of known pixels, read on demand."""
-
-    def __init__(self, path: Path, file: Hdf5File, size: tuple[int, int]) -> None:
-        self._path, self._file = path, file
-        self.t = _rising_times(path, file, "truth/known/t")
-        """Times from which the masks hold [us], shape ``(k,)``."""
-        self._masks = _column(file, "truth/known/mask", len(self.t), size[::-1])
-
-    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
-        at = range(len(self.t))[index]
-        with errors_name(self._path, lambda: f"truth/known {index}"):
-            return self._masks.read(at, at + 1)[0] != 0
-
-
-def _poses(path: Path, file: Hdf5File) -> _StoredRows | None:
-    """Return the poses of camera, bodies and joints, or None if they are not stored."""
-    if "truth/poses/t" not in file.columns:
-        return None
-    t = file.columns["truth/poses/t"]
-    camera = _column(file, "truth/poses/camera", len(t), (7,))
-    tables = {
-        what: (names, _column(file, table, len(t), (len(names), width)))
-        for what, names, table, width in (
-            ("bodies", _names(file, "truth/poses/body_names"), "truth/poses/bodies", 7),
-            ("joints", _names(file, "truth/joints/names"), "truth/joints/position", 3),
-        )
-        if names and table in file.columns
-    }
-    return _StoredRows(path, "truth/poses", len(t), partial(_read_poses, t, camera, tables), file)
-
-
-def _read_poses(
-    t: Column, camera: Column, tables: Mapping[str, tuple[tuple[str, ...], Column]], start: int, stop: int
-) -> Poses:
-    """Return the poses of the camera, and those of the bodies and joints, whose ``tables`` have names."""
-    named = {
-        what: dict(zip(names, np.moveaxis(_read_as(column, np.float64, start, stop), 1, 0), strict=True))
-        for what, (names, column) in tables.items()
-    }
-    return Poses(rounded_times(t.read(start, stop)), _read_as(camera, np.float64, start, stop), **named)
-
-
 # Files of MVSEC and Prophesee, which hold one row per event. They are read from the beginning.
 
 
@@ -1301,16 +680,11 @@ def open_rows(path: Path, layout: str, group: str) -> Recording:
     """Open the events of a group, which :func:`amiwarp.io.hdf5_server.find_layout` has found."""
     source = path.absolute()
     about = run(f"{SERVER}:read_head", source, group)
-    events = FileEvents(
-        path, partial(packets, f"{SERVER}:read_rows", source, f"{group}/events"), size=_size_of(about["size"])
-    )
+    size = about["size"] and tuple(about["size"])
+    events = FileEvents(path, partial(packets, f"{SERVER}:read_rows", source, f"{group}/events"), size=size)
     imu, frames, notes = read_sensors(path, about["counts"], SERVER, group)
     metadata = {"format": layout, "topic": group, **about["counts"], **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
-
-
-def _size_of(given: list[int] | None) -> tuple[int, int] | None:
-    return None if given is None else (given[0], given[1])
 
 
 def trigger_packets(path: Path) -> Iterator[Packet]:

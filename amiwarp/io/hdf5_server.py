@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.truth import EVENT_COLUMNS, MAPS
 from amiwarp.io.file_scan import microseconds, whole_pixels
-from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32, FORMAT
+from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32
+from amiwarp.io.native_format import FORMAT
 from amiwarp.io.prophesee import Columns
 from amiwarp.io.reading_process import Reply, forget, keep, kept
 
@@ -101,12 +103,13 @@ COLUMNS = {
     "encoder/second_angle": "f",
     "truth/x": "f",
     "truth/y": "f",
-    **{f"truth/events/{name}": "iu" for name in ("cause", "instance")},
-    **{f"truth/events/{name}": "f" for name in ("depth", "place")},
-    **{f"truth/frames/{name}": "iu" for name in ("t", "instance", "occlusion", "occlusion_with_prism")},
-    **{f"truth/frames/{name}": "f" for name in ("pose", "joints", "depth", "normal")},
-    **{f"truth/frames/{name}": "f" for name in ("intensity", "flow", "displacement")},
-    **{f"truth/frames/{name}_with_prism": "f" for name in ("intensity", "flow", "displacement")},
+    **{
+        f"truth/{group}/{name}": "f" if np.dtype(dtype).kind == "f" else "iu"
+        for group, table in (("events", EVENT_COLUMNS), ("frames", MAPS))
+        for name, (dtype, _) in table.items()
+    },
+    "truth/frames/t": "iu",
+    **{f"truth/frames/{name}": "f" for name in ("pose", "joints")},
     **{f"truth/known/{name}": "iu" for name in ("t", "mask")},
     "truth/poses/t": "iu",
     "truth/poses/camera": "f",
@@ -121,17 +124,15 @@ COLUMNS = {
 
 DIMENSIONS = {
     "t_offset": 0,
-    **{f"truth/{name}": 2 for name in ("events/place", "frames/pose", "poses/camera")},
+    **{f"truth/events/{name}": 1 + len(row) for name, (_, row) in EVENT_COLUMNS.items()},
+    **{f"truth/frames/{name}": 3 + len(tail) for name, (_, tail) in MAPS.items()},
+    **{f"truth/{name}": 2 for name in ("frames/pose", "poses/camera")},
     **{f"truth/{name}": 3 for name in ("frames/joints", "poses/bodies", "joints/position")},
-    **{f"truth/frames/{name}": 3 for name in ("depth", "instance", "intensity", "intensity_with_prism")},
-    **{f"truth/frames/{name}": 3 for name in ("occlusion", "occlusion_with_prism")},
     "truth/known/mask": 3,
     **{f"imu/{name}": 2 for name in ("angular_velocity", "acceleration")},
     "frames/image": 3,
-    **{f"truth/frames/{name}": 4 for name in ("normal", "flow", "flow_with_prism")},
-    **{f"truth/frames/{name}": 4 for name in ("displacement", "displacement_with_prism")},
 }
-"""Numbers of dimensions of the datasets that do not have exactly one dimension."""
+"""Numbers of dimensions of the datasets; of those that are not listed, one."""
 
 READ_AT_ONCE = (
     "t_offset", "encoder/t", "encoder/angle", "encoder/index_t", "encoder/second_t", "encoder/second_angle",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, held_bytes
-from amiwarp.io.hdf5_files import camera_attributes, prism_attributes, read_camera, read_prism
+from amiwarp.io.native_format import camera_attributes, prism_attributes, read_camera, read_prism
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import NominalPrism
 

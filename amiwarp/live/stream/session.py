@@ -24,7 +24,7 @@ from amiwarp.events.encoder import TWO_PI, Encoder, EncoderStream, rpm_between, 
 from amiwarp.events.recording import OVERHEAD, Events, MemoryEvents, Recording, held_bytes
 from amiwarp.imaging.iwe import CanvasShape
 from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.io.native_writer import LiveWriter
+from amiwarp.io.native_format import LiveWriter
 from amiwarp.live.link.clocks import CameraClock, ClockMap, monotonic_us
 from amiwarp.live.link.link import Link, LinkUpdate
 from amiwarp.live.queues import BackgroundWorker, EventSorter, PacketQueue, Policy

@@ -1,6 +1,6 @@
-"""Writers of native HDF5 recordings: of a whole file or none, and of live recordings, readable at any time.
+"""amiwarp's native recording format: reader, and writers of whole files and of live recordings.
 
-The format is described in ``docs/reference/recording-format.md``.
+The format is described in ``docs/reference/recording-format.md``. DSEC and M3ED store events alike, and are read here.
 """
 
 from __future__ import annotations
@@ -24,22 +24,609 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events import recording as checks
 from amiwarp.events import truth as ground_truth
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import Events, ImuSamples, MetadataValue, Recording, regroup
-from amiwarp.events.truth import EventTruth, FrameTruth, Poses, WorldLabels
+from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, ImuSamples, MetadataValue, Recording, regroup
+from amiwarp.events.truth import EVENT_COLUMNS, MAPS, EventTruth, FrameTruth, Poses, Truth, WorldLabels, check_truth
 from amiwarp.io import hdf5_files
-from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place
+from amiwarp.io.file_scan import head_limit, smallest_sensor
+from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place, register_reader
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
-from amiwarp.io.hdf5_files import CHUNK, ChunkFile, EncodedChunk, camera_attributes, open_hdf5, prism_attributes
-from amiwarp.optics.camera import Camera, check_size
-from amiwarp.optics.prism import NominalPrism
+from amiwarp.io.hdf5_files import CHUNK, ChunkFile, Column, EncodedChunk, Hdf5File
+from amiwarp.io.json_files import LARGEST_INTEGER
+from amiwarp.optics.camera import (
+    CAMERA_NUMBERS,
+    COEFFICIENTS,
+    DISTORTIONS,
+    LARGEST_SIZE,
+    Camera,
+    camera_to_json,
+    check_size,
+)
+from amiwarp.optics.prism import FlatSide, NominalPrism, Plate, Prism, UnsizedPrism, as_wedge
 from amiwarp.tasks import Progress, Result, in_order
-from amiwarp.validation import as_times, choice, guarded, shown
+from amiwarp.validation import array as as_numbers
+from amiwarp.validation import as_times, choice, guarded, instance, one_of, real, rounded_times, shown, whole
 
-# Layout of the file: header, datasets, chunks and the millisecond index.
+# Layout of the file.
 
+FORMAT = "amiwarp-recording"
+"""Value of the attribute ``format`` of native recordings."""
+
+FORMAT_VERSION = 1
+"""Newest version of the format that is read, and the version that is written."""
+
+EVENTS = {"x": np.uint16, "y": np.uint16, "t": np.int64, "p": np.uint8}
+"""Types of the datasets of events. Coordinates of compensated events are float32."""
+
+FLAGS = ("inside", "extrapolated")
+"""Names of the flags of compensated events, uint8."""
+
+ENCODERS = ("encoder/", "encoder/second_")
+"""Beginnings of the names of the datasets of an encoder, and of those of the second encoder."""
+
+POSE_TABLES = {
+    "joints": ("truth/joints/names", "truth/joints/position", 3),
+    "bodies": ("truth/poses/body_names", "truth/poses/bodies", 7),
+}
+"""Datasets of the names and of the values of what moves, and the length of a value."""
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """Arrays of a block of events, by the names of their datasets in the file."""
+
+
+# Camera and prism as attributes of an HDF5 group, or of a JSON object in a stream.
+
+
+def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[Any], default: Any = None) -> Any:
+    """Return an attribute as type ``kind``; raise :class:`AmiwarpError` if it is missing or of another type."""
+    if name not in attributes and default is None:
+        raise AmiwarpError(f"{where} has no attribute '{name}'; add this attribute")
+    value = attributes.get(name, default)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    what = f"{where} attribute '{name}'"
+    if kind is int:
+        return whole(value, what, -LARGEST_INTEGER, LARGEST_INTEGER)
+    if kind is float:
+        return real(value, what)
+    try:
+        text = value.decode() if isinstance(value, bytes) else value
+    except UnicodeDecodeError:
+        text = value
+    return instance(text, kind, what)
+
+
+def camera_attributes(camera: Camera) -> dict[str, Any]:
+    """Return a camera as attributes of an HDF5 group, by name."""
+    attributes = camera_to_json(camera)
+    lens = attributes.pop("distortion", {"kind": "none"})
+    attributes["distortion_model"] = lens.pop("kind")
+    if lens:
+        attributes["distortion"] = [float(value) for value in lens.values()]
+    return attributes
+
+
+def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
+    """Return the camera stored in the attributes of a file or stream.
+
+    Raises :class:`AmiwarpError` if an attribute is missing or unusable.
+    """
+    model = one_of(attribute(attributes, where, "distortion_model", str, "none"), (*DISTORTIONS, "none"),
+                   f"{where} attribute 'distortion_model'")  # fmt: skip
+    distortion = None
+    if model in DISTORTIONS:
+        lens, lengths = DISTORTIONS[model], COEFFICIENTS[model]
+        k = as_numbers(attributes.get("distortion", ()), f"{where} attribute 'distortion'")
+        if k.ndim != 1 or len(k) not in lengths:
+            expected = " or ".join(map(str, lengths))
+            raise AmiwarpError(f"camera distortion is {shown(k)}; expected {expected} numbers for {model}")
+        distortion = lens(*k.tolist())
+    kinds = dict(zip(CAMERA_NUMBERS, (int, int, float, float, float, float), strict=True))
+    numbers = {name: attribute(attributes, where, name, kind) for name, kind in kinds.items()}
+    return Camera(**numbers, distortion=distortion)
+
+
+def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
+    """Return the attributes of a nominal prism, without ``apex`` if that is unknown, or those of a plate."""
+    if isinstance(prism, Plate):
+        return {"thickness": prism.thickness, "tilt": prism.tilt, "index": prism.index}
+    known: dict[str, float | str] = {"apex": prism.apex} if isinstance(prism, Prism) else {}
+    known |= {"index": prism.index, "flat_side": prism.flat_side.value}
+    if isinstance(prism, Prism) and prism.second is not None:
+        known |= {f"second_{name}": value for name, value in prism_attributes(prism.second).items()}
+    return known
+
+
+def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
+    """Return the nominal prism stored in attributes. The apex angle is unknown if ``apex`` is missing.
+
+    A plate has a ``thickness``.
+    """
+    if "thickness" in attributes:
+        return Plate(*(attribute(attributes, where, name, float) for name in ("thickness", "tilt", "index")))
+    side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
+    prism = UnsizedPrism(attribute(attributes, where, "index", float), side)
+    if "apex" not in attributes:
+        return prism
+    second = {name: attributes[f"second_{name}"] for name in ("apex", "index", "flat_side")
+              if f"second_{name}" in attributes}  # fmt: skip
+    behind = as_wedge(read_prism(second, f"{where} second prism")) if second else None
+    if isinstance(behind, UnsizedPrism):
+        raise AmiwarpError(f"{where} has a second prism without 'second_apex'; add this attribute")
+    return dataclasses.replace(prism.with_apex(attribute(attributes, where, "apex", float)), second=behind)
+
+
+# Opening of a recording.
+
+
+def open_hdf5(path: Path, topic: str | None = None) -> Recording:
+    """Open a native recording, or a file of another layout. ``topic`` chooses among several cameras.
+
+    Raises :class:`AmiwarpError` for other files.
+    """
+    with errors_name(path, lambda: "opening HDF5"):
+        file = Hdf5File(path, topic)
+        try:
+            if file.layout in ("mvsec", "ecf"):
+                file.close()
+                return hdf5_files.open_rows(path, file.layout, file.group)
+            return _read_recording(path, file)
+        except BaseException:
+            file.close()
+            raise
+
+
+def _read_recording(path: Path, file: Hdf5File) -> Recording:
+    root = file.attributes.get("/", {})
+    version = attribute(root, f"{path}: /", "format_version", int, FORMAT_VERSION)
+    if version > FORMAT_VERSION:
+        raise AmiwarpError(f"{path}: format_version {version} is newer than {FORMAT_VERSION}; update amiwarp")
+    events = NativeEvents(path, file)
+    metadata: dict[str, MetadataValue] = {
+        name: value if isinstance(value, (str, int, float, bool)) else str(value)
+        for name, value in file.attributes.get("metadata", {}).items()
+    }
+    metadata["format"] = "native" if attribute(root, f"{path}: /", "format", str, "") == FORMAT else "dsec"
+    if file.layout == "m3ed":
+        metadata |= {"format": "m3ed", "topic": file.group}
+    camera, prism = file.attributes.get("camera"), file.attributes.get("prism")
+    found = None if camera is None else read_camera(camera, f"{path}: /camera")
+    if found is not None and (found.width, found.height) != events.size:
+        raise AmiwarpError(
+            f"{path}: camera is {found.width}x{found.height}, events are {events.size}; both must have the same size"
+        )
+    return Recording(
+        events=events,
+        camera=found,
+        encoder=_read_encoder(path, file) if "encoder" in file.attributes else None,
+        prism=None if prism is None else read_prism(prism, f"{path}: /prism"),
+        truth=read_truth(path, file, len(events), events.size) if "truth" in file.attributes else None,
+        metadata=metadata,
+        name=path.stem,
+        imu=read_imu(path, file),
+        frames=read_frames(path, file),
+    )
+
+
+def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int, ...] | None = None) -> Column:
+    """Return a dataset; raise :class:`AmiwarpError` if the dataset is missing or does not have the expected shape.
+
+    ``count``: expected number of rows; ``row``: expected shape of a row. None accepts any.
+    """
+    if name not in file.columns:
+        raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
+    column = file.columns[name]
+    shape = (len(column), *column.row)
+    expected = (len(column) if count is None else count, *(column.row if row is None else row))
+    if shape != expected:
+        raise AmiwarpError(f"dataset '{name}' has shape {shape}; expected {expected}; the file is damaged")
+    return column
+
+
+def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
+    samples = _read_samples(file, ENCODERS[0])
+    if samples is None:
+        return None
+    t, angle = samples
+    pulses = file.columns.get("encoder/index_t")
+    index_t = None if pulses is None else rounded_times(pulses.read(0, len(pulses)))
+    if file.unfinished and index_t is not None:
+        index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])]
+    second = _read_samples(file, ENCODERS[1]) if "encoder/second_t" in file.columns else None
+    offset = attribute(file.attributes["encoder"], f"{path}: /encoder", "clock_offset_us", float, 0.0)
+    return Encoder(t, angle, offset, index_t, None if second is None else Encoder(*second))
+
+
+def _read_samples(file: Hdf5File, name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+    """Return times [us] and angles [rad] of an encoder whose datasets begin with ``name``; None without samples."""
+    columns = [_column(file, name + column) for column in ("t", "angle")]
+    t, angle = (column.read(0, len(column)) for column in columns)
+    t, angle = rounded_times(t), angle.astype(np.float64)
+    if file.unfinished:
+        count = min(t.size, angle.size)
+        t, angle = t[:count], angle[:count]
+    # A live recording has datasets for an encoder before it is known whether an encoder is connected.
+    if t.size < 2 and (file.unfinished or t.size == angle.size == 0):
+        return None
+    return t, angle
+
+
+# Events of native recordings and of files of DSEC and M3ED, whose layouts are alike.
+
+DSEC_SIZE = (640, 480)
+"""Size of DSEC's sensors [px], which its files do not store."""
+
+
+class NativeEvents(EventSource):
+    """Events of an HDF5 recording, read on demand. Raises :class:`AmiwarpError` for a damaged file."""
+
+    def __init__(self, path: Path, file: Hdf5File) -> None:
+        """Open the events of a file. If the file is unfinished, these are the events that are complete now."""
+        self.path = path
+        self._file = file
+        self._columns = {name: _column(file, f"events/{name}") for name in ("t", "p", "x", "y")}
+        for name in FLAGS:
+            if f"events/{name}" in file.columns:
+                self._columns[name] = file.columns[f"events/{name}"]
+        lengths = {name: len(column) for name, column in self._columns.items()}
+        if len(set(lengths.values())) != 1 and not file.unfinished:
+            raise AmiwarpError(f"{path}: datasets of events differ in length: {lengths}; the file is damaged")
+        self._count = min(lengths.values())
+        offset = file.columns.get("t_offset")
+        self._offset = 0 if offset is None else rounded_times(offset.read(0, 1)).item()
+        # The index of an unfinished file may be incomplete. Bisection is used instead.
+        self._ms_to_idx = None if file.unfinished else file.columns.get("ms_to_idx")
+        self._size = self._find_size()
+        self._ends = [self.slice(at, at + 1).t for at in (0, self._count - 1)] if self._count else []
+        register_reader(self, self.path)
+
+    def _find_size(self) -> tuple[int, int]:
+        """Return the stored sensor size, or else the smallest known sensor that holds all events [px]."""
+        attributes = self._file.attributes.get("/", {})
+        if "width" in attributes and "height" in attributes:
+            width, height = (attribute(attributes, f"{self.path}: /", name, int) for name in ("width", "height"))
+            check_size(width, height, self.path)
+            return width, height
+        largest = [0, 0]
+        for start in range(0, min(self._count, head_limit() or self._count), DEFAULT_BLOCK):
+            for axis, name in enumerate(("x", "y")):
+                values = self._read(name, start, min(start + DEFAULT_BLOCK, self._count))
+                if values.dtype.kind == "f":  # compensated events may lie far outside, or have no coordinates
+                    values = np.rint(values[(values >= 0) & (values < LARGEST_SIZE)])
+                largest[axis] = max(largest[axis], int(values.max(initial=0)))
+        width, height = smallest_sensor(largest[0], largest[1])
+        return max(width, DSEC_SIZE[0]), max(height, DSEC_SIZE[1])
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def t_first(self) -> int:
+        """Time of the first event [us]."""
+        return self._end(0)
+
+    @property
+    def t_last(self) -> int:
+        """Time of the last event [us]."""
+        return self._end(-1)
+
+    def _end(self, which: int) -> int:
+        if not self._ends:
+            raise AmiwarpError(f"{self.path}: holds no events, so it has no first or last time")
+        return int(self._ends[which][0])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Sensor size (width, height) [px]."""
+        return self._size
+
+    def slice(self, start: int, stop: int) -> Events:
+        """Return the events with ``start <= index < stop``, and check them. Threads may call it in parallel."""
+        start, stop = max(start, 0), min(max(stop, start, 0), self._count)
+        with errors_name(self.path, lambda: f"events {start} .. {stop}"):
+            x, y, p = (self._read(name, start, stop) for name in ("x", "y", "p"))
+            t = self._read("t", start, stop)
+            # check_events finds times beyond the limit among sorted int64, also if adding the offset overflows.
+            t = self._since_zero(t if t.dtype == np.int64 else rounded_times(t))
+            events = Events(checks.as_coordinate("x", x), checks.as_coordinate("y", y), t, checks.as_polarity(p))
+            nan = "inside" in self._columns
+            checks.check_events(events, *self._size, where=str(self.path), first_index=start, allow_nan=nan)
+        return events
+
+    def inside(self, start: int, stop: int) -> NDArray[np.bool_] | None:
+        """Return whether each compensated event lies inside the image, shape ``(n,)``; None if this is not stored."""
+        return self._flags("inside", start, stop)
+
+    def extrapolated(self, start: int, stop: int) -> NDArray[np.bool_] | None:
+        """Return whether each event's angle was extrapolated, shape ``(n,)``; None if the file does not store it."""
+        return self._flags("extrapolated", start, stop)
+
+    def _flags(self, name: str, start: int, stop: int) -> NDArray[np.bool_] | None:
+        if name not in self._columns:
+            return None
+        with errors_name(self.path, lambda: f"events/{name} {start} .. {stop}"):
+            return np.asarray(self._read(name, max(start, 0), min(max(stop, 0), self._count)), np.bool_)
+
+    def find(self, t: int) -> int:
+        """Return the index of the first event at or after ``t`` [us], found with the file's millisecond index."""
+        if not self._count or t <= self.t_first:
+            return 0
+        if t > self.t_last:
+            return self._count
+        low, high = self._bracket(t)
+        at = low + int(np.searchsorted(self._times(low, high), t))
+        around = self._times(at - 1, at + 1) if 0 < at < self._count else np.zeros(0, np.int64)
+        if around.size != 2 or not around[0] < t <= around[1]:
+            raise AmiwarpError(
+                f"{self.path}: events/t is not sorted near {t} us, or ms_to_idx disagrees with it; the file is damaged"
+            )
+        return at
+
+    def between(self, t_start: int, t_end: int) -> Events:
+        """Return the events with ``t_start <= t < t_end`` [us], found with the file's millisecond index."""
+        with errors_name(self.path, lambda: f"events between {t_start} and {t_end} us"):
+            return self.slice(self.find(t_start), self.find(t_end))
+
+    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+        """Return all events in blocks, as :meth:`amiwarp.EventSource.blocks`."""
+        return regroup(self._pieces_in_order(), count=count, duration_us=duration_us)
+
+    def pieces(self, count: int) -> Iterator[Callable[[], Events]]:
+        """Yield functions that read ``count`` events each, in any thread. Whole chunks are read fastest."""
+        for start in range(0, self._count, count):
+            yield partial(self.slice, start, start + count)
+
+    def encoded_times_and_polarities(self, start: int, stop: int) -> dict[str, list[bytes]]:
+        """Return the stored chunks of times and polarities with ``start <= index < stop``, by name of the dataset.
+
+        A recording of the same events from the first one on holds the same chunks. ``start`` begins a chunk. Empty for
+        files of other formats, unfinished files, and times that do not start at the first event.
+        """
+        root = self._file.attributes.get("/", {})
+        if root.get("format") != FORMAT or self._file.unfinished or self._offset != self.t_first:
+            return {}
+        chunks = {n: self._columns[n].encoded(start, min(stop, self._count)) for n in ("t", "p")}
+        return {f"events/{n}": c for n, c in chunks.items() if c is not None and self._columns[n].dtype == EVENTS[n]}
+
+    def _pieces_in_order(self) -> Iterator[Events]:
+        start, last = 0, None
+        with contextlib.closing(in_order(self.pieces(CHUNK))) as pieces:
+            for piece in pieces:  # whose own order is checked
+                checks.check_events(piece[:1], *self._size, where=str(self.path), first_index=start, allow_nan=True,
+                                    after_t=last)  # fmt: skip
+                start, last = start + len(piece), int(piece.t[-1])
+                yield piece
+
+    def _times(self, start: int, stop: int) -> NDArray[np.int64]:
+        return self._since_zero(rounded_times(self._read("t", start, stop)))
+
+    def _since_zero(self, t: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Add the file's offset to times, in the same array if it can be written."""
+        return np.add(t, self._offset, out=t if t.flags.writeable else None) if self._offset else t
+
+    def _read(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        return self._columns[name].read(start, stop)
+
+    def _bracket(self, t: int) -> tuple[int, int]:
+        """Return a short range of event indices around time ``t`` [us], from the millisecond index or by bisection."""
+        ms = (t - self._offset) // 1000
+        if self._ms_to_idx is not None and 0 <= ms < len(self._ms_to_idx):
+            ends = self._ms_to_idx.read(ms, min(ms + 2, len(self._ms_to_idx))).tolist()
+            return max(0, min(ends[0], self._count)), max(
+                0, min(ends[1] if len(ends) > 1 else self._count, self._count)
+            )
+        low, high = 0, self._count
+        while high - low > 1024:
+            middle = (low + high) // 2
+            low, high = (middle, high) if int(self._times(middle, middle + 1)[0]) < t else (low, middle)
+        return low, high
+
+
+# Rows and images that are read on demand. The columns refer to their file weakly, so these objects keep it.
+
+
+class _StoredRows:
+    """Rows of one or several datasets that are read on demand."""
+
+    def __init__(self, path: Path, name: str, count: int, read: Callable[[int, int], Any], file: Hdf5File) -> None:
+        self._path, self._name, self._count, self._read, self._file = path, name, count, read, file
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, which: slice, /) -> Any:
+        with errors_name(self._path, lambda: self._name):
+            start, stop = checks.slice_bounds(which, self._count, "rows")
+        with errors_name(self._path, lambda: f"{self._name} {start} .. {stop}"):
+            return self._read(start, stop)
+
+
+class _StoredImages:
+    """Images, or ground truth of all pixels, at several times, read on demand."""
+
+    def __init__(
+        self, path: Path, name: str, t: NDArray[np.int64], size: tuple[int, int], read: Callable[[int], Any],
+        file: Hdf5File,
+    ) -> None:  # fmt: skip
+        self._path, self._name, self._read, self._file = path, name, read, file
+        self.t = t
+        """Times of the images [us], shape ``(k,)``."""
+        self.size = size
+        """Size (width, height) of the images [px]."""
+
+    def __getitem__(self, index: int, /) -> Any:
+        at = range(len(self.t))[index]
+        with errors_name(self._path, lambda: f"{self._name} {index}"):
+            return self._read(at)
+
+
+# IMU samples and frames of native recordings.
+
+
+def read_imu(path: Path, file: Hdf5File) -> ImuSamples | None:
+    """Return the IMU samples of a file, or None if it has none."""
+    if "imu/t" not in file.columns:
+        return None
+    with errors_name(path, lambda: "imu"):
+        count = len(file.columns["imu/t"])
+        values = [_column(file, f"imu/{name}", count, (3,)) for name in ("angular_velocity", "acceleration")]
+        t = rounded_times(file.columns["imu/t"].read(0, count))
+        return ImuSamples(t, *(column.read(0, count).astype(np.float64, copy=False) for column in values))
+
+
+def read_frames(path: Path, file: Hdf5File) -> _StoredImages | None:
+    """Return the frames of a file, or None if it has none."""
+    if "frames/t" not in file.columns:
+        return None
+    with errors_name(path, lambda: "frames"):
+        times = file.columns["frames/t"]
+        image = _column(file, "frames/image", len(times))
+        if image.dtype not in (np.uint8, np.uint16) or not all(image.row):
+            raise AmiwarpError(f"frames are {image.dtype} of shape {image.row}; expected uint8 or uint16")
+        t = rounded_times(times.read(0, len(times)))
+        if (t[1:] < t[:-1]).any():
+            raise AmiwarpError("frames/t decreases; the file is damaged")
+        height, width = image.row
+        return _StoredImages(path, "frames", t, (width, height), lambda at: image.read(at, at + 1)[0], file)
+
+
+# Ground truth of native recordings.
+
+
+def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) -> Truth:
+    """Return the ground truth of a file with ``count`` events.
+
+    ``size``: width and height of the sensor [px].
+    """
+    attributes = file.attributes["truth"]
+    values = {name: _event_values(path, file, name, count) for name in EVENT_COLUMNS}
+    return Truth(
+        {name: attribute(attributes, f"{path}: /truth", name, float) for name in attributes},
+        stored_points=_points(path, file, count),
+        stored_causes=values["cause"],
+        stored_instances=values["instance"],
+        stored_depths=values["depth"],
+        stored_places=values["place"],
+        labels=_labels(path, file),
+        frames=_frames(path, file, size),
+        poses=_poses(path, file),
+        known=_masks(path, file, size),
+    )
+
+
+def _points(path: Path, file: Hdf5File, count: int) -> _StoredRows | None:
+    """Return the true points of the events, or None if they are not stored."""
+    if "truth/x" not in file.columns:
+        return None
+    columns = [_column(file, f"truth/{name}", count) for name in ("x", "y")]
+
+    def read(start: int, stop: int) -> NDArray[np.float32]:
+        return np.stack([_read_as(column, np.float32, start, stop) for column in columns], axis=1)
+
+    return _StoredRows(path, "truth", count, read, file)
+
+
+def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> _StoredRows | None:
+    """Return the values of the dataset ``truth/events/name``, or None if the dataset is missing."""
+    stored, (dtype, row) = f"truth/events/{name}", EVENT_COLUMNS[name]
+    if stored not in file.columns:
+        return None
+    return _StoredRows(path, stored, count, partial(_read_as, _column(file, stored, count, row), dtype), file)
+
+
+def _read_as(column: Column, dtype: Any, start: int, stop: int) -> NDArray[Any]:
+    """Read rows of a dataset as ``dtype``.
+
+    Raises :class:`AmiwarpError` for integers that do not fit, and for values without meaning.
+    """
+    values = column.read(start, stop)
+    check_truth(column.name, values)
+    if values.dtype.kind in "iu" and values.size and not np.can_cast(values.dtype, dtype):
+        limits = np.iinfo(dtype)
+        if values.min() < limits.min or values.max() > limits.max:
+            raise AmiwarpError(f"holds numbers outside of {limits.min} .. {limits.max}; the file is damaged")
+    return values.astype(dtype, copy=False)
+
+
+def _labels(path: Path, file: Hdf5File) -> WorldLabels | None:
+    """Return the names and classes of the instances, or None if they are not stored."""
+    if "truth/world/instances" not in file.columns:
+        return None
+    name = attribute(file.attributes.get("truth/world", {}), f"{path}: /truth/world", "name", str, "")
+    instances, categories = (_names(file, f"truth/world/{what}") for what in ("instances", "categories"))
+    with errors_name(path, lambda: "truth/world"):
+        return WorldLabels(name, instances, categories or ("",) * len(instances))
+
+
+def _names(file: Hdf5File, name: str) -> tuple[str, ...]:
+    """Return the names in a dataset; an empty tuple if the dataset is missing."""
+    column = file.columns.get(name)
+    if column is None:
+        return ()
+    return tuple(bytes(text).decode("utf-8", "replace") for text in column.read(0, len(column)).tolist())
+
+
+def _rising_times(path: Path, file: Hdf5File, name: str) -> NDArray[np.int64]:
+    """Return the times of a dataset [us]. Raises :class:`AmiwarpError` if they do not rise."""
+    times = rounded_times(file.columns[name].read(0, len(file.columns[name])))
+    if (np.diff(times) <= 0).any():
+        raise AmiwarpError(f"{path}: {name} does not increase; the file is damaged")
+    return times
+
+
+def _frames(path: Path, file: Hdf5File, size: tuple[int, int]) -> _StoredImages | None:
+    """Return the ground truth of all pixels at several instants, or None if it is not stored."""
+    if "truth/frames/t" not in file.columns:
+        return None
+    t = _rising_times(path, file, "truth/frames/t")
+    maps = {
+        name: _column(file, f"truth/frames/{name}", len(t), (*size[::-1], *tail)) for name, (_, tail) in MAPS.items()
+    }
+    poses = _column(file, "truth/frames/pose", len(t), (7,))
+    names = _names(file, "truth/joints/names")
+    joints = _column(file, "truth/frames/joints", len(t), (len(names), 3)) if names else None
+
+    def read(at: int) -> FrameTruth:
+        found = {name: _read_as(maps[name], dtype, at, at + 1)[0] for name, (dtype, _) in MAPS.items()}
+        pose = _read_as(poses, np.float64, at, at + 1)[0]
+        places = np.zeros((0, 3)) if joints is None else _read_as(joints, np.float64, at, at + 1)[0]
+        found |= {"rotation": ground_truth.rotation_of(pose), "position": pose[:3]}
+        return FrameTruth(t_us=int(t[at]), **found, joints=dict(zip(names, places, strict=True)))
+
+    return _StoredImages(path, "truth/frames", t, size, read, file)
+
+
+def _masks(path: Path, file: Hdf5File, size: tuple[int, int]) -> _StoredImages | None:
+    """Return the masks of known pixels, or None if they are not stored."""
+    if "truth/known/t" not in file.columns:
+        return None
+    t = _rising_times(path, file, "truth/known/t")
+    masks = _column(file, "truth/known/mask", len(t), size[::-1])
+    return _StoredImages(path, "truth/known", t, size, lambda at: masks.read(at, at + 1)[0] != 0, file)
+
+
+def _poses(path: Path, file: Hdf5File) -> _StoredRows | None:
+    """Return the poses of camera, bodies and joints, or None if they are not stored."""
+    if "truth/poses/t" not in file.columns:
+        return None
+    t = file.columns["truth/poses/t"]
+    camera = _column(file, "truth/poses/camera", len(t), (7,))
+    tables = {}
+    for what, (listed, table, width) in POSE_TABLES.items():
+        names = _names(file, listed)
+        if names and table in file.columns:
+            tables[what] = names, _column(file, table, len(t), (len(names), width))
+
+    def read(start: int, stop: int) -> Poses:
+        named = {
+            what: dict(zip(names, np.moveaxis(_read_as(column, np.float64, start, stop), 1, 0), strict=True))
+            for what, (names, column) in tables.items()
+        }
+        return Poses(rounded_times(t.read(start, stop)), _read_as(camera, np.float64, start, stop), **named)
+
+    return _StoredRows(path, "truth/poses", len(t), read, file)
+
+
+# Header, columns and millisecond index of a file that is written.
 
 
 def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> None:
@@ -48,13 +635,6 @@ def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> N
     if camera is not None and (camera.width, camera.height) != (width, height):
         given = f"camera is {camera.width}x{camera.height}, the recording {width}x{height}"
         raise AmiwarpError(f"{path}: {given}; give both the same size")
-
-
-def check_lengths(columns: Columns, count: int) -> None:
-    """Raise :class:`AmiwarpError` for a column whose number of elements or rows differs from the number of events."""
-    for name, column in columns.items():
-        if column.shape[:1] != (count,) or (column.ndim > 1 and not name.startswith("truth/")):
-            raise AmiwarpError(f"{name} has shape {column.shape}; expected ({count},)")
 
 
 def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) -> Iterator[NDArray[np.int64]]:
@@ -83,11 +663,6 @@ def filled(chunk: Columns, start: int, columns: Columns) -> Columns:
     return chunk
 
 
-def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
-    """Return names and data types of columns as text for messages."""
-    return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
-
-
 def write_header(
     file: Any,
     size: tuple[int, int],
@@ -96,8 +671,8 @@ def write_header(
     metadata: Mapping[str, MetadataValue],
 ) -> None:
     """Write the parts of a file that are known before the first event: format, size, camera, prism and metadata."""
-    file.attrs["format"] = hdf5_files.FORMAT
-    file.attrs["format_version"] = hdf5_files.FORMAT_VERSION
+    file.attrs["format"] = FORMAT
+    file.attrs["format_version"] = FORMAT_VERSION
     file.attrs["width"], file.attrs["height"] = size
     if camera is not None:
         file.create_group("camera").attrs.update(camera_attributes(camera))
@@ -108,18 +683,31 @@ def write_header(
         group.attrs[name] = item
 
 
-def event_columns(truth: EventTruth, count: int) -> Columns:
-    """Return the ground truth of ``count`` events as datasets.
+def encoder_columns(encoder: Encoder) -> Columns:
+    """Return times [us], angles [rad] and index pulses [us] of an encoder and of its second one as datasets."""
+    columns = {f"{ENCODERS[0]}{name}": getattr(encoder, name) for name in ("t", "angle", "index_t")}
+    if encoder.second is not None:
+        columns |= {f"{ENCODERS[1]}{name}": getattr(encoder.second, name) for name in ("t", "angle")}
+    return {name: values for name, values in columns.items() if values is not None}
+
+
+def event_columns(events: Events, truth: EventTruth, **flags: ArrayLike | None) -> Columns:
+    """Return events, their flags and their ground truth as datasets, without the times.
 
     Raises :class:`AmiwarpError` for arrays of another length or shape, and for values without meaning.
     """
-    columns: Columns = {}
+    count = len(events)
+    columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
+    columns |= {f"events/{name}": np.asarray(flag).astype(np.uint8) for name, flag in flags.items() if flag is not None}
+    for name, column in columns.items():
+        if column.shape != (count,):
+            raise AmiwarpError(f"{name} has shape {column.shape}; expected ({count},)")
     if truth.points is not None:
         points = np.asarray(truth.points, np.float32)
         if points.shape != (count, 2):
             raise AmiwarpError(f"truth points have shape {points.shape}; expected ({count}, 2)")
         columns["truth/x"], columns["truth/y"] = points[:, 0], points[:, 1]
-    for name, (dtype, row) in ground_truth.EVENT_COLUMNS.items():
+    for name, (dtype, row) in EVENT_COLUMNS.items():
         given = getattr(truth, name)
         if given is not None:
             values = np.asarray(given, dtype)
@@ -127,161 +715,15 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
                 raise AmiwarpError(f"truth of {name} has shape {values.shape}; expected {(count, *row)}")
             columns[f"truth/events/{name}"] = values
     for name, values in columns.items():
-        ground_truth.check_truth(name, values)
+        if name.startswith("truth/"):
+            check_truth(name, values)
     return columns
 
 
+# Writer of a whole recording or none.
+
 ROWS = 1024
 """Number of rows per HDF5 chunk in datasets of small rows, such as poses."""
-
-
-class RecordWriter:
-    """Writer of an open HDF5 file through HDF5: ground truth, IMU samples, frames, and other small datasets.
-
-    Datasets are created at their first rows. All instants must have the same joints. All tables of poses must have the
-    same bodies and joints. Records that are refused leave the file as it was.
-    """
-
-    def __init__(self, file: Any, path: Path, size: tuple[int, int], codec: Codec) -> None:
-        """Set up the writer; ``size`` is the width and height of the sensor [px]."""
-        self._file, self._path, self._size, self._codec = file, path, size, codec
-        self._datasets: dict[str, Any] = {}
-        self._given: dict[str, tuple[str, ...]] = {}  # names that all calls must give: of datasets, bodies and joints
-
-    def dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = (), chunk_rows: int = CHUNK) -> Any:
-        """Return a dataset, which is created at the first call."""
-        if name not in self._datasets:
-            self._datasets[name] = hdf5_files.make_dataset(self._file, name, dtype, row, chunk_rows, self._codec)
-        return self._datasets[name]
-
-    def extend(self, name: str, values: NDArray[Any], chunk_rows: int = CHUNK) -> None:
-        """Append rows to a dataset."""
-        dataset = self.dataset(name, values.dtype, values.shape[1:], chunk_rows)
-        start = dataset.shape[0]
-        dataset.resize(start + len(values), axis=0)
-        dataset[start:] = values
-
-    def write_truth_header(self, parameters: Mapping[str, float] | None, labels: WorldLabels | None) -> None:
-        """Write the true parameters of a simulation, and the names of a world's instances and their classes."""
-        if parameters is not None:
-            group = self._file.create_group("truth")
-            for name, value in parameters.items():
-                group.attrs[name] = float(value)
-        if labels is None:
-            return
-        self._file.require_group("truth/world").attrs["name"] = labels.name
-        self._write_names("truth/world/instances", labels.instances)
-        self._write_names("truth/world/categories", labels.categories)
-
-    def append_frame(self, frame: FrameTruth) -> None:
-        """Append the ground truth of an instant, which must be later than the previous instants."""
-        width, height = self._size
-        maps: Columns = {}
-        for name, (dtype, tail) in ground_truth.MAPS.items():
-            values = np.asarray(getattr(frame, name), dtype)
-            if values.shape != (height, width, *tail):
-                raise AmiwarpError(
-                    f"{self._path}: {name} of the instant {frame.t_us} us has shape {values.shape}; "
-                    f"expected {(height, width, *tail)}"
-                )
-            maps[f"truth/frames/{name}"] = values[None]
-        pose = ground_truth.as_poses(frame.rotation, frame.position)[None]
-        rows = {"truth/frames/t": np.array([frame.t_us], np.int64), "truth/frames/pose": pose}
-        joints = {name: at[None] for name, at in frame.joints.items()}
-        self._append(rows, maps, {"truth/joints/names": ("truth/frames/joints", joints)})
-
-    def append_poses(self, poses: Poses) -> None:
-        """Append a table of poses, which must be later than the previous poses."""
-        rows = {
-            "truth/poses/t": np.asarray(poses.t, np.int64),
-            "truth/poses/camera": np.asarray(poses.camera, np.float64),
-        }
-        named = {
-            "truth/joints/names": ("truth/joints/position", poses.joints),
-            "truth/poses/body_names": ("truth/poses/bodies", poses.bodies),
-        }
-        if len(poses):
-            self._append(rows, named=named)
-
-    def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
-        """Append a mask of known pixels, which holds from a time later than those before."""
-        width, height = self._size
-        if mask.shape != (height, width):
-            raise AmiwarpError(f"{self._path}: mask at {t_us} us has shape {mask.shape}; expected {(height, width)}")
-        rows = {"truth/known/t": np.array([t_us], np.int64)}
-        self._append(rows, {"truth/known/mask": np.asarray(mask, np.uint8)[None]})
-
-    def append_imu(self, samples: ImuSamples) -> None:
-        """Append samples, which must not be earlier than those before."""
-        self._append({f"imu/{name}": getattr(samples, name) for name in ("t", "angular_velocity", "acceleration")})
-
-    def append_image(self, t_us: int, image: NDArray[Any]) -> None:
-        """Append a frame, which must not be earlier than the frame before."""
-        stored = self._datasets.get("frames/image")
-        shape, dtype = (image.shape, image.dtype) if stored is None else (stored.shape[1:], stored.dtype)
-        try:
-            checks.check_image(image, shape, dtype)
-        except AmiwarpError as error:
-            raise AmiwarpError(f"{self._path}: {error}") from error
-        self._append({"frames/t": np.array([t_us], np.int64)}, {"frames/image": image[None]})
-
-    def _append(
-        self,
-        rows: Columns,
-        images: Columns | None = None,
-        named: Mapping[str, tuple[str, Mapping[str, NDArray[np.float64]]]] | None = None,
-    ) -> None:
-        """Append records to their datasets, of which the first holds the times [us].
-
-        ``images`` are stored in chunks of one row. ``named`` are arrays by name, which are stored side by side in a
-        dataset, if there are any: by the dataset of the names, that of the values and the arrays.
-        """
-        times, *_ = rows
-        names: dict[str, tuple[str, ...]] = {}
-        for where, (name, arrays) in (named or {}).items():
-            if arrays:
-                names[where] = tuple(arrays)
-                rows[name] = np.stack(list(arrays.values()), axis=1).astype(np.float64)
-        columns = rows | (images or {})
-        self._check_later(times, rows[times])
-        given = {times: tuple(columns), **names}
-        for where, found in given.items():
-            before = self._given.get(where, found)
-            if found != before:
-                change = f"{where} comes with {shown(found)}, before with {shown(before)}"
-                raise AmiwarpError(f"{self._path}: {change}; append the same in each call")
-        for name, values in columns.items():
-            if name.startswith("truth/"):
-                ground_truth.check_truth(name, values)
-            row = self._datasets[name].shape[1:] if name in self._datasets else values.shape[1:]
-            if values.shape[1:] != row:
-                raise AmiwarpError(f"{self._path}: rows of {name} have shape {values.shape[1:]}; expected {row}")
-        for where, found in names.items():
-            if where not in self._given:
-                self._write_names(where, found)
-        self._given |= given
-        for name, values in columns.items():
-            self.extend(name, values, ROWS if name in rows else 1)
-
-    def _write_names(self, name: str, names: tuple[str, ...]) -> None:
-        """Write names to a dataset of UTF-8 strings."""
-        import h5py
-
-        encoded = [text.encode("utf-8", "replace") for text in names]
-        kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
-        self._file.create_dataset(name, data=np.array(encoded, kind))
-
-    def _check_later(self, name: str, t: NDArray[np.int64]) -> None:
-        """Raise :class:`AmiwarpError` if times [us] do not follow the last time in a dataset.
-
-        Only times of the ground truth must be later.
-        """
-        stored = self._datasets.get(name)
-        if stored is not None and len(stored) and len(t) and t[0] < int(stored[-1]) + name.startswith("truth/"):
-            raise AmiwarpError(
-                f"{self._path}: {name} {t[0]} us does not follow {int(stored[-1])} us; append in order of time"
-            )
-
 
 FlaggedEvents: TypeAlias = tuple[Events, NDArray[np.uint8], Mapping[str, Sequence[bytes]]]
 """Compensated events with flags of shape ``(n,)``: 1 if the event lies inside the image; and chunks of their columns
@@ -357,7 +799,9 @@ class RecordingWriter:
         self._truth_parameters, self._truth_labels = truth_parameters, truth_labels
         self._metadata = dict(metadata or {})
         self._chunks: Any = None
-        self._records: RecordWriter | None = None
+        self._open = False
+        self._datasets: dict[str, Any] = {}
+        self._given: dict[str, tuple[str, ...]] = {}  # names that all calls must give: of datasets, bodies and joints
         self._turns = itertools.count()
         self._new: NewFile | None = None
         self._pending: Columns = {}
@@ -375,9 +819,9 @@ class RecordingWriter:
         try:
             with errors_name(self.path, lambda: "making the file"):
                 self._chunks = ChunkFile(self._new.part)
-                self._records = RecordWriter(self._chunks.hdf5, self.path, self._size, self._codec)
+                self._open = True
                 write_header(self._chunks.hdf5, self._size, self._camera, self._prism, self._metadata)
-                self._records.write_truth_header(self._truth_parameters, self._truth_labels)
+                self._write_truth_header()
         except BaseException:
             self._discard()
             raise
@@ -427,13 +871,20 @@ class RecordingWriter:
         AmiwarpError
             If events are unsorted or outside the frame, or the arrays differ from those of the first call.
         """
-        self._open_records()
+        self._check_open()
         self._check(events, len(self), allow_nan=inside is not None, after_t=self._t_last)
         if not len(events):
             return
         with errors_name(self.path, lambda: f"after {len(self)} events"):
             known = truth or EventTruth(points=None if truth_points is None else np.asarray(truth_points, np.float32))
-            columns = self._as_columns(events, known, {"inside": inside, "extrapolated": extrapolated})
+            columns = event_columns(events, known, inside=inside, extrapolated=extrapolated)
+            dtypes = {name: column.dtype for name, column in columns.items()}
+            if not len(self):
+                self._columns = dtypes
+                self._t_offset = int(events.t[0])
+            elif dtypes != self._columns:
+                given, before = (", ".join(f"{n} {dtype}" for n, dtype in c.items()) for c in (dtypes, self._columns))
+                raise AmiwarpError(f"events come with {given}, those before with {before}; give the same arrays")
             self._index(events.t, len(self))
             columns["events/t"] = events.t - self._t_offset
             self._store(columns, len(events))
@@ -466,7 +917,7 @@ class RecordingWriter:
         AmiwarpError
             If other events were written before, or events are unsorted or outside the frame.
         """
-        self._open_records()
+        self._check_open()
         if len(self) or count % CHUNK:
             given = f"fill() was called after {len(self)} events, for pieces of {count}"
             raise AmiwarpError(f"{self.path}: {given}; call it before append(), for a multiple of {CHUNK}")
@@ -526,10 +977,20 @@ class RecordingWriter:
         Parameters
         ----------
         frame : FrameTruth
-            Ground truth of all pixels, at a later time than the frame before.
+            Ground truth of all pixels, at a later time than the frame before. All frames have the same joints.
         """
         with self._appending(lambda: f"truth of the instant {frame.t_us} us"):
-            self._open_records().append_frame(frame)
+            maps: Columns = {}
+            for name, (dtype, tail) in MAPS.items():
+                values, expected = np.asarray(getattr(frame, name), dtype), (*self._size[::-1], *tail)
+                if values.shape != expected:
+                    what = f"{name} of the instant {frame.t_us} us has shape {values.shape}"
+                    raise AmiwarpError(f"{self.path}: {what}; expected {expected}")
+                maps[f"truth/frames/{name}"] = values[None]
+            pose = ground_truth.as_poses(frame.rotation, frame.position)[None]
+            rows = {"truth/frames/t": np.array([frame.t_us], np.int64), "truth/frames/pose": pose}
+            joints = {name: at[None] for name, at in frame.joints.items()}
+            self._append(rows, maps, {"truth/joints/names": ("truth/frames/joints", joints)})
 
     def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
         """Append a mask of the pixels whose scene is known.
@@ -542,7 +1003,11 @@ class RecordingWriter:
             Whether the scene at each pixel without the prism is known, shape ``(height, width)``.
         """
         with self._appending(lambda: f"mask at {t_us} us"):
-            self._open_records().append_known(t_us, mask)
+            if mask.shape != self._size[::-1]:
+                what = f"mask at {t_us} us has shape {mask.shape}"
+                raise AmiwarpError(f"{self.path}: {what}; expected {self._size[::-1]}")
+            rows = {"truth/known/t": np.array([t_us], np.int64)}
+            self._append(rows, {"truth/known/mask": np.asarray(mask, np.uint8)[None]})
 
     def append_poses(self, poses: Poses) -> None:
         """Append true poses of camera, bodies and joints.
@@ -550,10 +1015,14 @@ class RecordingWriter:
         Parameters
         ----------
         poses : Poses
-            Poses at later times than those before.
+            Poses at later times than those before, of the same bodies and joints.
         """
         with self._appending(lambda: "true poses"):
-            self._open_records().append_poses(poses)
+            rows = {"truth/poses/t": np.asarray(poses.t, np.int64)}
+            rows["truth/poses/camera"] = np.asarray(poses.camera, np.float64)
+            named = {listed: (table, getattr(poses, what)) for what, (listed, table, _) in POSE_TABLES.items()}
+            if len(poses):
+                self._append(rows, named=named)
 
     def append_imu(self, samples: ImuSamples) -> None:
         """Append samples of an inertial measurement unit.
@@ -564,7 +1033,7 @@ class RecordingWriter:
             Samples, not earlier than those before.
         """
         with self._appending(lambda: "IMU samples"):
-            self._open_records().append_imu(samples)
+            self._append({f"imu/{name}": getattr(samples, name) for name in ("t", "angular_velocity", "acceleration")})
 
     def append_image(self, t_us: int, image: NDArray[Any]) -> None:
         """Append a frame.
@@ -577,20 +1046,108 @@ class RecordingWriter:
             Grey levels, uint8 or uint16, shape ``(height, width)``, as those of the frames before.
         """
         with self._appending(lambda: f"frame at {t_us} us"):
-            self._open_records().append_image(t_us, image)
+            stored = self._datasets.get("frames/image")
+            shape, dtype = (image.shape, image.dtype) if stored is None else (stored.shape[1:], stored.dtype)
+            try:
+                checks.check_image(image, shape, dtype)
+            except AmiwarpError as error:
+                raise AmiwarpError(f"{self.path}: {error}") from error
+            self._append({"frames/t": np.array([t_us], np.int64)}, {"frames/image": image[None]})
 
     @contextlib.contextmanager
     def _appending(self, place: Callable[[], str]) -> Iterator[None]:
-        """Name the file and the place in errors, and raise the error of a full disk."""
+        """Name the file and the place in errors, also in that of a writer that is not open and that of a full disk."""
         with errors_name(self.path, place):
+            self._check_open()
             yield
             self._chunks.check()
 
-    def _open_records(self) -> RecordWriter:
-        if self._records is None:
+    def _append(
+        self,
+        rows: Columns,
+        images: Columns | None = None,
+        named: Mapping[str, tuple[str, Mapping[str, NDArray[np.float64]]]] | None = None,
+    ) -> None:
+        """Append records to their datasets, of which the first holds the times [us].
+
+        ``images`` are stored in chunks of one row. ``named`` are arrays by name, which are stored side by side in a
+        dataset, if there are any: by the dataset of the names, that of the values and the arrays. Records that are
+        refused leave the file as it was.
+        """
+        times, *_ = rows
+        names: dict[str, tuple[str, ...]] = {}
+        for where, (name, arrays) in (named or {}).items():
+            if arrays:
+                names[where] = tuple(arrays)
+                rows[name] = np.stack(list(arrays.values()), axis=1).astype(np.float64)
+        columns = rows | (images or {})
+        self._check_later(times, rows[times])
+        given = {times: tuple(columns), **names}
+        for where, found in given.items():
+            before = self._given.get(where, found)
+            if found != before:
+                change = f"{where} comes with {shown(found)}, before with {shown(before)}"
+                raise AmiwarpError(f"{self.path}: {change}; append the same in each call")
+        for name, values in columns.items():
+            if name.startswith("truth/"):
+                check_truth(name, values)
+            row = self._datasets[name].shape[1:] if name in self._datasets else values.shape[1:]
+            if values.shape[1:] != row:
+                raise AmiwarpError(f"{self.path}: rows of {name} have shape {values.shape[1:]}; expected {row}")
+        for where, found in names.items():
+            if where not in self._given:
+                self._write_names(where, found)
+        self._given |= given
+        for name, values in columns.items():
+            self._extend(name, values, ROWS if name in rows else 1)
+
+    def _check_later(self, name: str, t: NDArray[np.int64]) -> None:
+        """Raise :class:`AmiwarpError` if times [us] do not follow the last time in a dataset.
+
+        Only times of the ground truth must be later.
+        """
+        stored = self._datasets.get(name)
+        if stored is not None and len(stored) and len(t) and t[0] < int(stored[-1]) + name.startswith("truth/"):
+            raise AmiwarpError(
+                f"{self.path}: {name} {t[0]} us does not follow {int(stored[-1])} us; append in order of time"
+            )
+
+    def _write_names(self, name: str, names: tuple[str, ...]) -> None:
+        """Write names to a dataset of UTF-8 strings."""
+        import h5py
+
+        encoded = [text.encode("utf-8", "replace") for text in names]
+        kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
+        self._chunks.hdf5.create_dataset(name, data=np.array(encoded, kind))
+
+    def _write_truth_header(self) -> None:
+        """Write the true parameters of a simulation, and the names of a world's instances and their classes."""
+        if self._truth_parameters is not None:
+            group = self._chunks.hdf5.create_group("truth")
+            for name, value in self._truth_parameters.items():
+                group.attrs[name] = float(value)
+        if self._truth_labels is not None:
+            self._chunks.hdf5.require_group("truth/world").attrs["name"] = self._truth_labels.name
+            for what in ("instances", "categories"):
+                self._write_names(f"truth/world/{what}", getattr(self._truth_labels, what))
+
+    def _dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = (), chunk_rows: int = CHUNK) -> Any:
+        """Return a dataset, which is created at the first call."""
+        if name not in self._datasets:
+            self._datasets[name] = hdf5_files.make_dataset(self._chunks.hdf5, name, dtype, row, chunk_rows, self._codec)
+        return self._datasets[name]
+
+    def _extend(self, name: str, values: NDArray[Any], chunk_rows: int = CHUNK) -> None:
+        """Append rows to a dataset through HDF5."""
+        dataset = self._dataset(name, values.dtype, values.shape[1:], chunk_rows)
+        start = dataset.shape[0]
+        dataset.resize(start + len(values), axis=0)
+        dataset[start:] = values
+
+    def _check_open(self) -> None:
+        if not self._open:
             given = "the writer is used outside its 'with' block, before or after it, or after it failed"
             raise AmiwarpError(f"{self.path}: {given}; append inside the block of a new writer")
-        return self._records
 
     @contextlib.contextmanager
     def _results(self, jobs: Iterable[Callable[[], Result]]) -> Iterator[Iterator[Result]]:
@@ -599,7 +1156,7 @@ class RecordingWriter:
             with contextlib.closing(in_order(jobs)) as results:
                 yield results
         except BaseException:
-            self._records = None
+            self._open = False
             raise
 
     def set_encoder(self, encoder: Encoder) -> None:
@@ -611,22 +1168,6 @@ class RecordingWriter:
             The encoder.
         """
         self._encoder = encoder
-
-    def _as_columns(self, events: Events, truth: EventTruth, flags: Mapping[str, ArrayLike | None]) -> Columns:
-        columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
-        for name, flag in flags.items():
-            if flag is not None:
-                columns[f"events/{name}"] = np.asarray(flag).astype(np.uint8)
-        columns |= event_columns(truth, len(events))
-        check_lengths(columns, len(events))
-        dtypes = {name: column.dtype for name, column in columns.items()}
-        if not len(self):
-            self._columns = dtypes
-            self._t_offset = int(events.t[0])
-        elif dtypes != self._columns:
-            given = f"events come with {describe_columns(dtypes)}"
-            raise AmiwarpError(f"{given}, those before with {describe_columns(self._columns)}; give the same arrays")
-        return columns
 
     def _index(self, t: NDArray[np.int64], start: int) -> None:
         """Extend the index ms_to_idx by the events from event ``start`` on.
@@ -642,7 +1183,7 @@ class RecordingWriter:
 
     def _write_index(self, least: int) -> None:
         if self._ms_count >= least:
-            self._open_records().extend("ms_to_idx", np.concatenate(self._ms))
+            self._extend("ms_to_idx", np.concatenate(self._ms))
             self._ms, self._ms_count = [], 0
 
     def _store(self, columns: Columns, count: int) -> None:
@@ -678,31 +1219,26 @@ class RecordingWriter:
             self._chunks.write(turn, chunks, self._dataset_of)
 
     def _dataset_of(self, chunk: EncodedChunk) -> Any:
-        return self._open_records().dataset(chunk.name, chunk.values.dtype, chunk.values.shape[1:])
+        return self._dataset(chunk.name, chunk.values.dtype, chunk.values.shape[1:])
 
     def _finish(self) -> None:
-        extend = self._open_records().extend
+        self._check_open()
         if self._pending_count:
             self._write([{name: column[: self._pending_count] for name, column in self._pending.items()}])
             self._pending_count = 0
         self._ms.append(np.array([len(self)], np.int64))
         self._write_index(0)
-        for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.uint8)):
-            extend(f"events/{name}", np.zeros(0, self._columns.get(f"events/{name}", np.dtype(dtype))))
+        for name, dtype in EVENTS.items():
+            self._extend(f"events/{name}", np.zeros(0, self._columns.get(f"events/{name}", np.dtype(dtype))))
         self._chunks.hdf5["t_offset"] = np.int64(self._t_offset)
         if self._encoder is not None:
             group = self._chunks.hdf5.create_group("encoder")
             group.attrs["clock_offset_us"] = float(self._encoder.clock_offset_us)
-            for name in ("t", "angle", "index_t"):
-                values = getattr(self._encoder, name)
-                if values is not None:
-                    extend(f"encoder/{name}", values)
-            if self._encoder.second is not None:
-                for name in ("t", "angle"):
-                    extend(f"encoder/second_{name}", getattr(self._encoder.second, name))
+            for name, values in encoder_columns(self._encoder).items():
+                self._extend(name, values)
 
     def _close(self) -> None:
-        self._records = None
+        self._open, self._datasets, self._given = False, {}, {}
         if self._chunks is not None:
             self._chunks.close()
 
@@ -718,7 +1254,7 @@ class RecordingWriter:
 #
 # DSEC's files do not hold the sensor size. It is added as attributes, which DSEC's programs ignore.
 
-COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.uint32, "p": np.uint8}
+DSEC = EVENTS | {"t": np.uint32}
 """Types of DSEC's datasets."""
 
 
@@ -729,7 +1265,7 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
         file.attrs["width"], file.attrs["height"] = about.width, about.height
         file["t_offset"] = np.int64(about.t_first)
         create = partial(hdf5_files.make_dataset, file, codec=about.codec)
-        datasets = {name: create(f"events/{name}", dtype) for name, dtype in COLUMNS.items()}
+        datasets = {name: create(f"events/{name}", dtype) for name, dtype in DSEC.items()}
         index = [np.zeros(0, np.int64)]
         written = ms = 0
         for events in regroup(blocks, count=CHUNK):
@@ -737,7 +1273,7 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
                 index.append(entries)
                 ms += entries.size
             columns = {"x": events.x, "y": events.y, "t": events.t - about.t_first, "p": events.p}
-            for name, dtype in COLUMNS.items():
+            for name, dtype in DSEC.items():
                 hdf5_files.append_values(datasets[name], written, columns[name].astype(dtype), about.codec)
             written += len(events)
             chunks.check()
@@ -780,7 +1316,7 @@ def _copy_events(
     ``size`` is that of the image [px]. Flags that a source of compensated events does not have follow from it.
     """
     source, truth = recording.events, recording.truth
-    flags = {name: getattr(source, name, None) for name in ("inside", "extrapolated")}
+    flags = {name: getattr(source, name, None) for name in FLAGS}
     start = 0
     for block in source.blocks():
         stop = start + len(block)
@@ -914,7 +1450,7 @@ class LiveWriter:
         self._t_offset = 0
         self._t_last: int | None = None
         self._next_ms = 0
-        self._names = ("encoder/", "encoder/second_")[:encoders]  # beginnings of the names of an encoder's datasets
+        self._names = ENCODERS[:encoders]
         self._spans: dict[str, tuple[int, int]] = {}  # times of the first and the last sample of each encoder [us]
         self._pulses = np.zeros(0, np.int64)  # index pulses later than the last encoder sample
         self._encoder: Encoder | None = None
@@ -960,11 +1496,11 @@ class LiveWriter:
 
     def _create_datasets(self) -> None:
         """Create all datasets, because none can be added in single-writer mode."""
-        file, coordinate = self._file, np.float32 if self._compensated else np.uint16
+        file = self._file
         write_header(file, self._size, self._camera, self._prism, self._metadata)
-        dtypes = {"x": coordinate, "y": coordinate, "p": np.uint8, "t": np.int64}
+        dtypes: dict[str, Any] = {name: EVENTS[name] for name in "xypt"}
         if self._compensated:
-            dtypes |= {"inside": np.uint8, "extrapolated": np.uint8}
+            dtypes |= dict.fromkeys("xy", np.float32) | dict.fromkeys(FLAGS, np.uint8)
         self._columns = {
             f"events/{name}": hdf5_files.make_dataset(file, f"events/{name}", dtype) for name, dtype in dtypes.items()
         }
@@ -1051,7 +1587,7 @@ class LiveWriter:
             pulses = np.append(self._pulses, as_times(index_t_us) + offset)
             self._small["encoder/index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
             self._pulses = pulses[pulses > last][-MOST_PULSES:]
-        if sum(small.waiting_bytes for small in self._small.values()) > MOST_WAITING:
+        if self._waiting_bytes() > MOST_WAITING:
             with errors_name(self.path, lambda: f"after {len(self)} events"):
                 self._flush()
         self.tick()
@@ -1085,23 +1621,17 @@ class LiveWriter:
             raise AmiwarpError(
                 f"{self.path}: compensated events need the flags inside, events from a sensor take no flags"
             )
-        columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
-        if self._compensated:
-            columns["events/inside"] = np.asarray(inside).astype(np.uint8)
-            flags = np.zeros(len(events)) if extrapolated is None else np.asarray(extrapolated)
-            columns["events/extrapolated"] = flags.astype(np.uint8)
-        check_lengths(columns, len(events))
-        return columns
+        if self._compensated and extrapolated is None:
+            extrapolated = np.zeros(len(events))
+        return event_columns(events, EventTruth(), inside=inside, extrapolated=extrapolated)
 
     def _to_finish(self) -> int:
         """Return the space that finishing the file may take [bytes]: one whole chunk and the waiting samples."""
         event = 19 if self._compensated else 13
-        return (
-            FINISH_BYTES
-            + event * CHUNK
-            + event * CHUNK // 64
-            + sum(small.waiting_bytes for small in self._small.values())
-        )
+        return FINISH_BYTES + event * CHUNK + event * CHUNK // 64 + self._waiting_bytes()
+
+    def _waiting_bytes(self) -> int:
+        return sum(small.waiting_bytes for small in self._small.values())
 
     def _reserve(self, extra: int = 0) -> None:
         """Reserve disk space to finish the file, and ``extra`` bytes.
@@ -1171,14 +1701,11 @@ class LiveWriter:
             put_in_place(self.part, self.path, overwrite=self._overwrite)
 
     def _replace_encoder(self, encoder: Encoder) -> None:
-        both = (encoder,) if encoder.second is None else (encoder, encoder.second)
-        self._reserve(2 * sum(each.t.nbytes + each.angle.nbytes for each in both))
+        columns = {"encoder/index_t": np.zeros(0, np.int64), **encoder_columns(encoder)}
+        self._reserve(2 * sum(values.nbytes for values in columns.values()))
         self._file["encoder"].attrs["clock_offset_us"] = float(encoder.clock_offset_us)
-        pulses = encoder.index_t
-        self._small["encoder/index_t"].replace(np.zeros(0, np.int64) if pulses is None else pulses)
-        for name, each in zip(self._names, both, strict=True):
-            for column in ("t", "angle"):
-                self._small[name + column].replace(getattr(each, column))
+        for name, values in columns.items():
+            self._small[name].replace(values)
 
     def _close(self) -> None:
         file, self._file = self._file, None
