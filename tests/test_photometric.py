@@ -164,7 +164,9 @@ def test_the_calmest_turns_are_used(texture: np.ndarray) -> None:
 
 
 def test_a_camera_that_moves_too_fast_is_named(texture: np.ndarray) -> None:
-    with pytest.raises(AmiwarpError, match=r"moves too fast for the prism.*hold the camera still"):
+    with pytest.raises(
+        AmiwarpError, match=r"moves too fast for the prism.*hold the camera still.*or record such motion for"
+    ):
         calibrate(shaken(texture, turning_s=0.13), photometric=COARSE, model="exact", **SHORT)
 
 
@@ -182,6 +184,30 @@ def test_a_tremor_that_hides_the_prism_is_refused(texture: np.ndarray) -> None:
     )  # fmt: skip
     with pytest.raises(AmiwarpError, match="the camera moves too fast for the prism"):
         calibrate(recording, photometric=COARSE, model="exact", **SHORT)
+
+
+def test_a_camera_that_never_rests_is_calibrated_turn_by_turn(texture: np.ndarray, device: str) -> None:
+    """It sways at 1.3 Hz, by up to 70 deg/s, and trembles at 9.7 Hz beside a prism of 12 turns per second."""
+    t = np.arange(0.0, 1.7, 0.005)
+    sway, tremor = 1.2 * np.sin(2.0 * math.pi * 1.3 * t + 1.0), 0.22 * np.sin(2.0 * math.pi * 9.7 * t + 1.0)
+    recording = simulate(
+        texture, Camera.from_fov(80, 60, math.radians(50)), TRUE_PRISM, duration_s=1.7,
+        camera_motion=CameraMotion(np.stack([t, np.gradient(sway, t) / 10.0 + tremor, sway, 0.3 * tremor], axis=1)),
+        seed=2, sensor=SensorModel(contrast_on=0.5, contrast_off=0.5),
+    )  # fmt: skip
+    said: list[str] = []
+    c = calibrate(
+        recording, photometric=COARSE, model="exact", device=device, progress=lambda what, _: said.append(what), **SHORT
+    )
+    assert [bool(re.search(r"never rests: the answer is the mean of those of \d+ turns", w)) for w in c.warnings] == [
+        True
+    ]
+    assert error_px(recording, c) < 0.05
+    assert c.free == ("apex", "phase")
+    assert set(c.parameters) == {"apex", "phase"}
+    assert c.photometric is not None
+    assert c.photometric.verdict.startswith("mean of the answers of")
+    assert "calibrating, turn by turn" in said
 
 
 def test_the_result_survives_its_file(calibration: Calibration, tmp_path: Path) -> None:

@@ -405,11 +405,11 @@ def test_arguments_of_another_kind_of_windows_are_refused(given: dict[str, Any],
 
 
 def test_events_that_are_not_in_order_are_named(device: str) -> None:
-    """Reversed ones, and those of a batch, without its windows."""
-    back = some_events(100)[::-1]
-    joined = amiwarp.Events.concatenate([some_events(100), some_events(100)])
-    for events, at in ((back, 1), (joined, 100)):
-        given = put(events, device)
+    """Events joined in reversed order, and those of a batch, without its windows."""
+    events = some_events(100)
+    join = amiwarp.Events.concatenate if device == "cpu" else DeviceEvents.concatenate
+    for parts, at in (([events[50:], events[:50]], 50), ([events, events], 100)):
+        given = join([put(part, device) for part in parts])
         said = rf"event {at} .* sort by time, or give the windows of amiwarp\.collate"
         for function in (partial(amiwarp.windows, duration_us=10), partial(amiwarp.event_count, width=9, height=9)):
             with pytest.raises(AmiwarpError, match=said):

@@ -3,15 +3,17 @@
 :func:`calibrate` runs a :class:`Calibrator`, and for the model ``auto`` lets a :class:`ModelChooser` choose among the
 models. :func:`prepare` sets up an attempt: the encoder, the events and the parameter space. The attempt is made by the
 stages of the settings; the photometric stage also corrects lens, prism and sensor, see ``photometric/causes.py``.
-If it still says that something is wrong, :meth:`Calibrator.run` makes further attempts, in this order:
+If it still says that something is wrong, :meth:`Calibrator.run` makes further attempts. With an encoder:
 
 1. with an error of the encoder that repeats every turn corrected
 2. without hot and flickering pixels, if no brightness map explains the events
-3. without the parts of the image in which something moves; if there are none and no map explains the events, with the
-   encoder's direction or scale corrected, which ends in an error that says so, or with the camera's rotation free
-4. with the camera's rotation free, also at a low cost if it explains much of the rest; it is dropped from the result
+3. then one of these: without the parts of the image in which something moves; or, if no map explains the events, with
+   the encoder's direction or scale corrected, which ends in an error that says so, or with the camera's rotation free;
+   or with the rotation free, if it explains much of the rest at a low cost. A camera that never rests is calibrated
+   turn by turn. The rotation is dropped from the result
 
-Without an encoder, an attempt also examines whether the prism's speed varies, and finds the path of its angle.
+Without an encoder, an attempt also examines whether the prism's speed varies, and finds the path of its angle. Another
+attempt corrects an error of the path that repeats every turn.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Unpack
 
@@ -31,6 +33,7 @@ from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
 from amiwarp.calib.model_choice import ModelChooser
 from amiwarp.calib.parameters import (
+    CHANGES,
     LINEAR_UNKNOWNS,
     MOTION,
     RATES,
@@ -41,8 +44,8 @@ from amiwarp.calib.parameters import (
     phase_names,
     units,
 )
-from amiwarp.calib.photometric import stage
-from amiwarp.calib.photometric.cost import upload_ahead
+from amiwarp.calib.photometric import consistency, stage
+from amiwarp.calib.photometric.cost import upload_ahead, van_der_corput
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
 from amiwarp.calib.settings import AUTO, CalibrationOptions, Settings
@@ -241,8 +244,7 @@ class Calibrator:
     def run(self) -> Calibration:
         """Return the calibration of ``settings.model``; raise :class:`AmiwarpError` as :func:`calibrate` does.
 
-        If no brightness map explains the events, or a slow rotation of the camera explains much of what is left, the
-        camera's rotation is freed too.
+        If the first attempt shows that something is wrong, further ones are made, see the top of this file.
         """
         began = time.perf_counter()
         tried = self.attempt()
@@ -275,12 +277,13 @@ class Calibrator:
             checks.check_nominal(found.model_name, found.parameters, recording.prism, recording.name)
         return replace(found, seconds=time.perf_counter() - began)
 
-    def attempt(self, rival: Attempt | None = None, *, angles_hold: bool = False) -> Attempt:
+    def attempt(self, rival: Attempt | None = None, *, angles_hold: bool = False, fast: bool = False) -> Attempt:
         """Calibrate once by the stages of the settings, with the free parameters that they name.
 
         The attempt fails early if its image is not clearly sharper than that of a ``rival``, another attempt, or if it
-        does not come to a clearly lower cost. With ``angles_hold``, an error of the prism's angles is looked for only
-        after corrections of the camera and the prism, and refused.
+        does not come to a clearly lower cost. With ``angles_hold``, lens and prism are corrected before an error of the
+        prism's angles is looked for; with such an error, the answer is rejected. With ``fast``, for a camera in fast
+        motion, the photometric stage ends with its first answer.
         """
         began, search = time.perf_counter(), None
         try:
@@ -298,7 +301,7 @@ class Calibrator:
                         checks.check_sharper(search.gain_over(rival.search), recording.name)
                 found = _sharpest(recording, search, *search.check_answer(recording.name))
                 if "photometric" in self.settings.stages:
-                    search.ahead, search.angles_hold = ahead, angles_hold
+                    search.ahead, search.angles_hold, search.fast = ahead, angles_hold, fast
                     search.meanwhile = iter(()) if self.meanwhile is None else self.meanwhile(found)
                     try:
                         refined = stage.refine(recording, search)
@@ -454,7 +457,8 @@ class Calibrator:
         """Return the attempt with a free camera rotation if that lowers the photometric cost enough; else ``tried``.
 
         It uses two turns of the prism: the calmest ones, if these are clearly calmer than those in the middle of the
-        recording. A camera that never rests must give about the same answer at other times.
+        recording. A camera that never rests must give about the same answer at other times. Otherwise the answer is
+        the mean of many turns, or an error if the recording is too short for it, or no rotation explains its turns.
         """
         encoder, name = self.recording.encoder, self.recording.name
         assert encoder is not None
@@ -462,15 +466,24 @@ class Calibrator:
         repetition, span = 1.0, None
         if MODELS[self.settings.model].ANGLES == 1:  # with two angles, a still scene does not repeat every turn
             repetition, span = first_guess.calmest_span(self.recording, encoder)
-        restless = repetition < first_guess.LEAST_REPETITION
+        restless, calm = repetition < first_guess.LEAST_REPETITION, repetition >= first_guess.LEAST_CALM
+        starts = self._starts()
+        many = len(starts) >= LEAST_STARTS
+        too_fast = Attempt(None, checks.moves_too_fast(name, repetition, short=not many))
+        if restless and many:
+            return self.turn_by_turn(tried, starts) or (tried if tried.accepted else too_fast)
         again = self._turning(rival) if span is None else self._turning_in(span)
         if not again.accepted or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
             # a rotation makes the image sharper, or the attempt would have failed
             if restless and not tried.accepted and rival is not None and again.calibration is not None:
-                return Attempt(None, checks.moves_too_fast(name, repetition))
-            return tried
-        if restless and not self._confirmed(again):
-            return Attempt(None, checks.moves_too_fast(name, repetition))
+                return too_fast
+            moves = many and not calm and not tried.accepted
+            return (self.turn_by_turn(tried, starts) if moves else None) or tried
+        apart_px = ENOUGH_PX if many else stage.LARGEST_INCONSISTENCY_PX  # two wrong answers may be alike by chance
+        if (not calm or (many and again.unexplained)) and not self._confirmed(again, apart_px):
+            mean = self.turn_by_turn(tried, starts) if many else None
+            if mean is not None or not calm:
+                return mean or too_fast
         found = again.found()
         speed = math.degrees(math.hypot(*(found.parameters[n] for n in RATES)))
         # only the prism's parameters are kept: the rotation holds for two turns of the recording
@@ -487,21 +500,75 @@ class Calibrator:
             said += ", from {:.2f} to {:.2f} s, where the camera is calmest".format(*since)
         return Attempt(_warning(still, said))
 
-    def _turning(self, rival: Attempt | None) -> Attempt:
+    def _starts(self) -> NDArray[np.int64]:
+        """Return the times [us] at which the turns of :meth:`turn_by_turn` begin: a random one in each equal interval.
+
+        At equal distances, a motion whose frequency differs from the prism's by a multiple of theirs would change all
+        answers alike.
+        """
+        source, encoder = self.recording.events, self.recording.encoder
+        assert encoder is not None
+        if MODELS[self.settings.model].ANGLES > 1 or not encoder.rpm:
+            return np.zeros(0, np.int64)
+        turn_us = 60e6 / abs(encoder.rpm)
+        longest = source.t_last - source.t_first - int(WINDOW_TURNS * turn_us)
+        count = min(MOST_STARTS, int(max(longest, 0) / (LEAST_STEP * turn_us)))
+        drawn = np.random.default_rng(0).uniform(size=count)
+        return source.t_first + (longest * (np.arange(count) + drawn) / max(count, 1)).astype(np.int64)
+
+    def turn_by_turn(self, tried: Attempt, starts: NDArray[np.int64]) -> Attempt | None:
+        """Return the mean of the answers of single turns of the prism, or the error that it is too uncertain.
+
+        None if no rotation of the camera explains the events of single turns. At least :data:`LEAST_STARTS` turns begin
+        at the times ``starts`` [us].
+
+        The camera's own motion changes the orbit by a different amount in each turn, unless it is in step with the
+        prism, so the mean of these changes vanishes. Within a turn, the camera's angular velocity is taken as linear in
+        time.
+        """
+        encoder, name = self.recording.encoder, self.recording.name
+        assert encoder is not None
+        length_us = int(WINDOW_TURNS * 60e6 / abs(encoder.rpm))
+        most_cost = min(LARGEST_FAST_COST, stage.LARGEST_COST_RATIO * tried.cost)
+        single = replace(self, progress=None)
+        answers: dict[int, Attempt] = {}
+        costs: list[float] = []
+        stated_px = math.inf
+        for k in van_der_corput(len(starts)):
+            answer = single._turning_in((int(starts[k]), int(starts[k]) + length_us), fast=True)
+            costs.append(answer.cost)
+            if answer.accepted:
+                answers[k] = answer
+            if self.progress is not None:
+                self.progress("calibrating, turn by turn", len(costs) / len(starts))
+            if len(costs) < LEAST_JUDGED:
+                continue
+            cost = float(np.median(costs))
+            if cost > most_cost or len(answers) < LEAST_ANSWERED * len(costs):
+                return None
+            mean, stated_px = _mean([answers[n] for n in sorted(answers)], cost)
+            if len(costs) >= LEAST_AVERAGED and stated_px <= ENOUGH_PX:
+                break
+        if stated_px > LARGEST_MEAN_PX:
+            return Attempt(None, checks.scatters(name, len(answers), stated_px, LARGEST_MEAN_PX))
+        said = f"the camera never rests: the answer is the mean of those of {len(answers)} turns, ± {stated_px:.2f} px"
+        return Attempt(_warning(mean, said))
+
+    def _turning(self, rival: Attempt | None, *, fast: bool = False) -> Attempt:
         """Return the attempt with a free camera rotation, in the middle of the recording."""
         encoder = self.recording.encoder
         assert encoder is not None
-        free = (*MODELS[self.settings.model].freed(encoder.ratio), "motion")
-        return replace(self, settings=replace(self.settings, free=free)).attempt(rival)
+        free = (*MODELS[self.settings.model].freed(encoder.ratio), "motion", *(CHANGES if fast else ()))
+        return replace(self, settings=replace(self.settings, free=free)).attempt(rival, fast=fast)
 
-    def _turning_in(self, span: tuple[int, int]) -> Attempt:
+    def _turning_in(self, span: tuple[int, int], *, fast: bool = False) -> Attempt:
         """Return the attempt with a free camera rotation in a time span [us]."""
         source = self.recording.events
         events = MemoryEvents(source.between(*span), *source.size)
-        return replace(self, recording=replace(self.recording, events=events))._turning(None)
+        return replace(self, recording=replace(self.recording, events=events))._turning(None, fast=fast)
 
-    def _confirmed(self, turning: Attempt) -> bool:
-        """Return whether the last or the first turns of the recording give the same answer as those in the middle.
+    def _confirmed(self, turning: Attempt, apart_px: float) -> bool:
+        """Return whether the answer of the last or the first turns is at most ``apart_px`` from that of the middle.
 
         A motion with frequencies near that of the prism changes the orbit by another amount at each time. Where there
         is no other answer, a low cost must do.
@@ -513,9 +580,60 @@ class Calibrator:
             for span in (source.t_last - length, source.t_last), (source.t_first, source.t_first + length):
                 other = self._turning_in(span)
                 if other.accepted:
-                    apart = predicted_error(turning.found().model, other.found().model, grid=8).rms
-                    return apart <= stage.LARGEST_INCONSISTENCY_PX
+                    return predicted_error(turning.found().model, other.found().model, grid=8).rms <= apart_px
         return not turning.unexplained
+
+
+# Calibration turn by turn, of a camera that never rests.
+
+WINDOW_TURNS = 1.05
+"""Length of each part of the recording that gives an answer [turns]. In longer ones, the velocity is less linear."""
+MOST_STARTS, LEAST_STARTS = 96, 16
+"""Largest and smallest number of these parts."""
+LEAST_STEP = 1.1
+"""Smallest mean distance of their starts [turns]."""
+LEAST_JUDGED, LEAST_AVERAGED = 8, 32
+"""Number of parts from which on the recording may be given up, and from which on the mean may suffice."""
+LEAST_ANSWERED = 0.75
+"""Smallest share of the parts with an accepted answer."""
+LARGEST_FAST_COST = 0.3
+"""Largest median of the costs. It is about 0.15 for a rotation alone, and 0.2 to 0.3 in a room. At 0.4, in a street at
+13 m/s, orbits come out 0.2 px too large."""
+GROUPS = 8
+"""Number of groups of successive answers."""
+PARALLAX_STD_PX = 0.02
+"""Standard deviation of size and phase that parallax leaves, however many turns are averaged [px]."""
+ENOUGH_PX, LARGEST_MEAN_PX = 0.03, 0.05
+"""Stated error of the mean that suffices, and the largest one [px rms]."""
+
+
+def _mean(answers: Sequence[Attempt], cost: float) -> tuple[Calibration, float]:
+    """Return the mean of the answers of successive turns, of which ``cost`` is the median cost, and its error [px rms].
+
+    The camera's rotation, which each turn has its own of, is left out. A motion with nearly the frequency of the prism
+    changes successive answers alike: their mean is then less certain than their scatter tells, and the scatter of the
+    means of groups counts.
+    """
+    best = min(answers, key=lambda a: a.cost)
+    assert best.search is not None
+    assert best.photometric is not None
+    space = best.search.full_space.without(MOTION)
+    each = np.array([space.to_vector(a.found().parameters) for a in answers])
+    groups = np.array([group.mean(axis=0) for group in np.array_split(each, min(GROUPS, len(each)))])
+    by_each, by_group = (np.cov(some.T) / len(some) for some in (each, groups))
+    scatter = by_each if np.trace(by_each) > np.trace(by_group) else by_group
+    v, covariance = each.mean(axis=0), scatter + PARALLAX_STD_PX**2 * np.eye(each.shape[1])
+    values = {n: x for n, x in space.to_values(v).items() if n not in MOTION}  # the rotation's are those of the start
+    stds = space.deviations(v, covariance)
+    photometric = replace(
+        best.photometric, parameters=values, uncertainty=stds, cost=cost, warnings=(),
+        verdict=f"mean of the answers of {len(each)} turns",
+    )  # fmt: skip
+    found = replace(
+        best.found(), parameters=values, uncertainty=stds, free=space.names, photometric=photometric, middle_us=None,
+        warnings=(),
+    )  # fmt: skip
+    return found, consistency.stated_px(space, v, covariance)
 
 
 def _warning(found: Calibration, *said: str) -> Calibration:

@@ -122,13 +122,27 @@ def wrong_direction(name: str, cost: float, reversed_cost: float) -> AmiwarpErro
     )
 
 
-def moves_too_fast(name: str, repetition: float) -> AmiwarpError:
-    """Return the error for a camera in fast motion; ``repetition`` is the correlation of events of successive turns."""
+HOLD_STILL = "hold the camera still for three turns, at any time of the recording, or turn the prism faster"
+"""Remedy for a camera in fast motion."""
+
+
+def moves_too_fast(name: str, repetition: float, *, short: bool) -> AmiwarpError:
+    """Return the error for a camera in fast motion; ``repetition`` is the correlation of events of successive turns.
+
+    A longer recording may help one that is ``short``.
+    """
     return AmiwarpError(
-        f"{name}: the camera moves too fast for the prism: even in the calmest two turns the events of one hardly "
-        f"repeat in the next (correlation {repetition:.2f}; 0.9 at rest, 0.7 in a calm hand), and no rotation at a "
-        "steady speed explains them; hold the camera still for three turns, at any time of the recording, or turn the "
-        "prism faster"
+        f"{name}: the camera moves too fast for the prism: the events of one turn repeat in the next with a correlation"
+        f" of {repetition:.2f} at most (0.9 at rest, 0.7 in a calm hand), and no rotation explains them at all times; "
+        f"{HOLD_STILL}{', or record such motion for 40 turns' if short else ''}"
+    )
+
+
+def scatters(name: str, turns: int, stated_px: float, most_px: float) -> AmiwarpError:
+    """Return the error for a fast camera if the answers of single turns differ too much for their mean to be used."""
+    return AmiwarpError(
+        f"{name}: the camera never rests, and the answers of {turns} turns of the prism differ: their mean is "
+        f"uncertain by {stated_px:.2f} px, more than {most_px:g} px; {HOLD_STILL}, or record more turns"
     )
 
 

@@ -158,6 +158,8 @@ CALM_TURNS = 2.15
 LEAST_REPETITION = 0.5
 """Smallest correlation of the events of successive turns in a calm span. A still camera's is 0.9, and that of a scene
 that moves by a cell in a turn is near 0."""
+LEAST_CALM = 0.7
+"""Correlation below which the camera may be in fast motion even in the calmest span: it is that of a calm hand."""
 MOST_CALM_TURNS = 96
 """Largest number of turns that are examined, which limits the memory."""
 LESS_CALM = 0.75

@@ -367,7 +367,9 @@ class Search:
         self.most_cost = math.inf
         """Cost of the photometric stage above which its answer is of no use."""
         self.angles_hold = False
-        """Whether the photometric stage takes the prism's angles as they are."""
+        """Whether the photometric stage corrects lens and prism before it looks for an error of the prism's angles."""
+        self.fast = False
+        """Whether the camera is in fast motion: the photometric stage ends with its first answer."""
         self.stages: list[StageSummary] = []
         self.pad = padding(self.space)
         """Border of the fine image outside the sensor [px]."""

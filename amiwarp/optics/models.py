@@ -1,4 +1,4 @@
-"""Models of the displacement by the prism, from two parameters to the exact refraction.
+"""Optical models of a prism, from two parameters to the exact refraction, of a pair of prisms and of a plate.
 
 The formulas are derived in ``docs/explanation/optics.md``.
 """

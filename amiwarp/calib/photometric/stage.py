@@ -53,6 +53,8 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     given = search.settings.photometric.sensor
     found = Equations(recording, search, given)
     answer = found.answers.search(found.start)
+    if search.fast:
+        return found.finished(answer)
     if found.answers.cost.space.moving:
         answer = found.with_paths(answer)
     if answer.result.cost > min(LARGEST_STILL_COST, search.most_cost):
