@@ -597,12 +597,13 @@ LEAST_JUDGED, LEAST_AVERAGED = 8, 32
 LEAST_ANSWERED = 0.75
 """Smallest share of the parts with an accepted answer."""
 LARGEST_FAST_COST = 0.3
-"""Largest median of the costs. It is about 0.15 for a rotation alone, and 0.2 to 0.3 in a room. At 0.4, in a street at
-13 m/s, orbits come out 0.2 px too large."""
+"""Largest median of the costs. It is about 0.15 for a rotation alone, and 0.4 in a street at 13 m/s."""
 GROUPS = 8
 """Number of groups of successive answers."""
-PARALLAX_STD_PX = 0.02
-"""Standard deviation of size and phase that parallax leaves, however many turns are averaged [px]."""
+PARALLAX_PX, ROTATION_COST = 0.25, 0.1
+"""Error of size and phase that parallax leaves, however many turns are averaged [px per cost above a rotation's].
+
+In six worlds it was 0.01 px at a cost of 0.15, 0.04 at 0.26 and 0.2 at 0.4."""
 ENOUGH_PX, LARGEST_MEAN_PX = 0.03, 0.05
 """Stated error of the mean that suffices, and the largest one [px rms]."""
 
@@ -622,7 +623,8 @@ def _mean(answers: Sequence[Attempt], cost: float) -> tuple[Calibration, float]:
     groups = np.array([group.mean(axis=0) for group in np.array_split(each, min(GROUPS, len(each)))])
     by_each, by_group = (np.cov(some.T) / len(some) for some in (each, groups))
     scatter = by_each if np.trace(by_each) > np.trace(by_group) else by_group
-    v, covariance = each.mean(axis=0), scatter + PARALLAX_STD_PX**2 * np.eye(each.shape[1])
+    parallax_px = PARALLAX_PX * max(0.0, cost - ROTATION_COST)
+    v, covariance = each.mean(axis=0), scatter + parallax_px**2 * np.eye(each.shape[1])
     values = {n: x for n, x in space.to_values(v).items() if n not in MOTION}  # the rotation's are those of the start
     stds = space.deviations(v, covariance)
     photometric = replace(
