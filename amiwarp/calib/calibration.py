@@ -136,7 +136,7 @@ def calibrate(
         return Calibrator(recording, settings, device, progress).run()
     chooser = ModelChooser(recording, settings, device)
     exact = Calibrator(recording, chooser.settings, device, progress, meanwhile=chooser.prepare).run()
-    return chooser.choose(exact, lambda again, free: Calibrator(again, free, device, progress, path=exact.path).run())
+    return chooser.choose(exact, lambda again, freed: Calibrator(again, freed, device, progress, path=exact.path).run())
 
 
 def _plate(recording: Recording, settings: Settings, device: Any, progress: Progress | None) -> Calibration:
@@ -165,11 +165,11 @@ LEAST_BAD_SHARE = 0.01
 """Share of the events on hot or flickering pixels above which these pixels are masked."""
 LARGEST_STRAIGHT_COST_RATIO = 1.05
 """Largest ratio of the photometric cost with a corrected encoder to that without, if the corrected answer is not
-accepted with a low cost. A small error of the encoder changes the cost by less than two maps of the same scene differ,
-and than one turn of four does that is no longer whole at the corrected speed."""
+accepted with a low cost. A right answer may cost more by as much: two maps of the same scene differ so, and one of four
+turns may no longer be whole at the corrected speed."""
 LEAST_LONGER = 1.5
 """Length of a recording from which on its ends can confirm the answer of its middle, as a multiple of the length of a
-calm span: they are half a turn apart then."""
+calm span. Each end then begins half a turn from the middle span."""
 QUADRATURE, NEAR_QUADRATURE = (0.25, 0.5, 2.0, 4.0), 0.03
 """Scales of a quadrature encoder of which other edges are counted than stated, and how near a found one must be."""
 LEAST_SCALE_ERROR = 0.003
@@ -183,7 +183,7 @@ class Attempt:
     calibration: Calibration | None
     error: AmiwarpError | None = None
     search: Search | None = None
-    """The sharpness search, if it came to an answer."""
+    """The last sharpness search that was begun."""
 
     @property
     def photometric(self) -> PhotometricSummary | None:
