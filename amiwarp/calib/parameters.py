@@ -17,23 +17,8 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.optics import mirror, vibration  # noqa: F401  # models in files of their own, which enter themselves in MODELS
+from amiwarp.optics import mirror, models, vibration  # noqa: F401  # models in files of their own, which enter themselves in MODELS
 from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
-from amiwarp.optics.models import (
-    MODELS,
-    PHASE,
-    ExactModel,
-    Model,
-    Parameter,
-    PlateModel,
-    RisleyModel,
-    build_model,
-    check_given,
-    compensate_by_each,
-    rms,
-    size_names,
-    wrap_angle,
-)
 from amiwarp.optics.prism import NominalPrism, Plate, Prism, UnsizedPrism, as_wedge
 from amiwarp.validation import guarded, instance, one_of, real, shown, vector
 
@@ -63,10 +48,10 @@ keeps its ratio to fx. ``rate_*`` and ``change_*`` describe the camera's rotatio
 """
 
 
-def optical_parameters() -> dict[str, Parameter]:
+def optical_parameters() -> dict[str, models.Parameter]:
     """Return the parameters of all optical models by name: sizes, phase, then others."""
-    found = {parameter.name: parameter for model in MODELS.values() for parameter in model.PARAMETERS}
-    return {name: found[name] for name in (*sorted(size_names()), PHASE.name, *found)}
+    found = {parameter.name: parameter for model in models.MODELS.values() for parameter in model.PARAMETERS}
+    return {name: found[name] for name in (*sorted(models.size_names()), models.PHASE.name, *found)}
 
 
 def units() -> dict[str, str]:
@@ -79,17 +64,17 @@ def of_orbit(space: ParameterSpace, k: int, at: Mapping[str, float]) -> Paramete
 
     Prisms before it have the values ``at``, later ones the size 0 if theirs is free.
     """
-    kind = MODELS[space.model]
+    kind = models.MODELS[space.model]
     later = {size: 0.0 for size, _ in kind.ORBITS[k + 1 :] if size in space.names}
     return space.holding({**at, **later}).without(tuple({*space.names} - {*kind.TOGETHER[k]}))
 
 
 def phase_names() -> set[str]:
     """Return the names of the parameters that are the phase of a prism."""
-    return {phase for model in MODELS.values() for _, phase in model.ORBITS}
+    return {phase for model in models.MODELS.values() for _, phase in model.ORBITS}
 
 
-def orbit_names(kind: type[Model]) -> tuple[str, ...]:
+def orbit_names(kind: type[models.Model]) -> tuple[str, ...]:
     """Return the names of size and phase of each prism."""
     return tuple(name for orbit in kind.ORBITS for name in orbit)
 
@@ -139,7 +124,7 @@ class ParameterSpace:
     @property
     def size_name(self) -> str:
         """Name of the parameter that sets the size of the orbit: ``apex`` or ``deflection``."""
-        return MODELS[one_of(self.model, MODELS, "model")].SIZE
+        return models.MODELS[one_of(self.model, models.MODELS, "model")].SIZE
 
     @property
     def cartesian(self) -> bool:
@@ -149,7 +134,7 @@ class ParameterSpace:
     @cached_property
     def orbits(self) -> tuple[int, ...]:
         """Indices of the vector's entries that are (size·cos phase, size·sin phase), with the next entry."""
-        found, orbits = [], MODELS[one_of(self.model, MODELS, "model")].ORBITS
+        found, orbits = [], models.MODELS[one_of(self.model, models.MODELS, "model")].ORBITS
         for size, phase in orbits:
             full = self.high.get(phase, 0.0) - self.low.get(phase, 0.0) >= 2.0 * math.pi - 1e-9
             if full and size in self.names and phase in self.names:
@@ -226,7 +211,7 @@ class ParameterSpace:
         ndarray
             The vector [px], shape ``(n,)`` for n free parameters.
         """
-        check_given(values, self.names)
+        models.check_given(values, self.names)
         v = np.array([values[n] * self.pixels[n] for n in self.names])
         for k in self.orbits:
             phase = values[self.names[k + 1]]
@@ -289,7 +274,7 @@ class ParameterSpace:
         variances = np.diag(jacobian @ covariance @ jacobian.T)
         return {n: float(math.sqrt(max(s, 0.0))) for n, s in zip(self.names, variances, strict=True)}
 
-    def build(self, values: Mapping[str, float]) -> Model:
+    def build(self, values: Mapping[str, float]) -> models.Model:
         """Build the optical model that has the given parameter values.
 
         Parameters
@@ -302,7 +287,7 @@ class ParameterSpace:
         Model
             The model.
         """
-        return build_model(self.model, self.camera, self.prism, values)
+        return models.build_model(self.model, self.camera, self.prism, values)
 
     def camera_rotation(self, values: Mapping[str, float]) -> CameraRotation:
         """Return the camera rotation that the parameter values describe.
@@ -352,7 +337,7 @@ def check_names(
         vector(pair, 2, f"bounds of {name}", real)
 
 
-def nominal(prism: NominalPrism | None, kind: type[Model] | None = None) -> Prism | Plate:
+def nominal(prism: NominalPrism | None, kind: type[models.Model] | None = None) -> Prism | Plate:
     """Return a recording's nominal glass, with the apex :data:`NOMINAL_APEX` if the apex of its prism is unknown.
 
     For a ``kind`` of model without a prism, its apex is 0.
@@ -369,11 +354,11 @@ def best_model(recording: Recording) -> str | None:
     """
     glass, two = recording.prism, recording.encoder is not None and recording.encoder.second is not None
     if isinstance(glass, Plate):
-        return PlateModel.NAME
-    named = MODELS.get(str(recording.metadata.get("optic")))
+        return models.PlateModel.NAME
+    named = models.MODELS.get(str(recording.metadata.get("optic")))
     if glass is None and named is not None and not named.PRISM and (named.ANGLES == 2) == two:
         return named.NAME
-    return ExactModel.NAME if not two else None if glass is None else RisleyModel.NAME
+    return models.ExactModel.NAME if not two else None if glass is None else models.RisleyModel.NAME
 
 
 def _difference(name: str, a: float, b: float) -> float:
@@ -391,14 +376,14 @@ def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraR
 
 def values_of(model: str, values: Mapping[str, float]) -> dict[str, float]:
     """Return the values without those of optical parameters that ``model`` does not have."""
-    foreign = optical_parameters().keys() - MODELS[model].FREE
+    foreign = optical_parameters().keys() - models.MODELS[model].FREE
     return {name: value for name, value in values.items() if name not in foreign}
 
 
 def kept_by_global_search(space: ParameterSpace) -> tuple[str, ...]:
     """Return the names of the free parameters whose start values the global search keeps."""
     fine = {name for name, parameter in optical_parameters().items() if parameter.fine}
-    exact_speed = () if MODELS[space.model].PRISM else ("rpm",)  # many turns tell it better than a coarse image
+    exact_speed = () if models.MODELS[space.model].PRISM else ("rpm",)  # many turns tell it better than a coarse image
     return tuple(n for n in space.names if n in MOTION or n in fine or n in exact_speed)
 
 
@@ -459,7 +444,7 @@ def make_space(
         If a name is unknown, not part of the model or in conflict with another one, if the bounds are in the wrong
         order, or if a free parameter moves no event.
     """
-    kind = MODELS[model]
+    kind = models.MODELS[model]
     names = _ordered_names(kind, kind.FREED if free is None else free)
     _check_given(kind, names, start, bounds)
     nominal = {**kind.start_values(prism), "focal_length": camera.fx}
@@ -508,9 +493,9 @@ def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
     )  # fmt: skip
 
 
-def _ordered_names(kind: type[Model], free: tuple[str, ...]) -> tuple[str, ...]:
+def _ordered_names(kind: type[models.Model], free: tuple[str, ...]) -> tuple[str, ...]:
     """Return the free parameters' names in the search vector's order; raise for unknown or conflicting names."""
-    wanted = {kind.SIZE if n in size_names() else n for n in free if n != "motion"}
+    wanted = {kind.SIZE if n in models.size_names() else n for n in free if n != "motion"}
     wanted |= set(RATES if "motion" in free else ())
     unknown = wanted - set(units())
     if unknown:
@@ -520,7 +505,7 @@ def _ordered_names(kind: type[Model], free: tuple[str, ...]) -> tuple[str, ...]:
         raise AmiwarpError("no parameter is free; name at least one free parameter")
     foreign = sorted(wanted - set(_names_of(kind)))
     if foreign:
-        other = next(each.NAME for each in MODELS.values() if foreign[0] in each.FREE)
+        other = next(each.NAME for each in models.MODELS.values() if foreign[0] in each.FREE)
         raise AmiwarpError(f"the {kind.NAME} model has no {foreign[0]}; use model {other!r}")
     if set(DRIFTS) <= wanted:
         raise AmiwarpError(
@@ -530,13 +515,16 @@ def _ordered_names(kind: type[Model], free: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(n for n in _names_of(kind) if n in wanted)
 
 
-def _names_of(kind: type[Model]) -> tuple[str, ...]:
+def _names_of(kind: type[models.Model]) -> tuple[str, ...]:
     """Return the names of all parameters that can be free for a model, in the search vector's order."""
     return (*kind.FREE[:2], *DRIFTS, *kind.FREE[2:], "focal_length", *MOTION)
 
 
 def _check_given(
-    kind: type[Model], names: tuple[str, ...], start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+    kind: type[models.Model],
+    names: tuple[str, ...],
+    start: Mapping[str, float],
+    bounds: Mapping[str, tuple[float, float]],
 ) -> None:
     """Raise :class:`AmiwarpError` for start values that the model lacks and bounds of parameters that are not free."""
     known = _names_of(kind)
@@ -551,7 +539,7 @@ def _check_given(
 
 
 def _default_bounds(
-    kind: type[Model], name: str, value: float, camera: Camera, prism: Prism | Plate, duration_us: float
+    kind: type[models.Model], name: str, value: float, camera: Camera, prism: Prism | Plate, duration_us: float
 ) -> tuple[float, float]:
     if name in kind.FREE:
         return kind.default_bounds(name, value, camera, prism)
@@ -577,7 +565,7 @@ def _pixels_per_unit(
     The displacement is differentiated by finite differences over a grid of pixels and prism angles, at the nominal
     size.
     """
-    kind = MODELS[model].closed_form()
+    kind = models.MODELS[model].closed_form()
     typical = {size: kind.start_values(prism)[size] for size, _ in kind.ORBITS}
     nominal = {**values, **typical, kind.SIZE: kind.typical_size(camera, prism)}
     lens = {"center_x": 1.0, "center_y": 1.0, "k1": 0.01, "fy_over_fx": 0.01}
@@ -588,11 +576,13 @@ def _pixels_per_unit(
     if "focal_length" in names:
         steps["focal_length"] = 0.01 * camera.fx
     built = [
-        build_model(kind.NAME, camera, prism, {**nominal, n: nominal[n] + h}) for n, x in steps.items() for h in (x, -x)
+        models.build_model(kind.NAME, camera, prism, {**nominal, n: nominal[n] + h})
+        for n, x in steps.items()
+        for h in (x, -x)
     ]
-    moved = compensate_by_each(built, *_grid_points(camera.width, camera.height))
+    moved = models.compensate_by_each(built, *_grid_points(camera.width, camera.height))
     moved = (moved[0::2] - moved[1::2]) / (2.0 * np.array([*steps.values()])[:, None, None])
-    shifts = dict(zip(steps, map(rms, moved), strict=True))
+    shifts = dict(zip(steps, map(models.rms, moved), strict=True))
     if set(DRIFTS) & set(names):
         shifts["clock_offset"] = shifts["phase"] * abs(rad_per_us)
         shifts["rpm"] = shifts["phase"] * 2.0 * math.pi / 60e6 * duration_us / math.sqrt(12.0)
@@ -623,4 +613,4 @@ def _grid_points(width: int, height: int) -> tuple[NDArray[np.float64], NDArray[
     x, y, theta = np.meshgrid(
         np.linspace(0, width - 1, 8), np.linspace(0, height - 1, 6), np.arange(8) * (np.pi / 4), indexing="ij"
     )
-    return np.stack([x.ravel(), y.ravel()], axis=1), wrap_angle(theta.ravel())
+    return np.stack([x.ravel(), y.ravel()], axis=1), models.wrap_angle(theta.ravel())

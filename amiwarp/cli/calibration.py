@@ -16,28 +16,8 @@ import numpy as np
 import typer
 
 from amiwarp.choices import CONTRAST, OPTICAL_MODELS, Fill, Layers, Sharpness, Tone
-from amiwarp.cli.common import (
-    OUTPUT,
-    CameraOptions,
-    Common,
-    EncoderOptions,
-    Format,
-    HdfCodec,
-    NominalPrismOptions,
-    Round,
-    Topic,
-    choose_device,
-    complete,
-    format_notes,
-    interval,
-    microseconds,
-    number,
-    numbers,
-    progress,
-    report,
-    span,
-    table,
-)
+from amiwarp.cli import common as cli
+from amiwarp.cli.common import span
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.io import open_recording
@@ -219,8 +199,10 @@ class ParameterOptions:
 
         Raises :class:`AmiwarpError` for unknown parameters and values that cannot be read.
         """
-        start = {name: number(text, unit, f"--start {name}") for name, unit, text in map(_named, self.start or ())}
-        bounds = {name: interval(text, unit, f"--bound {name}") for name, unit, text in map(_named, self.bound or ())}
+        start = {name: cli.number(text, unit, f"--start {name}") for name, unit, text in map(_named, self.start or ())}
+        bounds = {
+            name: cli.interval(text, unit, f"--bound {name}") for name, unit, text in map(_named, self.bound or ())
+        }
         if self.rpm is not None:
             start["rpm"] = self.rpm
         free = None if self.free is None else tuple(name.strip() for name in self.free.split(",") if name.strip())
@@ -243,7 +225,7 @@ def run_calibrate(
     out: Annotated[
         Path | None,
         typer.Argument(help="Calibration file to write. Default: NAME.calibration.json next to the recording."),
-        OUTPUT,
+        cli.OUTPUT,
     ] = None,
     *,
     method: Annotated[
@@ -259,7 +241,7 @@ def run_calibrate(
     figure: Annotated[
         Path | None,
         typer.Option(help="Figure to write: cost surface, and image of the events before and after (.png)."),
-        OUTPUT,
+        cli.OUTPUT,
     ] = None,
     window: Annotated[
         str | None,
@@ -269,9 +251,9 @@ def run_calibrate(
     ] = None,
     search: SearchOptions,
     parameters: ParameterOptions,
-    camera: CameraOptions,
-    prism: NominalPrismOptions,
-    common: Common,
+    camera: cli.CameraOptions,
+    prism: cli.NominalPrismOptions,
+    common: cli.Common,
 ) -> None:
     """Find the prism's parameters by contrast maximisation: those that make the image of warped events sharpest.
 
@@ -282,17 +264,17 @@ def run_calibrate(
     from amiwarp.calib.presets import Preset
     from amiwarp.calib.settings import Settings
 
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     base = Settings() if preset is None else Preset.load(preset, "calibration").calibration_settings()
     settings = replace(base, seed=common.seed, **search.changes(base.photometric), **parameters.changes())
-    opened = complete(open_recording(recording), camera, prism)
+    opened = cli.complete(open_recording(recording), camera, prism)
     opened = cut(opened, window) if window else opened
     out = out or recording.with_name(f"{recording.stem}.calibration.json")
     check_ending(out, "calibrations are written", [".json"])
     check_output(out)
     if figure is not None:
         check_ending(figure, "figures are written", [".png"])
-    with progress("calibrating") as advance:
+    with cli.progress("calibrating") as advance:
         if method is CalibrationMethod.PAPER:
             check_paper(search, parameters, preset)
             found = calibrate_as_paper(opened, start=settings.start, device=device, progress=advance)
@@ -308,7 +290,7 @@ def run_calibrate(
         "figure": None if figure is None else str(figure),
         "device": device,
     }
-    report(common, data, calibration_lines(found, data))
+    cli.report(common, data, calibration_lines(found, data))
 
 
 def check_paper(search: SearchOptions, parameters: ParameterOptions, preset: Path | None) -> None:
@@ -348,9 +330,9 @@ def calibration_lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
     ]
     sharp = data["sharpness"]
     return [
-        table(rows, "parameter", "value", "± std", "unit"),
+        cli.table(rows, "parameter", "value", "± std", "unit"),
         "",
-        table(stages, "stage", "algorithm", "evaluations", "time", "sharpness", "ended by"),
+        cli.table(stages, "stage", "algorithm", "evaluations", "time", "sharpness", "ended by"),
         "",
         *_ladder(c.ladder),
         f"sharpness ({sharp['kind']}): {sharp['before']:.5g} before, {sharp['after']:.5g} after",
@@ -375,10 +357,10 @@ def _ladder(ladder: ModelChoice | None) -> list[Any]:
     agreement = f"predicted errors and held-out sharpness {'agree' if ladder.agreed else 'do not agree'}"
     freed = [(p.name, "" if p.std_px is None else f"{p.std_px:.2g} px", p.verdict) for p in ladder.parameters]
     return [
-        table(models, "model", "parameters", "predicted error", *held_out, "verdict"),
+        cli.table(models, "model", "parameters", "predicted error", *held_out, "verdict"),
         f"budget {ladder.budget_px:.3g} px; blur from timing {ladder.timing_px:.2g} px"
         + (f"; {agreement}" if measured else ""),
-        *([table(freed, "additional parameter", "± std", "verdict")] if freed else []),
+        *([cli.table(freed, "additional parameter", "± std", "verdict")] if freed else []),
         *(_exact(ladder) if not any(r.chosen and r.model == "exact" for r in ladder.rungs) else []),
         "",
     ]
@@ -441,7 +423,7 @@ class IweOptions:
             help="Image of warped events (IWE) to write: .png for viewing, .npy with the counts. Can be given twice.",
             metavar="<path>",
         ),
-        OUTPUT,
+        cli.OUTPUT,
     ] = None
     iwe_window_ms: Annotated[
         float | None,
@@ -465,7 +447,9 @@ class IweOptions:
             return None
         from amiwarp.imaging.export import IweFiles
 
-        window_us = None if self.iwe_window_ms is None else microseconds(self.iwe_window_ms, "ms", "--iwe-window-ms")
+        window_us = (
+            None if self.iwe_window_ms is None else cli.microseconds(self.iwe_window_ms, "ms", "--iwe-window-ms")
+        )
         return IweFiles(self.iwe, recording.events, window_us=window_us, layers=self.iwe_layers, device=device)
 
 
@@ -474,7 +458,7 @@ def run_compensate(
     out: Annotated[
         Path,
         typer.Argument(help=f"Compensated recording to write. Its extension gives the format: {COMPENSATED_HELP}."),
-        OUTPUT,
+        cli.OUTPUT,
     ],
     *,
     calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
@@ -489,13 +473,13 @@ def run_compensate(
             "calibrated depth."
         ),
     ] = None,
-    format: Format = None,
-    codec: HdfCodec = Codec.BLOSC,
-    round: Round = None,
-    encoder: EncoderOptions,
-    topic: Topic = None,
+    format: cli.Format = None,
+    codec: cli.HdfCodec = Codec.BLOSC,
+    round: cli.Round = None,
+    encoder: cli.EncoderOptions,
+    topic: cli.Topic = None,
     iwe: IweOptions,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Compensate the prism's motion: move every event to its position without the prism.
 
@@ -510,7 +494,7 @@ def run_compensate(
     from amiwarp.compensation.recordings import compensate
     from amiwarp.io.depth_map import DepthMap
 
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     found = Calibration.load(calibration)
     if preset is not None:
         found = simplified(found, Preset.load(preset, "compensation").settings["model"])
@@ -519,7 +503,7 @@ def run_compensate(
     opened = opened if log is None else replace(opened, encoder=log)
     depths = None if depth is None else DepthMap.load(depth)
     files = iwe.build(opened, device)
-    with progress("compensating") as advance, files or contextlib.nullcontext():
+    with cli.progress("compensating") as advance, files or contextlib.nullcontext():
         done = compensate(
             opened, found, out, depth=depths, device=device, progress=advance,
             on_block=None if files is None else files.add, format=format, codec=codec, rounding=round,
@@ -539,7 +523,7 @@ def run_compensate(
         "device": device,
         "iwe": [] if files is None else [str(path) for path in files.written],
     }
-    report(common, data, _compensated_lines(data))
+    cli.report(common, data, _compensated_lines(data))
 
 
 def _compensated_lines(d: dict[str, Any]) -> list[str]:
@@ -547,7 +531,7 @@ def _compensated_lines(d: dict[str, Any]) -> list[str]:
     speed = f"{d['seconds']:.2f} s, {d['mev_per_s']:.3g} Mev/s by the {d['model']} model on {d['device']}"
     return [
         f"{d['file']}: {d['events']:,} events ({d['outside']:,} outside the image), {speed}",
-        *format_notes(d),
+        *cli.format_notes(d),
         *images,
     ]
 
@@ -593,15 +577,15 @@ class WindowOptions:
         from amiwarp.reconstruction.picture import window_span
 
         after = 0.0 if self.start is None and video else self.start
-        start = None if after is None else recording.events.t_first + microseconds(after, "s", "--start")
-        length = None if self.length is None else microseconds(self.length, "s", "--length")
+        start = None if after is None else recording.events.t_first + cli.microseconds(after, "s", "--start")
+        length = None if self.length is None else cli.microseconds(self.length, "s", "--length")
         return window_span(recording, turn_us, start, length, self.turns)
 
     def camera_rotation(self) -> CameraRotation | None:
         """Return the camera's rotation given by an option, or None."""
         if self.omega is None:
             return None
-        x, y, z = numbers(self.omega, 3, "--omega")
+        x, y, z = cli.numbers(self.omega, 3, "--omega")
         return CameraRotation((x, y, z))
 
 
@@ -633,7 +617,7 @@ class PictureOptions:
     mask: Annotated[
         Path | None,
         _in_picture(help="Mask of the pixels that events determine, to write (.png).", metavar="<path>"),
-        OUTPUT,
+        cli.OUTPUT,
     ] = None
 
 
@@ -662,7 +646,7 @@ class NetworkOptions:
 def run_reconstruct(
     recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     out: Annotated[
-        Path, typer.Argument(help="File to write: .png, .tif (16 bit), .npy (log intensity) or .mp4."), OUTPUT
+        Path, typer.Argument(help="File to write: .png, .tif (16 bit), .npy (log intensity) or .mp4."), cli.OUTPUT
     ],
     *,
     calibration: Annotated[
@@ -675,7 +659,7 @@ def run_reconstruct(
     window: WindowOptions,
     picture: PictureOptions,
     by: NetworkOptions,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Reconstruct a picture of the scene from the events of a window, or a video from a sliding window.
 
@@ -698,13 +682,13 @@ def run_reconstruct(
         raise AmiwarpError("--bins and --multiple apply to a network in a file; give it by --network")
     if not video and window.fps is not None:
         raise AmiwarpError(f"{out}: --fps applies to a video; give a name that ends in {VIDEO}")
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     given = None if calibration is None else Calibration.load(calibration)
     began = time.perf_counter()
     if by.network is not None:
         data = _by_network(open_recording(recording), given, out, window, picture, by, device)
         data = {"file": str(out), **data, "seconds": time.perf_counter() - began, "device": device}
-        report(common, data, [_network_line(data)])
+        cli.report(common, data, [_network_line(data)])
         return
     if given is None:
         raise AmiwarpError(f"{out}: --calibration is missing; give a calibration file, or a network by --network")
@@ -713,14 +697,14 @@ def run_reconstruct(
     )
     start, length = window.span(work.recording, work.turn_us, video=video)
     began = time.perf_counter()
-    with progress("reconstructing") as advance:
+    with cli.progress("reconstructing") as advance:
         if video:
             data = _video(work, out, (start, length), window.fps or 25.0, picture, advance)
         else:
             data = _still(work.window(start, length), out, picture)
     seconds = time.perf_counter() - began
     data = {"file": str(out), "start_us": start, "length_us": length, **data, "seconds": seconds, "device": device}
-    report(common, data, [_reconstructed_line(data)])
+    cli.report(common, data, [_reconstructed_line(data)])
 
 
 def _still(found: Picture, out: Path, options: PictureOptions) -> dict[str, Any]:
@@ -829,7 +813,7 @@ def _by_network(
         starts = start - length * np.arange(earlier, -1, -1, dtype=np.int64)
     first, after = (np.array([events.find(int(t)) for t in times]) for times in (starts, starts + length))
     cut = Windows(first, after, starts, starts + length)
-    with progress("reconstructing") as advance:
+    with cli.progress("reconstructing") as advance:
 
         def images() -> Iterator[Any]:
             for k, image in enumerate(network.over(recording, cut, **optic)):
@@ -880,7 +864,7 @@ MOST_NAMED = 20
 def run_pixels(
     recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     calibration: Annotated[Path, typer.Argument(help="Calibration file from 'amiwarp calibrate' (.json).")],
-    out: Annotated[Path, typer.Argument(help="Map of the pixels to write (.npz)."), OUTPUT],
+    out: Annotated[Path, typer.Argument(help="Map of the pixels to write (.npz)."), cli.OUTPUT],
     *,
     start: Annotated[
         float | None, _in_window(min=0.0, help="Start of the used time (s from the first event). Default: one turn.")
@@ -892,7 +876,7 @@ def run_pixels(
         float | None,
         typer.Option(min=0.0, help="Refractory period of the sensor (us). Default: that of the calibration."),
     ] = None,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Measure the ON and OFF threshold of every pixel, and find hot and dead pixels, from a calibrated recording.
 
@@ -904,17 +888,17 @@ def run_pixels(
     from amiwarp.reconstruction.pixels import pixel_thresholds
 
     check_ending(out, "pixel maps are written", [".npz"])
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     source = open_recording(recording)
     first = source.events.t_first if len(source.events) else 0
     began = time.perf_counter()
-    with progress("measuring the pixels") as advance:
+    with cli.progress("measuring the pixels") as advance:
         found = pixel_thresholds(
             source,
             Calibration.load(calibration),
             sensor=None if refractory_us is None else SensorTiming(refractory_us=refractory_us),
-            start_us=None if start is None else first + microseconds(start, "s", "--start"),
-            length_us=None if length is None else microseconds(length, "s", "--length"),
+            start_us=None if start is None else first + cli.microseconds(start, "s", "--start"),
+            length_us=None if length is None else cli.microseconds(length, "s", "--length"),
             device=device,
             progress=advance,
         )
@@ -934,7 +918,7 @@ def run_pixels(
     for name in ("hot", "dead"):
         y, x = np.nonzero(getattr(found, name))
         data[name] = np.stack([x, y], axis=1).tolist()
-    report(common, {**data, "seconds": time.perf_counter() - began, "device": device}, _pixel_lines(data))
+    cli.report(common, {**data, "seconds": time.perf_counter() - began, "device": device}, _pixel_lines(data))
 
 
 def _pixel_lines(data: dict[str, Any]) -> list[str]:
@@ -959,14 +943,14 @@ def _pixel_lines(data: dict[str, Any]) -> list[str]:
 def run_depth(
     recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     calibration: Annotated[Path, typer.Argument(help="Calibration file from 'amiwarp calibrate' (.json).")],
-    out: Annotated[Path, typer.Argument(help="Map of inverse depth to write (.npz)."), OUTPUT],
+    out: Annotated[Path, typer.Argument(help="Map of inverse depth to write (.npz)."), cli.OUTPUT],
     *,
-    ply: Annotated[Path | None, typer.Option(help="Point cloud to write (.ply)."), OUTPUT] = None,
+    ply: Annotated[Path | None, typer.Option(help="Point cloud to write (.ply)."), cli.OUTPUT] = None,
     figure: Annotated[
-        Path | None, typer.Option(help="Figure of the depths and their deviations to write (.png)."), OUTPUT
+        Path | None, typer.Option(help="Figure of the depths and their deviations to write (.png)."), cli.OUTPUT
     ] = None,
     nearest_m: Annotated[float, typer.Option(help="Smallest depth that is tried (m).")] = 0.25,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Find the depth of every edge from a camera at rest behind a rotating tilted plate, with its uncertainty.
 
@@ -979,9 +963,9 @@ def run_depth(
     for path, what, ending in ((ply, "points are written", ".ply"), (figure, "figures are written", ".png")):
         if path is not None:
             check_ending(path, what, [ending])
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     began = time.perf_counter()
-    with progress("finding depths") as advance:
+    with cli.progress("finding depths") as advance:
         found = depth(
             open_recording(recording), Calibration.load(calibration), nearest_m=nearest_m, device=device,
             progress=advance,
@@ -1003,7 +987,7 @@ def run_depth(
         "seconds": time.perf_counter() - began, "device": device,
     }  # fmt: skip
     near, middle, far = data["depth_m"]
-    report(common, data, [
+    cli.report(common, data, [
         f"{out}: {data['known']:,} of {width * height:,} pixels with a known depth, {near:.3g} to {far:.3g} m (median "
         f"{middle:.3g} m), to {100 * data['relative_std']:.2g} %, in {data['seconds']:.1f} s on {device}"
     ])  # fmt: skip

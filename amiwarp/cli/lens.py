@@ -10,17 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.cli.common import (
-    OUTPUT,
-    Common,
-    NominalPrismOptions,
-    choose_device,
-    fov_from,
-    parse_size,
-    progress,
-    report,
-    table,
-)
+from amiwarp.cli import common as cli
 from amiwarp.cli.rig import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
@@ -64,21 +54,21 @@ class BoardOptions:
         """Return the board; raise :class:`AmiwarpError` for a value out of range."""
         from amiwarp.lens.board import Board
 
-        return Board(*parse_size(self.board, "--board", "9x6"), self.square_mm * 1e-3, self.charuco)
+        return Board(*cli.parse_size(self.board, "--board", "9x6"), self.square_mm * 1e-3, self.charuco)
 
 
 def run_board(
-    out: Annotated[Path, typer.Argument(help="File to write (.pdf or .svg)."), OUTPUT],
+    out: Annotated[Path, typer.Argument(help="File to write (.pdf or .svg)."), cli.OUTPUT],
     *,
     board: BoardOptions,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Write a chessboard or ChArUco board in its true size, to print for a lens calibration."""
     made = board.build()
     made.save(out)
     width, height = (1e3 * side for side in made.size_m)
     data = {"file": str(out), "width_mm": width, "height_mm": height}
-    report(
+    cli.report(
         common,
         data,
         [f"{out}: {width:g} x {height:g} mm with its margin; print it at 100 % and glue it to a flat plate"],
@@ -93,7 +83,7 @@ def run_lens(
             "for 'amiwarp live'."
         ),
     ],
-    out: Annotated[Path, typer.Argument(help="Camera file to write (.json, or .yaml for ROS)."), OUTPUT],
+    out: Annotated[Path, typer.Argument(help="Camera file to write (.json, or .yaml for ROS)."), cli.OUTPUT],
     *,
     board: BoardOptions,
     fov_deg: Annotated[
@@ -106,16 +96,18 @@ def run_lens(
         typer.Option("--live", help="Take the poses from a live stream, say what is missing, end when it is enough."),
     ] = False,
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration of the prism to write (.json), for 'amiwarp compensate'."), OUTPUT
+        Path | None,
+        typer.Option(help="Calibration of the prism to write (.json), for 'amiwarp compensate'."),
+        cli.OUTPUT,
     ] = None,
     figure: Annotated[
         Path | None,
         typer.Option(help="Picture of corners, residuals and coverage to write (.png, .svg or .pdf)."),
-        OUTPUT,
+        cli.OUTPUT,
     ] = None,
     stream: SourceOptions,
-    prism: NominalPrismOptions,
-    common: Common,
+    prism: cli.NominalPrismOptions,
+    common: cli.Common,
 ) -> None:
     """Calibrate the camera's lens, and the prism with it, from a printed board that stands still.
 
@@ -128,21 +120,21 @@ def run_lens(
         check_ending(calibration, "calibrations are written", [".json"])
     if figure is not None:
         check_ending(figure, "figures are written", [".png", ".svg", ".pdf"])
-    device, made = choose_device(common.device), board.build()
-    fov, messages = None if fov_deg is None else fov_from(fov_deg, "--fov-deg"), dict[str, Any]()
+    device, made = cli.choose_device(common.device), board.build()
+    fov, messages = None if fov_deg is None else cli.fov_from(fov_deg, "--fov-deg"), dict[str, Any]()
     if live:
         if len(recordings) != 1:
             raise AmiwarpError(f"--live takes one source, and {len(recordings)} are given; see 'amiwarp live --help'")
         poses, said = _watch(str(recordings[0]), made, stream, prism, fov=fov, fisheye=fisheye, device=device)
         messages["messages"] = said
-        with progress("lens") as show:
+        with cli.progress("lens") as show:
             found = poses.calibrate(show)
     else:
         if stream != SourceOptions():
             raise AmiwarpError("--port, --counts-per-turn, --fast, --seconds and --wait-for-source belong to --live")
         opened = [open_recording(path) for path in recordings]
         given = [replace(recording, prism=prism.build(recording.prism)) for recording in opened]
-        with progress("lens") as show:
+        with cli.progress("lens") as show:
             found = calibrate_lens(given, made, fov=fov, fisheye=fisheye, device=device, progress=show)
     save_camera(out, found.camera)
     if calibration is not None:
@@ -151,12 +143,12 @@ def run_lens(
         from amiwarp.lens.figure import save_figure
 
         save_figure(found, figure)
-    report(common, {**_data(found, out), **messages}, _lines(found, out))
+    cli.report(common, {**_data(found, out), **messages}, _lines(found, out))
 
 
 def _watch(
-    source: str, board: Board, stream: SourceOptions, prism: NominalPrismOptions, *, fov: float | None, fisheye: bool,
-    device: str,
+    source: str, board: Board, stream: SourceOptions, prism: cli.NominalPrismOptions, *, fov: float | None,
+    fisheye: bool, device: str,
 ) -> tuple[LiveLens, list[str]]:  # fmt: skip
     """Collect poses from a stream until they are enough, it ends, or Ctrl-C. Return them, and what was said."""
     from amiwarp.lens.calibration import LEAST_POSES, first_camera
@@ -212,7 +204,7 @@ def _lines(found: LensCalibration, out: Path) -> list[Any]:
         if name != "index":
             value, std, unit = math.degrees(value), math.degrees(std), " deg"
         rows.append((name, f"{value:.6g}{unit}", f"± {std:.2g}{unit}"))
-    lines: list[Any] = [table(rows)]
+    lines: list[Any] = [cli.table(rows)]
     lines += [f"left out: {name}: {why}" for name, why in found.left_out.items()]
     lines += [*found.notes, *(f"to improve: {text}" for text in found.advice)]
     corners = sum(len(p.corners.ids) for p in found.poses)

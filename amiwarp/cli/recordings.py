@@ -13,24 +13,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from amiwarp.cli.common import (
-    OUTPUT,
-    OUTPUT_FOLDER,
-    CameraOptions,
-    Common,
-    EncoderOptions,
-    Format,
-    HdfCodec,
-    NominalPrismOptions,
-    Round,
-    Topic,
-    choose_device,
-    format_notes,
-    microseconds,
-    progress,
-    report,
-    table,
-)
+from amiwarp.cli import common as cli
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, rpm_between
 from amiwarp.events.recording import DEFAULT_BLOCK, EventSource, ImageStore, ImuSamples, Recording, mean_rate
@@ -60,8 +43,8 @@ def run_info(
     count: Annotated[
         bool, typer.Option("--count", help="Read all of a large file, to count its events instead of estimating them.")
     ] = False,
-    topic: Topic = None,
-    common: Common,
+    topic: cli.Topic = None,
+    common: cli.Common,
 ) -> None:
     """Show a recording's format, events, encoder, camera, prism, IMU, frames, ground truth and repairs.
 
@@ -75,10 +58,10 @@ def run_info(
     with head_only(HEAD_EVENTS) if large else contextlib.nullcontext():
         recording = open_recording(file, topic=topic)
     data = describe(recording, str(file), head=large)
-    report(common, data, [table(_rows(data))])
+    cli.report(common, data, [cli.table(_rows(data))])
 
 
-def _report_cameras(common: Common) -> None:
+def _report_cameras(common: cli.Common) -> None:
     """Print the connected cameras, and the names under which ``amiwarp record`` and ``live`` open them."""
     from amiwarp.live.stream.sources import list_cameras
 
@@ -88,7 +71,7 @@ def _report_cameras(common: Common) -> None:
         for each in list_cameras()
     ]  # fmt: skip
     rows = [(d["model"], d["source"] or f"cannot be opened: {d['error']}", d["connection"]) for d in data]
-    report(common, {"cameras": data}, [table(rows)] if rows else ["no camera is connected"])
+    cli.report(common, {"cameras": data}, [cli.table(rows)] if rows else ["no camera is connected"])
 
 
 def _file_bytes(path: Path) -> int:
@@ -140,7 +123,7 @@ def _glass(p: NominalPrism) -> dict[str, Any]:
 def _events(source: EventSource, *, head: bool) -> dict[str, Any]:
     n, on, outside, done = len(source), 0, 0, 0
     compensated = False
-    with progress("reading") as advance:
+    with cli.progress("reading") as advance:
         for block in source.blocks(count=min(DEFAULT_BLOCK, HEAD_EVENTS)):
             on += int(np.count_nonzero(block.p))
             done += len(block)
@@ -407,18 +390,18 @@ def run_convert(
             help=f"File to write. Its extension gives the format: {EXTENSION_HELP}; .rrd (Rerun), or .mcap with "
             "--foxglove, for viewers."
         ),
-        OUTPUT,
+        cli.OUTPUT,
     ],
     *,
-    format: Format = None,
-    codec: HdfCodec = Codec.BLOSC,
-    round: Round = None,
-    encoder: EncoderOptions,
-    camera: CameraOptions,
-    prism: NominalPrismOptions,
+    format: cli.Format = None,
+    codec: cli.HdfCodec = Codec.BLOSC,
+    round: cli.Round = None,
+    encoder: cli.EncoderOptions,
+    camera: cli.CameraOptions,
+    prism: cli.NominalPrismOptions,
     viewers: ViewerOptions,
-    topic: Topic = None,
-    common: Common,
+    topic: cli.Topic = None,
+    common: cli.Common,
 ) -> None:
     """Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.
 
@@ -431,7 +414,7 @@ def run_convert(
     began = time.perf_counter()
     for_viewer = viewers.chosen(out)
     if for_viewer and (format, codec, round, camera, prism) != (
-        None, Codec.BLOSC, None, CameraOptions(), NominalPrismOptions()
+        None, Codec.BLOSC, None, cli.CameraOptions(), cli.NominalPrismOptions()
     ):  # fmt: skip
         raise AmiwarpError(
             f"{out}: is a file for a viewer; leave out --format, --codec, --round, and the camera's and prism's options"
@@ -442,12 +425,12 @@ def run_convert(
         _write_for_viewer(opened if log is None else replace(opened, encoder=log), out, viewers, common, began)
         return
     lens = wedge = None
-    if camera != CameraOptions() or prism != NominalPrismOptions():  # opening may read the whole file
+    if camera != cli.CameraOptions() or prism != cli.NominalPrismOptions():  # opening may read the whole file
         recording = open_recording(source, topic=topic)
         # If the file does not hold the sensor's size, the camera's size is used.
         lens = camera.build(*recording.events.size, fixed=getattr(recording.events, "size_is_known", True))
         wedge = prism.build(recording.prism)
-    with progress("converting") as advance:
+    with cli.progress("converting") as advance:
         summary = convert(
             source, out, encoder=log, camera=lens, prism=wedge, topic=topic, format=format, codec=codec,
             progress=advance, rounding=round, seed=common.seed,
@@ -457,18 +440,20 @@ def run_convert(
     data |= {f"{name}_us": data.pop(name) for name in ("t_first", "t_last")}
     slip = data.pop("index_slip")
     data["slip_deg"] = None if slip is None else math.degrees(slip)
-    report(common, data, _convert_lines(data))
+    cli.report(common, data, _convert_lines(data))
 
 
-def _write_for_viewer(recording: Recording, out: Path, options: ViewerOptions, common: Common, began: float) -> None:
+def _write_for_viewer(
+    recording: Recording, out: Path, options: ViewerOptions, common: cli.Common, began: float
+) -> None:
     """Write a file for a viewer, and report it."""
     from amiwarp.calib.result import Calibration
     from amiwarp.plotting.viewers import FRAME_US, save_for_viewer
 
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     found = None if options.calibration is None else Calibration.load(options.calibration)
-    frame_us = FRAME_US if options.frame_ms is None else microseconds(options.frame_ms, "ms", "--frame-ms")
-    with progress("writing frames") as advance:
+    frame_us = FRAME_US if options.frame_ms is None else cli.microseconds(options.frame_ms, "ms", "--frame-ms")
+    with cli.progress("writing frames") as advance:
         summary = save_for_viewer(
             recording, out, calibration=found, frame_us=frame_us, device=device, progress=advance
         )  # fmt: skip
@@ -476,7 +461,7 @@ def _write_for_viewer(recording: Recording, out: Path, options: ViewerOptions, c
     data: dict[str, Any] = {"file": str(out), **asdict(summary), "device": device, "seconds": seconds}
     rate = summary.events / max(seconds, 1e-9) / 1e6
     frames = f"{summary.frames:,} frames ({' and '.join(summary.streams)})"
-    report(
+    cli.report(
         common,
         data,
         [
@@ -499,7 +484,7 @@ def _convert_lines(d: dict[str, Any]) -> list[str]:
         lines.append(
             f"warning: the encoder has {len(d['encoder_gaps'])} gaps, the first at {first[0]} .. {first[1]} us"
         )
-    lines += format_notes(d)
+    lines += cli.format_notes(d)
     if d["slip_deg"] is not None:
         lines.append(f"encoder slips up to {d['slip_deg']:.3g} deg at its index pulses")
     return lines
@@ -510,7 +495,7 @@ def _convert_lines(d: dict[str, Any]) -> list[str]:
 
 def run_truth(
     recording: Annotated[Path, typer.Argument(help="Recording of a simulated world, in amiwarp's format (.h5).")],
-    out: Annotated[Path, typer.Argument(help="Folder for the exported files."), OUTPUT_FOLDER],
+    out: Annotated[Path, typer.Argument(help="Folder for the exported files."), cli.OUTPUT_FOLDER],
     *,
     flow: Annotated[
         Literal["dsec", "mvsec"] | None,
@@ -529,7 +514,7 @@ def run_truth(
             "poses/body_NAME.txt."
         ),
     ] = None,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Export the ground truth of a simulated world: optical flow in the DSEC or MVSEC format, poses as TUM files.
 
@@ -548,7 +533,7 @@ def run_truth(
         raise AmiwarpError(f"{recording}: holds no optical flow; simulate the recording with --truth-hz")
     make_folder(out)
     data: dict[str, Any] = {"folder": str(out), "flow_maps": 0, "pose_files": 0}
-    with progress("writing flow") as advance:
+    with cli.progress("writing flow") as advance:
         if truth.frames is not None and flow == "dsec":
             data["flow_maps"] = save_flow_dsec(out / "flow", truth.frames, with_prism=with_prism, progress=advance)
         elif truth.frames is not None and flow == "mvsec":
@@ -558,7 +543,7 @@ def run_truth(
         data["pose_files"] = _save_poses(out / "poses", truth)
     data["seconds"] = time.perf_counter() - began
     line = f"{out}: {data['flow_maps']} maps of flow, {data['pose_files']} files of poses, {data['seconds']:.2f} s"
-    report(common, data, [line])
+    cli.report(common, data, [line])
 
 
 def _save_poses(folder: Path, truth: Truth) -> int:

@@ -20,18 +20,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from amiwarp.cli import common as cli
 from amiwarp.cli import say
-from amiwarp.cli.common import (
-    NO_FILE,
-    OUTPUT,
-    CameraOptions,
-    Common,
-    NominalPrismOptions,
-    choose_device,
-    microseconds,
-    report,
-    table,
-)
 from amiwarp.errors import AmiwarpError, printable
 from amiwarp.events.encoder import LARGEST_RATIO
 from amiwarp.events.recording import Recording
@@ -310,9 +300,9 @@ class AdaptiveOptions:
 class OutputOptions:
     """Options for the files and addresses that receive events."""
 
-    out: Annotated[Path | None, _in_outputs(help="Compensated recording to write (.h5)."), OUTPUT] = None
+    out: Annotated[Path | None, _in_outputs(help="Compensated recording to write (.h5)."), cli.OUTPUT] = None
     record: Annotated[
-        Path | None, _in_outputs(help="Recording of the uncompensated events to write (.h5)."), OUTPUT
+        Path | None, _in_outputs(help="Recording of the uncompensated events to write (.h5)."), cli.OUTPUT
     ] = None
     to: Annotated[
         str | None,
@@ -391,7 +381,7 @@ def run_live(
     second_ratio: SecondRatio = None,
     processing: ProcessingOptions,
     adaptive: AdaptiveOptions,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Compensate the events of a live stream and show rate, latency, coverage and sharpness on one line.
 
@@ -404,7 +394,7 @@ def run_live(
     from amiwarp.live.stream.session import clock_offset
 
     outputs.check(json=common.json)
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     found = Calibration.load(calibration)
     with contextlib.ExitStack() as resources:
         stop = threading.Event()
@@ -482,7 +472,7 @@ def _session(
     return Session(
         source, found, link=link, second_ratio=second_ratio, raw=receivers.raw, out=receivers.out,
         sinks=receivers.sinks, watch_s=options.watch_s or None, keeper=keeper,
-        wait_us=microseconds(options.wait_ms, "ms", "--wait-ms"), policy=options.policy, device=device, say=say,
+        wait_us=cli.microseconds(options.wait_ms, "ms", "--wait-ms"), policy=options.policy, device=device, say=say,
     )  # fmt: skip
 
 
@@ -505,10 +495,10 @@ def _follow(
     return status
 
 
-def _print_result(data: dict[str, Any], common: Common, *, to_stderr: bool) -> None:
+def _print_result(data: dict[str, Any], common: cli.Common, *, to_stderr: bool) -> None:
     """Print the result. If packets use standard output, print it as text on stderr."""
     if not to_stderr:
-        report(common, data, _live_lines(data))
+        cli.report(common, data, _live_lines(data))
         return
     for text in _live_lines(data):
         say(text)
@@ -589,13 +579,13 @@ def _live_lines(d: dict[str, Any]) -> list[str]:
 
 def run_record(
     source: SourceArgument,
-    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
+    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), cli.OUTPUT],
     *,
     stream: SourceOptions,
     second_ratio: SecondRatio = None,
-    camera: CameraOptions,
-    prism: NominalPrismOptions,
-    common: Common,
+    camera: cli.CameraOptions,
+    prism: cli.NominalPrismOptions,
+    common: cli.Common,
 ) -> None:
     """Record events and prism angles until the source ends, --seconds have passed, or Ctrl-C.
 
@@ -621,7 +611,7 @@ def run_record(
             status = session.run(stop, line.update, seconds=stream.seconds)
     data = {"file": str(out), **session_summary(status, opened), "messages": list(line.messages)}
     text = f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"
-    report(
+    cli.report(
         common,
         data,
         [text, *([f"{status.late:,} events arrived too late to be sorted by time"] if status.late else [])],
@@ -682,7 +672,7 @@ def run_motor(
         typer.Option(min=0.0, help="Largest accepted speed (turns/min): what prism, mount and bearing withstand."),
     ] = LIMIT_RPM,
     yes: Annotated[bool, typer.Option("--yes", help="For check: let the motor turn.")] = False,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Set the speed of the prism's motor, stop it, print the controller's status, or check the controller.
 
@@ -714,10 +704,10 @@ def run_motor(
             link.stop()
             _wait(link, messages, 0.0)
         data = _described(link, messages)
-    report(common, data, [table(_motor_rows(data)), *data["messages"], *_hint(data)])
+    cli.report(common, data, [cli.table(_motor_rows(data)), *data["messages"], *_hint(data)])
 
 
-def _check_motor(port: str | None, rpm: float, yes: bool, common: Common) -> None:
+def _check_motor(port: str | None, rpm: float, yes: bool, common: cli.Common) -> None:
     """Run the conformance suite and print its table; exit with status 1 if a check failed."""
     from amiwarp.live.link.conformance import Check, SerialWire, check_controller
 
@@ -743,7 +733,7 @@ def _check_motor(port: str | None, rpm: float, yes: bool, common: Common) -> Non
     verdict = f"{len(failed)} of {len(checks)} checks failed" if failed else "the controller passes"
     remedies = [f"{check.name}: {check.remedy}" for check in failed]
     data = {"port": wire.name, "rpm": rpm, "passed": not failed, "checks": [asdict(check) for check in checks]}
-    report(common, data, [table(rows, "check", "result", "measured"), "", *remedies, verdict])
+    cli.report(common, data, [cli.table(rows, "check", "result", "measured"), "", *remedies, verdict])
     if failed:
         raise typer.Exit(1)
 
@@ -892,14 +882,14 @@ def run_emulate(
     link: Annotated[
         Path | None,
         typer.Option(help="Symbolic link to create for the port; valid again after a fault 'unplug'. Default: none."),
-        NO_FILE,
+        cli.NO_FILE,
     ] = None,
     options: ControllerOptions,
     playback: PlaybackOptions,
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="Stop after this time (s). Default: at Ctrl-C.")
     ] = None,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Emulate a prism controller with motor, encoder and index pulse, and inject faults on request.
 
@@ -927,7 +917,7 @@ def run_emulate(
             say(f"{late}: this machine or a receiver is slower than the recording")
 
 
-def _print_names(terminal: PseudoTerminal, camera: EmulatedCamera | None, common: Common) -> None:
+def _print_names(terminal: PseudoTerminal, camera: EmulatedCamera | None, common: cli.Common) -> None:
     """Print the port, the camera's address and a command to try next."""
     if camera is None:
         hint = f"amiwarp motor status --port {terminal.name}"
@@ -936,7 +926,7 @@ def _print_names(terminal: PseudoTerminal, camera: EmulatedCamera | None, common
         hint = f"amiwarp live {camera.address} --port {terminal.name} --calibration CALIBRATION"
         data = {"port": terminal.name, "try": hint, "camera": camera.address}
         lines = [terminal.name, camera.address, f"try: {hint}"]
-    report(common, data, lines)
+    cli.report(common, data, lines)
 
 
 def _wait_for_end(stop: threading.Event, seconds: float | None, camera: EmulatedCamera | None) -> None:

@@ -14,24 +14,7 @@ import typer
 from numpy.typing import NDArray
 
 from amiwarp.choices import Optic, Seeing
-from amiwarp.cli.common import (
-    OUTPUT,
-    Common,
-    angles,
-    apex_from,
-    choose_device,
-    fov_from,
-    in_camera,
-    in_encoder,
-    in_prism,
-    numbers,
-    parse_size,
-    plate_tilt_from,
-    progress,
-    radians,
-    report,
-    thickness_from,
-)
+from amiwarp.cli import common as cli
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.io.camera_files import load_camera
@@ -64,46 +47,47 @@ class RigOptions:
 
     size: Annotated[
         str | None,
-        in_camera(
+        cli.in_camera(
             help="Size of the camera's image (px). Default: 640x480; for 'amiwarp translate', its pictures' size.",
             metavar="WIDTHxHEIGHT",
         ),
     ] = None
     fov_deg: Annotated[
-        float | None, in_camera(help="Horizontal field of view (deg). Default: 60 if --camera is not given.")
+        float | None, cli.in_camera(help="Horizontal field of view (deg). Default: 60 if --camera is not given.")
     ] = None
     camera: Annotated[
-        Path | None, in_camera(help="Camera intrinsics: JSON or YAML (including the size), or calib.txt.")
+        Path | None, cli.in_camera(help="Camera intrinsics: JSON or YAML (including the size), or calib.txt.")
     ] = None
-    apex_deg: Annotated[float | None, in_prism(help="True apex angle of the prism (deg). Default: 1.")] = None
+    apex_deg: Annotated[float | None, cli.in_prism(help="True apex angle of the prism (deg). Default: 1.")] = None
     nominal_apex_deg: Annotated[
-        float | None, in_prism(help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.")
+        float | None,
+        cli.in_prism(help="Nominal apex angle stored in the recording (deg). Default: the true apex angle."),
     ] = None
-    index: Annotated[float | None, in_prism(help="Refractive index of the glass. Default: 1.5168.")] = None
-    flat_side: Annotated[FlatSide | None, in_prism(help="Side that the prism's flat face is on. Default: scene.")] = (
-        None
-    )
+    index: Annotated[float | None, cli.in_prism(help="Refractive index of the glass. Default: 1.5168.")] = None
+    flat_side: Annotated[
+        FlatSide | None, cli.in_prism(help="Side that the prism's flat face is on. Default: scene.")
+    ] = None
     rpm: Annotated[
-        float | None, in_prism(help="Speed of the prism (turns/min); negative: backwards. Default: 720.")
+        float | None, cli.in_prism(help="Speed of the prism (turns/min); negative: backwards. Default: 720.")
     ] = None
     speed: Annotated[
-        Path | None, in_prism(help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.")
+        Path | None, cli.in_prism(help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.")
     ] = None
     phase_deg: Annotated[
         float | None,
-        in_prism(
+        cli.in_prism(
             help="Azimuth of the prism at encoder angle 0, or phase of a vibration at the start (deg). Default: 0."
         ),
     ] = None
     tilt_deg: Annotated[
         str | None,
-        in_prism(
+        cli.in_prism(
             help="Tilt of the prism's rotation axis about the camera's x and y axes (deg). Default: 0,0.", metavar="X,Y"
         ),
     ] = None
     cylinder_deg: Annotated[
         str | None,
-        in_prism(
+        cli.in_prism(
             help="Cylinder power of the prism's tilted face, along the wedge and at 45 deg to it (deg per unit of the "
             "ray's tangent). Default: 0,0.",
             metavar="X,Y",
@@ -111,26 +95,26 @@ class RigOptions:
     ] = None
     wobble_deg: Annotated[
         str | None,
-        in_prism(
+        cli.in_prism(
             help="Wobble of the prism about the rotation axis, along the wedge and across it (deg). Default: 0,0.",
             metavar="X,Y",
         ),
     ] = None
     second_apex_deg: Annotated[
-        float | None, in_prism(help="Apex angle of a second prism behind the first, a Risley pair (deg).")
+        float | None, cli.in_prism(help="Apex angle of a second prism behind the first, a Risley pair (deg).")
     ] = None
     second_rpm: Annotated[
-        float | None, in_prism(help="Speed of the second prism (turns/min). Default: that of the first, backwards.")
+        float | None, cli.in_prism(help="Speed of the second prism (turns/min). Default: that of the first, backwards.")
     ] = None
     second_phase_deg: Annotated[
-        float | None, in_prism(help="Azimuth of the second prism at encoder angle 0 (deg). Default: 0.")
+        float | None, cli.in_prism(help="Azimuth of the second prism at encoder angle 0 (deg). Default: 0.")
     ] = None
 
     def build_camera(self, default: tuple[int, int] = (640, 480)) -> Camera:
         """Return the camera. ``default`` is the size of its image [px] if no option gives one."""
-        width, height = default if self.size is None else parse_size(self.size)
+        width, height = default if self.size is None else cli.parse_size(self.size)
         if self.camera is None:
-            fov = fov_from(60.0 if self.fov_deg is None else self.fov_deg, "--fov-deg")
+            fov = cli.fov_from(60.0 if self.fov_deg is None else self.fov_deg, "--fov-deg")
             return Camera.from_fov(width, height, fov)
         if self.fov_deg is not None:
             raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
@@ -140,11 +124,11 @@ class RigOptions:
 
     def build_prism(self) -> Prism:
         """Return the prism with its true parameters."""
-        apex = apex_from(1.0 if self.apex_deg is None else self.apex_deg, "--apex-deg")
+        apex = cli.apex_from(1.0 if self.apex_deg is None else self.apex_deg, "--apex-deg")
         given: dict[str, Any] = {"index": self.index, "flat_side": self.flat_side}
         prism = Prism(apex, **{name: value for name, value in given.items() if value is not None})
         if self.second_apex_deg is not None:
-            return replace(prism, second=replace(prism, apex=apex_from(self.second_apex_deg, "--second-apex-deg")))
+            return replace(prism, second=replace(prism, apex=cli.apex_from(self.second_apex_deg, "--second-apex-deg")))
         if (self.second_rpm, self.second_phase_deg) != (None, None):
             raise AmiwarpError("--second-rpm and --second-phase-deg describe a second prism; give --second-apex-deg")
         return prism
@@ -154,14 +138,14 @@ class RigOptions:
         prism = self.build_prism()
         if self.nominal_apex_deg is None:
             return prism
-        return replace(prism, apex=apex_from(self.nominal_apex_deg, "--nominal-apex-deg"))
+        return replace(prism, apex=cli.apex_from(self.nominal_apex_deg, "--nominal-apex-deg"))
 
     def build_motion(self) -> PrismMotion:
         """Return the prism's motion: speed, phase, tilt, cylinder power and wobble."""
         if self.rpm is not None and self.speed is not None:
             raise AmiwarpError("--rpm and --speed both give the prism's speed; give one of them")
         tilt, cylinder, wobble = (
-            angles(given or "0,0", 2, name, math.pi / 2.0)
+            cli.angles(given or "0,0", 2, name, math.pi / 2.0)
             for given, name in (
                 (self.tilt_deg, "--tilt-deg"),
                 (self.cylinder_deg, "--cylinder-deg"),
@@ -174,14 +158,14 @@ class RigOptions:
             backwards = -rpm if isinstance(rpm, float) else rpm * (1.0, -1.0)
             second = PrismMotion(
                 backwards if self.second_rpm is None else self.second_rpm,
-                radians(self.second_phase_deg or 0.0, "--second-phase-deg"),
+                cli.radians(self.second_phase_deg or 0.0, "--second-phase-deg"),
             )
         return PrismMotion(rpm, self.phase, tilt, cylinder, wobble, second)
 
     @property
     def phase(self) -> float:
         """Azimuth of the prism at encoder angle 0, or phase of a vibration [rad]."""
-        return radians(self.phase_deg or 0.0, "--phase-deg")
+        return cli.radians(self.phase_deg or 0.0, "--phase-deg")
 
 
 def _read_speed(path: Path) -> NDArray[np.float64]:
@@ -189,7 +173,7 @@ def _read_speed(path: Path) -> NDArray[np.float64]:
     rows = []
     for number, line in text_lines(path):
         if line.strip() and not line.startswith("#"):
-            rows.append(numbers(line, 2, f"{path}: line {number}"))
+            rows.append(cli.numbers(line, 2, f"{path}: line {number}"))
         if len(rows) > MOST_SPEEDS:
             raise AmiwarpError(f"{path}: has over {MOST_SPEEDS} speeds; give fewer, which are interpolated")
     table = np.array(rows)
@@ -206,22 +190,22 @@ class OpticOptions:
 
     optic: Annotated[
         Optic,
-        in_prism(
+        cli.in_prism(
             help="What moves the image: wedge, plate (tilted and plane-parallel; needs --world), mirror (with two "
             "tilts), or vibration (the camera itself, without glass and encoder)."
         ),
     ] = Optic.WEDGE
-    thickness_mm: Annotated[float | None, in_prism(help="Thickness of the plate (mm). Default: 10.")] = None
+    thickness_mm: Annotated[float | None, cli.in_prism(help="Thickness of the plate (mm). Default: 10.")] = None
     plate_tilt_deg: Annotated[
         float | None,
-        in_prism(help="Angle between the normal of the plate and the rotation axis (deg). Default: 45."),
+        cli.in_prism(help="Angle between the normal of the plate and the rotation axis (deg). Default: 45."),
     ] = None
 
     def build_plate(self, index: float | None) -> Plate:
         """Return the plate with its true parameters."""
         return Plate(
-            thickness_from(10.0 if self.thickness_mm is None else self.thickness_mm),
-            plate_tilt_from(45.0 if self.plate_tilt_deg is None else self.plate_tilt_deg),
+            cli.thickness_from(10.0 if self.thickness_mm is None else self.thickness_mm),
+            cli.plate_tilt_from(45.0 if self.plate_tilt_deg is None else self.plate_tilt_deg),
             *(() if index is None else (index,)),
         )
 
@@ -262,11 +246,11 @@ class VibrationOptions:
 
     def build(self, rig: RigOptions) -> Vibration:
         """Return the vibration."""
-        bx, by = angles(self.backward_deg or "0,0", 2, "--backward-deg", LARGEST_AMPLITUDE)
-        rc, rs = angles(self.roll_deg or "0,0", 2, "--roll-deg", LARGEST_AMPLITUDE)
-        fx, fy, sx, sy = angles(self.second_deg or "0,0,0,0", 4, "--second-deg", LARGEST_AMPLITUDE)
+        bx, by = cli.angles(self.backward_deg or "0,0", 2, "--backward-deg", LARGEST_AMPLITUDE)
+        rc, rs = cli.angles(self.roll_deg or "0,0", 2, "--roll-deg", LARGEST_AMPLITUDE)
+        fx, fy, sx, sy = cli.angles(self.second_deg or "0,0,0,0", 4, "--second-deg", LARGEST_AMPLITUDE)
         degrees = 0.4 if self.amplitude_deg is None else self.amplitude_deg
-        amplitude = radians(degrees, "--amplitude-deg", 0.0, LARGEST_AMPLITUDE)
+        amplitude = cli.radians(degrees, "--amplitude-deg", 0.0, LARGEST_AMPLITUDE)
         hz = 100.0 if self.hz is None else self.hz
         return Vibration(hz, amplitude, rig.phase, (bx, by), (rc, rs), (fx, fy), (sx, sy))
 
@@ -307,15 +291,15 @@ class MirrorOptions:
 
     def build(self) -> Mirror:
         """Return the mirror."""
-        amplitude = angles(self.mirror_deg or "0.5,0.5", 2, "--mirror-deg", LARGEST_TILT, low=0.0)
-        phase = angles(self.mirror_phase_deg or "0,0", 2, "--mirror-phase-deg")
-        direction = angles(self.mirror_direction_deg or "0,90", 2, "--mirror-direction-deg")
-        first, second = numbers(self.mirror_hz or "60,77", 2, "--mirror-hz")
+        amplitude = cli.angles(self.mirror_deg or "0.5,0.5", 2, "--mirror-deg", LARGEST_TILT, low=0.0)
+        phase = cli.angles(self.mirror_phase_deg or "0,0", 2, "--mirror-phase-deg")
+        direction = cli.angles(self.mirror_direction_deg or "0,90", 2, "--mirror-direction-deg")
+        first, second = cli.numbers(self.mirror_hz or "60,77", 2, "--mirror-hz")
         incidence = 45.0 if self.incidence_deg is None else self.incidence_deg
         return Mirror(
             (first, second), amplitude, phase, direction,
-            fold=radians(self.fold_deg or 0.0, "--fold-deg"),
-            incidence=radians(incidence, "--incidence-deg", 0.0, LARGEST_INCIDENCE),
+            fold=cli.radians(self.fold_deg or 0.0, "--fold-deg"),
+            incidence=cli.radians(incidence, "--incidence-deg", 0.0, LARGEST_INCIDENCE),
         )  # fmt: skip
 
 
@@ -381,19 +365,19 @@ class SensorOptions:
 class EncoderModelOptions:
     """Options for the encoder's imperfections. Defaults are those of ``amiwarp.EncoderModel``."""
 
-    counts_per_turn: Annotated[int | None, in_encoder(help="Counts per turn; 0: no rounding to counts.")] = None
-    rate_hz: Annotated[float | None, in_encoder(help="Sample rate (Hz).")] = None
-    jitter_us: Annotated[float | None, in_encoder(help="Standard deviation of the sample times (us).")] = None
+    counts_per_turn: Annotated[int | None, cli.in_encoder(help="Counts per turn; 0: no rounding to counts.")] = None
+    rate_hz: Annotated[float | None, cli.in_encoder(help="Sample rate (Hz).")] = None
+    jitter_us: Annotated[float | None, cli.in_encoder(help="Standard deviation of the sample times (us).")] = None
     clock_offset_us: Annotated[
-        float | None, in_encoder(help="Encoder clock minus camera clock (us); stored in the ground truth only.")
+        float | None, cli.in_encoder(help="Encoder clock minus camera clock (us); stored in the ground truth only.")
     ] = None
-    dropouts_hz: Annotated[float | None, in_encoder(help="Rate of drop-outs (1/s).")] = None
+    dropouts_hz: Annotated[float | None, cli.in_encoder(help="Rate of drop-outs (1/s).")] = None
     dropout_us: Annotated[
-        float | None, in_encoder(help="Length of a drop-out, during which all samples are lost (us).")
+        float | None, cli.in_encoder(help="Length of a drop-out, during which all samples are lost (us).")
     ] = None
     encoder_error_deg: Annotated[
         str | None,
-        in_encoder(
+        cli.in_encoder(
             help="Error of the angle that repeats every turn: factors of its cosine and sine, and of those of twice "
             "the angle (deg). An eccentric disc causes the first two. Default: 0,0,0,0.",
             metavar="C1,S1,C2,S2",
@@ -404,7 +388,7 @@ class EncoderModelOptions:
         """Return the encoder model that the options describe."""
         given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
         error = given.pop("encoder_error_deg", "0,0,0,0")
-        given["harmonics"] = angles(error, 4, "--encoder-error-deg")
+        given["harmonics"] = cli.angles(error, 4, "--encoder-error-deg")
         if self.counts_per_turn == 0:
             given["counts_per_turn"] = None
         return EncoderModel(**given)
@@ -505,7 +489,7 @@ class WorldOptions:
             "prism, with depth and optical flow.",
             metavar="<path>",
         ),
-        OUTPUT,
+        cli.OUTPUT,
     ] = None
 
     def check(self) -> None:
@@ -566,16 +550,16 @@ class SceneOptions:
     @property
     def rates(self) -> tuple[float, ...]:
         """Angular velocity of the camera [rad/s]."""
-        return tuple(math.radians(v) for v in numbers(self.rotate_deg_s, 3, "--rotate-deg-s"))
+        return tuple(math.radians(v) for v in cli.numbers(self.rotate_deg_s, 3, "--rotate-deg-s"))
 
     @property
     def fov(self) -> float | None:
         """Horizontal angle that the picture spans [rad], or None for the default."""
-        return None if self.scene_fov_deg is None else fov_from(self.scene_fov_deg, "--scene-fov-deg")
+        return None if self.scene_fov_deg is None else cli.fov_from(self.scene_fov_deg, "--scene-fov-deg")
 
 
 def run_simulate(
-    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
+    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), cli.OUTPUT],
     *,
     picture: Annotated[Path | None, typer.Option(help="Picture of the scene: JPEG, PNG, TIFF ...")] = None,
     duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 1.0,
@@ -591,7 +575,7 @@ def run_simulate(
         _in_sensor(help="Thresholds of every pixel, hot and dead pixels: map from 'amiwarp pixels' (.npz)."),
     ] = None,
     encoder: EncoderModelOptions,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth.
 
@@ -603,7 +587,7 @@ def run_simulate(
     if (picture is None) == (world.world is None):
         raise typer.BadParameter("give one of them", param_hint="--picture, --world")
     world.check()
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     simulation = Simulation(
         _scene(picture, world, scene, duration, common.seed),
         rig.build_camera(),
@@ -634,10 +618,10 @@ def _scene(
     return world.build_scene(duration, seed=seed, blur=scene.blur_px)
 
 
-def write(simulation: Simulation, out: Path, common: Common, *, truth_hz: float | None = None) -> None:
+def write(simulation: Simulation, out: Path, common: cli.Common, *, truth_hz: float | None = None) -> None:
     """Run a simulation, write its recording to ``out`` and print the result."""
     began = time.perf_counter()
-    with progress("simulating", average_s=AVERAGE_S) as advance:
+    with cli.progress("simulating", average_s=AVERAGE_S) as advance:
         simulation.write(out, truth_hz=truth_hz, progress=advance)
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {
@@ -648,7 +632,7 @@ def write(simulation: Simulation, out: Path, common: Common, *, truth_hz: float 
         "times_real_time": seconds / simulation.duration_s,
         "device": simulation.device,
     }
-    report(common, data, [_line(data)])
+    cli.report(common, data, [_line(data)])
 
 
 def _line(d: dict[str, Any]) -> str:
@@ -670,7 +654,7 @@ def run_translate(
             "camera without a prism."
         ),
     ],
-    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
+    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), cli.OUTPUT],
     *,
     events: Annotated[
         Path | None, typer.Option(help="Recording of the events between the pictures, by the same camera.")
@@ -702,7 +686,7 @@ def run_translate(
     rig: RigOptions,
     sensor: SensorOptions,
     encoder: EncoderModelOptions,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Simulate the recording of an event camera behind the prism from a video, pictures, or a plain event recording.
 
@@ -713,10 +697,10 @@ def run_translate(
     from amiwarp.translation.translator import translation, translator_input
     from amiwarp.validation import choice
 
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     name = None if dataset is None else choice(DataSet, dataset, "--dataset")
     way = choice(Interpolation, interpolation, "--interpolation")
-    with progress("reading") as advance:
+    with cli.progress("reading") as advance:
         given = translator_input(
             source, events=events, dataset=name, interpolation=way, fps=fps, device=device, progress=advance
         )
@@ -726,7 +710,7 @@ def run_translate(
     simulation = translation(
         given,
         rig.build_prism(),
-        fov=None if picture_fov_deg is None else fov_from(picture_fov_deg, "--picture-fov-deg"),
+        fov=None if picture_fov_deg is None else cli.fov_from(picture_fov_deg, "--picture-fov-deg"),
         camera=None if chosen else rig.build_camera(given.frames.size),
         duration_s=duration,
         motion=rig.build_motion(),

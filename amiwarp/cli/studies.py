@@ -14,22 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amiwarp.cli import common as cli
 from amiwarp.cli import say
-from amiwarp.cli.common import (
-    OUTPUT_FOLDER,
-    CameraOptions,
-    Common,
-    choose_device,
-    in_camera,
-    in_prism,
-    made_again,
-    numbers,
-    parse_size,
-    plain,
-    progress,
-    report,
-    table,
-)
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.io.files import check_output, own_folder, write_csv, write_text
@@ -58,30 +44,30 @@ OWN_FOLDER = Path("amiwarp-demo")
 def run_demo(
     *,
     out: Annotated[
-        Path, typer.Option(help="Folder for the recording, calibration, picture and figure."), OUTPUT_FOLDER
+        Path, typer.Option(help="Folder for the recording, calibration, picture and figure."), cli.OUTPUT_FOLDER
     ] = OWN_FOLDER,
     picture: Annotated[
         Path | None, typer.Option(help="Picture to use as the scene. Default: a map of the earth.")
     ] = None,
     size: Annotated[str, typer.Option(help="Size of the camera's image (px).", metavar="WIDTHxHEIGHT")] = "480x360",
     duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 0.25,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Simulate a recording, calibrate it without an initial guess, compensate it and reconstruct the picture.
 
     Takes about 10 s on two idle CPU cores, longer the first time, when kernels are compiled, and on a busy machine.
     """
     began = time.perf_counter()
-    device = choose_device(common.device)
-    with progress("starting") as advance:
+    device = cli.choose_device(common.device)
+    with cli.progress("starting") as advance:
         from amiwarp.studies import demo
 
-        width, height = parse_size(size)
+        width, height = cli.parse_size(size)
         scene = demo.Demo(out, picture, width, height, duration, common.seed, device)
         with own_folder(out) if out == OWN_FOLDER else contextlib.nullcontext():
             outcome = demo.run_demo(scene, advance)
     data = asdict(outcome) | {"seconds": time.perf_counter() - began, "device": device}
-    report(common, data, demo_lines(data))
+    cli.report(common, data, demo_lines(data))
 
 
 def demo_lines(d: dict[str, Any]) -> list[Any]:
@@ -100,26 +86,26 @@ def demo_lines(d: dict[str, Any]) -> list[Any]:
         *((f"{name} file", path) for name, path in d["files"].items()),
     ]  # fmt: skip
     notes = [f"note: {note}" for note in d["notes"]]
-    return [table(rows), *notes, f"{d['events']:,} events, {d['seconds']:.1f} s in all on {d['device']}"]
+    return [cli.table(rows), *notes, f"{d['events']:,} events, {d['seconds']:.1f} s in all on {d['device']}"]
 
 
 # ``amiwarp warm-up``: kernels compiled in advance.
 
 
-def run_warm_up(*, common: Common) -> None:
+def run_warm_up(*, common: cli.Common) -> None:
     """Compile the kernels of the ordinary commands in advance, for containers and continuous integration.
 
     Later commands find them in Warp's cache, which WARP_CACHE_PATH moves. A second call compiles nothing. Without
     --device, the kernels for the CPU are compiled, and if there is a GPU, those for cuda:0.
     """
-    chosen = choose_device(common.device)
+    chosen = cli.choose_device(common.device)
     devices = [chosen] if common.device else sorted({"cpu", chosen})
-    with progress("starting", average_s=60.0) as advance:
+    with cli.progress("starting", average_s=60.0) as advance:
         from amiwarp.studies.demo import warm_up
 
         done = warm_up(devices, advance)
     what = f"compiled {done.compiled} modules of kernels in {done.seconds:.1f} s for {' and '.join(devices)}"
-    report(common, asdict(done) | {"devices": devices}, [what, f"cache: {done.cache}, {done.cached} modules"])
+    cli.report(common, asdict(done) | {"devices": devices}, [what, f"cache: {done.cache}, {done.cached} modules"])
 
 
 # ``amiwarp dataset``: thousands of simulated recordings from a specification, with a manifest.
@@ -139,7 +125,9 @@ SHOWN = 5
 
 def run_dataset(
     specification: Annotated[Path, typer.Argument(help="Specification of the data set (.toml).")],
-    out: Annotated[Path, typer.Argument(help="Folder of the data set. An existing one is continued."), OUTPUT_FOLDER],
+    out: Annotated[
+        Path, typer.Argument(help="Folder of the data set. An existing one is continued."), cli.OUTPUT_FOLDER
+    ],
     *,
     dry_run: Annotated[
         bool,
@@ -147,7 +135,7 @@ def run_dataset(
     ] = False,
     scheduler: Scheduler = None,
     workers: LocalWorkers = None,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Make thousands of simulated recordings from a specification, with labels, splits and a manifest.
 
@@ -161,19 +149,19 @@ def run_dataset(
     if dry_run:
         if scheduler is not None:
             raise AmiwarpError("--dry-run samples on this machine; leave --scheduler out, and give --workers instead")
-        with progress("sampling") as advance:
+        with cli.progress("sampling") as advance:
             plan = making.plan_dataset(specification, out, workers=workers, device=device, progress=advance)
-        report(common, asdict(plan) | {"seconds": plan.seconds}, _plan_lines(plan))
+        cli.report(common, asdict(plan) | {"seconds": plan.seconds}, _plan_lines(plan))
         return
     try:
-        with progress("starting workers", average_s=AVERAGE_S) as advance:
+        with cli.progress("starting workers", average_s=AVERAGE_S) as advance:
             done = making.make_dataset(
                 specification, out, scheduler=scheduler, workers=workers, device=device, progress=advance
             )
     except KeyboardInterrupt:
         say(f"amiwarp: finished recordings are kept in {out}; run the same command again to continue")
         raise
-    report(common, asdict(done) | {"folder": str(out), "device": device}, _dataset_lines(done, out))
+    cli.report(common, asdict(done) | {"folder": str(out), "device": device}, _dataset_lines(done, out))
     if done.failed:
         raise typer.Exit(1)
 
@@ -207,7 +195,7 @@ def _dataset_lines(done: DatasetSummary, out: Path) -> list[str]:
     lines = [f"failed: {file}: {error}" for file, error in list(done.failed.items())[:SHOWN]]
     if len(done.failed) > SHOWN:
         lines.append(f"... and {len(done.failed) - SHOWN:,} more failures, in {out / 'manifest.json'}")
-    lines += made_again(done.damaged)
+    lines += cli.made_again(done.damaged)
     if done.not_in_specification:
         lines.append(
             f"{len(done.not_in_specification):,} recordings in {out} are not in the specification, such as "
@@ -235,7 +223,7 @@ def _dataset_speed(done: DatasetSummary) -> str:
 
 def run_export(
     dataset: Annotated[Path, typer.Argument(help="Folder of the data set, which 'amiwarp dataset' made.")],
-    out: Annotated[Path, typer.Argument(help="Folder to write."), OUTPUT_FOLDER],
+    out: Annotated[Path, typer.Argument(help="Folder to write."), cli.OUTPUT_FOLDER],
     *,
     to: Annotated[
         str, typer.Option(help="Layout: webdataset (tar files) or parquet (a folder for Hugging Face's datasets).")
@@ -243,7 +231,7 @@ def run_export(
     shard_mb: Annotated[
         float, typer.Option(min=0.001, help="Size from which on the next file begins, before compression (MB).")
     ] = 256.0,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Export a data set to tar files for WebDataset, or to Parquet files for Hugging Face's datasets.
 
@@ -252,14 +240,14 @@ def run_export(
     """
     from amiwarp.studies.dataset.export import export_dataset
 
-    with progress("reading the manifest") as advance:
+    with cli.progress("reading the manifest") as advance:
         done = export_dataset(dataset, out, to, shard_mb=shard_mb, progress=advance)
     splits = ", ".join(f"{name} {count:,}" for name, count in done.splits.items())
     line = (
         f"{out}: {sum(done.splits.values()):,} recordings ({splits}) with {done.events:,} events in "
         f"{len(done.files):,} files, {done.size_bytes / 1e9:.3g} GB, {done.seconds:.1f} s"
     )
-    report(common, asdict(done) | {"folder": str(out)}, [line])
+    cli.report(common, asdict(done) | {"folder": str(out)}, [line])
 
 
 # ``amiwarp chart``: charts of speed against error on this machine, and settings for a budget.
@@ -270,7 +258,7 @@ def run_chart(
         Path | None, typer.Argument(help="Recording with ground truth. Default: simulated, 10 million events.")
     ] = None,
     *,
-    out: Annotated[Path, typer.Option(help="Folder for charts, tables and presets."), OUTPUT_FOLDER] = Path(
+    out: Annotated[Path, typer.Option(help="Folder for charts, tables and presets."), cli.OUTPUT_FOLDER] = Path(
         "amiwarp-chart"
     ),
     picture: Annotated[
@@ -283,7 +271,7 @@ def run_chart(
         float | None, typer.Option(min=0.0, help="Time limit (ms): choose the most accurate calibration within it.")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Measure a few settings once each, as a short trial.")] = False,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Measure speed and error of the settings on a recording with ground truth, and draw both Pareto fronts.
 
@@ -294,7 +282,7 @@ def run_chart(
         raise AmiwarpError("--budget-px and --budget-ms are two budgets; give one of them")
     if recording is not None and picture is not None:
         raise AmiwarpError("a recording and --picture both provide the events to measure on; give one of them")
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     from amiwarp.studies.chart import make, simulated
 
     if budget_px is not None or budget_ms is not None:
@@ -302,7 +290,7 @@ def run_chart(
             if out.is_dir():
                 check_output(out / f"preset_{kind}.json")
 
-    with progress("starting") as advance:
+    with cli.progress("starting") as advance:
         if recording is not None:
             opened = open_recording(recording)
         else:
@@ -311,7 +299,7 @@ def run_chart(
         charts = make(opened, out, device=device, seed=common.seed, quick=quick,
                       progress=advance)  # fmt: skip
     answers = charts.answer(out, budget_px=budget_px, budget_ms=budget_ms)
-    report(common, chart_summary(charts, answers, out) | {"device": device}, chart_lines(charts, answers, out))
+    cli.report(common, chart_summary(charts, answers, out) | {"device": device}, chart_lines(charts, answers, out))
 
 
 def chart_summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[str, Any]:
@@ -346,7 +334,7 @@ def chart_lines(charts: Charts, answers: dict[str, Row | None], out: Path) -> li
         for job, chosen in fronts(rows):
             default = [r for r in rows if r.default and r.job == job and r not in chosen]
             listed = [(_setting(r), *_setting_speed(r)) for r in [*told_apart(chosen), *default]]
-            shown += [table(listed, f"front, {job}", "speed", "error"), ""]
+            shown += [cli.table(listed, f"front, {job}", "speed", "error"), ""]
             shown += [f"faster or more accurate than the default: {', '.join(b.label for b in better)}"
                       for r in rows if r.default and r.job == job and (better := beaten_by(r, rows))]  # fmt: skip
     shown += [f"note: {note}" for note in charts.notes]
@@ -388,10 +376,14 @@ DEPTHS_M = "0.5,1,2"
 class GridOptions:
     """Options for the prisms and speeds to compare."""
 
-    apex_deg: Annotated[str, in_prism(help="Apex angles to compare (deg).", metavar="A,B,...")] = "0.25,0.5,1,2,4"
-    rpm: Annotated[str, in_prism(help="Speeds to compare (turns/min).", metavar="A,B,...")] = "180,360,720,1440,2880"
-    index: Annotated[float, in_prism(help="Refractive index of the prism.")] = 1.5168
-    flat_side: Annotated[FlatSide, in_prism(help="Direction that the prism's flat face points to.")] = FlatSide.SCENE
+    apex_deg: Annotated[str, cli.in_prism(help="Apex angles to compare (deg).", metavar="A,B,...")] = "0.25,0.5,1,2,4"
+    rpm: Annotated[str, cli.in_prism(help="Speeds to compare (turns/min).", metavar="A,B,...")] = (
+        "180,360,720,1440,2880"
+    )
+    index: Annotated[float, cli.in_prism(help="Refractive index of the prism.")] = 1.5168
+    flat_side: Annotated[FlatSide, cli.in_prism(help="Direction that the prism's flat face points to.")] = (
+        FlatSide.SCENE
+    )
 
     @property
     def apexes(self) -> list[float]:
@@ -478,22 +470,22 @@ class OpticsOptions:
 
 def run_design(
     *,
-    out: Annotated[Path, typer.Option(help="Folder for the chart and the tables."), OUTPUT_FOLDER] = Path(
+    out: Annotated[Path, typer.Option(help="Folder for the chart and the tables."), cli.OUTPUT_FOLDER] = Path(
         "amiwarp-design"
     ),
     size: Annotated[
         str | None,
-        in_camera(
+        cli.in_camera(
             help="Size of the camera's image (px). Default: 640x480, or the size in --camera.", metavar="WIDTHxHEIGHT"
         ),
     ] = None,
-    camera: CameraOptions,
+    camera: cli.CameraOptions,
     grid: GridOptions,
     limits: LimitOptions,
     faults: FaultOptions,
     optics: OpticsOptions,
     picture: Annotated[Path | None, typer.Option(help="Picture of the scene. Default: a map of the earth.")] = None,
-    common: Common,
+    common: cli.Common,
 ) -> None:  # fmt: skip
     """Compare prisms and speeds for a camera, and recommend one with the reasons.
 
@@ -503,7 +495,7 @@ def run_design(
     optics.check()
     seen = _camera_of_design(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     from amiwarp.plotting.figures import save_png_and_svg
     from amiwarp.simulation.description import Scene
     from amiwarp.simulation.sensor_model import SensorModel
@@ -520,7 +512,7 @@ def run_design(
     sensor = SensorModel(contrast_on=faults.contrast, contrast_off=faults.contrast)
     scene = Scene.from_picture(picture or earth())
     compared = None
-    with progress("starting") as advance:
+    with cli.progress("starting") as advance:
         made = design(
             seen, scene, glass, apexes=grid.apexes, rpms=grid.rpms, timing=faults.timing(), limits=limits.build(),
             sensor=sensor, seed=common.seed, device=device,
@@ -532,30 +524,30 @@ def run_design(
             compared = compare(made, scene, depths=optics.depths, sensor=sensor, seed=common.seed, device=device,
                                progress=part(advance, DESIGN_SHARE, 1.0))  # fmt: skip
     data = design_summary(made)
-    write_text(Path(files["json"]), json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+    write_text(Path(files["json"]), json.dumps(cli.plain(data), indent=1, allow_nan=False) + "\n")
     _write_csv(files["csv"], data["choices"])
     save_png_and_svg(chart(made), out / "design")
     if compared is None:
-        report(common, {**data, "files": files, "device": device}, design_lines(made, files))
+        cli.report(common, {**data, "files": files, "device": device}, design_lines(made, files))
         return
     from amiwarp.studies import optics_comparison
 
     optics_data = comparison_summary(compared)
-    write_text(Path(files["optics_json"]), json.dumps(plain(optics_data), indent=1, allow_nan=False) + "\n")
+    write_text(Path(files["optics_json"]), json.dumps(cli.plain(optics_data), indent=1, allow_nan=False) + "\n")
     _write_csv(files["optics_csv"], optics_data["optics"])
     save_png_and_svg(optics_comparison.chart(compared), out / "optics")
     lines = [*design_lines(made, {}), *comparison_lines(compared), "", *files.values()]
-    report(common, {**data, "comparison": optics_data, "files": files, "device": device}, lines)
+    cli.report(common, {**data, "comparison": optics_data, "files": files, "device": device}, lines)
 
 
-def _camera_of_design(options: CameraOptions, size: str | None) -> Camera:
-    width, height = parse_size(size or "640x480")
+def _camera_of_design(options: cli.CameraOptions, size: str | None) -> Camera:
+    width, height = cli.parse_size(size or "640x480")
     found = options.build(width, height, fixed=size is not None)
     return found or Camera.from_fov(width, height, math.radians(FOV_DEG))
 
 
 def _list(text: str, name: str) -> tuple[float, ...]:
-    return numbers(text, text.count(",") + 1, name)
+    return cli.numbers(text, text.count(",") + 1, name)
 
 
 def design_summary(design: Design) -> dict[str, Any]:
@@ -626,9 +618,9 @@ def design_lines(design: Design, files: dict[str, str]) -> list[Any]:
          c.model, f"{c.window_ms:.1f} ms", "recommended" if c is design.chosen else ", ".join(c.misses))
         for c in design.choices
     ]  # fmt: skip
-    shown = table(rows, "apex", "rpm", "events", "orbit", "error", "model", "window", "misses")
+    shown = cli.table(rows, "apex", "rpm", "events", "orbit", "error", "model", "window", "misses")
     said = [tuple(line.split(": ", 1)) for line in reasons(design)]
-    return [shown, "", headline(design), table(said), "", *files.values()]
+    return [shown, "", headline(design), cli.table(said), "", *files.values()]
 
 
 def comparison_summary(comparison: Comparison) -> dict[str, Any]:
@@ -707,7 +699,7 @@ def comparison_lines(comparison: Comparison) -> list[Any]:
         "misses",
     )
     said = [tuple(line.split(": ", 1)) for line in reasons(comparison)]
-    return [table(rows, *heads), "", table(said)]
+    return [cli.table(rows, *heads), "", cli.table(said)]
 
 
 # ``amiwarp stability``: limits and failures of the calibration, on simulated recordings with ground truth.
@@ -721,7 +713,7 @@ QUICK_MINUTES = 9.0
 def run_stability(
     *,
     out: Annotated[
-        Path, typer.Option(help="Folder for the results of single runs (cells), figures and tables."), OUTPUT_FOLDER
+        Path, typer.Option(help="Folder for the results of single runs (cells), figures and tables."), cli.OUTPUT_FOLDER
     ] = Path("amiwarp-atlas"),
     quick: Annotated[
         bool, typer.Option("--quick", help="Use three values per axis, three methods and one seed: within ten minutes.")
@@ -762,14 +754,14 @@ def run_stability(
     redraw: Annotated[
         bool, typer.Option("--redraw", help="Only draw figures and tables from the existing cells; run nothing.")
     ] = False,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Calibrate simulated recordings under growing disturbances, and draw where calibration works and fails.
 
     Each axis varies one disturbance, such as noise. A cell holds one recording and the results of all methods on it.
     Finished cells are saved in OUT/cells: the same command continues a stopped run and skips finished cells.
     """
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     from amiwarp.studies.stability.cells import DRAWS, Store, cells_of, identity
     from amiwarp.studies.stability.report import aggregate, draw, load
 
@@ -792,13 +784,13 @@ def run_stability(
         left = sum(not {identity(m) for m in chosen_methods} <= c.results.keys() for c in cells)
     took = time.perf_counter() - began
     atlas = aggregate(cells, chosen_axes, chosen_methods, _about(cells))
-    with progress("drawing"), own_folder(out) if earlier else contextlib.nullcontext():
+    with cli.progress("drawing"), own_folder(out) if earlier else contextlib.nullcontext():
         files = atlas.write(out) | draw(atlas, out)
     speed = {"cells": atlas.cells, "new_cells": new, "cells_left": left, "seconds": took, "cells_per_s": new / took}
     data = {"aims": atlas.aims.to_json(), "files": {name: str(path) for name, path in files.items()}, **speed}
-    damaged = [f"damaged, and left out: {what}" for what in store.damaged] if redraw else made_again(store.damaged)
+    damaged = [f"damaged, and left out: {what}" for what in store.damaged] if redraw else cli.made_again(store.damaged)
     shown = [*damaged, *stability_lines(atlas, files, new, left, took)]
-    report(common, data | {"device": device, "damaged": store.damaged}, shown)
+    cli.report(common, data | {"device": device, "damaged": store.damaged}, shown)
 
 
 def _axes(names: Sequence[str], quick: bool) -> tuple[Axis, ...]:
@@ -841,7 +833,7 @@ def _run_cells(
 
     try:
         with (
-            progress("starting workers") as advance,
+            cli.progress("starting workers") as advance,
             start_workers("amiwarp stability", "cluster", scheduler, cpu_threads(), device) as workers,
         ):
             cells = run(wanted, methods, store, workers, device=device, progress=count,
@@ -863,9 +855,9 @@ def stability_lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, t
     """Return the results as tables and lines of text: where each method works, the aims, the files and the speed."""
     from amiwarp.studies.stability.report import STATED_HEADINGS, summary
 
-    shown: list[Any] = [table(summary(atlas), "works at", *atlas.methods), "", *atlas.aims.lines(), ""]
+    shown: list[Any] = [cli.table(summary(atlas), "works at", *atlas.methods), "", *atlas.aims.lines(), ""]
     if atlas.stated:
-        shown += [table([d.row() for d in atlas.stated], *STATED_HEADINGS), ""]
+        shown += [cli.table([d.row() for d in atlas.stated], *STATED_HEADINGS), ""]
     listed = ("overview", "pages", "summary", "data", "table")
     shown += [f"{name}: {files[name]}" for name in listed]
     speed = f"{new:,} cells in {took:,.0f} s, {new / took:.3g} per second; " if new else ""
@@ -880,7 +872,7 @@ def stability_lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, t
 def run_evaluate(
     *,
     out: Annotated[
-        Path, typer.Option(help="Folder for the report. An existing one is continued."), OUTPUT_FOLDER
+        Path, typer.Option(help="Folder for the report. An existing one is continued."), cli.OUTPUT_FOLDER
     ] = Path("amiwarp-evaluation"),
     only: Annotated[
         str | None,
@@ -906,7 +898,7 @@ def run_evaluate(
     ] = None,
     scheduler: Scheduler = None,
     workers: LocalWorkers = None,
-    common: Common,
+    common: cli.Common,
 ) -> None:
     """Check the AMI-EV paper's results: compare with a plain event camera on simulated worlds, and write a report.
 
@@ -916,11 +908,11 @@ def run_evaluate(
     from amiwarp.studies.cluster import ANY_GPU
     from amiwarp.studies.evaluate.evaluation import evaluate
 
-    device = common.device if common.device == ANY_GPU else choose_device(common.device)
+    device = common.device if common.device == ANY_GPU else cli.choose_device(common.device)
 
     names = tuple(name.strip() for name in only.split(",") if name.strip()) if only else ()
     try:
-        with progress("starting workers", average_s=AVERAGE_S) as advance:
+        with cli.progress("starting workers", average_s=AVERAGE_S) as advance:
             done = evaluate(
                 out, only=names, full=full, seeds=seeds, recordings=recording or (), scheduler=scheduler,
                 workers=workers, device=device, seed=common.seed, progress=advance,
@@ -929,7 +921,7 @@ def run_evaluate(
         say(f"amiwarp: finished cells are kept in {out}; run the same command again to continue")
         raise
     files = {name: str(path) for name, path in done.files.items()}
-    report(common, asdict(done) | {"files": files, "device": device}, _evaluate_lines(done))
+    cli.report(common, asdict(done) | {"files": files, "device": device}, _evaluate_lines(done))
 
 
 def _evaluate_lines(done: EvaluationSummary) -> list[str]:
@@ -937,7 +929,7 @@ def _evaluate_lines(done: EvaluationSummary) -> list[str]:
     lines = [f"claims: {verdicts or 'none'}"]
     if done.failed:
         lines.append(f"{done.failed:,} cells failed; the report says why")
-    lines += made_again(done.damaged)
+    lines += cli.made_again(done.damaged)
     lines += [f"{name}: {path}" for name, path in done.files.items()]
     return [
         *lines,

@@ -17,18 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.choices import OPTICAL_MODELS, Axis, Colour, View
+from amiwarp.cli import common as cli
 from amiwarp.cli import say
-from amiwarp.cli.common import (
-    OUTPUT,
-    CameraOptions,
-    Common,
-    NominalPrismOptions,
-    choose_device,
-    complete,
-    parse_size,
-    report,
-    span,
-)
 from amiwarp.cli.rig import SourceOptions, check_angles
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
@@ -54,7 +44,7 @@ class LookOptions:
     screenshot: Annotated[
         Path | None,
         typer.Option(help="Write a picture of both event clouds (.png) and exit.", rich_help_panel=_LOOK),
-        OUTPUT,
+        cli.OUTPUT,
     ] = None
     view: Annotated[View, typer.Option(help="Viewpoint.", rich_help_panel=_LOOK)] = View.FREE
     colour: Annotated[
@@ -92,7 +82,7 @@ class LookOptions:
 
     def pixels(self, usual: tuple[int, int]) -> tuple[int, int]:
         """Return width and height [px], by default the ``usual`` ones. Raises :class:`AmiwarpError` for a bad size."""
-        width, height = usual if self.size is None else parse_size(self.size)
+        width, height = usual if self.size is None else cli.parse_size(self.size)
         if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
             raise AmiwarpError(f"--size {self.size!r}: width and height must be {LEAST_PX} to {MOST_PX} px")
         return width, height
@@ -178,7 +168,7 @@ class PageOptions:
     ] = 0
 
     def serve(
-        self, new_inspector: Callable[[], Inspector], library: Library | None, *, name: str, common: Common
+        self, new_inspector: Callable[[], Inspector], library: Library | None, *, name: str, common: cli.Common
     ) -> None:
         """Serve the inspector's page for a browser until interrupted.
 
@@ -189,7 +179,7 @@ class PageOptions:
         def ready(url: str) -> None:
             if (text := warning(self.host)) is not None:
                 say(text)
-            report(common, {"url": url}, [f"{name}: {url}", "stop with Ctrl-C"])
+            cli.report(common, {"url": url}, [f"{name}: {url}", "stop with Ctrl-C"])
 
         serve_panel(new_inspector, library, host=self.host, port=self.port, ready=ready)
 
@@ -249,7 +239,7 @@ class StartOptions:
             inspector.use_model(self.model)
         if self.window is not None:
             events = inspector.recording.events
-            low, high = span(self.window, events.t_first, events.t_last)
+            low, high = cli.span(self.window, events.t_first, events.t_last)
             inspector.window = low, high - low
         if self.beside is not None:
             inspector.put_beside(open_recording(self.beside))
@@ -267,9 +257,9 @@ def run_view(
     start: StartOptions,
     page: PageOptions,
     look: LookOptions,
-    camera: CameraOptions,
-    prism: NominalPrismOptions,
-    common: Common,
+    camera: cli.CameraOptions,
+    prism: cli.NominalPrismOptions,
+    common: cli.Common,
 ) -> None:
     """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
     from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector, Library
@@ -278,17 +268,17 @@ def run_view(
         raise AmiwarpError("--screenshot and --web are both given; give one of them")
     if not page.web and page != PageOptions():
         raise AmiwarpError("--host and --port apply to the page; give --web too")
-    device = choose_device(common.device)
+    device = cli.choose_device(common.device)
     with stream.follow(str(recording)) as latest:
 
         def new_inspector() -> Inspector:
             opened = open_recording(recording) if latest is None else latest()
-            return start.build(complete(opened, camera, prism), device, latest, None if page.web else WINDOW_POINTS)
+            return start.build(cli.complete(opened, camera, prism), device, latest, None if page.web else WINDOW_POINTS)
 
         waiting = [new_inspector()]  # created before the page opens, so that bad input is reported at once
         if look.screenshot is not None:
             data = {**look.write(waiting[0], look.screenshot), "device": device}
-            report(common, data, _lines(data))
+            cli.report(common, data, _lines(data))
             return
         if not page.web:
             from amiwarp.viewer import window
@@ -298,7 +288,7 @@ def run_view(
             return
 
         def open_other(path: Path) -> Inspector:
-            return Inspector(complete(open_recording(path), camera, prism), device=device)
+            return Inspector(cli.complete(open_recording(path), camera, prism), device=device)
 
         library = None if stream.live else Library(recording.parent, open_other)
 

@@ -22,18 +22,9 @@ import numpy as np
 
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
+from amiwarp.io import formats
 from amiwarp.io.export import export
 from amiwarp.io.files import check_output, errors_name, open_input, put_in_place, scratch_folder, write_text
-from amiwarp.io.formats import (
-    MANIFEST,
-    MOST_BYTES,
-    Codec,
-    ManifestItem,
-    OutputFormat,
-    make_folder,
-    open_item,
-    read_manifest,
-)
 from amiwarp.io.json_files import parse_json
 from amiwarp.studies.dataset.making import flat_rows, require_pyarrow
 from amiwarp.tasks import Progress, silent
@@ -155,7 +146,7 @@ def _export(
     folder: Path, out: Path, chosen: ExportFormat, limit: int, overwrite: bool, report: Progress, began: float
 ) -> ExportSummary:
     """Write the export to an existing folder, first to a scratch folder in it."""
-    head, items = read_manifest(folder / MANIFEST)
+    head, items = formats.read_manifest(folder / formats.MANIFEST)
     if not items:
         raise AmiwarpError(f"{folder}: has no recordings to export; make some with 'amiwarp dataset'")
     tensors = [item for item in items if item.representation is not None]
@@ -168,11 +159,11 @@ def _export(
     splits = Counter(item.split for item in items)
     count = 0
 
-    def opened(split: str) -> Iterator[tuple[ManifestItem, Any]]:
+    def opened(split: str) -> Iterator[tuple[formats.ManifestItem, Any]]:
         nonlocal count
         for item in items:
             if item.split == split:
-                yield item, open_item(folder, item) if item.representation is None else None
+                yield item, formats.open_item(folder, item) if item.representation is None else None
                 count += 1
                 report(f"{count:,} of {len(items):,} recordings", count / len(items))
 
@@ -194,7 +185,7 @@ def _export(
         # If this process is killed meanwhile, the index says so, and the next export removes all these files.
         _write_index(out, index | {"complete": False, "files": sorted(old | set(files))}, overwrite=overwrite)
         for inner in {Path(name).parent for name in files}:
-            make_folder(out / inner)
+            formats.make_folder(out / inner)
         for name in files:
             put_in_place(scratch / name, out / name, overwrite=overwrite)
     for name in old - set(files):
@@ -213,7 +204,7 @@ def _write_index(out: Path, index: Mapping[str, Any], *, overwrite: bool) -> Non
 def _folder(out: Path) -> Iterator[None]:
     """Create a folder. After an error a new one is removed if it is empty."""
     new = not out.exists()
-    make_folder(out)
+    formats.make_folder(out)
     try:
         yield
     except BaseException:
@@ -238,12 +229,12 @@ def _files_of_earlier(out: Path, overwrite: bool) -> set[str]:
         return set()
     check_output(index, overwrite=overwrite)
     with errors_name(index, lambda: "reading the index of an export"), open_input(index, noted=False) as file:
-        files = dict(parse_json(file.read(MOST_BYTES))).get("files")
+        files = dict(parse_json(file.read(formats.MOST_BYTES))).get("files")
     known = r"(data/)?[A-Za-z0-9_-]+[.](tar|parquet)|README[.]md"
     return {name for name in files or () if isinstance(name, str) and re.fullmatch(known, name)}
 
 
-def _names(items: Sequence[ManifestItem]) -> dict[str, str]:
+def _names(items: Sequence[formats.ManifestItem]) -> dict[str, str]:
     """Return the names of the samples by file: its path without ending, as far as WebDataset allows it.
 
     A hash of the file follows where several have the same name, because WebDataset joins members of one name.
@@ -266,7 +257,7 @@ def _write_tars(
     folder: Path,
     scratch: Path,
     split: str,
-    opened: Iterator[tuple[ManifestItem, Any]],
+    opened: Iterator[tuple[formats.ManifestItem, Any]],
     keys: Mapping[str, str],
     limit: int,
 ) -> Iterator[str]:
@@ -289,8 +280,8 @@ def _write_tars(
             else:
                 arrays = scratch / "events.npz"
                 export(
-                    recording.events, arrays, OutputFormat.NPZ, recording.events.size,
-                    codec=Codec.BLOSC, progress=None, overwrite=True,
+                    recording.events, arrays, formats.OutputFormat.NPZ, recording.events.size,
+                    codec=formats.Codec.BLOSC, progress=None, overwrite=True,
                 )  # fmt: skip
             with open_input(arrays, noted=False) as file:
                 _add(archive, f"{keys[item.file]}.npz", file, arrays.stat().st_size)
@@ -316,8 +307,8 @@ def _hub_name(split: str) -> str:
 def _write_parquet(
     scratch: Path,
     splits: Sequence[str],
-    opened: Callable[[str], Iterator[tuple[ManifestItem, Any]]],
-    items: Sequence[ManifestItem],
+    opened: Callable[[str], Iterator[tuple[formats.ManifestItem, Any]]],
+    items: Sequence[formats.ManifestItem],
     limit: int,
 ) -> list[str]:
     """Write Parquet files of at least ``limit`` bytes before compression. Return their names."""
@@ -345,8 +336,8 @@ def _rows(pa: Any, rows: Sequence[Mapping[str, Any]]) -> Any:
         except (pa.ArrowException, OverflowError) as error:
             what = " ".join(str(error).split())
             raise AmiwarpError(
-                f"{MANIFEST}: {name} of the items is no column of a table ({what}); give values of one type, or export "
-                "to webdataset"
+                f"{formats.MANIFEST}: {name} of the items is no column of a table ({what}); give values of one type, "
+                "or export to webdataset"
             ) from error
     return pa.table(columns)
 
@@ -354,7 +345,7 @@ def _rows(pa: Any, rows: Sequence[Mapping[str, Any]]) -> Any:
 def _parquet_parts(
     pa: Any,
     scratch: Path,
-    opened: Iterator[tuple[ManifestItem, Any]],
+    opened: Iterator[tuple[formats.ManifestItem, Any]],
     rows: Any,
     place: Mapping[str, int],
     limit: int,
@@ -397,7 +388,7 @@ def _parquet_parts(
             writer.close()
 
 
-def _columns(pa: Any, item: ManifestItem, recording: Any) -> dict[str, Any]:
+def _columns(pa: Any, item: formats.ManifestItem, recording: Any) -> dict[str, Any]:
     """Return the columns of one recording: lists of events, and the size of the sensor."""
     if item.events > MOST_EVENTS:
         raise AmiwarpError(
@@ -413,7 +404,7 @@ def _columns(pa: Any, item: ManifestItem, recording: Any) -> dict[str, Any]:
     }
 
 
-def _card(title: str, items: Sequence[ManifestItem]) -> str:
+def _card(title: str, items: Sequence[formats.ManifestItem]) -> str:
     """Return the README of a folder for Hugging Face, whose header names the files of each split."""
     splits = Counter(_hub_name(item.split) for item in items)
     given = Counter(str(item.entry.get("licence") or "not stated") for item in items)
