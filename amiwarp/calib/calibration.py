@@ -604,7 +604,7 @@ PARALLAX_PX, ROTATION_COST = 0.25, 0.1
 """Error of size and phase that parallax leaves, however many turns are averaged [px per cost above a rotation's].
 
 In six worlds it was 0.01 px at a cost of 0.15, 0.04 at 0.26 and 0.2 at 0.4."""
-ENOUGH_PX, LARGEST_MEAN_PX = 0.03, 0.05
+ENOUGH_PX, LARGEST_MEAN_PX = 0.03, 0.1
 """Stated error of the mean that suffices, and the largest one [px rms]."""
 
 
