@@ -21,7 +21,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Unpack
 
@@ -531,14 +531,16 @@ class Calibrator:
         length_us = int(WINDOW_TURNS * 60e6 / abs(encoder.rpm))
         most_cost = min(LARGEST_FAST_COST, stage.LARGEST_COST_RATIO * tried.cost)
         single = replace(self, progress=None)
-        answers: dict[int, Attempt] = {}
+        answers: dict[int, Mapping[str, float]] = {}  # not the attempts, which hold events and images
+        best: Attempt | None = None
         costs: list[float] = []
         stated_px = math.inf
         for k in van_der_corput(len(starts)):
             answer = single._turning_in((int(starts[k]), int(starts[k]) + length_us), fast=True)
             costs.append(answer.cost)
             if answer.accepted:
-                answers[k] = answer
+                answers[k] = answer.found().parameters
+                best = answer if best is None or answer.cost < best.cost else best
             if self.progress is not None:
                 self.progress("calibrating, turn by turn", len(costs) / len(starts))
             if len(costs) < LEAST_JUDGED:
@@ -546,7 +548,8 @@ class Calibrator:
             cost = float(np.median(costs))
             if cost > most_cost or len(answers) < LEAST_ANSWERED * len(costs):
                 return None
-            mean, stated_px = _mean([answers[n] for n in sorted(answers)], cost)
+            assert best is not None
+            mean, stated_px = _mean(best, [answers[n] for n in sorted(answers)], cost)
             if len(costs) >= LEAST_AVERAGED and stated_px <= ENOUGH_PX:
                 break
         if stated_px > LARGEST_MEAN_PX:
@@ -608,18 +611,18 @@ ENOUGH_PX, LARGEST_MEAN_PX = 0.03, 0.1
 """Stated error of the mean that suffices, and the largest one [px rms]."""
 
 
-def _mean(answers: Sequence[Attempt], cost: float) -> tuple[Calibration, float]:
-    """Return the mean of the answers of successive turns, of which ``cost`` is the median cost, and its error [px rms].
+def _mean(best: Attempt, answers: Sequence[Mapping[str, float]], cost: float) -> tuple[Calibration, float]:
+    """Return the mean of the answers of successive turns, and its error [px rms].
 
+    ``best`` is the attempt with the lowest cost, of which the rest of the calibration is taken; ``cost`` the median.
     The camera's rotation, which each turn has its own of, is left out. A motion with nearly the frequency of the prism
     changes successive answers alike: their mean is then less certain than their scatter tells, and the scatter of the
     means of groups counts.
     """
-    best = min(answers, key=lambda a: a.cost)
     assert best.search is not None
     assert best.photometric is not None
     space = best.search.full_space.without(MOTION)
-    each = np.array([space.to_vector(a.found().parameters) for a in answers])
+    each = np.array([space.to_vector(parameters) for parameters in answers])
     groups = np.array([group.mean(axis=0) for group in np.array_split(each, min(GROUPS, len(each)))])
     by_each, by_group = (np.cov(some.T) / len(some) for some in (each, groups))
     scatter = by_each if np.trace(by_each) > np.trace(by_group) else by_group
