@@ -179,8 +179,12 @@ def test_corrections_of_small_grids_in_one_block(shape: tuple[int, int]) -> None
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.3])
-@pytest.mark.parametrize("turns", [False, True])
-def test_positions_of_blocks_of_pairs(recording: Recording, drift: float, turns: bool) -> None:
+@pytest.mark.parametrize(
+    "rotation",
+    [CameraRotation(), CameraRotation((0.3, -0.2, 0.5), (1.0, 0.0, -2.0), growth=0.6), CameraRotation(growth=0.6)],
+    ids=["still", "turns", "grows"],
+)
+def test_positions_of_blocks_of_pairs(recording: Recording, drift: float, rotation: CameraRotation) -> None:
     """A camera without distortion is fast; with a distortion of zero it takes the general path."""
     assert recording.camera is not None
     assert recording.encoder is not None
@@ -191,7 +195,6 @@ def test_positions_of_blocks_of_pairs(recording: Recording, drift: float, turns:
         pairs = pairs.with_slope(lambda t: t * 1e-6, 0)
     tiles = Tiles(np.array([[4.0, 3.0]], np.float32), height, width, 1.0)
     brightness = BrightnessMap(pairs, tiles)
-    rotation = CameraRotation((0.3, -0.2, 0.5), (1.0, 0.0, -2.0)) if turns else CameraRotation()
     found = []
     for camera in (recording.camera, replace(recording.camera, distortion=RadialTangential())):
         brightness.place(ExactModel(camera, TRUE_PRISM, TRUE_PHASE), drift=drift, camera_rotation=rotation)

@@ -12,18 +12,24 @@ from numpy.typing import NDArray
 
 from amiwarp import (
     AmiwarpError,
+    Body,
     Calibration,
     Camera,
     CameraMotion,
     CameraRotation,
     Encoder,
     FlatSide,
+    Material,
+    Mesh,
     PhotometricSettings,
     Recording,
     Scene,
     SensorModel,
     SensorTiming,
     Simulation,
+    Trajectory,
+    World,
+    WorldScene,
     calibrate,
     iwe,
     model_error,
@@ -96,6 +102,24 @@ def test_it_turns_ever_faster_and_the_picture_follows(texture: NDArray[np.uint8]
         for rotation in (None, CameraRotation())
     )
     assert following.residual < 0.3 * still.residual
+
+
+def test_it_moves_forward_and_the_image_grows(texture: NDArray[np.uint8], device: str) -> None:
+    """Towards a picture at 1 m, at 1.5 m/s: in the middle of the recording, the growth is speed over depth."""
+    wall = Mesh(np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]), np.array([[0, 1, 2], [0, 2, 3]]),
+                np.array([[0, 0], [1, 0], [1, 1], [0, 1]]))  # fmt: skip
+    picture = Material(1.0, linear_luminance(texture))
+    path = Trajectory([0.0, 0.18], [[0.0, 0.0, -0.135], [0.0, 0.0, 0.135]], [[0.0, 0.0, 0.0, 1.0]] * 2)
+    recording = Simulation(
+        WorldScene(World("wall", (Body("wall", wall, picture),), ambient=1.0), path), CAMERA, TRUE_PRISM, 0.18, seed=4,
+        device=device,
+    ).run()  # fmt: skip
+    c = calibrate(recording, free=(*FREE, "growth"), photometric=KNOWN, events=40_000, device=device)
+    assert c.parameters["growth"] == pytest.approx(1.5, rel=0.03)
+    assert np.abs(rates_of(c)).max() < 0.03
+    assert error_px(c, recording) <= 0.03
+    assert c.camera_rotation is not None
+    assert c.camera_rotation.growth == c.parameters["growth"]
 
 
 def test_a_still_camera_is_found_to_be_still(recording: Recording) -> None:

@@ -681,10 +681,18 @@ def test_a_rotation_is_the_integral_of_its_velocity() -> None:
     np.testing.assert_allclose(later.rotation(tau), expected, rtol=0, atol=1e-12)
 
 
+def test_a_growth_may_be_expressed_about_any_time() -> None:
+    growing = CameraRotation(growth=1.6, middle_us=50_000)
+    later, tau = growing.about(80_000), np.linspace(-0.04, 0.07, 12)
+    whole, part = 1.0 - growing.growth * (tau + 0.03), 1.0 - growing.growth * 0.03
+    np.testing.assert_allclose(1.0 - later.growth * tau, whole / part, rtol=1e-12)
+
+
 def test_a_rotation_moves_if_it_turns_or_accelerates() -> None:
     assert CameraRotation().moves is False
     assert CameraRotation(angular_velocity=(0.0, 1e-6, 0.0)).moves is True
     assert CameraRotation(angular_acceleration=(0.0, 0.0, 1e-6)).moves is True
+    assert CameraRotation(growth=1e-6).moves is True
 
 
 def test_the_reach_of_a_pan_is_that_of_the_border() -> None:
@@ -698,6 +706,7 @@ def test_the_reach_of_a_pan_is_that_of_the_border() -> None:
     assert reach[1] == pytest.approx(corner, abs=1e-2)
     np.testing.assert_array_equal(CameraRotation().reach(camera, 0.1), np.zeros(2))
     assert CameraRotation(angular_acceleration=(0.0, 100.0, 0.0)).reach(camera, 0.1)[0] > reach[0]
+    np.testing.assert_allclose(CameraRotation(growth=2.0).reach(camera, 0.1), [20.0, 10.0], atol=1e-3)
     flipped = CameraRotation(angular_velocity=(0.0, math.pi, 0.0))
     np.testing.assert_array_equal(flipped.reach(camera, 1.0), [201.0, 101.0])
 
@@ -716,10 +725,16 @@ def undo_rotation(
     out[1, i] = undo_camera_rotation(general, xy[i], rotation, time)
 
 
-def test_a_rotation_is_undone_as_the_rotation_of_bearings(device: str) -> None:
-    """For a camera without distortion, whose principal point lies off the centre and whose pixels are not square."""
+@pytest.mark.parametrize("growth", [0.0, 1.5])
+@pytest.mark.parametrize("turns", [False, True])
+def test_a_rotation_is_undone_as_the_rotation_of_bearings(device: str, turns: bool, growth: float) -> None:
+    """And a forward motion as one towards a plane.
+
+    For a camera without distortion, whose principal point lies off the centre and whose pixels are not square.
+    """
     camera = Camera(201, 101, 150.0, 140.0, 90.0, 55.0)
-    rotation = CameraRotation((0.4, -0.6, 0.9), (2.0, 1.0, -3.0))
+    rotation = CameraRotation((0.4, -0.6, 0.9), (2.0, 1.0, -3.0)) if turns else CameraRotation()
+    rotation = replace(rotation, growth=growth)
     xy = np.array([[0.0, 0.0], [200.0, 0.0], [90.0, 55.0], [17.5, 80.25], [0.0, 100.0]])
     out = wp.zeros((2, len(xy)), dtype=wp.vec2, device=device)
     for time in (-0.1, 0.0, 0.15):
@@ -728,7 +743,9 @@ def test_a_rotation_is_undone_as_the_rotation_of_bearings(device: str) -> None:
         wp.launch(undo_rotation, len(xy), inputs=inputs, outputs=[out], device=device)
         rays = np.column_stack([(xy - [90.0, 55.0]) / [150.0, 140.0], np.ones(len(xy))])
         turned = Rotation.from_rotvec(rotation.rotation(np.array([time]))[0]).apply(rays)
-        expected = turned[:, :2] / turned[:, 2:] * [150.0, 140.0] + [90.0, 55.0]
+        plane = turned / turned[:, 2:]
+        plane[:, 2] += growth * time / (1.0 - growth * time)  # at the time 0 the plane is farther away
+        expected = plane[:, :2] / plane[:, 2:] * [150.0, 140.0] + [90.0, 55.0]
         np.testing.assert_allclose(out.numpy(), [expected, expected], rtol=0, atol=1e-3)  # px
 
 

@@ -84,7 +84,7 @@ def test_tiles_of_few_events_vote_as_one_pass_does(vote: Vote) -> None:
 
 def test_distorted_and_turning_cameras() -> None:
     camera = Camera(200, 150, 180.0, 180.0, 99.5, 74.5, RadialTangential(-0.2, 0.05, 0.0, 0.0, 0.0))
-    camera_rotation = CameraRotation((0.3, 0.2, 0.5), (0.0, 0.0, 0.0), 125_000)
+    camera_rotation = CameraRotation((0.3, 0.2, 0.5), (0.0, 0.0, 0.0), 125_000, growth=0.4)
     found, expected = both(CanvasShape(200, 150, 8), [CircleModel(camera, 0.02, 0.1)], camera_rotation=camera_rotation)
     assert np.abs(found[0] - expected[0]).max() < 0.004 * expected[0].max()
 

@@ -591,7 +591,7 @@ class PairPositions:
     def _in_blocks(self, model: Model, turn: CameraRotation) -> bool:
         """Return whether the fast kernels apply: no distortion, no slow pixels, and on CUDA only the prism moves."""
         arrays = self.pairs.arrays
-        moves = arrays.slope.shape[0] > 0 or any((*turn.angular_velocity, *turn.angular_acceleration))
+        moves = arrays.slope.shape[0] > 0 or turn.moves
         return model.camera.distortion is None and not arrays.lag.shape[0] and (self.device.is_cpu or not moves)
 
     @cached_property

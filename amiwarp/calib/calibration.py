@@ -21,7 +21,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Unpack
 
@@ -34,6 +34,7 @@ from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rot
 from amiwarp.calib.model_choice import ModelChooser
 from amiwarp.calib.parameters import (
     CHANGES,
+    GROWTH,
     LINEAR_UNKNOWNS,
     MOTION,
     RATES,
@@ -468,7 +469,7 @@ class Calibrator:
             repetition, span = first_guess.calmest_span(self.recording, encoder)
         restless, calm = repetition < first_guess.LEAST_REPETITION, repetition >= first_guess.LEAST_CALM
         starts = self._starts()
-        many = len(starts) >= LEAST_STARTS
+        many = len(starts) >= LEAST_TURNS
         too_fast = Attempt(None, checks.moves_too_fast(name, repetition, short=not many))
         if restless and many:
             return self.turn_by_turn(tried, starts) or (tried if tried.accepted else too_fast)
@@ -478,8 +479,8 @@ class Calibrator:
             if restless and not tried.accepted and rival is not None and again.calibration is not None:
                 return too_fast
             moves = many and not calm and not tried.accepted
-            return (self.turn_by_turn(tried, starts) if moves else None) or tried
-        apart_px = ENOUGH_PX if many else stage.LARGEST_INCONSISTENCY_PX  # two wrong answers may be alike by chance
+            return (self.turn_by_turn(tried, starts) or too_fast) if moves else tried
+        apart_px = CONFIRMED_PX if many else stage.LARGEST_INCONSISTENCY_PX  # two wrong answers may be alike by chance
         if (not calm or (many and again.unexplained)) and not self._confirmed(again, apart_px):
             mean = self.turn_by_turn(tried, starts) if many else None
             if mean is not None or not calm:
@@ -501,30 +502,30 @@ class Calibrator:
         return Attempt(_warning(still, said))
 
     def _starts(self) -> NDArray[np.int64]:
-        """Return the times [us] at which the turns of :meth:`turn_by_turn` begin: a random one in each equal interval.
+        """Return the times [us] at which the turns of :meth:`turn_by_turn` begin: successive turns in the middle.
 
-        At equal distances, a motion whose frequency differs from the prism's by a multiple of theirs would change all
-        answers alike.
+        All begin at the same angle of the prism. Then a motion of any frequency but the prism's changes the answers by
+        an oscillation, which a weighted mean of them removes.
         """
         source, encoder = self.recording.events, self.recording.encoder
         assert encoder is not None
         if MODELS[self.settings.model].ANGLES > 1 or not encoder.rpm:
             return np.zeros(0, np.int64)
         turn_us = 60e6 / abs(encoder.rpm)
-        longest = source.t_last - source.t_first - int(WINDOW_TURNS * turn_us)
-        count = min(MOST_STARTS, int(max(longest, 0) / (LEAST_STEP * turn_us)))
-        drawn = np.random.default_rng(0).uniform(size=count)
-        return source.t_first + (longest * (np.arange(count) + drawn) / max(count, 1)).astype(np.int64)
+        longest = source.t_last - source.t_first - WINDOW_TURNS * turn_us
+        count = min(MOST_TURNS, math.floor(longest / turn_us) + 1)
+        left = longest - (count - 1) * turn_us
+        return source.t_first + (0.5 * left + turn_us * np.arange(count)).astype(np.int64)
 
     def turn_by_turn(self, tried: Attempt, starts: NDArray[np.int64]) -> Attempt | None:
         """Return the mean of the answers of single turns of the prism, or the error that it is too uncertain.
 
-        None if no rotation of the camera explains the events of single turns. At least :data:`LEAST_STARTS` turns begin
+        None if no motion of the camera explains the events of single turns. At least :data:`LEAST_TURNS` turns begin
         at the times ``starts`` [us].
 
         The camera's own motion changes the orbit by a different amount in each turn, unless it is in step with the
         prism, so the mean of these changes vanishes. Within a turn, the camera's angular velocity is taken as linear in
-        time.
+        time and the growth of the image as steady; the scene of each tile moves on a path beyond that.
         """
         encoder, name = self.recording.encoder, self.recording.name
         assert encoder is not None
@@ -534,7 +535,6 @@ class Calibrator:
         answers: dict[int, Mapping[str, float]] = {}  # not the attempts, which hold events and images
         best: Attempt | None = None
         costs: list[float] = []
-        stated_px = math.inf
         for k in van_der_corput(len(starts)):
             answer = single._turning_in((int(starts[k]), int(starts[k]) + length_us), fast=True)
             costs.append(answer.cost)
@@ -543,15 +543,11 @@ class Calibrator:
                 best = answer if best is None or answer.cost < best.cost else best
             if self.progress is not None:
                 self.progress("calibrating, turn by turn", len(costs) / len(starts))
-            if len(costs) < LEAST_JUDGED:
-                continue
-            cost = float(np.median(costs))
-            if cost > most_cost or len(answers) < LEAST_ANSWERED * len(costs):
+            few = len(answers) < LEAST_ANSWERED * len(costs)
+            if len(costs) >= LEAST_JUDGED and (few or np.median(costs) > most_cost):
                 return None
-            assert best is not None
-            mean, stated_px = _mean(best, [answers[n] for n in sorted(answers)], cost)
-            if len(costs) >= LEAST_AVERAGED and stated_px <= ENOUGH_PX:
-                break
+        assert best is not None
+        mean, stated_px = _mean(best, answers, len(starts), float(np.median(costs)))
         if stated_px > LARGEST_MEAN_PX:
             return Attempt(None, checks.scatters(name, len(answers), stated_px, LARGEST_MEAN_PX))
         said = f"the camera never rests: the answer is the mean of those of {len(answers)} turns, ± {stated_px:.2f} px"
@@ -561,7 +557,7 @@ class Calibrator:
         """Return the attempt with a free camera rotation, in the middle of the recording."""
         encoder = self.recording.encoder
         assert encoder is not None
-        free = (*MODELS[self.settings.model].freed(encoder.ratio), "motion", *(CHANGES if fast else ()))
+        free = (*MODELS[self.settings.model].freed(encoder.ratio), "motion", *((*CHANGES, GROWTH) if fast else ()))
         return replace(self, settings=replace(self.settings, free=free)).attempt(rival, fast=fast)
 
     def _turning_in(self, span: tuple[int, int], *, fast: bool = False) -> Attempt:
@@ -589,45 +585,54 @@ class Calibrator:
 
 # Calibration turn by turn, of a camera that never rests.
 
-WINDOW_TURNS = 1.05
-"""Length of each part of the recording that gives an answer [turns]. In longer ones, the velocity is less linear."""
-MOST_STARTS, LEAST_STARTS = 96, 16
-"""Largest and smallest number of these parts."""
-LEAST_STEP = 1.1
-"""Smallest mean distance of their starts [turns]."""
-LEAST_JUDGED, LEAST_AVERAGED = 8, 32
-"""Number of parts from which on the recording may be given up, and from which on the mean may suffice."""
+WINDOW_TURNS = 1.5
+"""Length of each part of the recording that gives an answer [turns]. In longer ones, the velocity is less linear. In
+shorter ones, the map follows the few events, and orbits come out too large: by 0.013 px with 1.05 turns of 160×120 px,
+by 0.008 px with 2.1."""
+MOST_TURNS, LEAST_TURNS = 48, 16
+"""Largest and smallest number of these parts, which begin one turn after another."""
+LEAST_JUDGED = 8
+"""Number of parts from which on the recording may be given up."""
 LEAST_ANSWERED = 0.75
 """Smallest share of the parts with an accepted answer."""
-LARGEST_FAST_COST = 0.3
-"""Largest median of the costs. It is about 0.15 for a rotation alone, and 0.4 in a street at 13 m/s."""
-GROUPS = 8
-"""Number of groups of successive answers."""
+LARGEST_FAST_COST = 0.35
+"""Largest median of the costs. It is about 0.18 for a rotation alone, and 0.27 in a street at 13 m/s."""
+BESIDE = (2, 3)
+"""Frequencies at which the answers tell the error of their weighted mean, in oscillations over all turns. The mean has
+the frequency 0, which reaches to 2."""
 PARALLAX_PX, ROTATION_COST = 0.25, 0.1
 """Error of size and phase that parallax leaves, however many turns are averaged [px per cost above a rotation's].
 
 In six worlds it was 0.01 px at a cost of 0.15, 0.04 at 0.26 and 0.2 at 0.4."""
-ENOUGH_PX, LARGEST_MEAN_PX = 0.03, 0.1
-"""Stated error of the mean that suffices, and the largest one [px rms]."""
+CONFIRMED_PX, LARGEST_MEAN_PX = 0.03, 0.1
+"""Largest distance of two answers of two turns that confirm each other where the mean of many turns is possible, and
+largest stated error of that mean [px rms]."""
 
 
-def _mean(best: Attempt, answers: Sequence[Mapping[str, float]], cost: float) -> tuple[Calibration, float]:
-    """Return the mean of the answers of successive turns, and its error [px rms].
+def _mean(
+    best: Attempt, answers: Mapping[int, Mapping[str, float]], count: int, cost: float
+) -> tuple[Calibration, float]:
+    """Return the mean of the answers of ``count`` successive turns, by number of the turn, and its error [px rms].
 
     ``best`` is the attempt with the lowest cost, of which the rest of the calibration is taken; ``cost`` the median.
-    The camera's rotation, which each turn has its own of, is left out. A motion with nearly the frequency of the prism
-    changes successive answers alike: their mean is then less certain than their scatter tells, and the scatter of the
-    means of groups counts.
+    The camera's motion, which each turn has its own of, is left out.
+
+    A camera that moves at the frequency f changes the answers by an oscillation at f minus the prism's frequency. A
+    Hann window removes it unless it is slower than two oscillations over all turns (Harris 1978). What the answers do
+    at the next frequencies tells the error of the mean.
     """
     assert best.search is not None
     assert best.photometric is not None
     space = best.search.full_space.without(MOTION)
-    each = np.array([space.to_vector(parameters) for parameters in answers])
-    groups = np.array([group.mean(axis=0) for group in np.array_split(each, min(GROUPS, len(each)))])
-    by_each, by_group = (np.cov(some.T) / len(some) for some in (each, groups))
-    scatter = by_each if np.trace(by_each) > np.trace(by_group) else by_group
+    each = np.array([space.to_vector(parameters) for parameters in answers.values()])
+    share = (np.array([*answers]) + 0.5) / count
+    weight = np.sin(math.pi * share) ** 2
+    weight /= weight.sum()
+    v = weight @ each
+    waves = np.exp(2j * math.pi * np.outer(BESIDE, share)) @ (weight[:, None] * (each - v))
+    scatter = np.real(waves.T @ waves.conj()) / len(BESIDE)
     parallax_px = PARALLAX_PX * max(0.0, cost - ROTATION_COST)
-    v, covariance = each.mean(axis=0), scatter + parallax_px**2 * np.eye(each.shape[1])
+    covariance = scatter + parallax_px**2 * np.eye(each.shape[1])
     values = {n: x for n, x in space.to_values(v).items() if n not in MOTION}  # the rotation's are those of the start
     stds = space.deviations(v, covariance)
     photometric = replace(

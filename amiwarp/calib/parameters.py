@@ -30,8 +30,10 @@ RATES = ("rate_x", "rate_y", "rate_z")
 """Angular velocity of the camera about its x, y and z axes: names of the parameters."""
 CHANGES = ("change_x", "change_y", "change_z")
 """Angular acceleration of the camera about its x, y and z axes: names of the parameters."""
-MOTION = (*RATES, *CHANGES)
-"""Names of all parameters of the camera's rotation."""
+GROWTH = "growth"
+"""Growth of the image of a camera that moves forward: name of the parameter."""
+MOTION = (*RATES, *CHANGES, GROWTH)
+"""Names of all parameters of the camera's motion."""
 LINEAR_UNKNOWNS = ("off_ratio", "leak")
 """Free parameters that only the photometric stage has: unknowns of its linear equations."""
 _UNITS = {
@@ -40,11 +42,13 @@ _UNITS = {
     "focal_length": "px",
     **dict.fromkeys(RATES, "rad/s"),
     **dict.fromkeys(CHANGES, "rad/s2"),
+    GROWTH: "1/s",
 }
 """Unit of every parameter that can be free and is not one of an optical model.
 
 ``clock_offset`` is the encoder's clock offset (see :class:`amiwarp.Encoder`). ``focal_length`` is the camera's fx; fy
-keeps its ratio to fx. ``rate_*`` and ``change_*`` describe the camera's rotation (:class:`amiwarp.CameraRotation`).
+keeps its ratio to fx. ``rate_*``, ``change_*`` and ``growth`` describe the camera's motion
+(:class:`amiwarp.CameraRotation`).
 """
 
 
@@ -371,7 +375,7 @@ def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraR
         return CameraRotation(middle_us=middle_us)
     x, y, z = (values.get(n, 0.0) for n in RATES)
     a, b, c = (values.get(n, 0.0) for n in CHANGES)
-    return CameraRotation((x, y, z), (a, b, c), middle_us)
+    return CameraRotation((x, y, z), (a, b, c), middle_us, values.get(GROWTH, 0.0))
 
 
 def values_of(model: str, values: Mapping[str, float]) -> dict[str, float]:
@@ -391,7 +395,7 @@ def kept_by_global_search(space: ParameterSpace) -> tuple[str, ...]:
 
 MOST_TURNS_OFF = 0.25
 """Largest error of the number of turns in a recording that the frequency of a vibrating camera may start with."""
-_HALF_RANGE = {"clock_offset": 5000.0, **dict.fromkeys(RATES, 5.0), **dict.fromkeys(CHANGES, 50.0)}
+_HALF_RANGE = {"clock_offset": 5000.0, **dict.fromkeys(RATES, 5.0), **dict.fromkeys(CHANGES, 50.0), GROWTH: 5.0}
 """Half width of the default bounds of each parameter about its start value, in the parameter's unit."""
 
 
@@ -588,7 +592,7 @@ def _pixels_per_unit(
         shifts["rpm"] = shifts["phase"] * 2.0 * math.pi / 60e6 * duration_us / math.sqrt(12.0)
     seconds = duration_us * 1e-6
     radius = math.sqrt((camera.width**2 + camera.height**2) / 12.0)
-    for name, lever in zip(MOTION, (camera.fy, camera.fx, radius) * 2, strict=True):
+    for name, lever in zip(MOTION, (*(camera.fy, camera.fx, radius) * 2, radius), strict=True):
         # standard deviations of τ and τ²/2 over the recording, τ being the time from its middle
         shifts[name] = (
             lever * seconds * (seconds * math.sqrt(1.0 / 720.0) if name in CHANGES else math.sqrt(1.0 / 12.0))

@@ -219,15 +219,16 @@ def rays_to_pixels(c: CameraParams, rays: wp.array(dtype=wp.vec3), start: int, x
     xy[i] = ray_to_pixel(c, rays[i])
 
 
-# -- rotation of the camera
+# -- rotation of the camera, and growth of the image
 
 
 @wp.struct
 class CameraRotationParams:
-    """Angular velocity at time 0 [rad/s] and angular acceleration [rad/s²]."""
+    """Angular velocity at time 0 [rad/s], angular acceleration [rad/s²], and growth of the image [1/s]."""
 
     velocity: wp.vec3
     acceleration: wp.vec3
+    growth: float
 
 
 @wp.func
@@ -240,13 +241,18 @@ def rotation_vector(camera_rotation: CameraRotationParams, time: float) -> wp.ve
 def undo_camera_rotation(
     camera: CameraParams, xy: wp.vec2, camera_rotation: CameraRotationParams, time: float
 ) -> wp.vec2:
-    """Return the pixel that the scene point seen at ``xy`` at ``time`` [s] has at time 0."""
+    """Return the pixel that the scene point seen at ``xy`` at ``time`` [s] has at time 0.
+
+    A camera that moves forward by the share g of all distances sees the image grow by 1 / (1 - g).
+    """
     rotation = rotation_vector(camera_rotation, time)
     angle = wp.length(rotation)
-    if angle < 1.0e-9:
+    size = 1.0 - camera_rotation.growth * time
+    if angle < 1.0e-9 and size == 1.0:
         return xy
     ray = pixel_to_ray(camera, xy)
-    return ray_to_pixel(camera, wp.quat_rotate(wp.quat_from_axis_angle(rotation / angle, angle), ray))
+    ray = wp.quat_rotate(wp.quat_from_axis_angle(rotation / wp.max(angle, 1.0e-9), angle), ray)
+    return ray_to_pixel(camera, wp.vec3(size * ray[0], size * ray[1], ray[2]))
 
 
 @wp.func
@@ -256,11 +262,12 @@ def undo_camera_rotation(
     """Return the pixel at time 0, for a camera without distortion."""
     rotation = rotation_vector(camera_rotation, time)
     angle = wp.length(rotation)
-    if angle < 1.0e-9:
+    size = 1.0 - camera_rotation.growth * time
+    if angle < 1.0e-9 and size == 1.0:
         return xy
     ray = wp.vec3((xy[0] - camera.cx) * camera.inverse_fx, (xy[1] - camera.cy) * camera.inverse_fy, 1.0)
-    ray = wp.quat_rotate(wp.quat_from_axis_angle(rotation / angle, angle), ray)
-    scale = wp.where(ray[2] > 1.0e-6, 1.0 / ray[2], NAN)
+    ray = wp.quat_rotate(wp.quat_from_axis_angle(rotation / wp.max(angle, 1.0e-9), angle), ray)
+    scale = wp.where(ray[2] > 1.0e-6, size / ray[2], NAN)
     return wp.vec2(camera.fx * (ray[0] * scale) + camera.cx, camera.fy * (ray[1] * scale) + camera.cy)
 
 

@@ -251,7 +251,8 @@ def compensate_block(
         displace_block(even(model), camera, pairs, k, first, drifts, x, y)
     else:
         displace_block(model, camera, pairs, k, first, drifts, x, y)
-    if wp.length_sq(camera_rotation.velocity) + wp.length_sq(camera_rotation.acceleration) > 0.0:
+    moves = wp.length_sq(camera_rotation.velocity) + wp.length_sq(camera_rotation.acceleration)
+    if moves + camera_rotation.growth * camera_rotation.growth > 0.0:
         undo_rotations(camera, camera_rotation, pairs, k, first, x, y)
 
 

@@ -422,10 +422,10 @@ def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
 @guarded
 @dataclass(frozen=True, slots=True)
 class CameraRotation:
-    """Angular velocity of the camera in its own frame, constant or linear in time.
+    """Angular velocity of the camera in its own frame, constant or linear in time, and growth of the image.
 
     The angular velocity at time t is ``angular_velocity + angular_acceleration * (t - middle_us)``. Compensation
-    rotates every pixel back to the time ``middle_us``.
+    rotates every pixel back to the time ``middle_us``, and then undoes the growth of the image.
 
     Notes
     -----
@@ -444,6 +444,8 @@ class CameraRotation:
     """Angular acceleration [rad/s²], about x, y and z."""
     middle_us: int = 0
     """Reference time of the rotation [us], usually the middle of the time window."""
+    growth: float = 0.0
+    """Speed of a forward motion, divided by the scene's depth [1/s]: the image grows about the principal point."""
 
     def about(self, middle_us: int) -> CameraRotation:
         """Return the same rotation, expressed about another reference time.
@@ -460,12 +462,13 @@ class CameraRotation:
         """
         later = (middle_us - self.middle_us) * 1e-6
         x, y, z = (r + c * later for r, c in zip(self.angular_velocity, self.angular_acceleration, strict=True))
-        return CameraRotation((x, y, z), self.angular_acceleration, middle_us)
+        growth = self.growth / (1.0 - self.growth * later)
+        return CameraRotation((x, y, z), self.angular_acceleration, middle_us, growth)
 
     @property
     def moves(self) -> bool:
-        """Whether the camera rotates at all."""
-        return any(self.angular_velocity) or any(self.angular_acceleration)
+        """Whether the camera moves at all."""
+        return any((*self.angular_velocity, *self.angular_acceleration, self.growth))
 
     def rotation(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return rotation vectors since the reference time.
@@ -490,7 +493,7 @@ class CameraRotation:
         Returns
         -------
         amiwarp.kernels.camera.CameraRotationParams
-            Angular velocity and acceleration as a Warp struct.
+            Angular velocity, acceleration and growth as a Warp struct.
         """
         import warp as wp
 
@@ -498,6 +501,7 @@ class CameraRotation:
 
         p = CameraRotationParams()
         p.velocity, p.acceleration = wp.vec3(*self.angular_velocity), wp.vec3(*self.angular_acceleration)
+        p.growth = self.growth
         return p
 
     def reach(self, camera: Camera, half_s: float) -> NDArray[np.float64]:
@@ -517,14 +521,16 @@ class CameraRotation:
             view.
         """
         half_s = real(half_s, "half_s", 0.0, 1e9, " s")
-        rotations = self.rotation(np.array([-half_s, half_s]))
-        if not rotations.any():
+        ends = np.array([-half_s, half_s])
+        rotations, sizes = self.rotation(ends), 1.0 - self.growth * ends
+        if not (rotations.any() or self.growth):
             return np.zeros(2)
         from scipy.spatial.transform import Rotation  # here, because a still camera does not need this slow import
 
         xy = border(camera)
         rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float32)), np.float64)
-        moved = [camera.rays_to_pixels(Rotation.from_rotvec(r).apply(rays).astype(np.float32)) for r in rotations]
+        turned = (Rotation.from_rotvec(r).apply(rays) * (s, s, 1.0) for r, s in zip(rotations, sizes, strict=True))
+        moved = [camera.rays_to_pixels(each.astype(np.float32)) for each in turned]
         displacement = np.abs(np.concatenate([np.asarray(m) - xy for m in moved]))
         visible = displacement[np.isfinite(displacement).all(axis=1)]
         return visible.max(axis=0) if len(visible) else np.array([camera.width, camera.height], np.float64)

@@ -47,6 +47,8 @@ def place_arguments(space: ParameterSpace, values: Mapping[str, float]) -> dict[
 PATH_TERMS = int(POWERS)
 """Number of powers of time in the path of a tile. With four, the motion of a hand over two turns leaves under 0.001 px;
 with two it leaves 0.015 px."""
+FAST_PATH_TERMS = 3
+"""The same for a camera in fast motion over a turn and a half. With one, orbits come out larger by up to 0.03 px."""
 FIRST_SCALE = 1.0
 """Scale of the Cauchy weights before the first brightness map is solved [thresholds]."""
 SLOPE_PX = 0.005
@@ -72,24 +74,25 @@ class TilePaths:
     change of the paths explains.
     """
 
-    def __init__(self, brightness: BrightnessMap) -> None:
-        """Start with tiles at rest."""
+    def __init__(self, brightness: BrightnessMap, terms: int) -> None:
+        """Start with tiles at rest. ``terms`` is the number of powers of time."""
         self._map, pairs = brightness, brightness.pairs
         self.tile: NDArray[np.int32] = pairs.column("tile")
         """Tile of each pair."""
         self._order = np.argsort(self.tile, kind="stable")
         self._used, self._starts = np.unique(self.tile[self._order], return_index=True)
         half_s = max(0.5 * float(np.ptp(pairs.some_times)), 1e-6)
-        self._units = np.tile(half_s ** -np.arange(1.0, PATH_TERMS + 1.0), 2)
-        """Factors of the powers of time that move a tile by 1 px at the ends of the window."""
-        self.moved_px: Vector = np.zeros((len(brightness.tiles.origin), 2 * PATH_TERMS))
+        powers = np.diag(half_s ** -np.arange(1.0, PATH_TERMS + 1.0))[:terms]
+        self._units = np.kron(np.eye(2), powers)
+        """Factors of the powers of time that move a tile by 1 px at the ends of the window, shape (terms, powers)."""
+        self.moved_px: Vector = np.zeros((len(brightness.tiles.origin), 2 * terms))
         """Motion until the end of the window by each power of time along x, then y [px], shape (tiles, terms)."""
         self._changes: list[Any] = []
 
     def set(self, moved_px: Vector) -> None:
         """Set the paths."""
         self.moved_px = moved_px
-        self._map.pairs.set_path(moved_px * self._units)
+        self._map.pairs.set_path(moved_px @ self._units)
 
     def linearise(self, at: Mapping[str, Any], steps: int) -> None:
         """Compute the derivatives of the residuals by the paths, at a point where the map is solved."""
@@ -99,7 +102,7 @@ class TilePaths:
         for k, change in enumerate(changes):
             step = np.zeros_like(self.moved_px)
             step[:, k] = SLOPE_PX
-            up, down = (b.pairs.path_array((self.moved_px + s * step) * self._units) for s in (1.0, -1.0))
+            up, down = (b.pairs.path_array((self.moved_px + s * step) @ self._units) for s in (1.0, -1.0))
             slope = b.find_slope({**at, "path": up}, {**at, "path": down}, 2.0 * SLOPE_PX)
             left.append(self._on_host(b.unexplained(slope, change, steps=steps)))
             self._changes.append(b.explaining_change())
@@ -561,12 +564,14 @@ def collect_pairs(recording: Recording, search: Search, settings: PhotometricSet
 
     There are about :func:`most_pairs` pairs. At least :data:`FEWEST_TURNS` turns are used, if the recording has them.
     If these hold too many pairs, whole tiles are left out: fewer pairs on the same tiles would not determine the map.
+    A camera in fast motion always gets tiles, as their scenes move on their own paths.
     Silence is the time in which no events came.
     """
     first, most = recording.events.t_first, most_pairs(search)
     turn = turn_length(recording, search.calibration_events.encoder)
     margin = ROTATION_MARGIN_PX if search.full_space.moving else MARGIN_PX
-    if len(recording.events.between(first, first + int(FEWEST_TURNS * turn) + 1)) <= most:
+    few = len(recording.events.between(first, first + int(FEWEST_TURNS * turn) + 1)) <= most
+    if few and not search.fast:
         tile_of, tiles = one_tile(*recording.events.size, settings.density, margin)
     else:
         tile_of, tiles = choose_tiles(search.fine.image(search.best), search.pad, settings.density, margin)

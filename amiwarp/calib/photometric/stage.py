@@ -22,7 +22,9 @@ from amiwarp.calib.nlopt_solver import SearchStage, maximise
 from amiwarp.calib.parameters import LINEAR_UNKNOWNS, MOTION, ParameterSpace, like_size, units
 from amiwarp.calib.photometric import causes, consistency
 from amiwarp.calib.photometric.cost import (
+    FAST_PATH_TERMS,
     GRID,
+    PATH_TERMS,
     Cost,
     TilePaths,
     cauchy_costs,
@@ -54,7 +56,7 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     found = Equations(recording, search, given)
     answer = found.answers.search(found.start)
     if search.fast:
-        return found.finished(answer)
+        return found.finished(found.with_fast_paths(answer))
     if found.answers.cost.space.moving:
         answer = found.with_paths(answer)
     if answer.result.cost > min(LARGEST_STILL_COST, search.most_cost):
@@ -217,24 +219,38 @@ class Equations:
         result = replace(result, uncertainty={**self.rotation, **result.uncertainty})
         return result, summary, replace(space, names=(*space.names, *self.rotation))
 
+    def with_fast_paths(self, answer: Answer) -> Answer:
+        """Return the answer for tiles whose scenes move on their own paths while a camera in fast motion moves too."""
+        return self.answers.search(self._free_paths(answer, FAST_PATH_TERMS))
+
+    def _free_paths(self, answer: Answer, terms: int) -> Vector:
+        """Let the scenes of tiles move on paths with ``terms`` powers of time, and hold the camera's motion.
+
+        Return the search vector of ``answer`` in the new space. The map is solved there.
+        """
+        cost = self.answers.cost
+        names, values = tuple(n for n in cost.space.names if n in MOTION), cost.space.to_values(answer.stage.x)
+        self.rotation = {n: answer.result.uncertainty[n] for n in names}
+        cost.space = cost.space.without(names).holding({n: values[n] for n in names})
+        cost.paths = TilePaths(cost.brightness, terms)
+        v = cost.space.to_vector(values)
+        cost.residuals(v, rounds=2)
+        return v
+
     def with_paths(self, answer: Answer) -> Answer:
         """Return the answer for tiles whose scenes move on their own paths, if these explain much of the residual.
 
         The camera's rotation stays as it was found; the paths add what it lacks: a rotation that varies faster, and
         parallax. Tiles that are not explained then, such as those of a moving object, are left out.
         """
-        answers, cost = self.answers, self.answers.cost
-        turning, values = cost.space, cost.space.to_values(answer.stage.x)
-        names = tuple(n for n in turning.names if n in MOTION)
-        space = turning.without(names).holding({n: values[n] for n in names})
-        if not space.names or len(cost.brightness.tiles.origin) == 1:
+        answers, cost, turning = self.answers, self.answers.cost, self.answers.cost.space
+        if not {*turning.names} - {*MOTION} or len(cost.brightness.tiles.origin) == 1:
             return answer
-        v = space.to_vector(values)
-        cost.space, cost.paths = space, TilePaths(cost.brightness)
-        cost.residuals(v, rounds=2)
+        v = self._free_paths(answer, PATH_TERMS)
         cost.slopes(v)
+        assert cost.paths is not None
         if cost.paths.gain() <= LARGEST_ROTATION_GAIN:
-            cost.space, cost.paths = turning, None
+            cost.space, cost.paths, self.rotation = turning, None, {}
             cost.converge(answer.stage.x)
             return answer
         v = answers.descend(v).x
@@ -243,13 +259,11 @@ class Equations:
         keep = costs <= max(LARGEST_STILL_COST, LARGEST_OF_LEAST * float(costs[costs > 0.0].min()))
         if not keep[costs > 0.0].all():
             self.pairs = self.pairs.of_tiles(keep)
-            answers.cost = self.cost_on(cost.brightness.tiles, space)
-            answers.cost.paths = paths = TilePaths(answers.cost.brightness)
+            answers.cost = self.cost_on(cost.brightness.tiles, cost.space)
+            answers.cost.paths = paths = TilePaths(answers.cost.brightness, PATH_TERMS)
             paths.set(cost.paths.moved_px)
             answers.cost.warm_up(v)
-        again = answers.search(v)
-        self.rotation = {n: answer.result.uncertainty[n] for n in names}
-        return again
+        return answers.search(v)
 
     def with_slow_pixels(self, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
         """Return the answer for pixels with slow photoreceptors, and the angle per time constant [rad].
