@@ -40,6 +40,7 @@ from amiwarp import (
     truth_model,
 )
 from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap, EventTable, PairSet, Residuals, Tiles
+from amiwarp.calib.calibration import mean_of_turns
 from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.photometric.cost import TILE, Slopes, choose_tiles, iterate, near_tiles, one_tile, van_der_corput
 from amiwarp.imaging.iwe import CanvasShape, Image
@@ -208,6 +209,27 @@ def test_a_camera_that_never_rests_is_calibrated_turn_by_turn(texture: np.ndarra
     assert c.photometric is not None
     assert c.photometric.verdict.startswith("mean of the answers of")
     assert "calibrating, turn by turn" in said
+
+
+@pytest.mark.parametrize("oscillations", [2, 3.6, 9.5, 23, 45.2])
+def test_the_mean_of_turns_removes_oscillations(oscillations: float) -> None:
+    share = (np.arange(48) + 0.5) / 48
+    wave = np.exp(1j * (2.0 * math.pi * oscillations * share + 0.4))
+    mean, covariance = mean_of_turns(np.stack([3.0 + wave.real, 0.5 + wave.imag], axis=1), share)
+    np.testing.assert_allclose(mean, [3.0, 0.5], rtol=0, atol=0.02)
+    apart = min(oscillations, 48 - oscillations)  # with one answer a turn, 48 oscillations look like none
+    assert (np.sqrt(np.trace(covariance)) < 0.02) == (apart > 5)  # those near none tell the error
+
+
+def test_the_mean_of_turns_knows_its_error() -> None:
+    """Of answers with independent errors, some of which are missing."""
+    rng, share = np.random.default_rng(3), (np.arange(48) + 0.5) / 48
+    ratios = []
+    for _ in range(300):
+        there = rng.uniform(size=48) < 0.85
+        mean, covariance = mean_of_turns(rng.normal(size=(there.sum(), 2)), share[there])
+        ratios.append(float(mean @ mean) / float(np.trace(covariance)))
+    assert np.median(ratios) == pytest.approx(0.8, abs=0.25)
 
 
 def test_the_result_survives_its_file(calibration: Calibration, tmp_path: Path) -> None:

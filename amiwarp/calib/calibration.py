@@ -459,7 +459,7 @@ class Calibrator:
 
         It uses two turns of the prism: the calmest ones, if these are clearly calmer than those in the middle of the
         recording. A camera that never rests must give about the same answer at other times. Otherwise the answer is
-        the mean of many turns, or an error if the recording is too short for it, or no rotation explains its turns.
+        the mean of many turns, or an error if the recording is too short for it, or no motion explains its turns.
         """
         encoder, name = self.recording.encoder, self.recording.name
         assert encoder is not None
@@ -601,12 +601,29 @@ BESIDE = (2, 3)
 """Frequencies at which the answers tell the error of their weighted mean, in oscillations over all turns. The mean has
 the frequency 0, which reaches to 2."""
 PARALLAX_PX, ROTATION_COST = 0.25, 0.1
-"""Error of size and phase that parallax leaves, however many turns are averaged [px per cost above a rotation's].
-
-In six worlds it was 0.01 px at a cost of 0.15, 0.04 at 0.26 and 0.2 at 0.4."""
+"""Error of size and phase that parallax leaves, however many turns are averaged [px per cost above a rotation's]. In
+five worlds the error was 0.02 to 0.03 px at a cost of 0.19, and 0.03 to 0.04 at 0.26."""
 CONFIRMED_PX, LARGEST_MEAN_PX = 0.03, 0.1
 """Largest distance of two answers of two turns that confirm each other where the mean of many turns is possible, and
 largest stated error of that mean [px rms]."""
+
+
+def mean_of_turns(
+    each: NDArray[np.float64], share: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the weighted mean of the answers of turns, shape (n,), and its covariance, shape (n, n).
+
+    ``each`` holds their search vectors, shape (turns, n), and ``share`` their times as shares of the recording, 0 to 1.
+
+    A camera that moves at the frequency f changes the answers by an oscillation at f minus the prism's frequency. A
+    Hann window removes it unless it is slower than two oscillations over all turns (Harris 1978). What the answers do
+    at the next frequencies tells the error of the mean.
+    """
+    weight = np.sin(math.pi * share) ** 2
+    weight /= weight.sum()
+    mean = weight @ each
+    waves = np.exp(2j * math.pi * np.outer(BESIDE, share)) @ (weight[:, None] * (each - mean))
+    return mean, np.real(waves.T @ waves.conj()) / len(BESIDE)
 
 
 def _mean(
@@ -616,21 +633,12 @@ def _mean(
 
     ``best`` is the attempt with the lowest cost, of which the rest of the calibration is taken; ``cost`` the median.
     The camera's motion, which each turn has its own of, is left out.
-
-    A camera that moves at the frequency f changes the answers by an oscillation at f minus the prism's frequency. A
-    Hann window removes it unless it is slower than two oscillations over all turns (Harris 1978). What the answers do
-    at the next frequencies tells the error of the mean.
     """
     assert best.search is not None
     assert best.photometric is not None
     space = best.search.full_space.without(MOTION)
     each = np.array([space.to_vector(parameters) for parameters in answers.values()])
-    share = (np.array([*answers]) + 0.5) / count
-    weight = np.sin(math.pi * share) ** 2
-    weight /= weight.sum()
-    v = weight @ each
-    waves = np.exp(2j * math.pi * np.outer(BESIDE, share)) @ (weight[:, None] * (each - v))
-    scatter = np.real(waves.T @ waves.conj()) / len(BESIDE)
+    v, scatter = mean_of_turns(each, (np.array([*answers]) + 0.5) / count)
     parallax_px = PARALLAX_PX * max(0.0, cost - ROTATION_COST)
     covariance = scatter + parallax_px**2 * np.eye(each.shape[1])
     values = {n: x for n, x in space.to_values(v).items() if n not in MOTION}  # the rotation's are those of the start

@@ -133,8 +133,8 @@ def moves_too_fast(name: str, repetition: float, *, short: bool) -> AmiwarpError
     """
     return AmiwarpError(
         f"{name}: the camera moves too fast for the prism: the events of one turn repeat in the next with a correlation"
-        f" of {repetition:.2f} at most (0.9 at rest, 0.7 in a calm hand), and no rotation explains them at all times; "
-        f"{HOLD_STILL}{', or record such motion for 40 turns' if short else ''}"
+        f" of {repetition:.2f} at most (0.9 at rest, 0.7 in a calm hand), and no motion of the camera explains them at "
+        f"all times; {HOLD_STILL}{', or record such motion for 40 turns' if short else ''}"
     )
 
 
