@@ -24,6 +24,7 @@ from amiwarp.calib.calibration import prepare
 from amiwarp.calib.checks import check_pulses, check_texture
 from amiwarp.calib.first_guess import _period, encoder_turns_per_period
 from amiwarp.calib.model_choice import LARGEST_MOTION_PX, in_pixels
+from amiwarp.calib.parameters import units
 from amiwarp.calib.photometric.stage import judge_optimum
 from amiwarp.cli.common import interval, number
 from amiwarp.events.encoder import TWO_PI
@@ -237,6 +238,12 @@ def test_words_for_numbers_that_mean_nothing() -> None:
 )
 def test_bounds_share_a_unit_and_zero_needs_none(text: str, low: float, high: float) -> None:
     assert interval(text, "rad", "--bound apex") == pytest.approx((low, high))
+
+
+def test_every_parameter_may_be_written_on_the_command_line() -> None:
+    for name, unit in units().items():
+        assert number("0", unit, f"--start {name}") == 0.0
+    assert number("1.5", units()["growth"], "--start growth") == 1.5
 
 
 def test_bounds_that_are_none() -> None:

@@ -280,6 +280,7 @@ FORMS = {
     "px": (("px",), "554px"),
     "1": ((), "1.5168"),
     "1/m": ((), "2"),
+    "1/s": ((), "1.5"),
 }
 """Accepted suffixes of a parameter in each unit, and an example for error messages."""
 
