@@ -468,21 +468,21 @@ class Calibrator:
         if MODELS[self.settings.model].ANGLES == 1:  # with two angles, a still scene does not repeat every turn
             repetition, span = first_guess.calmest_span(self.recording, encoder)
         restless, calm = repetition < first_guess.LEAST_REPETITION, repetition >= first_guess.LEAST_CALM
-        starts = self._starts()
-        many = len(starts) >= LEAST_TURNS
+        turns = self._turns()
+        many = len(turns) >= LEAST_TURNS
         too_fast = Attempt(None, checks.moves_too_fast(name, repetition, short=not many))
         if restless and many:
-            return self.turn_by_turn(tried, starts) or (tried if tried.accepted else too_fast)
+            return self.turn_by_turn(tried, turns) or (tried if tried.accepted else too_fast)
         again = self._turning(rival) if span is None else self._turning_in(span)
         if not again.accepted or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
             # a rotation makes the image sharper, or the attempt would have failed
             if restless and not tried.accepted and rival is not None and again.calibration is not None:
                 return too_fast
             moves = many and not calm and not tried.accepted
-            return (self.turn_by_turn(tried, starts) or too_fast) if moves else tried
+            return (self.turn_by_turn(tried, turns) or too_fast) if moves else tried
         apart_px = CONFIRMED_PX if many else stage.LARGEST_INCONSISTENCY_PX  # two wrong answers may be alike by chance
         if (not calm or (many and again.unexplained)) and not self._confirmed(again, apart_px):
-            mean = self.turn_by_turn(tried, starts) if many else None
+            mean = self.turn_by_turn(tried, turns) if many else None
             if mean is not None or not calm:
                 return mean or too_fast
         found = again.found()
@@ -501,8 +501,8 @@ class Calibrator:
             said += ", from {:.2f} to {:.2f} s, where the camera is calmest".format(*since)
         return Attempt(_warning(still, said))
 
-    def _starts(self) -> NDArray[np.int64]:
-        """Return the times [us] at which the turns of :meth:`turn_by_turn` begin: successive turns in the middle.
+    def _turns(self) -> list[tuple[int, int]]:
+        """Return the time spans [us] of :meth:`turn_by_turn`, which begin one turn after another, about the middle.
 
         All begin at the same angle of the prism. Then a motion of any frequency but the prism's changes the answers by
         an oscillation, which a weighted mean of them removes.
@@ -510,46 +510,44 @@ class Calibrator:
         source, encoder = self.recording.events, self.recording.encoder
         assert encoder is not None
         if MODELS[self.settings.model].ANGLES > 1 or not encoder.rpm:
-            return np.zeros(0, np.int64)
+            return []
         turn_us = 60e6 / abs(encoder.rpm)
         longest = source.t_last - source.t_first - WINDOW_TURNS * turn_us
         count = min(MOST_TURNS, math.floor(longest / turn_us) + 1)
         left = longest - (count - 1) * turn_us
-        return source.t_first + (0.5 * left + turn_us * np.arange(count)).astype(np.int64)
+        starts = [source.t_first + int(0.5 * left + turn_us * k) for k in range(count)]
+        return [(start, start + int(WINDOW_TURNS * turn_us)) for start in starts]
 
-    def turn_by_turn(self, tried: Attempt, starts: NDArray[np.int64]) -> Attempt | None:
+    def turn_by_turn(self, tried: Attempt, turns: list[tuple[int, int]]) -> Attempt | None:
         """Return the mean of the answers of single turns of the prism, or the error that it is too uncertain.
 
-        None if no motion of the camera explains the events of single turns. At least :data:`LEAST_TURNS` turns begin
-        at the times ``starts`` [us].
+        None if no motion of the camera explains the events of single turns. ``turns`` are at least :data:`LEAST_TURNS`
+        time spans [us].
 
         The camera's own motion changes the orbit by a different amount in each turn, unless it is in step with the
         prism, so the mean of these changes vanishes. Within a turn, the camera's angular velocity is taken as linear in
         time and the growth of the image as steady; the scene of each tile moves on a path beyond that.
         """
-        encoder, name = self.recording.encoder, self.recording.name
-        assert encoder is not None
-        length_us = int(WINDOW_TURNS * 60e6 / abs(encoder.rpm))
         most_cost = min(LARGEST_FAST_COST, stage.LARGEST_COST_RATIO * tried.cost)
         single = replace(self, progress=None)
         answers: dict[int, Mapping[str, float]] = {}  # not the attempts, which hold events and images
         best: Attempt | None = None
         costs: list[float] = []
-        for k in van_der_corput(len(starts)):
-            answer = single._turning_in((int(starts[k]), int(starts[k]) + length_us), fast=True)
+        for k in van_der_corput(len(turns)):
+            answer = single._turning_in(turns[k], fast=True)
             costs.append(answer.cost)
             if answer.accepted:
                 answers[k] = answer.found().parameters
                 best = answer if best is None or answer.cost < best.cost else best
             if self.progress is not None:
-                self.progress("calibrating, turn by turn", len(costs) / len(starts))
+                self.progress("calibrating, turn by turn", len(costs) / len(turns))
             few = len(answers) < LEAST_ANSWERED * len(costs)
             if len(costs) >= LEAST_JUDGED and (few or np.median(costs) > most_cost):
                 return None
         assert best is not None
-        mean, stated_px = _mean(best, answers, len(starts), float(np.median(costs)))
+        mean, stated_px = _mean(best, answers, len(turns), float(np.median(costs)))
         if stated_px > LARGEST_MEAN_PX:
-            return Attempt(None, checks.scatters(name, len(answers), stated_px, LARGEST_MEAN_PX))
+            return Attempt(None, checks.scatters(self.recording.name, len(answers), stated_px, LARGEST_MEAN_PX))
         said = f"the camera never rests: the answer is the mean of those of {len(answers)} turns, ± {stated_px:.2f} px"
         return Attempt(_warning(mean, said))
 
@@ -597,9 +595,9 @@ LEAST_ANSWERED = 0.75
 """Smallest share of the parts with an accepted answer."""
 LARGEST_FAST_COST = 0.35
 """Largest median of the costs. It is about 0.18 for a rotation alone, and 0.27 in a street at 13 m/s."""
-BESIDE = (2, 3)
-"""Frequencies at which the answers tell the error of their weighted mean, in oscillations over all turns. The mean has
-the frequency 0, which reaches to 2."""
+NEAR_OSCILLATIONS = (2, 3)
+"""Numbers of oscillations over all turns whose amplitudes tell the error of the weighted mean. Slower ones change the
+mean itself."""
 PARALLAX_PX, ROTATION_COST = 0.25, 0.1
 """Error of size and phase that parallax leaves, however many turns are averaged [px per cost above a rotation's]. In
 five worlds the error was 0.02 to 0.03 px at a cost of 0.19, and 0.03 to 0.04 at 0.26."""
@@ -622,8 +620,9 @@ def mean_of_turns(
     weight = np.sin(math.pi * share) ** 2
     weight /= weight.sum()
     mean = weight @ each
-    waves = np.exp(2j * math.pi * np.outer(BESIDE, share)) @ (weight[:, None] * (each - mean))
-    return mean, np.real(waves.T @ waves.conj()) / len(BESIDE)
+    oscillations = np.exp(2j * math.pi * np.outer(NEAR_OSCILLATIONS, share))
+    amplitudes = oscillations @ (weight[:, None] * (each - mean))
+    return mean, np.real(amplitudes.T @ amplitudes.conj()) / len(NEAR_OSCILLATIONS)
 
 
 def _mean(
