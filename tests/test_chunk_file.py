@@ -14,7 +14,7 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from amiwarp import AmiwarpError, Events, RecordingWriter
+from amiwarp import AmiwarpError, Encoder, Events, Poses, RecordingWriter
 from amiwarp.io.hdf5_files import (
     CHUNK,
     ChunkFile,
@@ -102,6 +102,32 @@ def test_the_speed_of_threads_does_not_change_a_file(tmp_path, monkeypatch):
     with h5py.File(tmp_path / "a.filled.h5") as file:
         np.testing.assert_array_equal(file["events/t"][()], t - t[0])
         assert len(file["ms_to_idx"]) > 2 * CHUNK
+
+
+@pytest.mark.parametrize("held", ["ms_to_idx", "encoder/angle", "encoder/t", "truth/poses/t"])
+def test_who_refers_to_a_dataset_does_not_change_a_file(tmp_path, monkeypatch, held):
+    """As h5py does in a thread that closes another file."""
+    references: list[Any] = []
+
+    def kept(file, name, *options):
+        dataset = make_dataset(file, name, *options)
+        if name == held:
+            references.append(dataset)
+        return dataset
+
+    def write(path):
+        t = np.arange(2000, dtype=np.int64)
+        x = (t % 9).astype(np.uint16)
+        with RecordingWriter(path, width=9, height=9) as writer:
+            writer.append(Events(x, x, t, np.ones(len(t), np.uint8)))
+            writer.append_poses(Poses(t[:5], np.tile([0.0, 0, 0, 0, 0, 0, 1], (5, 1)), {}))
+            writer.set_encoder(Encoder(t, 0.01 * t, index_t=t[::700]))
+        return path.read_bytes()
+
+    alone = write(tmp_path / "a.h5")
+    monkeypatch.setattr("amiwarp.io.hdf5_files.make_dataset", kept)
+    assert write(tmp_path / "b.h5") == alone
+    assert len(references) == 1
 
 
 def test_a_thread_that_fails_stops_the_others(tmp_path):

@@ -398,11 +398,22 @@ class ChunkFile:
 
     def close(self) -> None:
         """Close the file, after all threads have written their chunks. Raises an error as :meth:`check` does."""
-        try:
-            self.hdf5.close()
-        finally:
-            self.output.close()
+        with contextlib.closing(self.output), self.hdf5:
+            if self.hdf5:
+                self.hdf5.visititems(_flush)
         self.check()
+
+
+def _flush(name: str, item: Any) -> None:
+    """Write what HDF5 holds of a dataset in its caches.
+
+    HDF5 would do so when nothing refers to the dataset any more. In a thread that closes another file, h5py refers to
+    all datasets, so their order in the file would depend on the speed of the threads.
+    """
+    import h5py
+
+    if isinstance(item, h5py.Dataset):
+        item.flush()
 
 
 class _Output(io.RawIOBase):

@@ -1238,9 +1238,10 @@ class RecordingWriter:
                 self._extend(name, values)
 
     def _close(self) -> None:
-        self._open, self._datasets, self._given = False, {}, {}
+        self._open = False
         if self._chunks is not None:
             self._chunks.close()
+        self._datasets, self._given = {}, {}
 
     def _discard(self) -> None:
         # The file is removed even if it cannot be closed.
