@@ -1,4 +1,4 @@
-"""What long tasks need: a number of CPU threads, the results of jobs in order, progress, and freed memory.
+"""What long tasks need: CPU threads, the results of jobs in order, progress, freed memory, and postponed interrupts.
 
 This module does not import Warp, so that file readers start fast.
 """
@@ -7,6 +7,7 @@ import contextlib
 import ctypes
 import gc
 import os
+import signal
 import sys
 import threading
 from collections import deque
@@ -134,3 +135,26 @@ def only_new_garbage() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
+
+
+@contextlib.contextmanager
+def interrupts_later() -> Iterator[list[int]]:
+    """Postpone Ctrl-C and signals that act like it to the end of the ``with`` block; yield those that have arrived.
+
+    Native code that calls Python, or is left half-done by an exception, cannot close its files and windows.
+    """
+    arrived: list[int] = []
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:
+            if callable(handler := signal.getsignal(number)):
+                before[number] = handler
+                signal.signal(number, lambda number, _frame: arrived.append(number))
+    try:
+        yield arrived
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if arrived:
+            signal.raise_signal(arrived[0])

@@ -623,6 +623,39 @@ main()
     assert done.stderr.count("\n") == 1, done.stderr
 
 
+def test_interrupt_while_h5py_is_loaded_is_not_lost(place: Path) -> None:
+    """Code by Cython drops exceptions in places while a module is loaded, here the registration of a class."""
+    script = f"""
+{INTERRUPTIBLE}
+import abc
+from amiwarp.io.hdf5_files import ChunkFile
+from amiwarp.__main__ import main
+
+def register(cls, other):
+    abc.ABCMeta.register = registered
+    signal.raise_signal(signal.SIGINT)
+    for _ in range(10):
+        pass
+    return registered(cls, other)
+
+def created(*args, **options):
+    global registered
+    registered, abc.ABCMeta.register = abc.ABCMeta.register, register
+    create(*args, **options)
+
+create, ChunkFile.__init__ = ChunkFile.__init__, created
+main()
+"""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-c", script, "simulate", "short.h5", "--picture", "photo.jpg", "--duration", "0.001"],
+        cwd=place, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert left_behind(place) == set()
+
+
 def wait_until(done: Any, seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while not done():

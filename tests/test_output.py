@@ -10,7 +10,6 @@ import math
 import os
 import re
 import shutil
-import signal
 import socket
 import stat
 import subprocess
@@ -524,20 +523,6 @@ def test_outputs_that_are_no_files_are_refused(place: Path, kind: str, line: str
     assert stat.S_IFMT(os.stat(path).st_mode) == mode
 
 
-@pytest.fixture
-def impatient() -> Iterator[None]:
-    """Fail a test that still waits after two minutes."""
-
-    def late(number: int, frame: object) -> None:
-        raise AssertionError("still waiting after two minutes")
-
-    before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(120)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
-
-
 ENDLESS = (
     "info {}",
     "convert {} out.h5",
@@ -599,7 +584,6 @@ ENDLESS = (
 )
 
 
-@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("line", ENDLESS)
 def test_inputs_that_never_end_are_refused(place: Path, line: str) -> None:
     name = next(word for word in line.split() if "{}" in word).format("pipe")

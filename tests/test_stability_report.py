@@ -324,9 +324,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> Axis:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
 def test_command_runs_goes_on_and_redraws(tiny: Axis, tmp_path: Path) -> None:
     words = ("--out", tmp_path, "--methods", "sharpness", "--seeds", "1", "--draws", "0", "--device", "cpu", "--json")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-    ) as cluster:
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
         first = run("--quick", "--scheduler", cluster.scheduler_address, *words)
         assert first.exit_code == 0, first.output
         second = run("--scheduler", cluster.scheduler_address, *words)

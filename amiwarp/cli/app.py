@@ -6,7 +6,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
+from functools import cache, wraps
+from importlib.machinery import ExtensionFileLoader
 from typing import Any, NamedTuple
 
 import typer
@@ -14,6 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from amiwarp.cli import INTERRUPTED, STOPPED, fail
 from amiwarp.errors import AmiwarpError
+from amiwarp.tasks import interrupts_later
 
 BAD_INPUT, USAGE = 1, 2
 
@@ -256,7 +258,20 @@ def _version(
 def main() -> None:
     """Run the command line and exit the process."""
     sys.unraisablehook = _repeat_dropped_interrupt
+    for method in ("create_module", "exec_module"):
+        setattr(ExtensionFileLoader, method, _loaded_whole(getattr(ExtensionFileLoader, method)))
     app(prog_name="amiwarp")
+
+
+def _loaded_whole(load: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the loader of compiled modules with Ctrl-C postponed, because some drop it: h5py, and more by Cython."""
+
+    @wraps(load)
+    def whole(*arguments: Any) -> Any:
+        with interrupts_later():
+            return load(*arguments)
+
+    return whole
 
 
 def _repeat_dropped_interrupt(unraisable: Any) -> None:

@@ -17,7 +17,6 @@ import os
 import re
 import secrets
 import shutil
-import signal
 import stat
 import threading
 import weakref
@@ -632,26 +631,3 @@ def _remove(unfinished: Path) -> None:
 
 def _reason(error: BaseException) -> str:
     return getattr(error, "strerror", None) or str(error)
-
-
-@contextlib.contextmanager
-def interrupts_later() -> Iterator[list[int]]:
-    """Postpone Ctrl-C and signals that act like it to the end of the ``with`` block; yield those that have arrived.
-
-    Native code that calls Python, or is left half-done by an exception, cannot close its files and windows.
-    """
-    arrived: list[int] = []
-    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in numbers:
-            if callable(handler := signal.getsignal(number)):
-                before[number] = handler
-                signal.signal(number, lambda number, _frame: arrived.append(number))
-    try:
-        yield arrived
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if arrived:
-            signal.raise_signal(arrived[0])

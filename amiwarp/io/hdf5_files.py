@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet, read_sensors
-from amiwarp.io.files import input_path, interrupts_later, read_at, write_at
+from amiwarp.io.files import input_path, read_at, write_at
 from amiwarp.io.formats import Codec
 from amiwarp.io.reading_process import ReadingProcess, borrow, give_back, packets, run
+from amiwarp.tasks import interrupts_later
 
 # Chunks of amiwarp's files, which parallel threads encode, decode, read and write. HDF5 itself uses one thread.
 #

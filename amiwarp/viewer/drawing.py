@@ -26,7 +26,7 @@ from amiwarp.imaging.residuals import WIDEST_PX, at_pixels, residual
 from amiwarp.imaging.sharpness import random_variance
 from amiwarp.imaging.tensors import latest_times
 from amiwarp.io.depth_map import DepthMap
-from amiwarp.io.files import check_output, interrupts_later
+from amiwarp.io.files import check_output
 from amiwarp.io.spans import read_span
 from amiwarp.plotting.colours import (
     GREY,
@@ -43,6 +43,7 @@ from amiwarp.plotting.colours import (
 from amiwarp.plotting.figures import instance_colours
 from amiwarp.plotting.meshes import Box
 from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.tasks import interrupts_later
 from amiwarp.validation import choice
 from amiwarp.viewer.inspector import DisplayedWindow, DrawnTruth, Inspector, Knobs, LoadedWindow, colours_on_offer
 

@@ -18,10 +18,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
-from amiwarp.io.files import interrupts_later
 from amiwarp.live.stream.session import LiveSource
 from amiwarp.optics.models import alternatives
-from amiwarp.tasks import no_garbage_collection
+from amiwarp.tasks import interrupts_later, no_garbage_collection
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import Look, Scene
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector, colours_on_offer
