@@ -29,6 +29,7 @@ def test_cells_are_compared_by_their_results() -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
 def test_two_workers_make_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two processes make the files of one worker, which is a thread of this process."""
+    import dask
     from distributed import Client, LocalCluster
 
     processes, out = two_gpus.cluster, tmp_path / "two.json"
@@ -40,6 +41,7 @@ def test_two_workers_make_the_same_files(tmp_path: Path, monkeypatch: pytest.Mon
                 yield client
             return
         with (
+            dask.config.set(two_gpus.LOCAL_CONFIGURATION),
             LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as local,
             Client(local) as client,
         ):

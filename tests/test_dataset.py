@@ -1,5 +1,6 @@
 """Data sets in bulk: what a specification makes, what is kept, and what a wrong specification or a failure says."""
 
+import gc
 import hashlib
 import json
 import math
@@ -301,11 +302,15 @@ def test_a_dry_run_makes_nothing(place: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
 def test_a_cluster_makes_the_same_files(place: Path) -> None:
+    import dask
     import distributed
 
     make(place)
     alone = checksums(place)
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address="127.0.0.1:0") as local:
+    with (
+        dask.config.set(cluster.LOCAL_CONFIGURATION),
+        distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address="127.0.0.1:0") as local,
+    ):
         words = (place / "spec.toml", place / "other", "--scheduler", local.scheduler_address, "--device", "cpu")
         result = run(*words, "--json")
     assert result.exit_code == 0, result.output
@@ -967,11 +972,27 @@ def test_recordings_are_those_of_the_simulator_on_each_device(place: Path, devic
         np.testing.assert_array_equal(recording.events.slice(0, 10**9).x, expected.slice(0, 10**9).x)
 
 
+@pytest.mark.parametrize("enabled", [True, False])
+def test_python_3_11_collects_no_garbage_while_it_lists_frames(monkeypatch: pytest.MonkeyPatch, enabled: bool) -> None:
+    """Dask lists the frames of a worker every 10 ms, and a collection meanwhile may block all of its threads."""
+    monkeypatch.setattr(launch, "start_quietly", list)
+    monkeypatch.setattr(sys, "_current_frames", lambda: gc.isenabled())
+    monkeypatch.setattr(sys, "version_info", (3, 11, 7))
+    cluster._prepare((), False, None)
+    before = gc.isenabled()
+    try:
+        (gc.enable if enabled else gc.disable)()
+        assert (sys._current_frames(), gc.isenabled()) == (False, enabled)
+    finally:
+        (gc.enable if before else gc.disable)()
+
+
 def test_each_local_worker_sees_one_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "start_quietly", lambda: ["cpu", "cuda:0", "cuda:1"])
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     assert cluster._visible_gpus() == ("0", "1")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    monkeypatch.setattr(sys, "_current_frames", sys._current_frames)  # the preparation may change it
     gpus = cluster._visible_gpus()
     assert gpus == ("3", "5")
     seen = []

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import dask
 import distributed
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from typer.testing import CliRunner, Result
 from amiwarp import AmiwarpError
 from amiwarp.cli.app import app
 from amiwarp.io.json_files import sealed
+from amiwarp.studies.cluster import LOCAL_CONFIGURATION
 from amiwarp.studies.stability import cells as study
 from amiwarp.studies.stability.cells import METHODS, Axis, Cell, Condition, Outcome, Store, Stored, identity
 from amiwarp.studies.stability.cells import Result as Found
@@ -324,7 +326,10 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> Axis:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
 def test_command_runs_goes_on_and_redraws(tiny: Axis, tmp_path: Path) -> None:
     words = ("--out", tmp_path, "--methods", "sharpness", "--seeds", "1", "--draws", "0", "--device", "cpu", "--json")
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+    with (
+        dask.config.set(LOCAL_CONFIGURATION),
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster,
+    ):
         first = run("--quick", "--scheduler", cluster.scheduler_address, *words)
         assert first.exit_code == 0, first.output
         second = run("--scheduler", cluster.scheduler_address, *words)

@@ -2,12 +2,14 @@
 
 import contextlib
 import functools
+import gc
 import importlib.util
 import logging
 import os
 import platform
 import re
 import signal
+import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -40,7 +42,7 @@ LOCAL_CONFIGURATION = {
 """Dask's configuration of local workers.
 
 By default Dask also makes the allocator return memory early, which costs a quarter more processor time here, and
-samples the stack of each worker.
+samples the stack of each worker and of the scheduler, which may hang with Python 3.11.
 """
 
 
@@ -139,7 +141,28 @@ def _prepare(gpus: tuple[str, ...], local: bool, dask_worker: Any) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus[int(dask_worker.name) % len(gpus)]
     if local:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.version_info < (3, 12):
+        sys._current_frames = _without_collection(sys._current_frames)
     launch.start_quietly()
+
+
+def _without_collection(function: Callable[[], Result]) -> Callable[[], Result]:
+    """Return a function during which no garbage is collected.
+
+    Dask samples the stacks of a worker by ``sys._current_frames``. If Python 3.11 collects garbage meanwhile, and
+    another thread ends, both wait for each other for ever (issue 106883 of CPython).
+    """
+
+    def call() -> Result:
+        enabled = gc.isenabled()
+        gc.disable()
+        try:
+            return function()
+        finally:
+            if enabled:
+                gc.enable()
+
+    return call
 
 
 def run_jobs(
