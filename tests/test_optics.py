@@ -686,6 +686,9 @@ def test_a_growth_may_be_expressed_about_any_time() -> None:
     later, tau = growing.about(80_000), np.linspace(-0.04, 0.07, 12)
     whole, part = 1.0 - growing.growth * (tau + 0.03), 1.0 - growing.growth * 0.03
     np.testing.assert_allclose(1.0 - later.growth * tau, whole / part, rtol=1e-12)
+    assert growing.about(650_000).growth == pytest.approx(1.6 / 0.04)
+    with pytest.raises(AmiwarpError, match=r"growth 1.6 1/s the camera reaches the scene 0.625 s after 50000 us"):
+        growing.about(675_000)
 
 
 def test_a_rotation_moves_if_it_turns_or_accelerates() -> None:
@@ -707,6 +710,7 @@ def test_the_reach_of_a_pan_is_that_of_the_border() -> None:
     np.testing.assert_array_equal(CameraRotation().reach(camera, 0.1), np.zeros(2))
     assert CameraRotation(angular_acceleration=(0.0, 100.0, 0.0)).reach(camera, 0.1)[0] > reach[0]
     np.testing.assert_allclose(CameraRotation(growth=2.0).reach(camera, 0.1), [20.0, 10.0], atol=1e-3)
+    np.testing.assert_allclose(CameraRotation(growth=2.0).reach(camera, 0.6), [120.0, 60.0], atol=1e-3)  # before it
     flipped = CameraRotation(angular_velocity=(0.0, math.pi, 0.0))
     np.testing.assert_array_equal(flipped.reach(camera, 1.0), [201.0, 101.0])
 
@@ -747,6 +751,10 @@ def test_a_rotation_is_undone_as_the_rotation_of_bearings(device: str, turns: bo
         plane[:, 2] += growth * time / (1.0 - growth * time)  # at the time 0 the plane is farther away
         expected = plane[:, :2] / plane[:, 2:] * [150.0, 140.0] + [90.0, 55.0]
         np.testing.assert_allclose(out.numpy(), [expected, expected], rtol=0, atol=1e-3)  # px
+    if growth:  # the camera has passed the plane
+        inputs[3] = 0.7
+        wp.launch(undo_rotation, len(xy), inputs=inputs, outputs=[out], device=device)
+        assert np.isnan(out.numpy()).all()
 
 
 def test_bounds_lie_about_the_value() -> None:

@@ -243,7 +243,8 @@ def undo_camera_rotation(
 ) -> wp.vec2:
     """Return the pixel that the scene point seen at ``xy`` at ``time`` [s] has at time 0.
 
-    A camera that moves forward by the share g of all distances sees the image grow by 1 / (1 - g).
+    A camera that moves forward by the share g of all distances sees the image grow by 1 / (1 - g). From g = 1 on, it is
+    behind the scene, and pixels are NaN.
     """
     rotation = rotation_vector(camera_rotation, time)
     angle = wp.length(rotation)
@@ -252,7 +253,7 @@ def undo_camera_rotation(
         return xy
     ray = pixel_to_ray(camera, xy)
     ray = wp.quat_rotate(wp.quat_from_axis_angle(rotation / wp.max(angle, 1.0e-9), angle), ray)
-    return ray_to_pixel(camera, wp.vec3(size * ray[0], size * ray[1], ray[2]))
+    return ray_to_pixel(camera, wp.vec3(size * ray[0], size * ray[1], wp.where(size > 0.0, ray[2], -1.0)))
 
 
 @wp.func
@@ -267,7 +268,7 @@ def undo_camera_rotation(
         return xy
     ray = wp.vec3((xy[0] - camera.cx) * camera.inverse_fx, (xy[1] - camera.cy) * camera.inverse_fy, 1.0)
     ray = wp.quat_rotate(wp.quat_from_axis_angle(rotation / wp.max(angle, 1.0e-9), angle), ray)
-    scale = wp.where(ray[2] > 1.0e-6, size / ray[2], NAN)
+    scale = wp.where(wp.min(ray[2], size) > 1.0e-6, size / ray[2], NAN)
     return wp.vec2(camera.fx * (ray[0] * scale) + camera.cx, camera.fy * (ray[1] * scale) + camera.cy)
 
 

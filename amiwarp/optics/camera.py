@@ -459,11 +459,21 @@ class CameraRotation:
         -------
         CameraRotation
             The rotation with the angular velocity at the new reference time.
+
+        Raises
+        ------
+        AmiwarpError
+            If a forward motion has reached the scene before the new reference time.
         """
         later = (middle_us - self.middle_us) * 1e-6
         x, y, z = (r + c * later for r, c in zip(self.angular_velocity, self.angular_acceleration, strict=True))
-        growth = self.growth / (1.0 - self.growth * later)
-        return CameraRotation((x, y, z), self.angular_acceleration, middle_us, growth)
+        left = 1.0 - self.growth * later
+        if left <= 0.0:
+            raise AmiwarpError(
+                f"middle_us is {middle_us}; with growth {self.growth:g} 1/s the camera reaches the scene "
+                f"{1.0 / self.growth:g} s after {self.middle_us} us; give a time before that, or no growth"
+            )
+        return CameraRotation((x, y, z), self.angular_acceleration, middle_us, self.growth / left)
 
     @property
     def moves(self) -> bool:
@@ -529,6 +539,7 @@ class CameraRotation:
 
         xy = border(camera)
         rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float32)), np.float64)
+        sizes = np.where(sizes > 0.0, sizes, np.nan)  # beyond the scene
         turned = (Rotation.from_rotvec(r).apply(rays) * (s, s, 1.0) for r, s in zip(rotations, sizes, strict=True))
         moved = [camera.rays_to_pixels(each.astype(np.float32)) for each in turned]
         displacement = np.abs(np.concatenate([np.asarray(m) - xy for m in moved]))
