@@ -217,6 +217,8 @@ def test_encoder_may_come_last(tmp_path):
         writer.append(make(5))
         writer.set_encoder(Encoder.constant_speed(60.0, 5_000_000, 5_001_000))
     assert open_recording(tmp_path / "a.h5").encoder.rpm == pytest.approx(60.0, abs=1e-6)
+    with pytest.raises(AmiwarpError, match="outside its 'with' block"):
+        writer.set_encoder(Encoder.constant_speed(60.0, 5_000_000, 5_001_000))
 
 
 @pytest.mark.parametrize(

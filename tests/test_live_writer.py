@@ -491,6 +491,8 @@ def test_an_encoder_with_another_number_of_prisms_is_not_set(tmp_path):
     with live(tmp_path / "pair.h5", encoders=2) as writer:
         writer.append(make(10))
         writer.set_encoder(encoder.with_second(-0.5))
+    with pytest.raises(AmiwarpError, match=r"set_encoder\(\) was called outside the writer's 'with' block"):
+        writer.set_encoder(encoder.with_second(-0.5))
     got = open_recording(tmp_path / "pair.h5").encoder
     np.testing.assert_array_equal(got.angles_at([0, 700]), encoder.with_second(-0.5).angles_at([0, 700]))
 

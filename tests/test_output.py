@@ -594,6 +594,19 @@ def test_inputs_that_never_end_are_refused(place: Path, line: str) -> None:
     assert not any(f.name.startswith("out.") for f in place.iterdir())
 
 
+def test_an_interrupted_command_leaves_no_empty_folder(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("amiwarp.studies.design.design", interrupted)
+    (place / "mine").mkdir()
+    for out in ("new/inner", "mine", "mine/inner"):
+        result = run("design", "--size", "64x48", "--fov-deg", "60", "--out", out)
+        assert result.exit_code == 130, result.output
+    assert not (place / "new").exists()
+    assert list((place / "mine").iterdir()) == []
+
+
 @pytest.mark.parametrize("exists", [True, False])
 @pytest.mark.parametrize("writer", ["convert", "record"])
 def test_a_symbolic_link_is_followed(place: Path, exists: bool, writer: str) -> None:

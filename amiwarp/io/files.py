@@ -76,6 +76,8 @@ class _Command:
     """Files that it has read."""
     written: set[Path] = field(default_factory=set)
     """Files that it has written itself. They are no inputs, even if it reads them."""
+    folders: list[Path] = field(default_factory=list)
+    """Folders that it has made, inner ones before outer ones."""
 
 
 _command: _Command | None = None
@@ -139,13 +141,19 @@ def note_output(path: Path) -> None:
         _command.written.add(path.resolve())
 
 
+def note_folders(paths: Iterable[Path]) -> None:
+    """Register folders that the running command has made, inner ones before outer ones."""
+    if _command is not None:
+        _command.folders.extend(paths)
+
+
 @contextlib.contextmanager
-def inputs_noted(paths: Iterable[Path]) -> Iterator[None]:
+def inputs_noted(paths: Iterable[Path]) -> Iterator[_Command]:
     """Treat ``paths``, and the files given to :func:`note_input` within the block, as inputs."""
     global _command
     before, _command = _command, _Command({path.absolute() for path in paths})
     try:
-        yield
+        yield _command
     finally:
         _command = before
 
@@ -303,12 +311,14 @@ def run(inputs: Collection[Path], outputs: Collection[Path], *, overwrite: bool)
     """Protect files during a command: ``inputs`` are not overwritten, existing files only with ``overwrite``.
 
     Raises :class:`AmiwarpError` immediately if one of the ``outputs`` is an input, is given twice, exists or cannot be
-    written. At the end all unfinished files are removed.
+    written. At the end all unfinished files are removed, and the folders that the command has made and left empty.
     """
     global _permissions
     before, _permissions = _permissions, _Permissions(overwrite)
+    made: list[Path] = []
     try:
-        with inputs_noted(inputs):
+        with inputs_noted(inputs) as command:
+            made = command.folders
             targets: set[Path] = set()
             for path in outputs:
                 target = check_output(path)
@@ -319,6 +329,9 @@ def run(inputs: Collection[Path], outputs: Collection[Path], *, overwrite: bool)
     finally:
         _permissions = before
         _discard_unfinished()
+        for folder in made:
+            with contextlib.suppress(OSError):  # it is not empty
+                folder.rmdir()
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.recording import Recording
-from amiwarp.io.files import check_regular, errors_name, name_kind, open_input
+from amiwarp.io.files import check_regular, errors_name, name_kind, note_folders, open_input
 from amiwarp.io.json_files import read_json
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import choice, guarded, instance, shown, whole
@@ -465,9 +465,11 @@ def video_library(path: Path) -> Any:
 
 def make_folder(path: Path) -> None:
     """Create a folder and its parents. Raises :class:`AmiwarpError` if that fails, or for the name of a file."""
-    for new in (path, *path.parents):
-        if not os.path.lexists(new) and new.suffix.lower() in FILE_ENDINGS:
+    missing = [new for new in (path, *path.parents) if not os.path.lexists(new)]
+    for new in missing:
+        if new.suffix.lower() in FILE_ENDINGS:
             raise AmiwarpError(f"{new}: is for a folder, but ends in {new.suffix}; give the name of a folder")
+    note_folders(missing)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

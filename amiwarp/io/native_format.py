@@ -1166,7 +1166,14 @@ class RecordingWriter:
         ----------
         encoder : Encoder
             The encoder.
+
+        Raises
+        ------
+        AmiwarpError
+            If the file is finished.
         """
+        if self._new is not None:
+            self._check_open()
         self._encoder = encoder
 
     def _index(self, t: NDArray[np.int64], start: int) -> None:
@@ -1596,8 +1603,9 @@ class LiveWriter:
     def set_encoder(self, encoder: Encoder) -> None:
         """Set the encoder data that the finished file holds instead of the appended encoder samples.
 
-        Raises :class:`AmiwarpError` if it has another number of encoders than the writer.
+        Raises :class:`AmiwarpError` outside the ``with`` block, and for another number of encoders than the writer has.
         """
+        self._check_open("set_encoder")
         given = 1 if encoder.second is None else 2
         if given != len(self._names):
             raise AmiwarpError(f"{self.path}: the encoder has {given} prisms; make the writer with encoders={given}")
