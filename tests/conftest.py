@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
+from hypothesis import HealthCheck, settings
 
 from amiwarp import (
     Calibration,
@@ -35,6 +36,12 @@ from tests import SHARE
 with contextlib.suppress(ImportError):
     # PyTorch's CUDA build imports Triton, which ends a process in which VTK has drawn with Mesa before.
     importlib.import_module("triton")
+# The same examples each time, however fast the machine is. A fixture's folder may serve all examples of a test.
+settings.register_profile(
+    "amiwarp", deadline=None, derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)  # fmt: skip
+settings.load_profile("amiwarp")
 wp.init()
 gc.set_threshold(MOST_NEW)  # as the command line does
 # The many processes that tests start would otherwise compile the package each time, and each of xdist's all the tests.

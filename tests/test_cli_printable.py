@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from amiwarp import AmiwarpError, Events, RecordingWriter, open_recording
@@ -79,7 +79,6 @@ def test_lines_and_cells_keep_their_markup_and_their_line(capsys: pytest.Capture
     assert lines[1].split() == [r"cell\r\n", r"[red]\x9b"]
 
 
-@settings(deadline=None)
 @given(st.text())
 def test_any_text_becomes_a_printable_line(text: str) -> None:
     shown = printable(text)

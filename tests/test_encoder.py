@@ -44,7 +44,7 @@ def test_wrapped_angles_unwrap_at_any_epoch(epoch):
 
 
 @given(st.floats(-9000, 9000), st.floats(-10, 10), st.integers(0, 2**32))
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 def test_counts_find_any_speed_below_half_a_turn_per_sample(rpm, phase, seed):
     rng = np.random.default_rng(seed)
     # Intervals jitter by a tenth; at 9000 rpm 2 ms are 0.3 turns.
@@ -186,7 +186,7 @@ def test_refuses(make, message):
         make()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=60), st.integers(0, 10**15), st.floats(-3e6, 3e6))
 def test_a_stream_is_the_encoder_of_its_last_samples(sizes, origin, offset):
     n = sum(sizes) + 2
@@ -288,7 +288,7 @@ def test_a_stream_refuses_what_is_no_angle():
         EncoderStream(capacity=3)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.integers(0, 30), min_size=1, max_size=12), st.sampled_from(["sines", "steps", "noise"]),
     st.integers(0, 99),

@@ -85,7 +85,7 @@ def test_indexing_by_slice_index_and_mask():
 
 
 @given(times, st.lists(st.integers(0, 80), max_size=6), st.integers(1, 30))
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 def test_regroup_by_count_keeps_all_in_order(t, edges, count):
     events = make(t)
     blocks = list(regroup(cut(events, edges), count=count))
@@ -95,7 +95,7 @@ def test_regroup_by_count_keeps_all_in_order(t, edges, count):
 
 
 @given(times, st.lists(st.integers(0, 80), max_size=6), st.integers(1, 500))
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 def test_regroup_by_duration_cuts_on_the_grid_of_the_first_event(t, edges, duration):
     events = make(t)
     blocks = list(regroup(cut(events, edges), duration_us=duration))

@@ -12,7 +12,7 @@ import h5py
 import hdf5plugin
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp import (
@@ -130,7 +130,7 @@ def test_only_events_are_needed(tmp_path):
     st.integers(-(10**15), 10**15),
     st.integers(0, 2**32),
 )
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40)
 def test_slices_by_time_and_index_are_those_of_memory(tmp_path, count, edges, mean_us, start, seed):
     events = make(count, seed, start, mean_us)
     path = tmp_path / f"{count}-{seed}-{start}-{mean_us}-{len(edges)}.h5"
@@ -481,7 +481,7 @@ def test_noise_that_does_not_compress(tmp_path):
 
 
 @given(st.binary(max_size=3000), st.integers(0, 3))
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_checksum_is_fletchers(data, fill):
     """Compare with a computation word by word, as HDF5 does it."""
     data = data + bytes([0, 255, 0, 1][fill : fill + 1]) * (700 * fill)
@@ -500,7 +500,7 @@ def test_checksum_is_fletchers(data, fill):
 
 
 @given(st.lists(st.binary(max_size=200), max_size=40), st.integers(0, 25_000), st.sampled_from([0, 1, 255]))
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 def test_the_kernel_computes_the_same_checksums(parts, size, fill):
     """Also if the sums are multiples of 65535 before a row of zeros."""
     parts = [*parts, bytes([fill]) * size, bytes([fill]) * 11520 + bytes(size), b"".join(parts)]

@@ -13,7 +13,7 @@ import hdf5plugin  # noqa: F401 - its import registers the compression
 import numpy as np
 import pytest
 from faery.extension import aedat
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from amiwarp import (
@@ -95,7 +95,7 @@ GAPS = st.one_of(
 @example(start=0, gaps=[0] * 20, seed=1)
 @example(start=2**25, gaps=[], seed=1)
 @example(start=4095 << 12, gaps=[1 << 12, 4094 << 12, 4095 << 12, 1 << 12], seed=1)
-@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20)
 def test_any_events_come_back_from_other_programs(tmp_path, name, start, gaps, seed):
     events = events_at(np.cumsum([start, *gaps]).tolist(), seed)
     assert_columns(CLIENTS[name][1](exported(tmp_path, name, MemoryEvents(events, *SIZE))), events)
@@ -464,7 +464,7 @@ def test_a_missing_rosbags_is_named(tmp_path, monkeypatch):
 @given(
     cuts=st.lists(st.integers(0, 60), max_size=5), gaps=st.lists(GAPS, min_size=60, max_size=60), whole=st.booleans()
 )
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_evt3_words_follow_the_format(cuts, gaps, whole):
     """Decode word by word, as Prophesee's documentation defines them, with the wraps of the time counted."""
     events = events_at(np.cumsum(gaps).tolist(), len(cuts))

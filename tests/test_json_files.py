@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp import AmiwarpError, Calibration, Camera, load_camera
@@ -149,7 +149,7 @@ def leaves(value: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int
     return [place for key, entry in inner for place in [(*path, key), *leaves(entry, (*path, key))]]
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200)
 @given(data=st.data())
 def test_any_value_in_any_place(calibration: Calibration, tmp_path: Path, data: st.DataObject) -> None:
     path = tmp_path / "c.json"

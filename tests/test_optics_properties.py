@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import hypothesis.strategies as st
 import numpy as np
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given, settings
 
 from amiwarp import (
     Camera,
@@ -27,7 +27,7 @@ from reference import optics as oracle
 ATOL = 1e-3  # px, the documented limit for float32
 COUNT = 300
 
-quick = settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+quick = settings(max_examples=60)
 few = settings(quick, max_examples=12)
 
 

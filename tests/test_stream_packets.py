@@ -79,7 +79,7 @@ def assert_same(got: object, expected: object) -> None:
         assert got == expected
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(cuts=st.lists(st.integers(0, 25_000), max_size=40))
 def test_all_kinds_come_back_from_pieces_of_any_size(cuts):
     messages, data = stream()
@@ -240,7 +240,7 @@ def test_after_a_second_without_disorder_all_passes_at_once_again():
     assert sorter.put(at(1_010_050)).t.tolist() == [1_010_050]
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(
     times=st.lists(st.lists(st.integers(0, 40_000), max_size=30), max_size=30),
     most=st.integers(1, 60),

@@ -67,7 +67,7 @@ THREE_SAMPLES = (np.array([1000, 2000, 3000]), np.array([0.0, 0.28860215, -0.079
 """With 8 bits from 182 on, the counts are 182, 0 and 162: a steady rotation with 360 counts per turn as well."""
 
 
-@settings(deadline=None, max_examples=500)
+@settings(max_examples=500)
 @example(THREE_SAMPLES, 8, False, 182, False)
 @given(rotations(), st.integers(8, 32), st.booleans(), st.integers(0, 2**32), st.booleans())
 def test_counts_are_right_or_refused(rotation, bits, signed, start, given_bits):
@@ -86,7 +86,7 @@ def test_counts_are_right_or_refused(rotation, bits, signed, start, given_bits):
     assert np.abs(encoder.angle - encoder.angle[0] - true).max() <= 1.001 * TWO_PI / per_turn
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(rotations(), st.integers(0, 2**32), st.sampled_from([0, None]))
 def test_counters_that_start_anew_each_turn(rotation, start, bits):
     t, progress, per_turn, way, _ = rotation
