@@ -10,6 +10,7 @@ import math
 import os
 import re
 import shutil
+import signal
 import socket
 import stat
 import subprocess
@@ -658,6 +659,24 @@ def test_a_file_that_appears_in_the_last_moment_is_kept(tmp_path: Path, monkeypa
     with pytest.raises(AmiwarpError, match="another program"), new:
         pass
     assert path.read_text() == "theirs"
+
+
+def test_an_interrupt_while_the_lock_is_taken_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lock file exists by then, but the process does not know of it yet."""
+    taken = output._lock
+
+    def interrupted(file: Any) -> bool | None:
+        signal.raise_signal(signal.SIGINT)
+        return taken(file)
+
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        monkeypatch.setattr(output, "_lock", interrupted)
+        with pytest.raises(KeyboardInterrupt), output.run([], [], overwrite=False):
+            NewFile(tmp_path / "a.txt")
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert os.listdir(tmp_path) == []
 
 
 def test_disks_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

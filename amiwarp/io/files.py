@@ -29,6 +29,7 @@ from types import TracebackType
 from typing import IO, Any
 
 from amiwarp.errors import WORD_HEAD, AmiwarpError, printable
+from amiwarp.tasks import interrupts_later
 
 # Check that an input is a regular file. A pipe or a device could block its reader, or never end.
 
@@ -513,7 +514,7 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
 
 def _unfinished_name(target: Path) -> Path:
     """Return a new name for the unfinished version of a file. No other process removes it while this one lives."""
-    with _locks_guard:
+    with interrupts_later(), _locks_guard:
         lock = _locks.get(target.parent) or _locks.setdefault(target.parent, _take_lock(target.parent))
         part = target.with_name(f".{target.name[:40]}.{lock.owner}-{secrets.token_hex(4)}.part")
         lock.files.add(part)
@@ -560,7 +561,7 @@ def _system() -> str:
 
 def _forget(part: Path) -> None:
     """Take a file that was removed or renamed from the unfinished files; release the lock after the last."""
-    with _locks_guard:
+    with interrupts_later(), _locks_guard:
         lock = _locks.get(part.parent)
         if lock is None:
             return
