@@ -976,9 +976,15 @@ def test_recordings_are_those_of_the_simulator_on_each_device(place: Path, devic
 def test_python_3_11_collects_no_garbage_while_it_lists_frames(monkeypatch: pytest.MonkeyPatch, enabled: bool) -> None:
     """Dask lists the frames of a worker every 10 ms, and a collection meanwhile may block all of its threads."""
     monkeypatch.setattr(launch, "start_quietly", list)
-    monkeypatch.setattr(sys, "_current_frames", lambda: gc.isenabled())
+
+    def frames() -> bool:
+        return gc.isenabled()
+
+    monkeypatch.setattr(sys, "_current_frames", frames)
     monkeypatch.setattr(sys, "version_info", (3, 11, 7))
-    cluster._prepare((), False, None)
+    for _ in range(2):  # each command prepares the workers of a cluster
+        cluster._prepare((), False, None)
+    assert sys._current_frames.__wrapped__ is frames
     before = gc.isenabled()
     try:
         (gc.enable if enabled else gc.disable)()

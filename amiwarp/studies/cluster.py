@@ -141,7 +141,8 @@ def _prepare(gpus: tuple[str, ...], local: bool, dask_worker: Any) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus[int(dask_worker.name) % len(gpus)]
     if local:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if sys.version_info < (3, 12):
+    # An earlier command may have prepared this worker already.
+    if sys.version_info < (3, 12) and not hasattr(sys._current_frames, "__wrapped__"):
         sys._current_frames = _without_collection(sys._current_frames)
     launch.start_quietly()
 
@@ -153,6 +154,7 @@ def _without_collection(function: Callable[[], Result]) -> Callable[[], Result]:
     another thread ends, both wait for each other for ever (issue 106883 of CPython).
     """
 
+    @functools.wraps(function)
     def call() -> Result:
         enabled = gc.isenabled()
         gc.disable()
