@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import gc
 import importlib.util
 import logging
 import os
@@ -20,7 +19,7 @@ from typing import Any, TypeVar
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.kernels import launch
-from amiwarp.tasks import cpu_threads
+from amiwarp.tasks import cpu_threads, no_garbage_collection
 from amiwarp.validation import whole
 
 Job = TypeVar("Job")
@@ -156,13 +155,8 @@ def _without_collection(function: Callable[[], Result]) -> Callable[[], Result]:
 
     @functools.wraps(function)
     def call() -> Result:
-        enabled = gc.isenabled()
-        gc.disable()
-        try:
+        with no_garbage_collection():
             return function()
-        finally:
-            if enabled:
-                gc.enable()
 
     return call
 
