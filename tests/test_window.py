@@ -95,6 +95,99 @@ def test_a_slider_moves_the_compensated_cloud(window: Window, name: str, value: 
     assert window.knob == name
 
 
+def mouse(window: Window, event: str, place: tuple[int, int], *, shift: bool = False) -> None:
+    """Send a mouse event at a place, in pixels from left and bottom, as a window system does."""
+    interactor = window.plotter.iren.interactor
+    interactor.SetEventInformation(*place, 0, int(shift), "\0", 0, None)
+    interactor.InvokeEvent(f"{event}Event")
+
+
+def pull(window: Window, place: tuple[int, int], button: str, *, shift: bool = False) -> None:
+    """Press a button, move the mouse in steps, also over the other cloud, and release the button."""
+    x, y = place
+    mouse(window, f"{button}ButtonPress", place, shift=shift)
+    for step in (10, 20, 30):
+        mouse(window, "MouseMove", (x + step, y + step // 2), shift=shift)
+    mouse(window, f"{button}ButtonRelease", (x + 30, y + 15), shift=shift)
+
+
+def nine_places(window: Window) -> list[tuple[int, int]]:
+    """Return nine places on the clouds, in pixels from left and bottom."""
+    shown = [renderer.GetViewport() for renderer in window.scene._views if renderer.GetDraw()]
+    left, bottom = shown[0][:2]
+    width, height = window.plotter.window_size
+    return [
+        (round(width * (left + across * (1.0 - left))), round(height * (bottom + up * (1.0 - bottom))))
+        for across in (0.05, 0.45, 0.9)
+        for up in (0.05, 0.5, 0.9)
+    ]
+
+
+def check_the_mouse_moves_the_camera(window: Window) -> None:
+    """Each drag, and the wheel after it, moves the camera, and what is drawn follows."""
+    camera = window.scene._views[0].camera
+    for place in nine_places(window):
+        window.look_from(View.FREE)
+        assert window.turn()
+        picture = window.scene.picture()
+        for action in ("Left", "MouseWheelForward", "shift", "Middle", "MouseWheelBackward", "Right"):
+            before = *camera.position, *camera.focal_point, *camera.up
+            if action.startswith("MouseWheel"):
+                mouse(window, action, place)
+            elif action == "shift":
+                pull(window, place, "Left", shift=True)
+            else:
+                pull(window, place, action)
+            after = *camera.position, *camera.focal_point, *camera.up
+            assert np.abs(np.subtract(after, before)).max() > 0.1, (place, action)
+        assert window.turn(), place
+        # only the clouds, their frames and labels have changed, not texts, legends and charts
+        changed = (window.scene.picture() != picture).any(axis=2)
+        outside = changed.copy()
+        for renderer in window.scene._views:
+            (left, low), (width, height) = renderer.GetOrigin(), renderer.GetSize()
+            bottom = len(changed) - low
+            outside[bottom - height : bottom, left : left + width] = False
+        assert changed.sum() > 1000, place
+        assert not outside.any(), place
+
+
+def test_the_mouse_turns_shifts_and_zooms_the_clouds(window: Window) -> None:
+    """At nine places, beside each other and overlaid, and after help and statistics were shown."""
+    while window.turn():  # until the curves are there
+        pass
+    check_the_mouse_moves_the_camera(window)
+    for key in ("h", "h", "i", "i"):
+        window.key(key)
+        assert window.turn()
+    window.toggle("overlaid")
+    assert window.turn()
+    check_the_mouse_moves_the_camera(window)
+
+
+def test_the_mouse_turns_a_cloud_without_charts(recording: Recording) -> None:
+    made = Window(Inspector(replace(recording, encoder=None, prism=None)), size=SIZE, off_screen=True)
+    assert not made.compensates
+    check_the_mouse_moves_the_camera(made)
+    made.scene.close()
+
+
+def test_a_drag_that_leaves_a_cloud_turns_it_nevertheless(window: Window) -> None:
+    """The mouse moves over help, charts and sliders, and is released there."""
+    window.key("h")
+    assert window.turn()
+    camera = window.scene._views[0].camera
+    for end in ((450, 450), (600, 60), (60, 300)):  # help, charts, sliders
+        mouse(window, "LeftButtonPress", (320, 200))
+        mouse(window, "MouseMove", (330, 210))
+        before = camera.position
+        mouse(window, "MouseMove", end)
+        mouse(window, "LeftButtonRelease", end)
+        assert window.turn()
+        assert math.dist(camera.position, before) > 1.0
+        assert window.knob == "apex"  # no slider has moved
+
+
 def test_the_slider_of_the_size_is_that_of_a_vibrating_camera(recording: Recording) -> None:
     inspector = Inspector(replace(recording, encoder=None, prism=None))
     inspector.use_model("vibration")

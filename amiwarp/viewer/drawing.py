@@ -497,6 +497,8 @@ PICK_PX = 4.0
 """Distance from the mouse up to which an event is found [px]."""
 ROUND_PX = 4.0
 """Diameter of the points from which they are round [px]. Smaller discs have no shape, and squares are faster."""
+NOWHERE = (0.0, 0.0, 0.0, 0.0)
+"""Place of a renderer that is hidden."""
 VIEW_ANGLE = 26.0
 """Vertical field of view of the camera [deg]."""
 MARGIN = 0.1
@@ -536,6 +538,16 @@ def font() -> Path:
     from matplotlib import get_data_path
 
     return Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
+
+
+def place_renderer(renderer: Any, place: tuple[float, ...], *, shown: bool) -> None:
+    """Draw a renderer at a place (left, bottom, right and top, in shares of the picture's size), or hide it.
+
+    A hidden renderer gets an empty place. PyVista lets each renderer under a pressed mouse button follow the mouse,
+    also one that draws nothing, which would take the mouse from the clouds.
+    """
+    renderer.SetDraw(shown)
+    renderer.SetViewport(*(place if shown else NOWHERE))
 
 
 class Scene:
@@ -778,13 +790,10 @@ class Scene:
         self._strip, self._overlaid, (left, right, legend, foot, *_) = strip, overlaid, self.plotter.renderers
         start, low = self._corner[0] + strip, self._corner[1] + self._foot
         middle = (1.0 + start) / 2.0
-        legend.SetViewport(self._corner[0], low, start, 1.0)
-        foot.SetViewport(self._corner[0], self._corner[1], 1.0, low)
-        left.SetViewport(start, low, 1.0 if overlaid else middle, 1.0)
-        right.SetViewport(middle, low, 1.0, 1.0)
-        legend.SetDraw(strip > 0.0)
-        foot.SetDraw(self._foot > 0.0)
-        right.SetDraw(not overlaid)
+        place_renderer(legend, (self._corner[0], low, start, 1.0), shown=strip > 0.0)
+        place_renderer(foot, (self._corner[0], self._corner[1], 1.0, low), shown=self._foot > 0.0)
+        place_renderer(left, (start, low, 1.0 if overlaid else middle, 1.0), shown=True)
+        place_renderer(right, (middle, low, 1.0, 1.0), shown=not overlaid)
 
     def _axes(self, k: int, look: Look, ink: str, title: str) -> list[Any]:
         import pyvista

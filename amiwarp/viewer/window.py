@@ -409,11 +409,6 @@ class Window(layout.Actions):
 
     def _start(self) -> None:
         self._controls.SetViewport(0.0, 0.0, CORNER[0], 1.0)
-        self._charts.SetViewport(CORNER[0], 0.0, 1.0, CORNER[1])
-        self._help.SetViewport(*HELP_PLACE)
-        self._statistics.SetViewport(*STATISTICS_PLACE)
-        for renderer, place in zip(self._depth, itertools.pairwise(DEPTH_SHARES), strict=True):
-            renderer.SetViewport(place[0], CORNER[1], place[1], 1.0)
         homes = self._controls, self._help, self._controls, self._statistics
         for renderer, actor in zip(homes, self._texts, strict=True):
             renderer.add_actor(actor, render=False, pickable=False, reset_camera=False)
@@ -525,7 +520,7 @@ class Window(layout.Actions):
         ink = drawing.BACKGROUND_AND_INK[self.look.dark][1]
         for name, (chart, _) in self._plots.items():
             (self._statistics if name == "intervals" else self._charts).remove_chart(chart)
-        self._charts.SetDraw(self.compensates)
+        drawing.place_renderer(self._charts, (CORNER[0], 0.0, 1.0, CORNER[1]), shown=self.compensates)
         self._plots = {}
         for k, name in enumerate((*self._curve_names(), "orbit")):
             label, unit, *_ = layout.SLIDERS.get(name, ("prism angle", "°"))
@@ -612,10 +607,10 @@ class Window(layout.Actions):
             actor.input = "\n".join(lines)
         for actor in self._texts:
             actor.prop.color = ink
-        shown = (self._help, self.help_shown), (self._statistics, self.statistics_shown)
-        for renderer, drawn in (*shown, *((each, self.depth_shown) for each in self._depth)):
-            renderer.SetDraw(drawn)
-            renderer.SetInteractive(drawn)  # or it would take the mouse from the clouds while it is hidden
+        drawing.place_renderer(self._help, HELP_PLACE, shown=self.help_shown)
+        drawing.place_renderer(self._statistics, STATISTICS_PLACE, shown=self.statistics_shown)
+        for renderer, (left, right) in zip(self._depth, itertools.pairwise(DEPTH_SHARES), strict=True):
+            drawing.place_renderer(renderer, (left, CORNER[1], right, 1.0), shown=self.depth_shown)
         for renderer in (self._help, self._statistics):
             renderer.set_background(HELP_PAPER[self.look.dark])
         for renderer in (self._controls, self._charts):
