@@ -15,7 +15,7 @@ calibration = amiwarp.calibrate(recording)
 before, after = amiwarp.event_clouds(recording, calibration)
 print(
     f"{after.n_points:,} events; residual {before['residual_px'].mean():.2f} px recorded, "
-    f"{after['residual_px'].mean():.2f} px compensated"
+    f"{np.nanmean(after['residual_px']):.2f} px compensated"
 )
 
 plotter = pyvista.Plotter(off_screen=True, shape=(1, 2), window_size=(1200, 500))

@@ -54,7 +54,29 @@ def test_the_clouds_hold_all_events_with_their_values(
         assert recording.truth.stored_causes is not None
         np.testing.assert_array_equal(cloud["cause"], recording.truth.stored_causes[: len(events)])
         assert list(cloud.field_data["axes"])[2] == "(theta [deg] - z_start) * z_scale"
-    assert after["residual_px"].mean() < before["residual_px"].mean() - 0.2
+    assert np.nanmean(after["residual_px"]) < before["residual_px"].mean() - 0.2
+
+
+def test_a_residual_is_unknown_where_the_model_moves_an_event_out(
+    recording: Recording, calibration: amiwarp.Calibration
+) -> None:
+    """Out of the region, or of the sensor. All others are what they are in a larger region."""
+    region = (20, 10, 70, 60)
+    whole_before, whole_after = amiwarp.event_clouds(recording, calibration)
+    before, after = amiwarp.event_clouds(recording, calibration, region=region)
+    for cloud, whole in ((before, whole_before), (after, whole_after)):
+        x, y = np.rint(cloud.points[:, 0]), np.rint(-cloud.points[:, 1])
+        in_region = (x >= 20) & (x < 70) & (y >= 10) & (y < 60)
+        np.testing.assert_array_equal(np.isfinite(cloud["residual_px"]), in_region)
+        same = whole["residual_px"][np.searchsorted(whole["index"], cloud["index"])]
+        np.testing.assert_allclose(cloud["residual_px"][in_region], same[in_region], atol=1e-5)
+    assert np.isfinite(before["residual_px"]).all()
+    assert 100 < np.count_nonzero(np.isnan(after["residual_px"])) < 0.2 * after.n_points
+    x, y = np.rint(whole_after.points[:, 0]), np.rint(-whole_after.points[:, 1])
+    width, height = recording.events.size
+    on_sensor = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    assert not on_sensor.all()
+    np.testing.assert_array_equal(np.isfinite(whole_after["residual_px"]), on_sensor)
 
 
 def test_window_region_and_time_axis(recording: Recording, calibration: amiwarp.Calibration) -> None:

@@ -30,7 +30,7 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.imaging.residuals import WIDEST_PX, residual
 from amiwarp.io.spans import read_span
 from amiwarp.optics.models import build_model, rungs
-from amiwarp.viewer.drawing import Look, Scene, axis_range, colours_of, orbit_lines, third_axis
+from amiwarp.viewer.drawing import Look, Scene, axis_range, colours_of, legend, orbit_lines, third_axis, unknown_rows
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection
 from reference.calibration_sample import exact_calibration
 
@@ -405,10 +405,34 @@ def test_residuals_fall_when_the_calibration_gets_better(inspector: Inspector, r
     ]
     for worse_and_worse in wrong:
         shown = [inspector.show(knobs) for knobs in worse_and_worse]
-        means = [residual(each.image_after, each.after).mean() for each in shown]
+        means = [np.nanmean(residual(each.image_after, each.after)) for each in shown]
         assert (np.diff(means) > 0.05).all()
     right = inspector.show(true)
-    assert residual(right.image_after, right.after).mean() < residual(right.image_before, right.before).mean() - 0.3
+    as_recorded = residual(right.image_before, right.before).mean()
+    assert np.nanmean(residual(right.image_after, right.after)) < as_recorded - 0.3
+
+
+@pytest.mark.parametrize("colour", [Colour.RESIDUAL, Colour.DENSITY])
+def test_unknown_values_are_grey_and_counted(inspector: Inspector, recording: Recording, colour: Colour) -> None:
+    """Those of events that the model moves out of the region, or out of the image."""
+    region = (0, 0, 40, 30)
+    inspector.open(*inspector.first_window(), replace(inspector.selection, region=region))
+    shown = inspector.show(replace(true_knobs(recording), apex=math.radians(2.5)))
+    x, y = np.rint(shown.after).T
+    known = (x >= 0) & (y >= 0)
+    if colour is Colour.RESIDUAL:
+        known &= (x < 40) & (y < 30)
+    count = np.count_nonzero(~known)
+    assert 10 < count < len(known)
+    grey = (colours_of(shown, Look(colour), after=True) == 0xBB).all(axis=1)
+    np.testing.assert_array_equal(grey, ~known)
+    assert not (colours_of(shown, Look(colour), after=False) == 0xBB).all(axis=1).any()
+    assert unknown_rows(shown, colour) == (("#bbbbbb", f"unknown: {count:,} events"),)
+    assert legend(shown, colour, dark=False)["rows"] == [["#bbbbbb", f"unknown: {count:,} events"]]
+    assert unknown_rows(shown, Colour.TIME) == ()
+    # both clouds compensated
+    both = inspector.show(against=replace(true_knobs(recording), apex=math.radians(2.5)))
+    assert "on the left" in unknown_rows(both, colour)[0][1]
 
 
 @pytest.mark.parametrize(("width", "tolerance"), [(0.3, 0.3), (1.0, 0.05), (2.0, 0.05), (3.0, 0.1), (5.0, 0.2)])
@@ -434,5 +458,6 @@ def test_a_residual_of_a_lone_event_is_large() -> None:
     lone = np.zeros((20, 30), np.float32)
     lone[10, 12] = 1.0
     places = np.array([[12.0, 10.0], [25.0, 3.0], [np.nan, np.nan], [-5.0, 99.0]], np.float32)
-    assert (residual(lone, places) > 3.0).all()
-    assert residual(lone, places)[1:] == pytest.approx(WIDEST_PX)
+    assert (residual(lone, places)[:2] > 3.0).all()
+    assert residual(lone, places)[1] == pytest.approx(WIDEST_PX)
+    assert np.isnan(residual(lone, places)[2:]).all()  # outside

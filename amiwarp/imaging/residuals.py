@@ -18,14 +18,23 @@ WIDE_EVENTS = 2.0
 """Number of spread events that are assumed near each event, so that a lone event has a large residual."""
 
 
+def outside(xy: NDArray[np.float32], rows: slice, columns: slice) -> NDArray[np.bool_]:
+    """Return which points lie outside rows and columns of an image, shape ``(n,)``. Points that are not finite do."""
+    column = np.rint(xy[:, 0])
+    row = np.rint(xy[:, 1])
+    in_columns = (column >= columns.start) & (column < columns.stop)
+    in_rows = (row >= rows.start) & (row < rows.stop)
+    return np.asarray(~(in_columns & in_rows), np.bool_)
+
+
 def at_pixels(image: NDArray[Any], xy: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the image's value at each point, 0 outside the image, shape ``(n,)``."""
-    x, y = (np.nan_to_num(xy[:, k], nan=-9.0) for k in (0, 1))
-    column, row = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
-    inside = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])
-    out = np.zeros(len(xy))
-    out[inside] = image[row[inside], column[inside]]
-    return out
+    """Return the image's value at each point, shape ``(n,)``; NaN outside the image."""
+    height, width = image.shape
+    known = ~outside(xy, slice(0, height), slice(0, width))
+    column, row = np.rint(xy[known]).astype(np.int64).T
+    values = np.full(len(xy), np.nan)
+    values[known] = image[row, column]
+    return values
 
 
 def residual(
@@ -34,16 +43,15 @@ def residual(
     """Return the width of the edge at each point, or what is left of the prism's motion [px], shape ``(n,)``.
 
     It is the standard deviation across the edge of the events near the point: near 0 on a sharp edge, and
-    :data:`WIDEST_PX` among spread events and outside the rows and columns ``where``, in which it is computed. The event
-    itself does not count.
+    :data:`WIDEST_PX` among spread events. The event itself does not count. Outside the rows and columns ``where``, in
+    which it is computed, it is unknown: NaN.
     """
-    wide = np.full(image.shape, WIDEST_PX)
+    width_at = np.full(image.shape, np.nan)
     spread = _spread_across_edges(image, where)
     # Gaussian weights of variance n² and an edge of variance w² give a spread of 1 / (1 / n² + 1 / w²).
-    width = spread * NEAR_PX**2 / np.maximum(NEAR_PX**2 - spread, 1e-6) - ROUNDING_VARIANCE
-    wide[where] = np.sqrt(np.clip(width, 1e-6, WIDEST_PX**2))
-    found = at_pixels(wide, xy)
-    return np.where(found > 0.0, found, WIDEST_PX)
+    variance = spread * NEAR_PX**2 / np.maximum(NEAR_PX**2 - spread, 1e-6) - ROUNDING_VARIANCE
+    width_at[where] = np.sqrt(np.clip(variance, 1e-6, WIDEST_PX**2))
+    return at_pixels(width_at, xy)
 
 
 def _spread_across_edges(image: NDArray[np.float32], where: tuple[slice, slice]) -> NDArray[np.float64]:

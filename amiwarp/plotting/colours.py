@@ -21,6 +21,8 @@ CAUSE_COLOURS = (BLUE, ORANGE, PINK, VERMILION)
 """Colour of each cause of events, in the order of the codes of :class:`amiwarp.Cause`."""
 GREY = "#808080"
 """Colour of the sky, and of unknown causes."""
+LIGHT_GREY = "#bbbbbb"
+"""Colour of points without a value. No colour of a scale is like it."""
 DEPTH_MAP = "viridis_r"
 """Matplotlib colour map of depth. Near points are light."""
 DEPTH_PERCENTILES = (2.0, 98.0)

@@ -80,7 +80,8 @@ def event_clouds(
     - ``theta_rad`` (float64): prism angle, from 0 to 2π [rad],
     - ``polarity`` (uint8): 1 for ON, 0 for OFF,
     - ``index`` (int64): index of the event in the recording,
-    - ``residual_px`` (float32): standard deviation across the edge on which the event lies [px], up to 6,
+    - ``residual_px`` (float32): standard deviation across the edge on which the event lies [px], up to 6; NaN, as it
+      is unknown, if the model moves the event out of the region,
     - of a simulation: ``cause``, ``instance``, ``depth_m`` [m] and ``place_m`` (point in the world that the event saw
       [m], shape ``(n, 3)``), as far as the recording holds them.
 

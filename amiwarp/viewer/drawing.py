@@ -22,7 +22,7 @@ from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.export import GAMMA, save_png
 from amiwarp.imaging.palette import OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK
 from amiwarp.imaging.regions import SMOOTHING_PX, Region, inside
-from amiwarp.imaging.residuals import WIDEST_PX, at_pixels, residual
+from amiwarp.imaging.residuals import WIDEST_PX, at_pixels, outside, residual
 from amiwarp.imaging.sharpness import random_variance
 from amiwarp.imaging.tensors import latest_times
 from amiwarp.io.depth_map import DepthMap
@@ -30,6 +30,7 @@ from amiwarp.io.files import check_output
 from amiwarp.io.spans import read_span
 from amiwarp.plotting.colours import (
     GREY,
+    LIGHT_GREY,
     Scale,
     as_bytes,
     cause_colours,
@@ -329,8 +330,33 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
     image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
     if look.colour is Colour.DENSITY:
         return scale.rgb(at_pixels(image, xy))
+    return scale.rgb(residual(image, xy, _known_part(shown, look.colour)))
+
+
+def _known_part(shown: DisplayedWindow, colour: Colour) -> tuple[slice, slice]:
+    """Return the rows and columns in which density or residual are known: those of the image, or of the region."""
+    if colour is Colour.DENSITY:
+        height, width = shown.image_after.shape
+        return slice(0, height), slice(0, width)
     left, top, right, bottom = shown.region
-    return scale.rgb(residual(image, xy, (slice(top, bottom), slice(left, right))))
+    return slice(top, bottom), slice(left, right)
+
+
+def unknown_rows(shown: DisplayedWindow, colour: Colour) -> tuple[tuple[str, str], ...]:
+    """Return the row of the legend that counts the drawn events whose density or residual is unknown.
+
+    The model moves them out of the image or the region. Returns no row if there are none.
+    """
+    if colour not in (Colour.DENSITY, Colour.RESIDUAL):
+        return ()
+    part = _known_part(shown, colour)
+    on_left, on_right = (
+        int(np.count_nonzero(np.isfinite(xy).all(axis=1) & outside(xy, *part)))
+        for xy in (shown.first.before, shown.after)
+    )
+    if on_left:
+        return ((LIGHT_GREY, f"unknown: {on_left:,} on the left, {on_right:,} on the right"),)
+    return ((LIGHT_GREY, f"unknown: {on_right:,} events"),) if on_right else ()
 
 
 def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | None:
@@ -339,6 +365,9 @@ def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | N
     The colour maps are perceptually uniform; that of the angle is cyclic, with white ends and a black middle. The scale
     of the density is that of both clouds.
     """
+    from matplotlib.colors import to_rgb
+
+    unknown = to_rgb(LIGHT_GREY)
     if colour is Colour.ANGLE:
         return Scale("prism angle θ", "°", 0.0, 360.0, f"twilight on {'dark' if dark else 'light'}")
     if colour is Colour.TIME:
@@ -346,8 +375,10 @@ def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | N
     if colour is Colour.DENSITY:
         image = shown.image_after
         top = math.ceil(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0
-        return Scale("events", "per pixel", 0.0, float(top), "cividis", GAMMA)
-    return Scale("residual σ", "px", 0.0, WIDEST_PX, "cividis") if colour is Colour.RESIDUAL else None
+        return Scale("events", "per pixel", 0.0, float(top), "cividis", GAMMA, missing=unknown)
+    if colour is Colour.RESIDUAL:
+        return Scale("residual σ", "px", 0.0, WIDEST_PX, "cividis", missing=unknown)
+    return None
 
 
 # Legend of the inspector's picture as VTK actors: rows of a coloured mark and the meaning of the colour, or a scale.
@@ -759,6 +790,7 @@ class Scene:
         width, height = self.plotter.window_size
         bar = scale_of(shown, look.colour, dark=look.dark)
         rows = legend_of(shown.truth, look.colour, max(LEAST_ROWS, min(MOST_ROWS, height // ROW_PX)))
+        rows = (*rows, *unknown_rows(shown, look.colour))
         if look.overlaid and len(look.titles) > 1:
             rows = (*rows, (GREY, look.titles[0]))
         title = [] if bar is None else [bar.label]
@@ -907,15 +939,20 @@ def cloud_state(shown: DisplayedWindow, colour: Colour, axis: Axis, *, dark: boo
 
 
 def legend(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> dict[str, Any]:
-    """Return the legend of a colour choice: title, rows of colour and text, or a scale with its ends."""
+    """Return the legend of a colour choice: title, rows of colour and text, and a scale with its ends if it has one."""
     bar = scale_of(shown, colour, dark=dark)
     if bar is None:
         (_, title), *rows = legend_of(shown.truth, colour, LEGEND_ROWS)
         return {"title": title, "rows": [list(row) for row in rows], "bar": "", "low": "", "high": ""}
     title = f"{bar.label} (square root)" if bar.counts else bar.title
     unit = "" if bar.counts else bar.unit if bar.unit == "°" else f" {bar.unit}"
-    return {"title": title, "rows": [], "bar": gradient(bar.colours), "low": f"{bar.low:.6g}",
-            "high": f"{bar.high:.6g}{unit}"}  # fmt: skip
+    return {
+        "title": title,
+        "rows": [list(row) for row in unknown_rows(shown, colour)],
+        "bar": gradient(bar.colours),
+        "low": f"{bar.low:.6g}",
+        "high": f"{bar.high:.6g}{unit}",
+    }
 
 
 def gradient(colours: str) -> str:
