@@ -293,6 +293,32 @@ def test_refused_truth_leaves_a_file_that_can_be_read(tmp_path: Path, recording:
     same_poses(found[:], amiwarp.Poses.concatenate([poses(0, "ball"), poses(1, "ball")]))
 
 
+@pytest.mark.parametrize(
+    ("rotation", "message"),
+    [
+        (np.full((3, 3), np.inf), "rotation holds a value that is not within -1 .. 1"),
+        (np.diag([np.inf, 1.0, 1.0]), "rotation holds a value that is not within -1 .. 1"),
+        (np.diag([np.nan, 1.0, 1.0]), "rotation holds a value that is not within -1 .. 1"),
+        (np.diag([1e200, 1.0, 1.0]), "rotation holds a value that is not within -1 .. 1"),
+        (np.zeros((3, 3)), "rotation is no rotation matrix"),
+        (np.diag([1.0, 1.0, -1.0]), "right-handed"),
+        (np.eye(4), r"rotation has shape \(4, 4\); expected \(3, 3\)"),
+        (np.stack([np.eye(3)] * 2), "the instant"),
+    ],
+)
+def test_matrices_that_are_no_rotations_are_refused(
+    tmp_path: Path, recording: amiwarp.Recording, rotation: NDArray[np.float64], message: str
+) -> None:
+    """SciPy never returns for infinite values, and cannot be interrupted."""
+    frame = frames_of(recording)[0]
+    with amiwarp.RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        with pytest.raises(AmiwarpError, match=message):
+            writer.append_frame(dataclasses.replace(frame, rotation=rotation))
+        writer.append_frame(dataclasses.replace(frame, rotation=frame.rotation + 1e-4))
+    (stored,) = frames_of(amiwarp.open_recording(tmp_path / "a.h5"))
+    np.testing.assert_allclose(stored.rotation, frame.rotation, rtol=0, atol=1e-3)
+
+
 def test_the_file_is_read_with_h5py_as_the_page_shows(stored: Path, tmp_path: Path) -> None:
     page = (ROOT / "docs" / "reference" / "recording-format.md").read_text()
     (program,) = (

@@ -308,11 +308,34 @@ class Poses:
 
 
 def as_poses(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert rotation matrices ``(..., 3, 3)`` and positions ``(..., 3)`` [m] to poses of shape ``(..., 7)``."""
+    """Convert rotation matrices ``(..., 3, 3)`` and positions ``(..., 3)`` [m] to poses of shape ``(..., 7)``.
+
+    Raises :class:`AmiwarpError` for matrices that are no rotations. SciPy would replace them by the nearest rotation,
+    and never returns for infinite values.
+    """
+    check_rotation(rotation)
     from scipy.spatial.transform import Rotation
 
     quaternions = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()
     return np.concatenate([position, quaternions.reshape(*position.shape[:-1], 4)], axis=-1)
+
+
+def check_rotation(rotation: NDArray[Any]) -> None:
+    """Raise :class:`AmiwarpError` if an array is not one of rotation matrices, shape ``(..., 3, 3)``."""
+    if rotation.shape[-2:] != (3, 3):
+        raise AmiwarpError(f"rotation has shape {rotation.shape}; expected (3, 3)")
+    if not (np.abs(rotation) <= 1.0 + ROTATION_TOLERANCE).all():  # also refuses NaN
+        raise AmiwarpError("rotation holds a value that is not within -1 .. 1; expected a rotation matrix")
+    product = rotation @ np.swapaxes(rotation, -2, -1)
+    if not (np.abs(product - np.eye(3)) <= ROTATION_TOLERANCE).all() or (np.linalg.det(rotation) < 0.0).any():
+        raise AmiwarpError(
+            "rotation is no rotation matrix: its rows must be orthogonal, of length 1, and right-handed; "
+            "amiwarp's camera looks along z, with x to the right and y down"
+        )
+
+
+ROTATION_TOLERANCE = 0.01
+"""Largest deviation of the products of a rotation matrix's rows from the identity matrix."""
 
 
 def rotation_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
