@@ -147,6 +147,15 @@ def array(value: object, what: str, kinds: str = "iuf") -> NDArray[Any]:
     return found
 
 
+def packed(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a C-contiguous and aligned array, without a copy if it is one already.
+
+    Along an axis of length 1, NumPy accepts any stride in such an array. Warp takes other strides than those of the
+    shape for gaps, so they are set here.
+    """
+    return np.require(values, requirements=["C", "A"]).reshape(-1).reshape(values.shape)
+
+
 TIME_LIMIT = 2**62
 """Limit of the magnitude of times of events, encoder samples and index pulses [us]: 146,000 years.
 

@@ -214,6 +214,29 @@ def test_images_of_warp_stay_as_they_are_and_events_on_their_device(device: str)
     assert str(events.device) == device
 
 
+def test_images_of_any_strides_are_taken(device: str) -> None:
+    images = textures(2, cameras=1)
+    padded = np.zeros((4, 8, 20), np.float32)
+    sensor = EventSensor(1, 8, 10, device=device)
+    expected = [sensor.step(images[k], 1500 * k) for k in range(2)]
+    assert len(expected[1][0]) > 30
+
+    def views(image: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+        padded[::4, :, ::2] = image
+        return {
+            "one image": image,
+            "with an axis": image[None],
+            "every fourth camera": padded[::4, :, ::2],
+            "by columns": np.asfortranarray(image),
+            "backwards": np.ascontiguousarray(image[::-1])[::-1],
+        }
+
+    for name in views(images[0, 0]):
+        sensor = EventSensor(1, 8, 10, device=device)
+        found = [sensor.step(views(images[k, 0])[name], 1500 * k) for k in range(2)]
+        same(of_camera(found, 0), of_camera(expected, 0))
+
+
 @pytest.mark.parametrize(
     ("images", "t_us", "message"),
     [

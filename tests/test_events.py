@@ -68,6 +68,15 @@ def test_from_arrays_refuses(arrays, message):
         Events.from_arrays(*arrays)
 
 
+def test_one_event_of_a_longer_array_has_no_gaps() -> None:
+    """NumPy keeps the stride of an array of one value, which Warp takes for a gap."""
+    x, t, p = np.arange(8, dtype=np.uint16)[::8], np.arange(8)[::8], np.ones(8, np.uint8)[::8]
+    found = Events.from_arrays(x, x, t, p)
+    assert [getattr(found, name).strides for name in "xytp"] == [(2,), (2,), (8,), (1,)]
+    on_device = DeviceEvents.from_arrays(x, x, t, p, device="cpu")
+    assert all(getattr(on_device, name).is_contiguous for name in "xytp")
+
+
 def test_events_refuses_other_types():
     events = make([1, 2])
     with pytest.raises(AmiwarpError, match="int64"):

@@ -20,7 +20,7 @@ from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, describ
 from amiwarp.kernels import events as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import TIME_LIMIT, as_times, guarded, instance, on_gpu, one_of, shown, whole
+from amiwarp.validation import TIME_LIMIT, as_times, guarded, instance, on_gpu, one_of, packed, shown, whole
 
 # Arrays of any library as Warp arrays, through DLPack: without a copy if the type allows, else with a checked copy.
 
@@ -41,7 +41,7 @@ def event_column(name: str, values: Any, device: Any, t_unit: str) -> Any:
     if on_gpu(values):
         found = converted(name, import_array(values, f"events' {name}"), t_unit)
     else:
-        host = np.require(HOST[name](name, values, t_unit), requirements=["C", "A"])
+        host = packed(HOST[name](name, values, t_unit))
         found = wp.array(host, dtype=wp.dtype_from_numpy(host.dtype), device="cpu", copy=False)
     return found if device is None else found.to(device)
 

@@ -20,7 +20,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.truth import StoredInstants, Truth
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import NominalPrism
-from amiwarp.validation import INT64, TIME_LIMIT, as_times, guarded, instance, shown, whole
+from amiwarp.validation import INT64, TIME_LIMIT, as_times, guarded, instance, packed, shown, whole
 from amiwarp.validation import array as as_numbers
 
 # Conversion and checks of event arrays: types, time limits, frame and order.
@@ -247,7 +247,7 @@ class Events:
         [500000, 600000]
         """
         columns = as_coordinate("x", x), as_coordinate("y", y), as_times(t, unit=t_unit), as_polarity(p)
-        events = cls(*(np.require(column, requirements=["C", "A"]) for column in columns))
+        events = cls(*(packed(column) for column in columns))
         check_order(events, where="events")
         return events
 

@@ -37,7 +37,7 @@ from amiwarp.kernels.tensors import BLOCK, RUN
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.models import Model
 from amiwarp.tasks import cpu_threads
-from amiwarp.validation import TIME_LIMIT, check_names, guarded, instance, real, shown, whole
+from amiwarp.validation import TIME_LIMIT, check_names, guarded, instance, packed, real, shown, whole
 from amiwarp.validation import array as as_numbers
 
 # Windows of events.
@@ -315,7 +315,7 @@ def on_device(events: Events | DeviceEvents, device: Any) -> DeviceEvents:
     """Return events in Warp arrays on the device. On a CPU they are not copied."""
     if isinstance(events, DeviceEvents):
         return events
-    columns = (np.require(getattr(events, name), requirements=["C", "A"]) for name in device_events.NAMES)
+    columns = (packed(getattr(events, name)) for name in device_events.NAMES)
     return DeviceEvents(
         *(wp.array(v, dtype=wp.dtype_from_numpy(v.dtype), device=device, copy=not device.is_cpu) for v in columns)
     )

@@ -16,7 +16,7 @@ from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import LATEST_US, KeyBuffer, bus_of, row_scan, sensor_params, sort_keys
-from amiwarp.validation import TIME_LIMIT, array, guarded, instance, on_gpu, whole
+from amiwarp.validation import TIME_LIMIT, array, guarded, instance, on_gpu, packed, whole
 
 MOST_CAMERAS = 1 << 16
 """Largest number of cameras of an :class:`EventSensor`."""
@@ -137,8 +137,9 @@ class EventSensor:
         Parameters
         ----------
         images : array
-            Natural log intensity of each pixel, float32, shape (cameras, height, width), of Warp, PyTorch, CuPy, JAX or
-            any other library with DLPack. Arrays in host memory are copied to a GPU. Arrays are not modified.
+            Natural log intensity of each pixel, float32, shape (cameras, height, width), for one camera also (height,
+            width), of Warp, PyTorch, CuPy, JAX or any other library with DLPack. Arrays in host memory are copied to a
+            GPU. Arrays are not modified.
             The simulator's scale is ``log(luminance + 0.02)`` with white at 1; the bandwidth and the noise of the model
             depend on it, thresholds do not.
         t_us : int
@@ -224,8 +225,10 @@ class EventSensor:
             levels = import_array(images, "images")
             kind, where = wp.dtype_to_numpy(levels.dtype), levels.device
         else:
-            host = np.require(array(images, "images"), requirements=["C", "A"])
-            levels, kind, where = host, host.dtype, self._device
+            levels = packed(array(images, "images"))
+            kind, where = levels.dtype, self._device
+        if self._shape[0] == 1 and levels.shape == self._shape[1:]:
+            levels = levels.reshape(self._shape)
         if kind != np.float32 or levels.shape != self._shape:
             raise AmiwarpError(f"images are {np.dtype(kind)} of shape {levels.shape}; expected {what}")
         if where != self._device:
