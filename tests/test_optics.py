@@ -493,6 +493,21 @@ def test_fit_says_when_pairs_do_not_determine_it() -> None:
         EllipseModel.fit(camera(), *(samples(camera(), 500)[0], np.zeros(500)), samples(camera(), 500)[0])
 
 
+def test_fit_leaves_out_pairs_that_are_not_finite() -> None:
+    cam, wedge = camera(60.0, None, (64, 48)), prism(1.0)
+    xy, theta = samples(cam, 600)
+    moved = oracle.move(cam, wedge, xy, theta, to_scene=True)
+    expected = EllipseModel.fit(cam, xy[3:], theta[3:], moved[3:], degree=2)
+    xy[0], theta[1], moved[2] = np.nan, np.inf, np.nan
+    found = EllipseModel.fit(cam, xy, theta, moved, degree=2)
+    np.testing.assert_allclose(found.cosine, expected.cosine, rtol=0, atol=1e-6)  # px
+    with pytest.raises(AmiwarpError, match="600 pairs hold no finite values"):
+        EllipseModel.fit(cam, xy, theta * np.nan, moved)
+    moved[3] = 1e300
+    with pytest.raises(AmiwarpError, match=r"lies 1e\+300 px from the origin; give pixels within 65536 px"):
+        EllipseModel.fit(cam, xy, theta, moved)
+
+
 # -- invalid rays
 
 

@@ -419,6 +419,9 @@ def test_a_flickering_lamp_makes_events_of_its_rate() -> None:
         (lambda: Trajectory([0.0, 1e-3], [[0, 0, 0], [9, 0, 0]], [[0, 0, 0, 1]] * 2), "split the trajectory"),
         (lambda: Trajectory([0.0, 0.0], np.zeros((2, 3)), [[0, 0, 0, 1]] * 2), "do not increase"),
         (lambda: Trajectory([0.0], [[0, 0, 0]], [[0, 0, 0, 2]]), "unit quaternions"),
+        (lambda: Trajectory.still((0.0, 0.0, 0.0)).poses([0.0, np.nan]), r"t holds NaN; give times in seconds"),
+        (lambda: moving_camera().poses(np.array([np.nan])), r"t holds NaN"),
+        (lambda: moving_camera().poses(np.zeros((2, 2))), r"t has shape \(2, 2\); .*shape \(k,\)"),
         (lambda: Sun((0.0, 0.0, 0.0)), "length 0"),
     ],
 )

@@ -20,7 +20,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import plate as plate_kernels
 from amiwarp.kernels import refraction as kernels
 from amiwarp.kernels.launch import RecordedLaunch, launch
-from amiwarp.optics.camera import Camera, with_lens
+from amiwarp.optics.camera import LARGEST_SIZE, Camera, with_lens
 from amiwarp.optics.prism import (
     FlatSide,
     NominalPrism,
@@ -1062,7 +1062,7 @@ class EllipseModel(Model):
         theta : numpy.ndarray
             Prism angle of the encoder [rad], shape (n,).
         compensated : numpy.ndarray
-            The same points without the prism [px], shape (n, 2). Pairs with NaN are left out.
+            The same points without the prism [px], shape (n, 2). Pairs with a value that is not finite are left out.
         degree : int, default 4
             Total degree of the polynomials.
 
@@ -1074,7 +1074,7 @@ class EllipseModel(Model):
         Raises
         ------
         AmiwarpError
-            If the pairs do not determine all coefficients.
+            If the pairs do not determine all coefficients, or a pixel is over 65,536 px away.
         """
         xy, theta = np.asarray(xy, dtype=np.float64), np.asarray(theta, dtype=np.float64)
         compensated, degree = np.asarray(compensated, dtype=np.float64), whole(degree, "degree", 0, 20)
@@ -1082,7 +1082,15 @@ class EllipseModel(Model):
             given = f"xy has shape {xy.shape}, theta {theta.shape} and compensated {compensated.shape}"
             raise AmiwarpError(f"{given}; give (n, 2), (n,) and (n, 2)")
         shift = compensated - xy
-        valid = np.isfinite(shift).all(axis=1)
+        valid = np.isfinite(shift).all(axis=1) & np.isfinite(theta)
+        if not valid.any():
+            raise AmiwarpError(f"{len(xy)} pairs hold no finite values; give measured pairs of pixels")
+        farthest = float(max(np.abs(xy[valid]).max(), np.abs(compensated[valid]).max()))
+        if farthest > LARGEST_SIZE:
+            raise AmiwarpError(
+                f"a pair of pixels lies {farthest:g} px from the origin; give pixels within {LARGEST_SIZE} px, or NaN "
+                "for points outside the image"
+            )
         basis = _polynomials(camera, xy[valid], degree)
         angle = theta[valid][:, None]
         design = np.hstack([basis, basis * np.cos(angle), basis * np.sin(angle)])

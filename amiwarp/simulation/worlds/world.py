@@ -145,12 +145,21 @@ class Trajectory:
             Rotation matrices from the frame of the camera or body to the world's frame, shape ``(k, 3, 3)``.
         position : ndarray
             Positions in the world [m], shape ``(k, 3)``.
+
+        Raises
+        ------
+        AmiwarpError
+            If the times are no one-dimensional array of numbers, or hold NaN.
         """
         from scipy.spatial.transform import Rotation, Slerp
 
         at, position = self._table()
         orientation: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
-        inside = np.clip(np.atleast_1d(np.asarray(array(t, "t"), np.float64)), at[0], at[-1])
+        given = np.atleast_1d(np.asarray(array(t, "t"), np.float64))
+        if given.ndim != 1 or np.isnan(given).any():
+            what = "holds NaN" if given.ndim == 1 else f"has shape {given.shape}"
+            raise AmiwarpError(f"t {what}; give times in seconds, shape (k,)")
+        inside = np.clip(given, at[0], at[-1])
         if at.size == 1:
             ones = np.ones(inside.size)
             return np.repeat(orientation.as_matrix(), inside.size, axis=0), ones[:, None] * position
@@ -232,7 +241,7 @@ class Trajectory:
         Raises
         ------
         AmiwarpError
-            If the file does not exist, or is not a table of poses.
+            If the file cannot be read, or is not a table of poses.
         """
         path = Path(path)
         values = plain_array("d")
@@ -254,8 +263,10 @@ class Trajectory:
         if not values:
             raise AmiwarpError(f"{path}: holds no poses; expected lines of 8 numbers t x y z qx qy qz qw")
         table = np.frombuffer(values).reshape(-1, COLUMNS)
+        with np.errstate(invalid="ignore", over="ignore"):  # refused below
+            t = table[:, 0] - table[0, 0]
         try:
-            return cls(table[:, 0] - table[0, 0], table[:, 1:4], table[:, 4:])
+            return cls(t, table[:, 1:4], table[:, 4:])
         except AmiwarpError as error:
             raise AmiwarpError(f"{path}: {error}") from error
 
