@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+import amiwarp
 from amiwarp import AmiwarpError, Sun, Trajectory, load_world
 from amiwarp.io.files import inputs_in_use, inputs_noted
 from amiwarp.simulation.pictures import LUMINANCE, linear_luminance
@@ -407,6 +408,25 @@ def test_trajectories_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "b.txt").write_text("0" + row + "#" * 1001 + "\n")
     with pytest.raises(AmiwarpError, match=r"b\.txt: line 2 is longer than 1000 characters"):
         Trajectory.from_file(tmp_path / "b.txt")
+
+
+@pytest.mark.parametrize("row", ["nan 0 0 0 0 0 0 1", "inf 0 0 0 0 0 0 1", "-1e308 0 0 0 0 0 0 1\n1e308 0 0 0 0 0 0 1"])
+def test_trajectories_that_are_not_finite_are_refused(tmp_path: Path, row: str) -> None:
+    (tmp_path / "a.txt").write_text(f"{row}\n")
+    with pytest.raises(AmiwarpError, match=r"a\.txt: trajectory holds values that are not finite"):
+        Trajectory.from_file(tmp_path / "a.txt")
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="needs a file that can be opened but not read")
+@pytest.mark.parametrize(
+    "read", [Trajectory.from_file, load_world, amiwarp.open_recording, amiwarp.load_camera, amiwarp.Calibration.load]
+)
+def test_errors_while_reading_name_the_file(tmp_path: Path, read: Any) -> None:
+    """As a damaged disk, the memory of this process at address 0 is a regular file that cannot be read."""
+    link = tmp_path / "world.json"
+    link.symlink_to("/proc/self/mem")
+    with pytest.raises(AmiwarpError, match=r"world\.json: .*Input/output error; check the disk"):
+        read(link)
 
 
 def test_the_length_of_the_direction_of_the_sun_has_no_effect() -> None:

@@ -85,15 +85,35 @@ _command: _Command | None = None
 """Files of the running command, or None if no command runs."""
 
 
+class _Input(io.FileIO):
+    """Open input whose read errors, such as those of a damaged disk, are :class:`AmiwarpError`."""
+
+    def readinto(self, buffer: Any) -> int | None:  # type: ignore[override]
+        with self._errors_named():
+            return super().readinto(buffer)
+
+    def readall(self) -> bytes:
+        with self._errors_named():
+            return super().readall()
+
+    @contextlib.contextmanager
+    def _errors_named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            reason = f"{self.name}: cannot be read: {_reason(error)}"
+            raise AmiwarpError(f"{reason}; check the disk, or copy the file again") from error
+
+
 def open_input(path: str | os.PathLike[str], *, noted: bool = True) -> io.BufferedReader:
     """Open an input for reading. ``noted`` is False for results that the command continues, and so may replace.
 
-    Raises :class:`AmiwarpError` if the file cannot be opened or is not a regular file.
+    Raises :class:`AmiwarpError` if the file cannot be opened or is not a regular file, and later if it cannot be read.
     """
     path = Path(path)
     check_regular(path)
     try:
-        file = open(path, "rb")  # noqa: SIM115
+        file = io.BufferedReader(_Input(path))
     except OSError as error:
         raise AmiwarpError(f"{path}: cannot be opened: {error.strerror}; give another file") from error
     if noted:
