@@ -342,6 +342,46 @@ REFUSALS: dict[str, Callable[[Path], Any]] = {
 }  # fmt: skip
 
 
+def declaring(path: Path, state: str, output: str = "1") -> Network:
+    """A network of a file that declares a state and an output of these shapes, but has no such arrays."""
+    text = f"""<ir_version: 8, opset_import: ["": 18]>
+    large (float[1,{BINS},h,w] grid, float[{state}] before) => (float[1,1,h,w] image, float[{output}] after) {{
+        axes = Constant <value_ints: ints = [1]> ()
+        image = ReduceSum (grid, axes)
+        after = Identity (before)
+    }}"""
+    onnx.save(onnx.parser.parse_model(text), path)
+    return Network(path, GRID)
+
+
+@pytest.mark.parametrize(
+    ("state", "output", "message"),
+    [
+        ("400000,400000", "x,y", "its states of shape [400000, 400000] take 596 GiB; expected at most 4 GiB"),
+        ("1000000000,1000000000,1000000000", "x,y,z", "take 3.725e+18 GiB"),
+        ("1073741825", "x", "its states of shape [1073741825] take 4 GiB"),
+        ("a,b,c,d", "2000,1000,c,1000", "its output after of shape [2000, 1000, 'c', 1000] take 7.451 GiB"),
+    ],
+)
+def test_onnx_files_of_absurd_sizes_are_refused_at_once(tmp_path: Path, state: str, output: str, message: str) -> None:
+    with pytest.raises(AmiwarpError, match=re.escape(f"a.onnx: {message}" if "its" in message else message)):
+        declaring(tmp_path / "a.onnx", state, output)
+
+
+def test_an_onnx_state_of_no_size_must_be_given(tmp_path: Path) -> None:
+    with pytest.raises(AmiwarpError, match=r"before has the shape \[0, 5\]; give its first value in states"):
+        declaring(tmp_path / "a.onnx", "0,5", "0,5")(EVENTS, WIDTH, HEIGHT)
+
+
+def test_states_up_to_the_limit_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = onnx_file(tmp_path / "n.onnx", images=1)
+    monkeypatch.setattr(networks, "LARGEST_BYTES", 4 * 24 * 40)
+    assert Network(path, GRID)(EVENTS, WIDTH, HEIGHT).shape == (1, HEIGHT, WIDTH)
+    monkeypatch.setattr(networks, "LARGEST_BYTES", 4 * 24 * 40 - 1)
+    with pytest.raises(AmiwarpError, match=r"its states of shape \[1, 1, 24, 40\] take"):
+        Network(path, GRID)
+
+
 def broken(path: Path) -> Network:
     path.write_bytes(b"no network")
     return Network(path)

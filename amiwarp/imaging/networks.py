@@ -21,12 +21,14 @@ from amiwarp.imaging.tensors import ToTensor, Windows, on_device, polarity_histo
 from amiwarp.io.files import input_path
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import Model
-from amiwarp.validation import guarded, instance, whole
+from amiwarp.validation import guarded, instance, shown, whole
 
 ENDINGS = (".pt", ".pth", ".ts", ".onnx")
 """File suffixes of networks: TorchScript has the first three."""
 LARGEST_MULTIPLE = 1 << 12
 """Largest number whose multiples the sizes of a network's input can be."""
+LARGEST_BYTES = 1 << 32
+"""Largest states or output that an ONNX file may declare [bytes]: 20 times the states of E2VID at 1280 x 720 px."""
 
 
 @guarded
@@ -493,6 +495,22 @@ class _OnnxFile:
                 "; export the network with one output for each state"
             )
         self.dtype = self._type(self._inputs[0].type)
+        self._check_sizes("states", self._inputs[1:])
+        for output in session.get_outputs():
+            self._check_sizes(f"output {output.name}", [output])
+
+    def _check_sizes(self, what: str, declared: Sequence[Any]) -> None:
+        """Raise :class:`AmiwarpError` if inputs or outputs take too much memory. Sizes without a number count as 1."""
+        size = 0
+        for one in declared:
+            item = wp.types.type_size_in_bytes(TYPES[one.type]) if one.type in TYPES else 1
+            size += item * math.prod(length for length in one.shape if isinstance(length, int))
+        if size > LARGEST_BYTES:
+            shapes = ", ".join(shown(one.shape) for one in declared[:4])
+            raise AmiwarpError(
+                f"{self.path}: its {what} of shape {shapes} take {size / 2**30:.4g} GiB; expected at most "
+                f"{LARGEST_BYTES >> 30} GiB; the file is damaged, or export the network for smaller images"
+            )
 
     def _type(self, name: str) -> Any:
         if name not in TYPES:
@@ -504,7 +522,7 @@ class _OnnxFile:
         if first is not None:
             return first
         for wanted in self._inputs[1:]:
-            if not all(isinstance(size, int) for size in wanted.shape):
+            if not all(isinstance(size, int) and size > 0 for size in wanted.shape):
                 raise AmiwarpError(
                     f"{self.path}: {wanted.name} has the shape {wanted.shape}; give its first value in states"
                 )
