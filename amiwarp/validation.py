@@ -41,6 +41,9 @@ UNUSABLE = (TypeError, ValueError, OverflowError, RecursionError)
 HOST_MEMORY = (1, 3)
 """DLPack's numbers of devices in host memory: CPU, and pinned memory of CUDA."""
 
+LONGEST_NAME, LONGEST_PATH = 255, 4095
+"""Limits of file systems: of the name of a file or folder, and of a whole path [bytes]."""
+
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = _short.maxlong = 80
 _short.maxlevel = 2
@@ -454,14 +457,18 @@ def _fits_array(value: Any) -> bool:
 
 def _fits_path(value: Any) -> bool:
     with contextlib.suppress(Exception):  # other classes may raise anything
-        return b"\0" not in os.fsencode(os.fspath(value)) and isinstance(os.fspath(value), str)
+        plain = os.fspath(value)
+        check_name_lengths(Path(plain))
+        return b"\0" not in os.fsencode(plain) and isinstance(plain, str)
     return False
 
 
 _CHECKS: dict[Any, tuple[Callable[[Any], bool], str]] = {
     bool: (lambda value: isinstance(value, bool | np.bool_), "True or False"),
     types.NoneType: (lambda value: value is None, "None"),
-    **dict.fromkeys((os.PathLike, Path), (_fits_path, "a path without null bytes")),
+    **dict.fromkeys(
+        (os.PathLike, Path), (_fits_path, f"a path without null bytes and with names of at most {LONGEST_NAME} bytes")
+    ),
     np.ndarray: (_fits_array, "a NumPy array of numbers without masked values"),
     collections.abc.Callable: (callable, "a function"),
     collections.abc.Iterable: (lambda value: np.iterable(value) and not isinstance(value, str), "an iterable"),
@@ -483,6 +490,23 @@ def _no_device(value: Any, kind: Any, *, here: bool) -> str:
             wp.get_device(value)
             return ""
     return f"a device of this machine; choose among {', '.join(device.alias for device in wp.get_devices())}"
+
+
+def check_name_lengths(path: Path, longest: int = LONGEST_NAME) -> None:
+    """Raise :class:`AmiwarpError` if a name in a path, or the path, is too long for a file system.
+
+    ``longest``: limit of each name [bytes].
+    """
+    for name in path.parts:
+        if len(os.fsencode(name)) > longest:
+            what = f"the name {name}" if len(path.parts) > 1 else "the name"
+            raise AmiwarpError(
+                f"{path}: {what} has {len(os.fsencode(name))} bytes; the limit is {longest}; give a shorter name"
+            )
+    if len(os.fsencode(path)) > LONGEST_PATH:
+        raise AmiwarpError(
+            f"{path}: the path has {len(os.fsencode(path))} bytes; the limit is {LONGEST_PATH}; give a shorter path"
+        )
 
 
 def check_names(given: Collection[str], known: Collection[str], what: str) -> None:

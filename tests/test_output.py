@@ -608,6 +608,50 @@ def test_an_interrupted_command_leaves_no_empty_folder(place: Path, monkeypatch:
     assert list((place / "mine").iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "convert {}.h5 b.h5",
+        "info {}.h5",
+        "info {}/a.h5",
+        "convert a.h5 {}.h5",
+        "convert a.h5 {}/b.h5",
+        "record a.h5 {}.h5 --fast",
+        "record a.h5 {}/b.h5 --fast",
+        "design --size 64x48 --apex-deg 1 --rpm 720 --out {}",
+        "dataset a.toml {}",
+        "export {} b --to dsec",
+        "export . {} --to dsec",
+    ],
+)
+def test_names_that_are_too_long_are_refused_at_once(place: Path, line: str) -> None:
+    before = snapshot(place)
+    result = run(*line.format("é" * 130).split())
+    assert result.exit_code == 1, result.stderr
+    assert re.search(r"has 26\d bytes; the limit is 255; give a shorter name", result.stderr), result.stderr
+    assert snapshot(place) == before
+
+
+def test_the_longest_names_can_be_written(place: Path) -> None:
+    """The names of unfinished files are longer than those of files."""
+    for name in ("n" * 252 + ".h5", "é" * 126 + ".h5"):
+        assert run("convert", "a.h5", name).exit_code == 0
+        assert (place / name).is_file()
+    live = "n" * 247
+    assert run("record", "a.h5", f"{live}.h5", "--fast").exit_code == 0
+    result = run("record", "a.h5", f"{live}n.h5", "--fast")
+    assert result.exit_code == 1
+    assert re.search(r"\.part\.h5: the name .* has 256 bytes; the limit is 255", result.stderr), result.stderr
+    assert not list(place.glob(".*.part"))
+
+
+def test_file_systems_may_have_shorter_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "pathconf", lambda path, name: 143, raising=False)
+    check_output(tmp_path / ("n" * 143))
+    with pytest.raises(AmiwarpError, match="has 144 bytes; the limit is 143"):
+        check_output(tmp_path / ("n" * 144))
+
+
 @pytest.mark.parametrize("exists", [True, False])
 @pytest.mark.parametrize("writer", ["convert", "record"])
 def test_a_symbolic_link_is_followed(place: Path, exists: bool, writer: str) -> None:

@@ -57,6 +57,9 @@ PLACES: list[tuple[Callable[[Path], Path], str]] = [
     (loop, "cannot be opened: .*symbolic links"),
     (lambda path: path, "no such file"),
     (lambda path: Path("a\0b"), "cannot be opened: .*null|without null bytes"),
+    (lambda path: path.with_name("n" * 256), "has 256 bytes; the limit is 255; give a shorter|at most 255 bytes"),
+    (lambda path: path / ("é" * 128) / "a", "has 256 bytes; the limit is 255; give a shorter|at most 255 bytes"),
+    (lambda path: Path(*["n" * 250] * 20), "path has 5019 bytes; the limit is 4095|at most 255 bytes"),
 ]
 
 READERS: list[Callable[[Path], object]] = [

@@ -41,7 +41,7 @@ from amiwarp.optics.prism import (
     UnsizedPrism,
 )
 from amiwarp.tasks import Progress
-from amiwarp.validation import real
+from amiwarp.validation import check_name_lengths, real
 
 # Options that several commands use. A group of options is a dataclass.
 
@@ -444,6 +444,8 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
     def run(**values: Any) -> None:
         force = writes and values.pop("force")
         paths = list(_paths(values))
+        for _, path in paths:
+            check_name_lengths(path)
         inputs = [path for name, path in paths if not {OUTPUT, OUTPUT_FOLDER, NO_FILE} & set(marks[name])]
         for path in inputs:
             if path.exists() and not path.is_dir():  # the command itself reports missing files and folders

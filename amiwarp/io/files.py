@@ -30,6 +30,7 @@ from typing import IO, Any
 
 from amiwarp.errors import WORD_HEAD, AmiwarpError, printable
 from amiwarp.tasks import interrupts_later
+from amiwarp.validation import LONGEST_NAME, check_name_lengths
 
 # Check that an input is a regular file. A pipe or a device could block its reader, or never end.
 
@@ -49,8 +50,10 @@ def check_regular(path: Path) -> None:
     Raises
     ------
     AmiwarpError
-        If the file does not exist or cannot be reached, or is a folder, a named pipe, a socket or a device.
+        If the file does not exist or cannot be reached, or is a folder, a named pipe, a socket or a device; or if a
+        name is too long.
     """
+    check_name_lengths(path)
     try:
         kind = stat.S_IFMT(path.stat().st_mode)
     except FileNotFoundError as error:
@@ -370,8 +373,9 @@ def check_output(path: Path, *, overwrite: bool = False) -> Path:
     """Return the file that writing to ``path`` creates or replaces: ``path`` itself, or the target of a symbolic link.
 
     Raises :class:`AmiwarpError` if the file is read in this run, exists and must not be replaced, or is not a regular
-    file; and if its folder does not exist or is not writable.
+    file; if its folder does not exist or is not writable; and if its name is too long for the folder's file system.
     """
+    check_name_lengths(path)
     try:
         target = path.resolve()
         mode = target.stat().st_mode if os.path.lexists(target) else None
@@ -382,6 +386,7 @@ def check_output(path: Path, *, overwrite: bool = False) -> Path:
         raise AmiwarpError(f"{path}: is {what}; give the name of a file")
     if not target.parent.is_dir():
         raise AmiwarpError(f"{path}: its folder {target.parent} does not exist; create it first")
+    check_name_lengths(path, _longest_name(target.parent))
     if not os.access(target.parent, os.W_OK):
         raise AmiwarpError(f"{path}: its folder {target.parent} is not writable; choose another place")
     if mode is not None:
@@ -390,6 +395,14 @@ def check_output(path: Path, *, overwrite: bool = False) -> Path:
         if not _may_replace(target, overwrite):
             raise AmiwarpError(f"{path}: exists; give another name, or --force (overwrite=True in Python)")
     return target
+
+
+def _longest_name(folder: Path) -> int:
+    """Return the limit of names in a folder [bytes]. Some file systems have a smaller one than others."""
+    with contextlib.suppress(AttributeError, OSError, ValueError):  # Windows has no such function
+        limit = os.pathconf(folder, "PC_NAME_MAX")
+        return min(limit, LONGEST_NAME) if limit > 0 else LONGEST_NAME
+    return LONGEST_NAME
 
 
 def _is_read(target: Path) -> bool:
