@@ -76,7 +76,7 @@ MEMORY_KIB = 3 << 19
 """Largest memory that a check may take, 1.5 GiB [KiB]."""
 
 LONGEST_S = 300.0
-"""Time after which a check counts as hanging, on any machine [s]. Reading itself ends after 30 s of processor time."""
+"""Time after which a check counts as hanging, on any machine [s]. Reading itself ends after 3 s of processor time."""
 
 EVENTS = make_events(300)
 
@@ -738,7 +738,7 @@ class Checker:
     ``cpu_seconds`` is the processor time after which the package's own reading process refuses a file.
     """
 
-    def __init__(self, cpu_seconds: int = reading_process.CPU_SECONDS) -> None:
+    def __init__(self, cpu_seconds: float = reading_process.CPU_SECONDS) -> None:
         self._cpu_seconds = cpu_seconds
         self._start()
 
@@ -774,7 +774,7 @@ class Checker:
         self._process.stdout.close()
 
 
-def serve(cpu_seconds: int) -> None:
+def serve(cpu_seconds: float) -> None:
     """Check the files whose names arrive on standard input."""
     reading_process.CPU_SECONDS = cpu_seconds
     replies = sys.stdout
@@ -810,6 +810,6 @@ def main(count: int, names: list[str]) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--serve"]:
-        serve(int(sys.argv[2]))
+        serve(float(sys.argv[2]))
     else:
         main(int(sys.argv[1]), sys.argv[2:])

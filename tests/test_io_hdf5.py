@@ -1,5 +1,6 @@
 """HDF5 files that refer to other files, declare more data than they hold, or crash or block HDF5: one error each."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -245,8 +246,8 @@ def count_down(notes: dict[str, int], n: int):
     ("function", "arguments", "message"),
     [
         ("crash", (signal.SIGSEGV,), r"crashed its process \(SIGSEGV\); the file is damaged"),
-        ("crash", (signal.SIGKILL,), r"crashed its process \(SIGKILL\)"),
-        ("hang", (), "over 1 s of processor time; the file is damaged"),
+        ("crash", (signal.SIGKILL,), r"process was ended by SIGKILL; check that enough memory is free, and retry$"),
+        ("hang", (), "over 1 s of processor time, the limit for its size; the file is damaged"),
         ("swallow", (), "needs over 1024 MiB of memory at once"),
         ("panic", (), "index out of bounds$"),
     ],
@@ -256,6 +257,62 @@ def test_what_misbehaves_costs_one_error(monkeypatch, function, arguments, messa
     with pytest.raises(AmiwarpError, match=message):
         run(f"{SERVED}:{function}", *arguments)
     assert run(f"{SERVED}:echo", "next") == "next"
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_that_end_a_command_do_not_end_its_reading_process(ending):
+    """A container or a service may send them to all processes. The file was then called damaged."""
+    process = reading_process.ReadingProcess()
+    os.kill(process._child.pid, ending)  # while it loads
+    assert process.call(f"{SERVED}:echo", "loaded")[0] == "loaded"
+    os.kill(process._child.pid, ending)
+    assert process.call(f"{SERVED}:echo", "later")[0] == "later"
+    process.close()
+
+
+def test_a_file_is_not_blamed_for_a_library_that_cannot_be_loaded(tmp_path, monkeypatch):
+    with pytest.raises(AmiwarpError, match=r"amiwarp cannot be loaded: No module named 'amiwarp\.none'; install"):
+        run("amiwarp.none:read")
+    write_native(tmp_path / "a.h5", EVENTS)
+    monkeypatch.setitem(sys.modules, "blosc", None)
+    hdf5_files._blosc.cache_clear()
+    with pytest.raises(AmiwarpError, match=r"a\.h5: is not read, because a library cannot be loaded: .*blosc"):
+        open_recording(tmp_path / "a.h5").events.slice(0, 600)
+
+
+def trickle(notes: dict[str, int], seconds: float):
+    """Yield one event for some processor time, and send each by itself."""
+    reading_process.PACKET_S = 0.0
+    while True:
+        until = time.process_time() + seconds
+        while time.process_time() < until:
+            pass
+        yield (np.zeros(1, np.uint8),)
+
+
+def test_a_file_that_gives_little_for_its_time_is_refused(monkeypatch):
+    """Each of its requests is short."""
+    monkeypatch.setattr(reading_process, "CPU_SECONDS", 0.5)
+    given = reading_process.packets(f"{SERVED}:trickle", 0.05, {})
+    with pytest.raises(AmiwarpError, match=r"over 0\.5 s of processor time"):
+        list(itertools.islice(given, 40))
+
+
+def test_the_processor_time_grows_with_the_size(tmp_path):
+    for name, size in (("a", 5_000_000), ("b", 10_000_000), ("c", 25_000_000)):
+        with open(tmp_path / name, "wb") as file:
+            file.truncate(size)
+    whole = reading_process.CPU_SECONDS
+    allowed = [reading_process.Allowance(tmp_path / name).seconds for name in "abc"]
+    assert allowed == [whole, whole, 2.5 * whole]
+    assert reading_process.Allowance(tmp_path, 3, "c").seconds == 4.0 * whole
+    assert reading_process.Allowance(tmp_path / "none").seconds == whole
+    allowance = reading_process.Allowance()
+    allowance.left = 0.25 * whole
+    allowance.renew(0.5)
+    assert allowance.left == 0.75 * whole
+    allowance.renew(0.5)
+    assert allowance.left == whole
 
 
 def test_what_a_library_prints_is_not_taken_for_a_reply():
@@ -480,9 +537,14 @@ def test_a_filter_that_hangs(monkeypatch, dsec, name, found):
         file[name].id.write_direct_chunk((0,), stored[: len(stored) // 2])
         if name == "encoder/t":
             file["encoder/angle"] = np.arange(600.0)
+    ended: list[float] = []
+    end = reading_process.ReadingProcess._ended
+    monkeypatch.setattr(reading_process.ReadingProcess, "_ended", lambda self: ended.append(self._cpu_s) or end(self))
     message = rf"a\.h5: .*dataset '{name}' \(bzip2\), elements {found}: reading took over 2 s"
     with pytest.raises(AmiwarpError, match=message):
         open_recording(dsec).events.slice(0, 600)
+    assert len(ended) == (2 if name == "encoder/t" else 1)  # processes that were ended
+    assert sum(ended) <= 2.0  # s, all of the opening together
 
 
 def test_a_forged_chunk_of_the_native_layout(tmp_path):

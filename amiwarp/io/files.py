@@ -213,6 +213,8 @@ def errors_name(path: Path, place: Callable[[], str]) -> Iterator[None]:
         raise
     except FileNotFoundError as error:
         raise AmiwarpError(f"{path}: no such file") from error
+    except ImportError as error:
+        raise AmiwarpError(f"{path}: is not read, because a library cannot be loaded: {error}; repair it") from error
     except BaseException as error:
         what = " ".join(str(error).split())[:300] or type(error).__name__
         raise AmiwarpError(f"{path}: {place()}: {what}") from error

@@ -23,7 +23,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet, read_sensors
 from amiwarp.io.files import input_path, read_at, write_at
 from amiwarp.io.formats import Codec
-from amiwarp.io.reading_process import ReadingProcess, borrow, give_back, packets, run
+from amiwarp.io.reading_process import Allowance, ReadingProcess, borrow, give_back, packets, run
 from amiwarp.tasks import interrupts_later
 
 # Chunks of amiwarp's files, which parallel threads encode, decode, read and write. HDF5 itself uses one thread.
@@ -522,6 +522,9 @@ class _Output(io.RawIOBase):
 PIECE = 1 << 20
 """Number of elements that the reading process reads per request."""
 
+FIRST_SHARE = 0.6
+"""Share of the processor time for the first attempt to open a file. If it fails, the rest is for naming the reason."""
+
 SERVER = "amiwarp.io.hdf5_server"
 """Name of the module that runs in the reading process."""
 
@@ -539,6 +542,7 @@ class Hdf5File:
         self._absolute = path.absolute()
         self._lock = threading.Lock()
         self._process: list[ReadingProcess] = []  # at most one; the finalizer has the same list
+        self._allowance, self._opened = Allowance(path), False
         handle = os.open(input_path(path), os.O_RDONLY | getattr(os, "O_BINARY", 0))
         self.close = weakref.finalize(self, _close, handle, self._process)
         file = os.fstat(handle)
@@ -570,20 +574,29 @@ class Hdf5File:
         with self._lock:
             if not self._process or not self._process[0].usable:
                 self._start(again=True)
-            return self._process[0].call(f"{SERVER}:{function}", *arguments)[1]
+            found = self._process[0].call(f"{SERVER}:{function}", *arguments, allowance=self._allowance)[1]
+            if self._opened:
+                self._allowance.renew()
+            return found
+
+    def opened(self) -> None:
+        """End the opening of the file, for all of which the allowance is: from now on it is for each request."""
+        self._opened = True
+        self._allowance.renew()
 
     def _find(self) -> Found:
         """Let the reading process open the file for the first time."""
         try:
-            return self._start(again=False)
+            return self._start(again=False, share=FIRST_SHARE)
         except AmiwarpError:
             if self._process[0].usable:
                 raise
         return self._start(again=True)  # a dataset that crashed HDF5 is named when it is read alone
 
-    def _start(self, *, again: bool) -> Found:
+    def _start(self, *, again: bool, share: float = 1.0) -> Found:
         self._process[:] = [borrow()]
-        found = self._process[0].call(f"{SERVER}:open_file", str(self._absolute), self._topic, again)
+        function, name = f"{SERVER}:open_file", str(self._absolute)
+        found = self._process[0].call(function, name, self._topic, again, allowance=self._allowance, share=share)
         if found[0]["identity"] != self._identity:
             raise AmiwarpError("was replaced by another file while it was read; open the file again")
         return found

@@ -169,7 +169,9 @@ def open_hdf5(path: Path, topic: str | None = None) -> Recording:
             if file.layout in ("mvsec", "ecf"):
                 file.close()
                 return hdf5_files.open_rows(path, file.layout, file.group)
-            return _read_recording(path, file)
+            recording = _read_recording(path, file)
+            file.opened()
+            return recording
         except BaseException:
             file.close()
             raise

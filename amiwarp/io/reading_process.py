@@ -29,8 +29,11 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import input_folder, input_path
 
-CPU_SECONDS = 30
-"""Limit of the processor time of one request [s]. Unlike elapsed time, it does not depend on the machine's load."""
+CPU_SECONDS = 3.0
+"""Processor time that a file of at most :data:`SMALL_BYTES` may take [s]; see :class:`Allowance`. Unlike elapsed time,
+it does not depend on the machine's load."""
+SMALL_BYTES = 10_000_000
+"""Size from which on the processor time grows with the size of the file [bytes]."""
 
 MEMORY_BYTES = 1 << 30
 """Limit of the additional memory of one request [bytes]."""
@@ -39,12 +42,53 @@ PIPE_BYTES = 1 << 20
 """Size of the pipe from the reading process [bytes], if the system supports it. A larger pipe needs fewer process
 switches."""
 
+LEAST_SECONDS = 0.2
+"""Least processor time of a request [s], if requests before it have taken the rest."""
+
+SECONDS_PER_BYTE = 1e-6
+"""Processor time that is allowed for each byte of packets, so that the time of a long recording does not count [s]."""
+
+CRASHES = [
+    getattr(signal, name)
+    for name in ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE", "SIGILL", "SIGTRAP", "SIGSYS")
+    if hasattr(signal, name)
+]
+"""Signals by which the system ends a program with an error of its own. Others come from other programs."""
+
 START = "import sys; sys.path[:] = sys.argv[1:]; from amiwarp.io.reading_process import serve; serve()"
 """Python program that the reading process runs."""
 
 
 Function: TypeAlias = str | Callable[..., Any]
 """Function of amiwarp that the process runs: itself, or ``module:function`` if only the process imports its module."""
+
+
+class Allowance:
+    """Processor time that a file may still take in reading processes: for its opening, and later for each result.
+
+    Several requests, also in several processes, share it. Starting a process does not count.
+    """
+
+    def __init__(self, *arguments: Any) -> None:
+        """Allow the time for the files and folders among the arguments of a request."""
+        size = sum(_size(value) for value in arguments if isinstance(value, Path))
+        self.seconds = CPU_SECONDS * max(1.0, size / SMALL_BYTES)
+        """The whole time [s]."""
+        self.left = self.seconds
+        """The remaining time [s]."""
+
+    def renew(self, share: float = 1.0) -> None:
+        """Allow this share of the whole time again, because the file has given results."""
+        self.left = min(self.seconds, self.left + share * self.seconds)
+
+
+def _size(path: Path) -> int:
+    """Return the size of a file, or of the files in a folder [bytes]; 0 for one that cannot be read."""
+    try:
+        files = path.iterdir() if path.is_dir() else [path]
+        return sum(file.stat().st_size for file in files)
+    except OSError:
+        return 0  # the request reports it
 
 
 class ReadingProcess:
@@ -56,17 +100,20 @@ class ReadingProcess:
         # The process gets this module path, so that it imports the same modules without the start-up time of site.
         paths = [root, *(os.path.abspath(path) for path in sys.path if path != root)]
         self.owner = os.getpid()
-        # A new session, so that Ctrl-C reaches only this process, which then ends the other.
-        self._child = subprocess.Popen(
-            [sys.executable, "-I", "-S", "-c", START, *paths],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-            start_new_session=True,
-        )
+        # In a new session and without signals that end a command, even if they go to all processes of a container or
+        # a service: they reach only this process, which then ends the other.
+        with _signals_blocked():
+            self._child = subprocess.Popen(
+                [sys.executable, "-I", "-S", "-c", START, *paths],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+                start_new_session=True,
+            )
         self._preparing = False
         self._keeps = False  # whether the process keeps values for the present reader
+        self._allowance = Allowance()  # of the request that was sent last
         self._requests: Any = self._child.stdin
         self._replies: Any = self._child.stdout
         self.close = weakref.finalize(self, _end, self._child, self.owner)
@@ -81,15 +128,18 @@ class ReadingProcess:
         """Whether the process is alive and was started by this process. A fork of its owner cannot use it."""
         return self.close.alive and self.owner == os.getpid() and self._child.poll() is None
 
-    def call(self, function: Function, *arguments: Any) -> tuple[Any, list[NDArray[Any]]]:
+    def call(
+        self, function: Function, *arguments: Any, allowance: Allowance | None = None, share: float = 1.0
+    ) -> tuple[Any, list[NDArray[Any]]]:
         """Run a function of amiwarp, and return its JSON value and its arrays, each of shape ``(n,)``.
 
         Raises
         ------
         AmiwarpError
-            If the function raises, or if the process crashes or exceeds :data:`CPU_SECONDS`.
+            If the function raises, or if the process crashes or exceeds this ``share`` of the ``allowance``. By
+            default, the allowance is that of the paths among the arguments.
         """
-        self.send(function, *arguments)
+        self.send(function, *arguments, allowance=allowance, share=share)
         return self.receive()
 
     def prepare(self, module: str) -> None:
@@ -97,7 +147,7 @@ class ReadingProcess:
         self.send(prepare, module)
         self._preparing = True
 
-    def send(self, function: Function, *arguments: Any) -> None:
+    def send(self, function: Function, *arguments: Any, allowance: Allowance | None = None, share: float = 1.0) -> None:
         """Send a call to the process; :meth:`receive` returns its result.
 
         A path among the arguments is an input: it is checked and noted here, and sent as an absolute path.
@@ -105,8 +155,10 @@ class ReadingProcess:
         if self._preparing:
             self._preparing = False
             self.receive()
+        self._allowance = Allowance(*arguments) if allowance is None else allowance
+        self._cpu_s = max(self._allowance.left * share, LEAST_SECONDS)
         arguments = tuple(_absolute(value) if isinstance(value, Path) else value for value in arguments)
-        limits = {"cpu_s": CPU_SECONDS, "memory_bytes": MEMORY_BYTES}
+        limits = {"cpu_s": self._cpu_s, "memory_bytes": MEMORY_BYTES}
         request = json.dumps({"function": name_of(function), "arguments": arguments, **limits}).encode()
         try:
             self._requests.write(request + b"\n")
@@ -127,6 +179,7 @@ class ReadingProcess:
             self.close()  # the rest of this reply must not be read as the next reply
             raise
         self._keeps = reply["keeps"]
+        self._allowance.left -= reply["cpu_s"]
         if "error" in reply:
             raise AmiwarpError(reply["error"])
         return reply["result"], arrays
@@ -145,14 +198,30 @@ class ReadingProcess:
         """Return the error to raise for a reading process that has ended."""
         code = self._child.wait()
         self.close()
-        if code == -getattr(signal, "SIGXCPU", 0):
-            return AmiwarpError(
-                f"reading took over {CPU_SECONDS} s of processor time; the file is damaged or too large"
-            )
-        if code < 0:
+        if code == -getattr(signal, "SIGPROF", 0):
+            self._allowance.left -= self._cpu_s
+            whole = f"{self._allowance.seconds:.3g} s of processor time"
+            return AmiwarpError(f"reading took over {whole}, the limit for its size; the file is damaged")
+        if code < 0 and -code in CRASHES:
             return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
+        if code < 0:
+            name = signal.Signals(-code).name
+            return AmiwarpError(f"the reading process was ended by {name}; check that enough memory is free, and retry")
         remedy = f"check that '{sys.executable}' is Python and that enough memory is free"
         return AmiwarpError(f"the reading process ended with code {code}; {remedy}")
+
+
+@contextlib.contextmanager
+def _signals_blocked() -> Iterator[None]:
+    """Postpone the signals that end a command, and let a process that is started meanwhile never get them."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def name_of(function: Function) -> str:
@@ -231,10 +300,11 @@ def packets(function: Function, *arguments: Any) -> Iterator[Any]:
     last argument is a dictionary of counts, which is updated from the dictionary that the generator gets first.
     """
     *given, notes = arguments
+    allowance = Allowance(*given)
     process = borrow()
     try:
-        process.call(begin, name_of(function), *given)
-        process.send(advance)
+        process.call(begin, name_of(function), *given, allowance=allowance)
+        process.send(advance, allowance=allowance)
         waiting = True
         try:
             while True:
@@ -243,7 +313,9 @@ def packets(function: Function, *arguments: Any) -> Iterator[Any]:
                 notes.update(found)
                 if not arrays:
                     return
-                process.send(advance)
+                size = sum(array.nbytes for array in arrays)
+                allowance.renew(size * SECONDS_PER_BYTE / allowance.seconds)
+                process.send(advance, allowance=allowance)
                 waiting = True
                 yield tuple(arrays)
         finally:
@@ -278,9 +350,8 @@ def serve() -> None:
     with contextlib.suppress(BrokenPipeError):
         while line := requests.readline():
             request = json.loads(line)
-            _limit(request["cpu_s"], request["memory_bytes"])
-            head, arrays = _answer(request)
-            encoded = json.dumps({**head, "keeps": bool(_state)}).encode()
+            head, arrays, cpu_s = _answer(request)
+            encoded = json.dumps({**head, "keeps": bool(_state), "cpu_s": cpu_s}).encode()
             replies.write(struct.pack("<I", len(encoded)) + encoded)
             for array in arrays:
                 replies.write(array.data if array.size else b"")
@@ -288,11 +359,24 @@ def serve() -> None:
     os._exit(0)
 
 
-def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]]]:
-    """Run the function of a request, and return its result or its error."""
+def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]], float]:
+    """Run the function of a request. Return its result or its error, its arrays, and the processor time [s]."""
     module, _, name = request["function"].partition(":")
     try:
-        result, arrays = getattr(importlib.import_module(module), name)(*request["arguments"])
+        function = getattr(importlib.import_module(module), name)
+    except Exception as error:  # the file is not to blame
+        return {"error": f"amiwarp cannot be loaded: {_said(error)}; install it again"}, [], 0.0
+    began = time.process_time()
+    _limit(request["cpu_s"], request["memory_bytes"])
+    head, arrays = _outcome(function, request)
+    _limit_cpu(0.0)
+    return head, arrays, time.process_time() - began
+
+
+def _outcome(function: Callable[..., Reply], request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Return the result of a function, or its error, and its arrays."""
+    try:
+        result, arrays = function(*request["arguments"])
         arrays = [np.ascontiguousarray(array) for array in arrays]
         return {"result": result, "arrays": [(array.dtype.str, array.size) for array in arrays]}, arrays
     except AmiwarpError as error:
@@ -301,18 +385,29 @@ def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]]
         most = request["memory_bytes"] >> 20
         return {"error": f"needs over {most} MiB of memory at once; the file is damaged or too large"}, []
     except BaseException as error:  # panics of compiled decoders derive from BaseException
-        return {"error": " ".join(str(error).split())[:300] or type(error).__name__}, []
+        return {"error": _said(error)}, []
 
 
-def _limit(cpu_s: int, memory_bytes: int) -> None:
+def _said(error: BaseException) -> str:
+    """Return the message of an exception as one line, or the name of its type."""
+    return " ".join(str(error).split())[:300] or type(error).__name__
+
+
+def _limit(cpu_s: float, memory_bytes: int) -> None:
     """Limit processor time and memory of one request, if the system supports it."""
+    _limit_cpu(cpu_s)
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
         _set_limit(resource.RLIMIT_CORE, 0)
-        _set_limit(resource.RLIMIT_CPU, int(time.process_time()) + 1 + cpu_s)
         taken = int(os.pread(_memory_sizes(), 64, 0).split()[0]) * resource.getpagesize()
         _set_limit(resource.RLIMIT_AS, taken + memory_bytes)
+
+
+def _limit_cpu(cpu_s: float) -> None:
+    """End this process after some processor time [s], if the system supports it; 0: never."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_PROF, cpu_s)
 
 
 _limits: dict[int, tuple[int, int]] = {}

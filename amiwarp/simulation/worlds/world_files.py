@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name, note_input, open_input
 from amiwarp.io.json_files import at_field, build, fields_of, read_json, read_toml
-from amiwarp.io.reading_process import borrow, give_back
+from amiwarp.io.reading_process import Allowance, borrow, give_back
 from amiwarp.simulation.pictures import BAND, LUMINANCE, MOST_PIXELS, PICTURE_FORMATS, read_picture, srgb_to_linear
 from amiwarp.simulation.worlds.named.catalogue import named_world
 from amiwarp.simulation.worlds.world import Body, Lamp, Material, Mesh, Sky, Sun, Trajectory, World, looking_at
@@ -115,9 +115,11 @@ def _check_trimesh(path: Path) -> None:
 
 def _called(path: Path, kind: str, turn: NDArray[np.float64]) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     """Return what :func:`read_parts` returns, and register the files as inputs."""
+    # a glTF file has its arrays in files next to it
+    allowance = Allowance(path, path.parent) if kind == "gltf" else Allowance(path)
     process = borrow()
     try:
-        found, arrays = process.call(f"{__name__}:read_parts", path, kind, turn.tolist())
+        found, arrays = process.call(f"{__name__}:read_parts", path, kind, turn.tolist(), allowance=allowance)
     finally:
         give_back(process)
     for file in found["files"]:
