@@ -42,8 +42,8 @@ PIPE_BYTES = 1 << 20
 """Size of the pipe from the reading process [bytes], if the system supports it. A larger pipe needs fewer process
 switches."""
 
-LEAST_SECONDS = 0.2
-"""Least processor time of a request [s], if requests before it have taken the rest."""
+LEAST_SECONDS = 0.01
+"""Least processor time of a request [s], because the system counts it in steps."""
 
 SECONDS_PER_BYTE = 1e-6
 """Processor time that is allowed for each byte of packets, so that the time of a long recording does not count [s]."""
@@ -80,6 +80,11 @@ class Allowance:
     def renew(self, share: float = 1.0) -> None:
         """Allow this share of the whole time again, because the file has given results."""
         self.left = min(self.seconds, self.left + share * self.seconds)
+
+    def exceeded(self) -> AmiwarpError:
+        """Return the error to raise for a file that takes too long."""
+        whole = f"{self.seconds:.3g} s of processor time"
+        return AmiwarpError(f"reading took over {whole}, the limit for its size; the file is damaged")
 
 
 def _size(path: Path) -> int:
@@ -156,6 +161,8 @@ class ReadingProcess:
             self._preparing = False
             self.receive()
         self._allowance = Allowance(*arguments) if allowance is None else allowance
+        if self._allowance.left <= 0.0:
+            raise self._allowance.exceeded()
         self._cpu_s = max(self._allowance.left * share, LEAST_SECONDS)
         arguments = tuple(_absolute(value) if isinstance(value, Path) else value for value in arguments)
         limits = {"cpu_s": self._cpu_s, "memory_bytes": MEMORY_BYTES}
@@ -200,8 +207,7 @@ class ReadingProcess:
         self.close()
         if code == -getattr(signal, "SIGPROF", 0):
             self._allowance.left -= self._cpu_s
-            whole = f"{self._allowance.seconds:.3g} s of processor time"
-            return AmiwarpError(f"reading took over {whole}, the limit for its size; the file is damaged")
+            return self._allowance.exceeded()
         if code < 0 and -code in CRASHES:
             return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
         if code < 0:
