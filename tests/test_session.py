@@ -6,6 +6,7 @@ Results are compared with offline compensation of the same recording and with th
 from __future__ import annotations
 
 import math
+import re
 import sys
 import threading
 import time
@@ -392,6 +393,69 @@ def test_a_session_that_is_stopped_finishes_what_came(tmp_path: Path) -> None:
         status = Session(Endless([]), KNOWN, raw=[raw]).run(stop, lambda _: None)
     assert 10_000 <= status.events == status.done < 20_000
     assert len(open_recording(tmp_path / "raw.h5").events) == status.events
+
+
+@pytest.mark.parametrize("slow", ["compensation", "writing"])
+def test_a_stopped_session_drops_what_takes_too_long(monkeypatch: pytest.MonkeyPatch, slow: str) -> None:
+    """The time for it begins with the stop. What was dropped is counted."""
+    monkeypatch.setattr(session_module, "DRAIN_S", 0.2)
+    monkeypatch.setattr(session_module, "STEP_BYTES", 1)
+    recording, stop, said = points(20_000, 0.5), threading.Event(), list[str]()
+    given, go = packets_of(recording), threading.Event()
+
+    class Slow:
+        """A consumer that takes 10 ms for each packet."""
+
+        count = 0
+
+        def append(self, events: Events) -> None:
+            stop.set()
+            go.wait(0.01)
+            self.count += len(events)
+
+        def append_encoder(self, *_: object, second: bool) -> None:
+            pass
+
+        def tick(self) -> None:
+            pass
+
+    class Ahead(Made):
+        def packets(self) -> Iterator[Packet]:
+            yield from given
+            stop.wait(LONG_S)
+
+    def take(_packet: Compensated) -> None:
+        stop.set()
+        go.wait(0.05)
+
+    raw = Slow()
+    if slow == "writing":
+        session = Session(Ahead([]), raw=[raw], say=said.append)
+    else:
+        session = Session(Ahead([]), KNOWN, sinks=(take,), say=said.append)
+        session._compensator.batch = 1  # type: ignore[union-attr]
+    status = session.run(stop, lambda _: None)
+    (message,) = said
+    processed, written = (int(n.replace(",", "")) for n in re.findall(r"([\d,]+) (?:events )?that waited", message))
+    assert message.startswith("dropped 0.2 s after the stop: ")
+    if slow == "writing":
+        assert processed + written + raw.count == 20_000
+        assert written > 0
+        assert raw.count > 0
+    else:
+        assert (processed, written) == (20_000 - status.events, 0)
+        assert status.dropped == processed > 0
+
+
+def test_a_session_whose_source_ends_drops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session_module, "DRAIN_S", 0.0)
+    source = Made(packets_of(points(20_000, 0.5)))
+    out: list[Compensated] = []
+    status = Session(source, KNOWN, sinks=(out.append, lambda _: time.sleep(0.02))).run(
+        threading.Event(), lambda _: None, seconds=LONG_S
+    )
+    assert status.done == sum(len(p.events) for p in out) == 20_000
+    assert status.dropped == 0
 
 
 def test_a_session_ends_at_its_time_and_not_at_the_next_report(monkeypatch: pytest.MonkeyPatch) -> None:

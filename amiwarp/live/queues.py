@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -73,15 +74,17 @@ class BackgroundWorker:
         self._most_bytes = most_bytes
         self.held_bytes = 0
         """Memory of the waiting and running jobs [bytes]."""
-        self._jobs: deque[tuple[Callable[[], object], int]] = deque()
+        self.dropped = 0
+        """Number of events of jobs that were dropped by :meth:`abandon`."""
+        self._jobs: deque[tuple[Callable[[], object], int, int]] = deque()
         self._error: BaseException | None = None
         self._ended = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="amiwarp-worker", daemon=True)
         self._thread.start()
 
-    def put(self, job: Callable[[], object], held_bytes: int = 0) -> None:
-        """Add a job once memory allows.
+    def put(self, job: Callable[[], object], held_bytes: int = 0, events: int = 0) -> None:
+        """Add a job once memory allows. ``events``: number of events that are lost if the job is dropped.
 
         Raises the error of an earlier job; after an error no job runs.
         """
@@ -92,7 +95,7 @@ class BackgroundWorker:
             )
             if self._error is not None:
                 raise self._error
-            self._jobs.append((job, count))
+            self._jobs.append((job, count, events))
             self.held_bytes += count
             self._changed.notify_all()
 
@@ -107,13 +110,24 @@ class BackgroundWorker:
         """Drop the waiting jobs, and wait for the running job for at most :data:`LAST_JOB_S`."""
         with self._changed:
             self._ended = True
+            self.dropped += sum(events for _, _, events in self._jobs)
             self._jobs.clear()
             self._changed.notify_all()
         self._thread.join(LAST_JOB_S)
 
-    def close(self) -> None:
-        """Run all waiting jobs and stop the thread. Raises the error of a job that failed."""
-        self.end()
+    def close(self, most_s: float = math.inf) -> None:
+        """Run the waiting jobs for at most ``most_s`` [s], drop the rest, and stop the thread.
+
+        Raises the error of a job that failed.
+        """
+        if math.isinf(most_s):
+            self.end()
+        else:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+            self._thread.join(most_s)
+            self.abandon()
         if self._error is not None:
             raise self._error
 
@@ -123,7 +137,7 @@ class BackgroundWorker:
                 self._changed.wait_for(lambda: self._jobs or self._ended)
                 if not self._jobs:
                     return
-                job, count = self._jobs.popleft()
+                job, count, _ = self._jobs.popleft()
             try:
                 job()
             except BaseException as error:
@@ -220,6 +234,16 @@ class PacketQueue:
             self.held_bytes -= packet.held_bytes
             self._changed.notify_all()
             return packet
+
+    def discard(self) -> int:
+        """Close the queue and drop the packets in it. Return their number of events."""
+        with self._changed:
+            self._closed = True
+            lost, self._held, self.held_bytes, self._emptied = self._held, 0, 0, 0
+            self._packets.clear()
+            self.dropped += lost
+            self._changed.notify_all()
+        return lost
 
     def close(self) -> None:
         """Close the queue to further packets. The packets in it can still be taken."""

@@ -170,11 +170,11 @@ class PhaseCheck:
         estimated, self._estimated = self._estimated, []
         return estimated
 
-    def close(self) -> None:
-        """Wait for a running estimate, and start no further one."""
+    def close(self, most_s: float = math.inf) -> None:
+        """Wait for a running estimate for at most ``most_s`` [s], and start no further one."""
         self._closed = True
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(None if math.isinf(most_s) else most_s)
 
     def _estimate(self, events: Events, encoder: Encoder) -> None:
         """Estimate the phases by a calibration in which all other parameters are fixed."""
@@ -225,7 +225,7 @@ class Consumers:
     def append(self, events: Events) -> None:
         """Pass the sensor's events to the consumers of raw events."""
         for served in list(self.raw):
-            self._put(served, partial(served[0].append, events), held_bytes(events))
+            self._put(served, partial(served[0].append, events), held_bytes(events), len(events))
 
     def append_encoder(
         self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64], second: bool
@@ -242,20 +242,29 @@ class Consumers:
         flags = packet.flags
         inside, extrapolated = (flags & OUTSIDE) == 0, (flags & (EXTRAPOLATED | NO_ANGLE)) != 0
         append = partial(self.out[0].append, packet.events, inside=inside, extrapolated=extrapolated)
-        self._put(self.out, append, held_bytes(packet.events) + flags.nbytes)
+        self._put(self.out, append, held_bytes(packet.events) + flags.nbytes, len(flags))
 
     def tick(self) -> None:
         """Let all consumers continue pending work, even without new data."""
         for served in self._all():
             self._put(served, served[0].tick)
 
-    def finish(self) -> None:
-        """Wait until the consumers have processed all data, and collect their errors."""
+    def finish(self, most_s: float) -> None:
+        """Wait until the consumers have processed all data, and collect their errors.
+
+        After ``most_s`` [s] the rest is dropped.
+        """
+        end = time.monotonic() + most_s
         for _, worker in self._all():
             try:
-                worker.close()
+                worker.close(max(end - time.monotonic(), 0.0))
             except Exception as error:
                 self._fail(error)
+
+    @property
+    def dropped(self) -> int:
+        """Number of events that were dropped at the end, of all consumers."""
+        return sum(worker.dropped for _, worker in self._all())
 
     def end(self) -> None:
         """Wait for the end of all background threads."""
@@ -271,11 +280,15 @@ class Consumers:
         return [*self.raw, *([] if self.out is None else [self.out])]
 
     def _put(
-        self, served: tuple[RawConsumer | LiveWriter, BackgroundWorker], job: Callable[[], object], held: int = 0
+        self,
+        served: tuple[RawConsumer | LiveWriter, BackgroundWorker],
+        job: Callable[[], object],
+        held: int = 0,
+        events: int = 0,
     ) -> None:
         """Pass a job to a consumer's thread; remove the consumer if it has failed."""
         try:
-            served[1].put(job, held)
+            served[1].put(job, held, events)
         except Exception as error:
             self._fail(error)
             served[1].end()
@@ -387,6 +400,8 @@ class WindowSharpness:
 
 PATIENCE_S = 1.0
 """Longest wait at the end of a session for the source's thread and for encoder samples of the last events [s]."""
+DRAIN_S = 10.0
+"""Longest time for the waiting data after a session was stopped from outside [s]. The rest is dropped and counted."""
 POLL_S = 0.001
 """Longest wait for a packet between two polls of the encoder [s]."""
 QUEUE_EVENTS = 1 << 23
@@ -439,6 +454,7 @@ class Session:
         self.encoder = EncoderStream(offset, second=second, harmonics=harmonics)
         self._source, self._link, self._sinks, self._keeper = source, link, list(sinks), keeper
         self._stop, self._hasty = threading.Event(), False
+        self._say, self._drain_until, self._discarded = say, math.inf, 0
         self._failure: BaseException | None = None
         self._consumers = Consumers(raw, out, self._fail)
         self._feed = EncoderFeed(link, self.encoder, self._consumers.append_encoder, say)
@@ -460,7 +476,8 @@ class Session:
     ) -> SessionStatus:  # fmt: skip
         """Process the source until it ends or ``stop`` is set, and then everything received by then.
 
-        The session sets ``stop`` itself after ``seconds`` [s], unless None. ``on_status`` gets the status every
+        If others set ``stop``, this takes :data:`DRAIN_S` at most. The rest is dropped, and counted in a message. The
+        session sets ``stop`` itself after ``seconds`` [s], unless None. ``on_status`` gets the status every
         ``every_s`` [s] and at the end. Raises the error of the source or of a consumer, after everything received
         before it was processed. KeyboardInterrupt ends the session at once and drops all waiting data.
         """
@@ -483,6 +500,11 @@ class Session:
                 self._abandon()
                 raise
         self._report(on_status)
+        if self._discarded or self._consumers.dropped:
+            self._say(
+                f"dropped {DRAIN_S:g} s after the stop: {self._discarded:,} events that waited to be processed, "
+                f"{self._consumers.dropped:,} that waited to be written or sent"
+            )
         if self._failure is not None:
             raise self._failure
         return self.status
@@ -491,16 +513,21 @@ class Session:
         self, stop: threading.Event, on_status: Callable[[SessionStatus], None], every_s: float, most_s: float
     ) -> None:
         """Process packets until the queue is closed and empty."""
-        due, stopped = 0.0, math.inf
+        due, stopped, on_time = 0.0, math.inf, False
         while not self._queue.ended:
             self._step()
             if self._seconds >= due:
                 due = self._seconds + every_s
                 self._report(on_status)
-            if self._seconds >= most_s:
+            if self._seconds >= most_s and not stop.is_set():
+                on_time = True
                 stop.set()
             if stop.is_set():
                 stopped = min(stopped, self._seconds)
+                if not on_time:
+                    self._drain_until = stopped + DRAIN_S
+                if self._seconds > self._drain_until:
+                    self._discarded += self._queue.discard()
                 if self._seconds - stopped > PATIENCE_S:  # the source's thread does not return
                     self._queue.close()
 
@@ -509,9 +536,10 @@ class Session:
         reader.join(PATIENCE_S)
         if not reader.is_alive():
             self._source.close()
-        for background in (self._phase_check, self._keeper):
-            if background is not None and not self._hasty:
-                background.close()
+        if self._phase_check is not None and not self._hasty:
+            self._phase_check.close(self._drain_left)
+        if self._keeper is not None and not self._hasty:
+            self._keeper.close()
         self._consumers.end()
 
     def _abandon(self) -> None:
@@ -522,6 +550,11 @@ class Session:
     def _fail(self, error: Exception) -> None:
         self._failure = self._failure or error
         self._stop.set()
+
+    @property
+    def _drain_left(self) -> float:
+        """Remaining time for the waiting data [s]."""
+        return max(self._drain_until - self._seconds, 0.0)
 
     @property
     def _seconds(self) -> float:
@@ -617,7 +650,7 @@ class Session:
             time.sleep(POLL_S)
         if self._compensator is not None:
             self._give(self._compensator.flush())
-        self._consumers.finish()
+        self._consumers.finish(self._drain_left)
 
 
 MOST_WAITING = 1 << 20
