@@ -210,8 +210,14 @@ def test_what_cannot_be_exported_is_named(made: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(AmiwarpError, match=r"to is 'zip'; choose among webdataset, parquet"):
         export_dataset(made, out, "zip")
-    with pytest.raises(AmiwarpError, match=r"made: holds other files, such as manifest\.json; give a new folder"):
-        export_dataset(made, made, "parquet")
+    for inside in (made, made / "x", made / ".." / made.name / "train" / "x"):
+        with pytest.raises(AmiwarpError, match=r"is in the data set .*made; export to a folder outside it"):
+            export_dataset(made, inside, "parquet")
+    assert not (made / "x").exists()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").touch()
+    with pytest.raises(AmiwarpError, match=r"other: holds other files, such as notes\.txt; give a new folder"):
+        export_dataset(made, tmp_path / "other", "parquet")
     (made / "test" / "a.b_7-0000000000000007.h5").unlink()
     for to in ("webdataset", "parquet"):
         with pytest.raises(AmiwarpError, match=r"a\.b_7-0000000000000007\.h5: no such file"):

@@ -365,6 +365,16 @@ def test_an_exception_keeps_what_was_appended(tmp_path, error):
     assert os.listdir(tmp_path) == ["a.h5"]
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, AmiwarpError])
+def test_an_exception_before_anything_came_leaves_nothing(tmp_path, error):
+    """For example, a second output cannot be created."""
+    with pytest.raises(error), live(tmp_path / "a.h5"), live(tmp_path / "b.h5") as second:  # noqa: PT012
+        second.append_encoder([0, 1000], [0.0, 0.1])
+        raise error("refused")
+    assert os.listdir(tmp_path) == ["b.h5"]
+    assert open_recording(tmp_path / "b.h5").encoder is not None
+
+
 def test_the_file_that_was_there_is_replaced_at_the_end(tmp_path):
     path = tmp_path / "a.h5"
     path.write_bytes(b"old")

@@ -51,7 +51,7 @@ from amiwarp.cli.common import NO_FILE, OUTPUT, OUTPUT_FOLDER
 from amiwarp.events.truth import MAPS, MemoryFrames
 from amiwarp.imaging.export import IweFiles
 from amiwarp.io import files as output
-from amiwarp.io.files import NewFile, check_output, own_folder, remove_abandoned, write_text
+from amiwarp.io.files import NewFile, check_output, only_writer, own_folder, remove_abandoned, write_text
 from amiwarp.io.json_files import read_json
 from amiwarp.io.native_format import LiveWriter
 from reference.calibration_sample import exact_calibration
@@ -650,6 +650,55 @@ def test_file_systems_may_have_shorter_names(tmp_path: Path, monkeypatch: pytest
     check_output(tmp_path / ("n" * 143))
     with pytest.raises(AmiwarpError, match="has 144 bytes; the limit is 143"):
         check_output(tmp_path / ("n" * 144))
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["dataset s.toml {}", "evaluate --quick --out {}", "stability --quick --out {}", "stability --redraw --out {}"],
+)
+def test_two_commands_do_not_continue_the_results_in_one_folder(place: Path, line: str) -> None:
+    (place / "one.pgm").write_text("P2 4 2 255 0 255 0 255 255 0 255 0")
+    (place / "s.toml").write_text("""
+        format = "amiwarp-dataset-specification"
+        version = 1
+        duration_s = 0.002
+        camera = {size = [16, 12]}
+        prisms = [{apex_deg = 1.0}]
+        speeds_rpm = [720.0]
+        sources = [{pictures = "one.pgm"}]
+    """)
+    (place / "results").mkdir()
+    with only_writer(place / "results"):
+        result = run(*line.format("results").split())
+        assert result.exit_code == 1, result.stderr
+        assert "amiwarp: results: another command writes its results to this folder; wait" in result.stderr
+        with pytest.raises(AmiwarpError, match="another command"), only_writer(place / "results"):
+            pass
+        with only_writer(place):  # another folder
+            pass
+    assert not [path for path in (place / "results").rglob("*") if path.is_file()]
+    with only_writer(place / "results"):  # it is free again
+        pass
+    if line.startswith("dataset"):
+        assert run(*line.format("results").split()).exit_code == 0
+
+
+def test_a_folder_without_locks_can_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with only_writer(tmp_path), only_writer(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("second", ["--out b.h5", "--to unix:no/socket", "--raw-to tcp:256.0.0.1:5000"])
+def test_a_second_output_that_cannot_be_made_leaves_no_first_one(place: Path, second: str) -> None:
+    (place / "b.part.h5").touch()  # as if another command writes b.h5
+    before = snapshot(place)
+    result = run(*f"live a.h5 --fast --calibration cal.json --record first.h5 {second}".split())
+    assert result.exit_code == 1, result.stderr
+    assert snapshot(place) == before
 
 
 @pytest.mark.parametrize("exists", [True, False])

@@ -18,7 +18,7 @@ from amiwarp.cli import common as cli
 from amiwarp.cli import say
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.io.files import check_output, own_folder, write_csv, write_text
+from amiwarp.io.files import check_output, only_writer, own_folder, write_csv, write_text
 from amiwarp.io.formats import make_folder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
@@ -768,24 +768,25 @@ def run_stability(
     chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
     cells_in = out / "cells"
     make_folder(cells_in)
-    earlier = any(cells_in.iterdir())  # existing figures were drawn from the cells in this folder and may be replaced
-    began = time.perf_counter()
-    new = left = 0
-    store = Store(cells_in)
-    if redraw:
-        cells = load(store)
-    else:
-        of_each = seeds or (QUICK_SEEDS if quick else SEEDS)
-        limit = QUICK_MINUTES if quick and minutes is None else minutes
-        if draws is None:
-            draws = 0 if quick or axes else DRAWS
-        wanted = cells_of(chosen_axes, of_each, first=common.seed, draws=draws)
-        cells, new = _run_cells(wanted, chosen_methods, store, device, scheduler, limit)
-        left = sum(not {identity(m) for m in chosen_methods} <= c.results.keys() for c in cells)
-    took = time.perf_counter() - began
-    atlas = aggregate(cells, chosen_axes, chosen_methods, _about(cells))
-    with cli.progress("drawing"), own_folder(out) if earlier else contextlib.nullcontext():
-        files = atlas.write(out) | draw(atlas, out)
+    with only_writer(out):
+        earlier = any(cells_in.iterdir())  # existing figures were drawn from these cells and may be replaced
+        began = time.perf_counter()
+        new = left = 0
+        store = Store(cells_in)
+        if redraw:
+            cells = load(store)
+        else:
+            of_each = seeds or (QUICK_SEEDS if quick else SEEDS)
+            limit = QUICK_MINUTES if quick and minutes is None else minutes
+            if draws is None:
+                draws = 0 if quick or axes else DRAWS
+            wanted = cells_of(chosen_axes, of_each, first=common.seed, draws=draws)
+            cells, new = _run_cells(wanted, chosen_methods, store, device, scheduler, limit)
+            left = sum(not {identity(m) for m in chosen_methods} <= c.results.keys() for c in cells)
+        took = time.perf_counter() - began
+        atlas = aggregate(cells, chosen_axes, chosen_methods, _about(cells))
+        with cli.progress("drawing"), own_folder(out) if earlier else contextlib.nullcontext():
+            files = atlas.write(out) | draw(atlas, out)
     speed = {"cells": atlas.cells, "new_cells": new, "cells_left": left, "seconds": took, "cells_per_s": new / took}
     data = {"aims": atlas.aims.to_json(), "files": {name: str(path) for name, path in files.items()}, **speed}
     damaged = [f"damaged, and left out: {what}" for what in store.damaged] if redraw else cli.made_again(store.damaged)

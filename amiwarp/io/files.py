@@ -371,6 +371,49 @@ def own_folder(path: Path) -> Iterator[None]:
         _permissions.folders.remove(folder)
 
 
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Lock a folder in which a command continues earlier results, so that no other command does so meanwhile.
+
+    The folder itself is locked, so that no lock file can be left. Raises :class:`AmiwarpError` if it is locked already.
+    File systems without locks are not locked.
+    """
+    handle = _lock_folder(folder)
+    try:
+        yield
+    finally:
+        if handle is not None:
+            _unlock(handle)
+
+
+def _lock_folder(folder: Path) -> int | None:
+    """Lock a folder, and return its open handle; None without locks."""
+    try:
+        import fcntl
+
+        handle = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):  # Windows, which does not open folders
+        return None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        what = "another command writes its results to this folder; wait for its end, or give another folder"
+        raise AmiwarpError(f"{folder}: {what}") from error
+    except OSError:  # a file system without locks
+        os.close(handle)
+        return None
+    return handle
+
+
+def _unlock(handle: int) -> None:
+    """Unlock a folder, also for a worker process that was forked meanwhile and holds the handle too."""
+    import fcntl
+
+    fcntl.flock(handle, fcntl.LOCK_UN)
+    os.close(handle)
+
+
 def check_output(path: Path, *, overwrite: bool = False) -> Path:
     """Return the file that writing to ``path`` creates or replaces: ``path`` itself, or the target of a symbolic link.
 

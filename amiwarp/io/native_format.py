@@ -1416,9 +1416,10 @@ class LiveWriter:
     """Writer that streams a live recording into ``NAME.part.h5`` next to ``path``, and renames it to ``path``.
 
     The file is finished and renamed in every case: after an exception and on a full disk it keeps the events appended
-    so far, and the error gives their number. ``compensated`` recordings hold float32 coordinates and flags. Recordings
-    of a pair of prisms or of a mirror have two ``encoders``. All events are in the file after ``flush_s`` [s] at the
-    latest, if :meth:`append` or :meth:`tick` is called that often. Use it in one thread.
+    so far, and the error gives their number. Only if there are neither events nor encoder samples at an exception, such
+    as that of a second output, no file is left. ``compensated`` recordings hold float32 coordinates and flags.
+    Recordings of a pair of prisms or of a mirror have two ``encoders``. All events are in the file after ``flush_s``
+    [s] at the latest, if :meth:`append` or :meth:`tick` is called that often. Use it in one thread.
 
     Raises :class:`AmiwarpError` for a path that does not end in .h5 or .hdf5, cannot be written or exists (unless
     ``overwrite``), for an existing part file, and for events that are unsorted or outside the frame. After bad events
@@ -1527,6 +1528,10 @@ class LiveWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._file is None:  # writing failed before, and the file is finished
+            return
+        if error is not None and not len(self) and not self._spans:  # nothing arrived before the error
+            self._close()
+            self.part.unlink()
             return
         self._finish(tidy=True)
         if error is not None:

@@ -120,23 +120,27 @@ def export_dataset(
     Raises
     ------
     AmiwarpError
-        If the folder is no data set, a recording is not as the manifest says, or ``out`` holds other files. Then
-        nothing is written.
+        If the folder is no data set, a recording is not as the manifest says, or ``out`` holds other files or is in the
+        data set. Then nothing is written.
 
     Examples
     --------
     >>> import json, pathlib
     >>> events = amiwarp.Events.from_arrays([1, 2], [0, 0], [0, 10], [1, 0])
-    >>> amiwarp.save_recording("000000.h5", amiwarp.Recording(amiwarp.MemoryEvents(events, 4, 4)))
+    >>> folder = pathlib.Path("set")
+    >>> folder.mkdir()
+    >>> amiwarp.save_recording(folder / "000000.h5", amiwarp.Recording(amiwarp.MemoryEvents(events, 4, 4)))
     >>> item = {"file": "000000.h5", "split": "train", "labels": {"shape": "disc"}, "events": 2}
     >>> manifest = {"format": "amiwarp-dataset", "version": 1, "items": [item]}
-    >>> _ = pathlib.Path("manifest.json").write_text(json.dumps(manifest))
-    >>> amiwarp.export_dataset(".", "tars", "webdataset").files
+    >>> _ = (folder / "manifest.json").write_text(json.dumps(manifest))
+    >>> amiwarp.export_dataset(folder, "tars", "webdataset").files
     ('train-000000.tar',)
     """
     began = time.perf_counter()
     folder, out, report = Path(folder), Path(out), progress or silent
     chosen = choice(ExportFormat, to, "to")
+    if out.resolve().is_relative_to(folder.resolve()):
+        raise AmiwarpError(f"{out}: is in the data set {folder}; export to a folder outside it")
     limit = round(1e6 * real(shard_mb, "shard_mb", 1e-3, 1e6, " MB"))
     with _folder(out):
         return _export(folder, out, chosen, limit, overwrite, report, began)

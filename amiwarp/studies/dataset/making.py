@@ -34,7 +34,7 @@ from amiwarp.events.recording import Events
 from amiwarp.events.truth import MAPS, FrameTruth
 from amiwarp.imaging.tensors import windows
 from amiwarp.io import convert, open_recording
-from amiwarp.io.files import NewFile, errors_name, put_in_place, scratch_folder, write_text
+from amiwarp.io.files import NewFile, errors_name, only_writer, put_in_place, scratch_folder, write_text
 from amiwarp.io.formats import FORMAT, MANIFEST, VERSION, make_folder
 from amiwarp.io.json_files import LARGEST_INTEGER, append_line, build, create_journal, read_journal
 from amiwarp.io.plain_files import save_tensors
@@ -760,6 +760,24 @@ def make_dataset(
     items = list_items(loaded)
     count = _local_workers(scheduler, workers, device)
     make_folder(out)
+    with only_writer(out):
+        return _make_missing(
+            loaded, items, out, scheduler=scheduler, count=count, device=device, report=report, began=began
+        )
+
+
+def _make_missing(
+    loaded: spec.Specification,
+    items: Sequence[Item],
+    out: Path,
+    *,
+    scheduler: str | None,
+    count: int | None,
+    device: str,
+    report: Progress,
+    began: float,
+) -> DatasetSummary:
+    """Make the recordings that the folder lacks, and write the manifest."""
     journal = Journal(out)
     journal.create()
     todo = missing(journal, items, report)

@@ -20,7 +20,7 @@ from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.io import open_recording
-from amiwarp.io.files import NewFile, check_output, own_folder, write_csv, write_text
+from amiwarp.io.files import NewFile, check_output, only_writer, own_folder, write_csv, write_text
 from amiwarp.io.formats import make_folder
 from amiwarp.io.json_files import CellStore, fields_of, value_of
 from amiwarp.kernels.launch import load_all, load_kernels
@@ -651,21 +651,22 @@ def evaluate(
     jobs = plan(chosen, settings, [Path(r) for r in recordings], worlds=bool(only) or not recordings)
     folder = Path(out)
     make_folder(folder / "cells")
-    earlier = any((folder / "cells").iterdir())  # an existing report was made from these cells and may be replaced
-    for name in () if earlier else REPORT_FILES:
-        check_output(folder / name)
-    count = worker_count(workers, device, settings.width * settings.height * BYTES_PER_PIXEL)
-    if scheduler is None:
-        jobs = [replace(job, threads=max(1, cpu_threads() // count)) for job in jobs]
-    store = Store(folder / "cells")
-    with start_workers("amiwarp evaluate", "cluster", scheduler, count, device) as there:
-        results, new, processor_s = _run(jobs, store, there, progress or silent)
-    names = [name for name in EVALUATIONS if any(r.evaluation == name for r in results)]
-    sections = [section(name, [r for r in results if r.evaluation == name]) for name in names]
-    with contextlib.ExitStack() as stack:
-        for own in (folder, folder / "tables", folder / "figures") if earlier else ():
-            stack.enter_context(own_folder(own))
-        files = write(folder, sections, settings, processor_s)
+    with only_writer(folder):
+        earlier = any((folder / "cells").iterdir())  # an existing report was made from these cells and may be replaced
+        for name in () if earlier else REPORT_FILES:
+            check_output(folder / name)
+        count = worker_count(workers, device, settings.width * settings.height * BYTES_PER_PIXEL)
+        if scheduler is None:
+            jobs = [replace(job, threads=max(1, cpu_threads() // count)) for job in jobs]
+        store = Store(folder / "cells")
+        with start_workers("amiwarp evaluate", "cluster", scheduler, count, device) as there:
+            results, new, processor_s = _run(jobs, store, there, progress or silent)
+        names = [name for name in EVALUATIONS if any(r.evaluation == name for r in results)]
+        sections = [section(name, [r for r in results if r.evaluation == name]) for name in names]
+        with contextlib.ExitStack() as stack:
+            for own in (folder, folder / "tables", folder / "figures") if earlier else ():
+                stack.enter_context(own_folder(own))
+            files = write(folder, sections, settings, processor_s)
     verdicts = [claim.verdict.value for s in sections for claim in s.claims if claim.number is not None]
     return EvaluationSummary(
         len(results), new, sum(bool(r.error) for r in results), {v: verdicts.count(v) for v in dict.fromkeys(verdicts)},
