@@ -209,7 +209,7 @@ OPENERS = {"open", "np.load", "h5py.File", "trimesh.load", "trimesh.load_mesh", 
 """Functions that open a file, of Python and of the libraries that the package uses."""
 OPENING_NAMES = {
     "open", "read_text", "read_bytes", "memmap", "open_memmap", "fromfile", "loadtxt", "genfromtxt", "loadmat",
-    "read_csv", "read_table", "ZipFile", "TarFile", "GzipFile", "FileIO", "imread", "imopen", "VideoCapture",
+    "read_csv", "read_table", "ZipFile", "TarFile", "GzipFile", "FileIO", "_Input", "imread", "imopen", "VideoCapture",
     "Decoder", "copyfile", "copy2",
 }  # fmt: skip
 """Last parts of the names of others, whatever their module is called."""
@@ -220,7 +220,7 @@ OPEN_NO_FILE = {
 }  # fmt: skip
 """Functions with such names that read no file."""
 OPENED_OTHERWISE = {
-    "amiwarp.io.files: open(path, 'rb')": "the way that all take",
+    "amiwarp.io.files: _Input(path)": "the way that all take",
     # Functions of the reading process. ReadingProcess.send has checked and noted the path.
     "amiwarp.io.aedat: aedat.Decoder(path)": "reading process",
     "amiwarp.io.prophesee: es.Decoder(path, 0)": "reading process",
@@ -242,6 +242,7 @@ OPENED_OTHERWISE = {
     # Unfinished files of this process, or of a child of it.
     "amiwarp.imaging.export: open(part, 'r+b')": "own file",
     "amiwarp.io.files: open(path, 'r+b')": "lock file",
+    "amiwarp.io.files: os.open(folder, os.O_RDONLY)": "folder that is locked",
     "amiwarp.io.native_format: open(self.part, 'r+b')": "own file",
     "amiwarp.io.plain_files: (folder / name).open('rb')": "own file",
     # What is no file.

@@ -91,7 +91,7 @@ _command: _Command | None = None
 class _Input(io.FileIO):
     """Open input whose read errors, such as those of a damaged disk, are :class:`AmiwarpError`."""
 
-    def readinto(self, buffer: Any) -> int | None:  # type: ignore[override]
+    def readinto(self, buffer: Any) -> int | None:
         with self._errors_named():
             return super().readinto(buffer)
 
@@ -116,7 +116,7 @@ def open_input(path: str | os.PathLike[str], *, noted: bool = True) -> io.Buffer
     path = Path(path)
     check_regular(path)
     try:
-        file = io.BufferedReader(_Input(path))
+        file: io.BufferedReader = io.BufferedReader(_Input(path))
     except OSError as error:
         raise AmiwarpError(f"{path}: cannot be opened: {error.strerror}; give another file") from error
     if noted:
