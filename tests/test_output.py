@@ -692,6 +692,33 @@ def test_a_folder_without_locks_can_be_written_to(tmp_path: Path, monkeypatch: p
         pass
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "compensate a.h5 first.h5 --calibration cal.json --iwe {}/i.png",
+        "compensate a.h5 {}/b.h5 --calibration cal.json --iwe i.png",
+        "live a.h5 --fast --calibration cal.json --record r.h5 --out {}/o.h5",
+    ],
+)
+def test_a_folder_that_takes_no_files_is_found_before_the_first_output(
+    place: Path, monkeypatch: pytest.MonkeyPatch, line: str
+) -> None:
+    """Only an attempt shows it, for example on a network drive."""
+    (place / "full").mkdir()
+    before, take = snapshot(place), output._take_lock
+
+    def refused(folder: Path) -> Any:
+        if folder.name == "full":
+            raise OSError(errno.EROFS, "Read-only file system")
+        return take(folder)
+
+    monkeypatch.setattr(output, "_take_lock", refused)
+    result = run(*line.format("full").split())
+    assert result.exit_code == 1, result.stderr
+    assert re.search(r"amiwarp: full/\w\.\w+: cannot be written: Read-only file system; choose", result.stderr)
+    assert snapshot(place) == before
+
+
 @pytest.mark.parametrize("second", ["--out b.h5", "--to unix:no/socket", "--raw-to tcp:256.0.0.1:5000"])
 def test_a_second_output_that_cannot_be_made_leaves_no_first_one(place: Path, second: str) -> None:
     (place / "b.part.h5").touch()  # as if another command writes b.h5

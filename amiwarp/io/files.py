@@ -351,6 +351,8 @@ def run(inputs: Collection[Path], outputs: Collection[Path], *, overwrite: bool)
                 if target in targets:
                     raise AmiwarpError(f"{path}: is given for two outputs; give each output its own name")
                 targets.add(target)
+            for path in outputs:  # a folder that takes no files is found before the work and before the first output
+                NewFile(path).discard()
             yield
     finally:
         _permissions = before
