@@ -675,9 +675,8 @@ def _sharpest(
         sharpness_before=search.fine.values(still),
         sharpness_after=search.score,
         stages=tuple(search.stages),
-        # without an encoder, the prism angle is 0 at this time
-        zero_us=middle_time(recording) if recording.encoder is None and space.sized else None,
-        path=search.calibration_events.encoder if recording.encoder is None and _on_path(search) else None,
+        zero_us=zero_time(recording, search),
+        path=path_of(recording, search),
         middle_us=space.middle_us if space.moving else None,
         events=len(search.calibration_events.events),
         seconds=0.0,
@@ -746,6 +745,16 @@ def prepare(
                 checks.check_turned(angles[:, k], name, which)
         searches.append(Search(space, calibration_events, settings, device, progress))
     return searches
+
+
+def zero_time(recording: Recording, search: Search) -> int | None:
+    """Return the time at which the prism's angle of a calibration without an encoder is 0 [us]; else None."""
+    return middle_time(recording) if recording.encoder is None and search.space.sized else None
+
+
+def path_of(recording: Recording, search: Search) -> Encoder | None:
+    """Return the path of the prism's angle that a search without an encoder follows; None for an encoder or a speed."""
+    return search.calibration_events.encoder if recording.encoder is None and _on_path(search) else None
 
 
 def _on_path(search: Search) -> bool:

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.calibration import prepare
+from amiwarp.calib.calibration import path_of, prepare, zero_time
 from amiwarp.calib.nlopt_solver import SearchStage, best_of
 from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.settings import STAGES, Settings
 from amiwarp.calib.sharpness_search import Search
 from amiwarp.choices import Sharpness
 from amiwarp.events.recording import MemoryEvents, Recording
-from amiwarp.tasks import Progress
+from amiwarp.tasks import Progress, part, silent
 
 WINDOW_US = 2_000_000
 """Duration of the events that the paper calibrates on [us]."""
@@ -44,16 +44,24 @@ def calibrate_as_paper(
 ) -> Calibration:
     """Return a calibration by the paper's method from the recording's first 2 s.
 
-    ``start`` may give the mounted phase [rad]. Raises :class:`AmiwarpError` if the recording does not suit a
-    calibration: too few events, or an encoder that does not cover them.
+    Without an encoder, the prism's speed or path is found as :func:`amiwarp.calibrate` finds it; the result then holds
+    for these 2 s only. ``start`` may give the mounted phase [rad]. Raises :class:`AmiwarpError` if the recording does
+    not suit a calibration: too few events, or an encoder that does not cover them.
     """
     began = time.perf_counter()
     source = recording.events
     cut = source.between(source.t_first, source.t_first + WINDOW_US)
     given = dict(start or {})
     settings = Settings(model="circle", sharpness=Sharpness.PAPER_J, events=len(cut), stages=STAGES[:1], start=given)
-    search = prepare(replace(recording, events=MemoryEvents(cut, *source.size)), settings, device=device)[0]
-    stage = _grid_search(search, mounted="phase" in given, progress=progress)
+    used = replace(recording, events=MemoryEvents(cut, *source.size))
+    searches = prepare(used, settings, device=device)
+    report, share = progress or silent, 1.0 / len(searches)
+    stages = [
+        _grid_search(search, mounted="phase" in given, progress=part(report, k * share, (k + 1) * share))
+        for k, search in enumerate(searches)
+    ]
+    # without an encoder, both senses of rotation are tried
+    stage, search = max(zip(stages, searches, strict=True), key=lambda found: found[0].score)
     best = search.space.to_values(stage.x)
     return Calibration(
         model_name="circle",
@@ -66,12 +74,14 @@ def calibrate_as_paper(
         sharpness_before=search.fine.values({**best, search.space.size_name: 0.0}),
         sharpness_after=stage.score,
         stages=(StageSummary.of("grid", stage, search.space.names, map(search.space.to_values, stage.points)),),
+        zero_us=zero_time(used, search),
+        path=path_of(used, search),
         events=len(cut),
         seconds=time.perf_counter() - began,
     )
 
 
-def _grid_search(search: Search, *, mounted: bool, progress: Progress | None) -> SearchStage:
+def _grid_search(search: Search, *, mounted: bool, progress: Progress) -> SearchStage:
     """Return the best point of successively finer grids; ``mounted``: whether the phase of the mount is given."""
     space, began = search.space, time.perf_counter()
     nominal = space.start
@@ -90,8 +100,7 @@ def _grid_search(search: Search, *, mounted: bool, progress: Progress | None) ->
                 v = space.to_vector({**nominal, space.size_name: float(s), "phase": float(p)})
                 points.append(v)
                 scores.append(search.fine(v))
-                if progress is not None:
-                    progress("calibrating, global", len(points) / budget)
+                progress("calibrating, global", len(points) / budget)
         size, phase = (space.to_values(points[int(np.argmax(scores))])[n] for n in (space.size_name, "phase"))
         size_half, phase_half, columns = 2.0 * size_half / (SIDE - 1), 2.0 * phase_half / (columns - 1), SIDE
     return best_of("grid", points, scores, seconds=time.perf_counter() - began, ended="its budget")
