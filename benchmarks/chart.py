@@ -88,6 +88,8 @@ def _print(charts: Charts) -> None:
                 better = ", ".join(b.label for b in beaten_by(r, rows))
                 print(f"default, {r.label}: " + (f"beaten by {better}" if better else "on the front"))
     print("\n".join(charts.notes))
+    for label, error in charts.failed.items():
+        print(f"failed: {label}: {error}")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from amiwarp import (
     ExactModel,
     FlatSide,
     MemoryEvents,
+    Model,
     Prism,
     RadialTangential,
     Recording,
@@ -138,9 +139,17 @@ def test_every_library_makes_the_same_image(known: KnownRecording) -> None:
 
 def test_compensation_rows_tell_speed_and_error(known: KnownRecording, device: str, tmp_path: Path) -> None:
     said = []
+    failed: dict[str, str] = {}
     rows, _ = measurement.compensation_rows(
-        known, device, repeats=1, quick=True, folder=tmp_path, progress=lambda what, share: said.append((what, share))
+        known,
+        device,
+        repeats=1,
+        quick=True,
+        folder=tmp_path,
+        progress=lambda what, share: said.append((what, share)),
+        failed=failed,
     )
+    assert failed == {}
     by_label = {row.label: row for row in rows}
     assert by_label["exact, bilinear"].error_px < 0.001
     assert by_label["exact, bilinear"].image_error < 0.005
@@ -164,9 +173,7 @@ def test_an_image_that_is_wrong_is_refused(
 ) -> None:
     monkeypatch.setattr(measurement, "exact_image", lambda known: np.roll(exact_image(known), 1, axis=1))
     with pytest.raises(AmiwarpError, match=r"exact, bilinear differs from the float64 one"):
-        measurement.compensation_rows(
-            known, "cpu", repeats=1, quick=True, folder=tmp_path, progress=lambda what, share: None
-        )
+        measurement.compensation_rows(known, "cpu", repeats=1, quick=True, folder=tmp_path, progress=silent, failed={})
 
 
 def test_settings_are_different_and_one_is_the_default(known: KnownRecording) -> None:
@@ -320,6 +327,58 @@ def test_quick_chart_writes_everything(charted: tuple[Path, dict[str, Any]]) -> 
         (same,) = (r for r in whole[kind]["rows"] if r["label"] == preset["measured"]["label"])
         assert preset["measured"]["error_px"] == same["error_px"] <= 0.3
         assert preset["measured"][unit] == same[unit] == pytest.approx(data["answers"][kind][unit])
+
+
+def test_settings_that_fail_do_not_end_the_command(
+    charted: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calibrate, compensate, bent = measurement.calibrate, measurement.compensate, measurement._places
+
+    def planted(recording: Recording, settings: Settings, **more: Any) -> Calibration:
+        if settings.model == "circle":
+            raise np.linalg.LinAlgError("Singular matrix")
+        return calibrate(recording, settings, **more)
+
+    def also(source: Recording, calibration: Calibration, *args: Any, **more: Any) -> Any:
+        if calibration.model_name == "circle":
+            raise AmiwarpError("no disk")
+        return compensate(source, calibration, *args, **more)
+
+    def nowhere(model: Model, *args: Any) -> np.ndarray:
+        places = bent(model, *args)
+        return places if isinstance(model, ExactModel) else places * np.nan
+
+    monkeypatch.setattr(measurement, "calibrate", planted)
+    monkeypatch.setattr(measurement, "compensate", also)
+    monkeypatch.setattr(measurement, "_places", nowhere)
+    folder, _ = charted
+    words = ("chart", folder / "recording.h5", "--quick", "--out", tmp_path / "out", "--device", "cpu")
+    done = run(*words)
+    assert done.exit_code == 0, done.output
+    whole = json.loads((tmp_path / "out" / "chart.json").read_text())
+    failed = whole["failed"]
+    sharp = "circle, 50 k events, sharpness"
+    assert failed[sharp].startswith("LinAlgError: Singular matrix (in run, studies/chart/measurement.py:")
+    assert failed["circle, file to file"].startswith("no disk (in run, ")
+    assert failed["circle, bilinear"].startswith("no event has a finite position in both models")
+    labels = {chart: [r["label"] for r in whole[chart]["rows"]] for chart in ("compensation", "calibration")}
+    assert labels["calibration"] == ["default", "50 k events, sharpness"]
+    assert {"exact, bilinear", "exact, file to file"} < set(labels["compensation"])
+    assert not set(failed) & {*labels["compensation"], *labels["calibration"]}
+    assert len(failed) == 5
+    assert all(f"failed: {label}: {error}" in done.stdout for label, error in failed.items())
+    assert done.stdout.endswith(f"{sum(map(len, labels.values()))} settings measured; {len(failed)} failed\n")
+    assert Charts.load(tmp_path / "out" / "chart.json").failed == failed
+
+    def never(*_: Any, **__: Any) -> None:
+        raise MemoryError
+
+    for name in ("calibrate", "compensate", "_places"):
+        monkeypatch.setattr(measurement, name, never)
+    nothing = run(*words[:4], tmp_path / "none", *words[5:])
+    assert nothing.exit_code == 1, nothing.output
+    assert "note: calibration: not drawn, no setting was measured" in nothing.stdout
+    assert sorted(file.name for file in (tmp_path / "none").iterdir()) == ["chart.csv", "chart.json"]
 
 
 def test_charts_are_drawn_later(

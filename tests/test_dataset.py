@@ -13,6 +13,7 @@ import tempfile
 import time
 import tomllib
 from collections.abc import Callable
+from concurrent.futures import Future
 from glob import glob
 from pathlib import Path
 from types import SimpleNamespace
@@ -256,6 +257,67 @@ def test_a_failure_is_reported_and_does_not_stop_the_rest(place: Path) -> None:
     assert "14 of 14 recordings" in done.stdout
     assert "12 of them kept" in done.stdout
     assert manifest(place)["complete"]
+
+
+def test_an_unexpected_error_and_a_dead_worker_fail_their_recording_alone(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = recordings.write_recording
+
+    def planted(item: recordings.Item, *args: Any) -> Any:
+        if item.source.endswith("0.png"):
+            raise np.linalg.LinAlgError("Singular\nmatrix")
+        return write(item, *args)
+
+    monkeypatch.setattr(recordings, "write_recording", planted)
+    plan = amiwarp.plan_dataset(place / "spec.toml", place / "out", workers=1)
+    assert (plan.samples, len(plan.failed)) == (10, 2)
+    shown = run(place / "spec.toml", place / "out", "--dry-run", "--workers", "1", "--device", "cpu")
+    assert shown.exit_code == 0
+    assert shown.stdout.count("sample failed: train/0-") == 2
+    done = make(place)
+    assert (done.made, len(done.failed)) == (10, 2)
+    for error in (*done.failed.values(), *plan.failed.values()):
+        assert error.startswith("LinAlgError: Singular matrix (in ")
+        assert "studies/dataset/making.py:" in error
+    monkeypatch.setattr(recordings, "write_recording", write)
+    again = make(place)
+    assert (again.made, again.kept, dict(again.failed)) == (2, 10, {})
+
+    monkeypatch.setattr(recordings, "write_recording", lambda *_: {}["all"])
+    with pytest.raises(AmiwarpError, match=r"no sample of pictures can be made; train/\S+: KeyError: 'all' \(in "):
+        amiwarp.plan_dataset(place / "spec.toml", place / "elsewhere", workers=1)
+
+    (item, *_) = list_items(load_specification(place / "spec.toml"))
+    job = recordings.Job(item, place, place, "cpu", 1)
+    dead: Future[Any] = Future()
+    dead.set_exception(type("KilledWorker", (Exception,), {})("make-1"))
+    message = "its worker died, out of memory or killed: KilledWorker: make-1"
+    assert recordings._result(job, dead) == recordings.Failed(item.key, message)
+    for ending in (KeyboardInterrupt(), AmiwarpError("the worker on here does not see the folder")):
+        future: Future[Any] = Future()
+        future.set_exception(ending)
+        with pytest.raises(type(ending)):
+            recordings._result(job, future)
+
+
+def test_a_finished_recording_that_cannot_be_read_is_made_again(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make(place)
+    before = checksums(place)
+    lost = place / "out" / min(before)
+    digest = specification.content_digest
+
+    def planted(path: Path, **more: Any) -> str:
+        if path == lost:
+            lost.unlink()
+            raise AmiwarpError(f"{path}: cannot be read: Input/output error")
+        return digest(path, **more)
+
+    monkeypatch.setattr(specification, "content_digest", planted)
+    again = make(place)
+    assert (again.made, again.kept) == (1, 11)
+    assert again.damaged == (f"{lost}: cannot be read: Input/output error",)
+    assert checksums(place) == before
 
 
 def test_a_killed_run_is_continued(place: Path) -> None:

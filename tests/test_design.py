@@ -31,6 +31,7 @@ from amiwarp import (
 from amiwarp.calib.model_choice import QUANTISATION_PX
 from amiwarp.cli import studies as command_line
 from amiwarp.cli.common import Common, command, report
+from amiwarp.studies import design as study
 from amiwarp.studies.design import (
     ACROSS,
     LEAST_SWING,
@@ -38,7 +39,9 @@ from amiwarp.studies.design import (
     TILE,
     Design,
     Limits,
+    Orbit,
     Timing,
+    _complete,
     chart,
     design,
     filled,
@@ -299,6 +302,64 @@ def test_the_command_writes_chart_and_tables(tmp_path: Path, texture: np.ndarray
     assert said["recommended"]["misses"] == []
     with Image.open(out / "design.png") as drawn:
         assert drawn.size[0] > 1000
+
+
+def test_what_fails_does_not_end_the_command(
+    tmp_path: Path, texture: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app = typer.Typer()
+    command(app, command_line.run_design, name="design", example="")
+    picture, out = tmp_path / "picture.png", tmp_path / "out"
+    Image.fromarray(texture).save(picture)
+    orbit_of, simulated = study.orbit_of, study.simulated_yield
+
+    def planted(camera: Camera, prism: Prism, *args: Any) -> Orbit:
+        if prism.apex == math.radians(2.0):
+            raise np.linalg.LinAlgError("Singular matrix")
+        return orbit_of(camera, prism, *args)
+
+    def also(case: Simulation, *args: Any) -> tuple[float, float]:
+        if math.degrees(case.glass.apex) < 0.6 and float(np.asarray(case.motion.rpm)) > 600.0:
+            raise MemoryError
+        return simulated(case, *args)
+
+    monkeypatch.setattr(study, "orbit_of", planted)
+    monkeypatch.setattr(study, "simulated_yield", also)
+    words = ["--picture", str(picture), "--size", "64x48", "--fov-deg", "10", "--rpm", "720,360"]
+    run = CliRunner().invoke
+    done = run(app, [*words, "--apex-deg", "0.5,1,2", "--out", str(out), "--device", "cpu"])
+    assert done.exit_code == 0, done.output
+    data = json.loads((out / "design.json").read_text())
+    assert list(data["failed"]) == ["apex 2°", "simulation of apex 0.5° at 720 rpm"]
+    assert data["failed"]["apex 2°"].startswith("LinAlgError: Singular matrix (in design, studies/design.py:")
+    assert [round(c["apex_deg"], 6) for c in data["choices"]] == [0.5, 0.5, 1.0, 1.0]
+    assert data["volume"]["apex_deg"] == pytest.approx([1.0], abs=1e-9)
+    assert f"failed: apex 2°: {data['failed']['apex 2°']}" in data["reasons"]
+    assert done.stdout.endswith("failed, and left out: apex 2°; simulation of apex 0.5° at 720 rpm\n")
+    nothing = run(app, [*words, "--apex-deg", "2", "--out", str(tmp_path / "none"), "--device", "cpu"])
+    assert nothing.exit_code == 1
+    assert "apex 2°: LinAlgError: Singular matrix" in str(nothing.exception)
+
+
+@pytest.mark.parametrize(
+    ("missing", "rows", "columns"),
+    [
+        ([], [0, 1, 2], [0, 1]),
+        ([(1, 0)], [0, 2], [0, 1]),
+        ([(0, 1), (1, 1)], [0, 1, 2], [0]),
+        ([(0, 0), (1, 0), (2, 0), (1, 1)], [0, 2], [1]),
+    ],
+)
+def test_a_law_keeps_as_many_simulations_as_form_a_table(
+    missing: list[tuple[int, int]], rows: list[int], columns: list[int]
+) -> None:
+    there = np.ones((3, 2), np.bool_)
+    for at in missing:
+        there[at] = False
+    kept = _complete(there)
+    assert kept is not None
+    assert [each.tolist() for each in kept] == [rows, columns]
+    assert _complete(np.zeros((3, 2), np.bool_)) is None
 
 
 def test_what_people_read(made: Design, capsys: pytest.CaptureFixture[str]) -> None:

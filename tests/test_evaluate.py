@@ -21,12 +21,13 @@ from amiwarp.io.json_files import sealed
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.studies import cluster
 from amiwarp.studies.cluster import single_worker
-from amiwarp.studies.evaluate import apex_speed, corners, fading, study, texture
+from amiwarp.studies.evaluate import apex_speed, corners, evaluation, fading, study, texture
 from amiwarp.studies.evaluate.claims import Verdict
 from amiwarp.studies.evaluate.edges import Counts, best_f, binary_entropy, geometric_edges, match
 from amiwarp.studies.evaluate.evaluation import (
     EVALUATIONS,
     Job,
+    JobResult,
     Store,
     _run,
     load,
@@ -577,6 +578,98 @@ def test_a_recording_from_the_command_line(tmp_path: Path) -> None:
     assert (first["cells"], first["new_cells"], first["failed"]) == (1, 1, 0)
     assert (second["cells"], second["new_cells"]) == (1, 0)
     assert "plain.h5" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_recording_that_fails_does_not_end_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from typer.testing import CliRunner
+
+    from amiwarp.cli.app import app
+
+    rng = np.random.default_rng(0)
+    words = ["evaluate", "--out", str(tmp_path / "out"), "--workers", "1", "--device", "cpu"]
+    for name, n in (("good", 5_000), ("odd", 4_000), ("broken", 0)):
+        events = amiwarp.Events.from_arrays(
+            rng.integers(0, 64, n), rng.integers(0, 48, n), np.sort(rng.integers(0, 100_000, n)), rng.integers(0, 2, n)
+        )
+        path = tmp_path / f"{name}.h5"
+        amiwarp.save_recording(path, amiwarp.Recording(amiwarp.MemoryEvents(events, 64, 48)))
+        words += ["--recording", str(path)]
+    whole = (tmp_path / "broken.h5").read_bytes()
+    (tmp_path / "broken.h5").write_bytes(whole[:100])
+    measure = texture.measure
+
+    def planted(streams: RecordedStreams, *args: Any) -> Any:
+        if len(streams.recording.events) == 4_000:
+            raise np.linalg.LinAlgError("Singular matrix")
+        return measure(streams, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(texture, "measure", planted)
+        first = CliRunner().invoke(app, words)
+    assert first.exit_code == 0, first.output
+    (odd,) = (line for line in first.stdout.splitlines() if "LinAlgError" in line)
+    assert odd.startswith(
+        f"failed: texture, {tmp_path / 'odd.h5'}: LinAlgError: Singular matrix (in _run_cell, studies/"
+    )
+    assert f"failed: texture, {tmp_path / 'broken.h5'}: " in first.stdout
+    assert first.stdout.endswith("; 2 failed: run the same command again to try them again\n")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "<dd>2 of 3 cells" in page
+    assert f"{tmp_path / 'odd.h5'}: LinAlgError: Singular matrix" in page
+    assert "good.h5" in (tmp_path / "out" / "tables" / "event_rate.csv").read_text()
+    (said,) = json.loads((tmp_path / "out" / "report.json").read_text())["evaluations"]
+    assert (said["cells"], len(said["errors"])) == (3, 2)
+
+    again = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)
+    assert (again["cells"], again["new_cells"], again["failed"]) == (3, 2, 1)
+    assert list(again["failures"]) == [f"texture, {tmp_path / 'broken.h5'}"]
+    only = [*words[:7], "--recording", str(tmp_path / "broken.h5"), "--json"]
+    nothing = CliRunner().invoke(app, only)
+    assert nothing.exit_code == 1
+    assert json.loads(nothing.stdout)["failed"] == 1
+    assert "<dd>1 of 1 cells" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_prism_whose_calibration_fails_and_a_worker_that_dies_fail_their_cells_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual, other = (
+        Condition(world, "still", width=64, height=48, duration_s=60 / rpm, rpm=rpm, cutoff_hz=0.0)
+        for world, rpm in ((DISCS, 1440.0), ("room", 720.0))
+    )
+    jobs = [Job(usual, ("fading", "apex_speed"), SMALL), Job(other, ("texture", "edges", "fading"), SMALL)]
+    dead = {usual}
+
+    def simulated(job: Job) -> JobResult:
+        if job.condition in dead:
+            raise MemoryError
+        return JobResult([CellResult(name, job.condition, known_values(name)) for name in job.evaluations], 1.0)
+
+    def known_values(name: str) -> dict[str, Any]:
+        cell: CellResult = stored_fading()
+        assert name == cell.evaluation
+        return cell.values
+
+    def refused(job: Job) -> tuple[Setup, float]:
+        raise amiwarp.AmiwarpError("too few events")
+
+    monkeypatch.setattr(evaluation, "run_job", simulated)
+    monkeypatch.setattr(evaluation, "run_setup", refused)
+    with single_worker() as workers:
+        results, new, _ = _run(jobs, Store(tmp_path), workers, silent)
+        assert new == 5
+        found = {(r.condition.world, r.evaluation): r.error for r in results if isinstance(r.condition, Condition)}
+        assert [key for key, error in found.items() if not error] == [("room", "fading")]
+        assert all(found[DISCS, name].startswith("MemoryError") for name in ("fading", "apex_speed"))
+        assert {re.sub(r" \(in .*", "", found["room", name]) for name in ("texture", "edges")} == {
+            "calibration of the prism: too few events"
+        }
+        dead.clear()
+        jobs = [Job(usual, ("fading",), SMALL), jobs[1]]
+        results, new, _ = _run(jobs, Store(tmp_path), workers, silent)
+    assert new == 3
+    failed = {(r.evaluation, r.condition) for r in results if r.error}
+    assert (len(results), failed) == (4, {("texture", other), ("edges", other)})
 
 
 def test_a_report_that_is_not_ours_is_kept(tmp_path: Path) -> None:

@@ -4,9 +4,11 @@ import csv
 import itertools
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,9 +32,22 @@ from amiwarp import (
 from amiwarp.calib.model_choice import QUANTISATION_PX
 from amiwarp.cli import studies as command_line
 from amiwarp.cli.common import Common, command, report
-from amiwarp.studies.design import LEAST_SWING, Limits, Timing, design, filled, image_grid, orbit_of, paths
+from amiwarp.studies import optics_comparison
+from amiwarp.studies.design import (
+    LEAST_SWING,
+    Choice,
+    Design,
+    Limits,
+    Timing,
+    design,
+    filled,
+    image_grid,
+    orbit_of,
+    paths,
+)
 from amiwarp.studies.optics_comparison import (
     PATH_ANGLES,
+    Compared,
     Comparison,
     Setting,
     across_edges,
@@ -51,7 +66,7 @@ GLASS = Prism(0.0)
 CAMERA = Camera.from_fov(160, 120, math.radians(60.0))
 SMALL = Camera.from_fov(64, 48, math.radians(10.0))
 """A focal length of 366 px, between those of a 60° and a 90° lens at 640 × 480, and fast to simulate."""
-SETTINGS = {each.name: each for each in settings(CAMERA, GLASS, math.radians(2.0), 12.0, (0.3, 0.6))}
+SETTINGS = {each.name: each for each in settings(CAMERA, GLASS, math.radians(2.0), 12.0, (0.3, 0.6), {})}
 NAMES = list(SETTINGS)
 RADIUS = orbit_of(CAMERA, Prism(math.radians(2.0))).radius
 
@@ -325,6 +340,39 @@ def test_without_a_suitable_wedge_the_nearest_is_compared(compared: Comparison) 
 def test_impossible_depths_are_refused(compared: Comparison, scene: Scene, depths: tuple[float], words: str) -> None:
     with pytest.raises(AmiwarpError, match=words):
         compare(compared.design, scene, depths=depths)
+
+
+def test_an_optic_that_fails_does_not_end_the_comparison(
+    compared: Comparison, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compare_one, sized = optics_comparison._compared, optics_comparison._sized
+
+    def planted(design: Design, reference: Choice, setting: Setting, *args: Any) -> Compared:
+        if setting.kind in ("wedge", "plate"):
+            raise np.linalg.LinAlgError("Singular matrix")
+        return compare_one(design, reference, setting, *args)
+
+    def also(make: Callable[[float], Setting], size: float, *args: Any) -> Setting:
+        if make(size).kind == "vibration":
+            raise AmiwarpError("no such motor")
+        return sized(make, size, *args)
+
+    monkeypatch.setattr(optics_comparison, "_compared", planted)
+    monkeypatch.setattr(optics_comparison, "_sized", also)
+    found = compare(compared.design, scene, depths=[0.5])
+    assert [r.setting.name for r in found.results] == [
+        "pair, opposite", "pair, unequal", "mirror, circle", "mirror, 3:4",
+    ]  # fmt: skip
+    assert list(found.failed) == ["vibration", "wedge", "plate, 0.5 m"]
+    assert found.failed["vibration"].startswith("no such motor (in ")
+    assert {a.task: a.chosen is None for a in found.advice}["depth"]
+    assert "no plate could be compared" in found.advice[-1].why
+    assert f"failed: wedge: {found.failed['wedge']}" in reasons(found)
+    assert "Failed, and left out: vibration; wedge; plate, 0.5 m." in [t.get_text() for t in chart(found).texts]
+    assert command_line.comparison_summary(found)["failed"] == found.failed
+    monkeypatch.setattr(optics_comparison, "_compared", lambda *_: {}["nothing"])
+    with pytest.raises(AmiwarpError, match=r"vibration: no such motor .*; wedge: KeyError: 'nothing'"):
+        compare(compared.design, scene, depths=[0.5])
 
 
 def test_settings_repeat_after_their_turns() -> None:

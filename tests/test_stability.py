@@ -1,18 +1,22 @@
 """Recordings of the stability study, the methods that run on them, and calibration of formerly failing cases."""
 
 import math
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
-from amiwarp import AmiwarpError, Calibration, ExactModel, calibrate, model_error
+from amiwarp import AmiwarpError, Calibration, Events, ExactModel, MemoryEvents, calibrate, model_error
 from amiwarp.calib.paper_method import calibrate_as_paper
-from amiwarp.studies.cluster import single_worker
+from amiwarp.studies.cluster import Workers, single_worker
 from amiwarp.studies.stability.cells import (
     AXES,
     TROUBLES,
+    Axis,
     Condition,
     Outcome,
     SceneKind,
@@ -277,6 +281,80 @@ def test_the_papers_method_on_sparse_edges() -> None:
     assert abs(away) <= math.radians(45.0) * 1.3
     anywhere = calibrate_as_paper(sample.recording)
     assert anywhere.stages[0].evaluations > found.stages[0].evaluations
+
+
+@pytest.mark.parametrize("ramp", [0.0, 0.5])
+def test_the_papers_method_without_an_encoder(ramp: float) -> None:
+    """Its result gives the angle of the prism over the recording, in either sense of rotation."""
+    condition = replace(SMALL, scene=SceneKind.EDGES.value, fov_deg=30.0, apex_deg=2.0, turns=8.0)
+    condition = replace(condition, no_encoder=True, ramp=ramp)
+    sample = make(condition, 2)
+    assert sample.hardware == {}
+    events = sample.recording.events.slice(0, len(sample.recording.events))
+    mirrored = Events(condition.width - 1 - events.x, events.y, events.t, events.p)
+    first, last = int(events.t[0]), int(events.t[-1])
+    true = float(np.ptp(sample.motion.angle(np.array([first, last]))))
+    for seen, sense in ((events, 1.0), (mirrored, -1.0)):
+        source = MemoryEvents(seen, condition.width, condition.height)
+        found = calibrate_as_paper(replace(sample.recording, events=source))
+        assert found.model_name == "circle"
+        start, end = found.encoder_for(None, first, last).angle_at(np.array([first, last]))
+        assert end - start == pytest.approx(sense * true, abs=0.3)  # rad, of eight turns or six
+    assert math.isfinite(compare(calibrate_as_paper(sample.recording), sample).rms)
+
+
+class Killed(Executor):
+    """Executor that runs its jobs at once, and whose first job ends with an error as of a worker that died."""
+
+    def __init__(self, error: BaseException) -> None:
+        self.errors = [error]
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        if self.errors:
+            future.set_exception(self.errors.pop())
+        else:
+            future.set_result(fn(*args, **kwargs))
+        return future
+
+
+def test_a_worker_that_dies_fails_its_cell_alone_and_the_cell_is_run_again(tmp_path: Path) -> None:
+    small = [Axis("width", "width", (48, 64), also=(("height", 48), ("turns", 1.0)))]
+    cells, methods = cells_of(small, 1), chosen(("sharpness",))[1:]
+    dead = type("KilledWorker", (Exception,), {})("cell-1")
+    first = run(cells, methods, Store(tmp_path), Workers(Killed(dead), lambda: 1))
+    assert {r.message for r in first[0].results.values()} == {
+        "its worker died, out of memory or killed: KilledWorker: cell-1"
+    }
+    assert [{r.outcome is Outcome.FAILED for r in stored.results.values()} for stored in first] == [{True}, {False}]
+    assert Store(tmp_path).load(cells[0]) == first[0]
+    with single_worker() as worker:
+        again = run(cells, methods, Store(tmp_path), worker)
+    assert [stored.events > 0 for stored in again] == [True, True]
+    assert again[1] == first[1]
+    assert all(r.outcome is not Outcome.FAILED for stored in again for r in stored.results.values())
+    assert set(again[0].results) == {identity(m) for m in methods}
+
+    more = chosen(("sharpness", "gradient"))[1:]
+    lost = run(cells, more, Store(tmp_path), Workers(Killed(dead), lambda: 1))[0]
+    assert lost.events == again[0].events
+    assert [lost.results[identity(m)] for m in methods] == [again[0].results[identity(m)] for m in methods]
+    assert lost.lacks(more[-1])
+
+
+def test_an_interrupt_and_a_lost_scheduler_end_the_study(tmp_path: Path) -> None:
+    cells, methods = cells_of([Axis("width", "width", (48,), also=(("height", 48),))], 1), chosen(("sharpness",))
+    with pytest.raises(KeyboardInterrupt):
+        run(cells, methods, Store(tmp_path), Workers(Killed(KeyboardInterrupt()), lambda: 1))
+    dropped: Future[Any] = Future()
+    dropped.cancel()
+    dropped.set_running_or_notify_cancel()
+    with (
+        mock.patch.object(Killed, "submit", return_value=dropped),
+        pytest.raises(AmiwarpError, match="the scheduler stopped or dropped the work; run the same command again"),
+    ):
+        run(cells, methods, Store(tmp_path), Workers(Killed(KeyboardInterrupt()), lambda: 1))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_cells_are_kept_and_only_what_misses_is_run(tmp_path: Path) -> None:

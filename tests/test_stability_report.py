@@ -27,6 +27,7 @@ from amiwarp.studies.stability import cells as study
 from amiwarp.studies.stability.cells import METHODS, Axis, Cell, Condition, Outcome, Store, Stored, identity
 from amiwarp.studies.stability.cells import Result as Found
 from amiwarp.studies.stability.report import (
+    JUDGED,
     OVERVIEW,
     Atlas,
     Rate,
@@ -101,7 +102,7 @@ def test_rates_have_wilsons_interval() -> None:
 def test_spots_count_what_the_cells_hold(atlas: Atlas) -> None:
     assert (atlas.cells, atlas.methods) == (6 * 8, ["default", "paper", "circle"])
     spot = atlas.of(NOISE)["default", 0.8]
-    assert [spot.rate(o).count for o in Outcome] == [0, 8, 0]
+    assert [spot.rate(o).count for o in JUDGED] == [0, 8, 0]
     assert (spot.errors, spot.quantiles, spot.common_message(Outcome.REFUSAL)) == ([], {}, "too hard by 1.00")
     silent = atlas.of(SCENE)["paper", "one edge direction"]
     assert silent.rate(Outcome.SILENT) == Rate(8, 8)
@@ -146,6 +147,41 @@ def test_deviations_are_counted_for_combinations_and_the_sensible_range() -> Non
         ("sensible range", "apex", 6, 6, 6, 6), ("sensible range", "phase", 0, 0, 6, 6),
     ]  # fmt: skip
     assert "| random combinations | apex | 25 % (4.56 % to 69.9 %; 1 of 4) | 100 %" in _markdown(atlas)
+
+
+def test_recordings_that_failed_are_named_and_part_of_no_rate(tmp_path: Path) -> None:
+    every = cells({"default": good, "paper": poor})
+    default, paper = identity(METHOD["default"]), identity(METHOD["paper"])
+    lost = [s for s in every if s.cell.condition == NOISE.conditions()[1] and s.cell.seed < 3]
+    gone = [s for s in every if s.cell.condition == SCENE.conditions()[1]]
+    for stored in lost:
+        stored.results[default] = found(Outcome.FAILED, None, "no such scene (in make, cells.py:1)")
+    for stored in gone:
+        stored.results = dict.fromkeys((default, paper), found(Outcome.FAILED, None, "its worker died"))
+    atlas = aggregate(every, AXES, METHODS[:2], {})
+    spot = atlas.of(NOISE)["default", 0.25]
+    assert (spot.failed, str(spot.rate(Outcome.SUCCESS))) == (3, "100 % (56.6 % to 100 %; 5 of 5)")
+    assert (atlas.failed_cells, atlas.cells, atlas.measured) == (11, 48, True)
+    assert atlas.works(SCENE, "default") == "dense texture"
+    assert sum(rate.total for rate in (atlas.aims.inside, atlas.aims.outside)) == 48 - 11
+    assert all(w.default.total in (5, 8) for w in atlas.aims.worse)
+    files = atlas.write(tmp_path)
+    with files["table"].open() as file:
+        rows = {(r["axis"], r["value"], r["method"]): r for r in csv.DictReader(file)}
+    row = rows["scene", "one edge direction", "default"]
+    assert (row["n"], row["failed"], row["success"], row["seconds"]) == ("0", "8", "0", "")
+    data = json.loads(files["data"].read_text())
+    assert [s["failed"] for s in data["spots"]] == [s.failed for s in atlas.spots]
+    assert {f["message"] for f in data["failures"]} == {"no such scene (in make, cells.py:1)", "its worker died"}
+    text = files["summary"].read_text()
+    assert "48 recordings, 11 failed in the study itself" in text
+    one = f"| {gone[0].cell.name} | scene one edge direction | default, paper | its worker died |"
+    assert one in text
+    assert f"| {lost[2].cell.name} | background noise 25 % | default | no such scene (in make, cells.py:1) |" in text
+    words = [t.get_text() for t in _page(atlas, SCENE).axes[0].texts]
+    assert words.count("8 failed") == words.count("–") == 2
+    assert "5/5, 3 failed" in [t.get_text() for t in _page(atlas, NOISE).axes[0].texts]
+    assert _overview(atlas).texts[-1].get_text().endswith("; 11 failed")
 
 
 def test_worse_than_the_paper_is_told_by_the_same_recordings() -> None:
@@ -225,7 +261,11 @@ def of_result(**values: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
 WRONG: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
     "huge": (of_result(error_px=1e300, outcome="silent failure"), r"error_px = 1e\+300 is not a finite number in 0"),
     "negative": (of_result(seconds=-1.0), r"seconds = -1\.0 is not a finite number"),
-    "outcome": (of_result(outcome="triumph"), r"outcome is 'triumph'; choose among success, refusal, silent failure"),
+    "outcome": (
+        of_result(outcome="triumph"),
+        r"outcome is 'triumph'; choose among success, refusal, silent failure, f",
+    ),
+    "failed": (of_result(outcome="failed"), r"outcome failed does not fit error_px = 0\.02"),
     "contradiction": (of_result(error_px=99.0), r"outcome success does not fit error_px = 99\.0"),
     "field": (of_result(colour="red"), r"colour is unknown; expected outcome, error_px"),
     "missing": (lambda data: {**data, "results": {"a": {}}}, r"field results\.a\.outcome is missing"),
@@ -346,6 +386,65 @@ def test_command_runs_goes_on_and_redraws(tiny: Axis, tmp_path: Path) -> None:
     assert third.exit_code == 0, third.output
     assert "2 cells in all" in third.stdout
     assert (tmp_path / "atlas.csv").read_text() == before
+
+
+def test_a_cell_that_fails_does_not_end_the_command(
+    tiny: Axis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("--out", tmp_path, "--methods", "sharpness", "--seeds", "1", "--draws", "0", "--device", "cpu")
+    monkeypatch.setattr("amiwarp.cli.studies.cpu_threads", lambda: 1)
+    make, judge = study.make, study._judge
+
+    def planted(condition: Condition, *args: Any) -> study.SimulatedSample:
+        if condition.width == 48:
+            raise np.linalg.LinAlgError("Singular matrix")
+        return make(condition, *args)
+
+    def also(cell: Cell, method: study.Method, *args: Any) -> Found:
+        if method.name == "sharpness":
+            raise MemoryError
+        return judge(cell, method, *args)
+
+    monkeypatch.setattr(study, "make", planted)
+    monkeypatch.setattr(study, "_judge", also)
+    first = run(*words)
+    assert first.exit_code == 0, first.output
+    every = "failed: width 48, seed 0, default, paper, sharpness: LinAlgError: Singular matrix (in run_cell, studies/"
+    assert every in first.stdout
+    assert "failed: width 64, seed 0, sharpness: MemoryError" in first.stdout
+    assert first.stdout.endswith("cells; 2 failed: run the same command again to try them again\n")
+    assert "| width 48 | default, paper, sharpness | LinAlgError" in (tmp_path / "summary.md").read_text()
+    with (tmp_path / "atlas.csv").open() as file:
+        counts = {(r["value"], r["method"]): (r["n"], r["failed"]) for r in csv.DictReader(file)}
+    assert counts == {(v, m): ("1", "0") if (v, m) in (("64", "default"), ("64", "paper")) else ("0", "1")
+                      for v in ("48", "64") for m in ("default", "paper", "sharpness")}  # fmt: skip
+    redrawn = run("--redraw", "--out", tmp_path, "--device", "cpu")
+    assert redrawn.exit_code == 0, redrawn.output
+    assert every in redrawn.stdout
+
+    monkeypatch.undo()
+    monkeypatch.setattr(study, "AXES", (tiny,))
+    monkeypatch.setattr("amiwarp.cli.studies.cpu_threads", lambda: 1)
+    again = run(*words, "--json")
+    assert again.exit_code == 0, again.output
+    data = json.loads(again.stdout)
+    assert (data["new_cells"], data["cells_failed"], data["failed"]) == (2, 0, [])
+
+
+def test_a_study_in_which_all_fails_writes_its_report_and_exits_with_1(
+    tiny: Axis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def planted(*args: Any) -> study.SimulatedSample:
+        raise AmiwarpError("no recording today")
+
+    monkeypatch.setattr("amiwarp.cli.studies.cpu_threads", lambda: 1)
+    monkeypatch.setattr(study, "make", planted)
+    done = run("--out", tmp_path, "--methods", "sharpness", "--seeds", "1", "--draws", "0", "--device", "cpu")
+    assert done.exit_code == 1, done.output
+    assert "2 failed: run the same command again" in done.stdout
+    assert done.stdout.count("no recording today (in ") == 2
+    assert "not measured" in (tmp_path / "summary.md").read_text()
+    assert (tmp_path / "overview.png").stat().st_size > 1000
 
 
 def test_command_says_what_is_wrong(tiny: Axis, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -120,7 +120,15 @@ LocalWorkers = Annotated[
 AVERAGE_S = 600.0
 """Time over which the speed is averaged [s]; recordings differ in length."""
 SHOWN = 5
-"""Number of failures that are printed; the manifest lists all."""
+"""Number of failures that are printed; a file of the study lists all."""
+
+
+def failed_lines(failed: Mapping[str, str], listed_in: Path) -> list[str]:
+    """Return a line of text for each of the first failures of a study, and the file that lists all."""
+    lines = [f"failed: {name}: {error}" for name, error in list(failed.items())[:SHOWN]]
+    if len(failed) > SHOWN:
+        lines.append(f"... and {len(failed) - SHOWN:,} more failures, in {listed_in}")
+    return lines
 
 
 def run_dataset(
@@ -151,7 +159,8 @@ def run_dataset(
             raise AmiwarpError("--dry-run samples on this machine; leave --scheduler out, and give --workers instead")
         with cli.progress("sampling") as advance:
             plan = making.plan_dataset(specification, out, workers=workers, device=device, progress=advance)
-        cli.report(common, asdict(plan) | {"seconds": plan.seconds}, _plan_lines(plan))
+        lines = [*(f"sample failed: {file}: {error}" for file, error in plan.failed.items()), *_plan_lines(plan)]
+        cli.report(common, asdict(plan) | {"seconds": plan.seconds}, lines)
         return
     try:
         with cli.progress("starting workers", average_s=AVERAGE_S) as advance:
@@ -192,9 +201,7 @@ def _plan_lines(plan: DatasetPlan) -> list[str]:
 
 
 def _dataset_lines(done: DatasetSummary, out: Path) -> list[str]:
-    lines = [f"failed: {file}: {error}" for file, error in list(done.failed.items())[:SHOWN]]
-    if len(done.failed) > SHOWN:
-        lines.append(f"... and {len(done.failed) - SHOWN:,} more failures, in {out / 'manifest.json'}")
+    lines = failed_lines(done.failed, out / "manifest.json")
     lines += cli.made_again(done.damaged)
     if done.not_in_specification:
         lines.append(
@@ -275,8 +282,8 @@ def run_chart(
 ) -> None:
     """Measure speed and error of the settings on a recording with ground truth, and draw both Pareto fronts.
 
-    With a budget, the chosen settings are written to preset_calibration.json and preset_compensation.json. Pass these
-    files to calibrate and compensate with --preset.
+    A setting that fails is reported and does not stop the others. With a budget, the chosen settings are written to
+    preset_calibration.json and preset_compensation.json. Pass these files to calibrate and compensate with --preset.
     """
     if budget_px is not None and budget_ms is not None:
         raise AmiwarpError("--budget-px and --budget-ms are two budgets; give one of them")
@@ -300,6 +307,8 @@ def run_chart(
                       progress=advance)  # fmt: skip
     answers = charts.answer(out, budget_px=budget_px, budget_ms=budget_ms)
     cli.report(common, chart_summary(charts, answers, out) | {"device": device}, chart_lines(charts, answers, out))
+    if not (charts.compensation or charts.calibration):
+        raise typer.Exit(1)
 
 
 def chart_summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[str, Any]:
@@ -322,6 +331,7 @@ def chart_summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> 
                     for kind, row in answers.items()},
         "files": {name: str(path) for name, path in charts.files.items()},
         "notes": list(charts.notes),
+        "failed": dict(charts.failed),
     }  # fmt: skip
 
 
@@ -347,7 +357,12 @@ def chart_lines(charts: Charts, answers: dict[str, Row | None], out: Path) -> li
             shown.append(
                 f"{kind} within the budget: {row.label}, {speed}, {error} measured; use it with --preset {file}"
             )
-    return [*shown, *(f"{name}: {path}" for name, path in charts.files.items())]
+    shown += failed_lines(charts.failed, charts.files["data"])
+    shown += [f"{name}: {path}" for name, path in charts.files.items()]
+    measured = len(charts.compensation) + len(charts.calibration)
+    if charts.failed:
+        shown.append(f"{measured:,} settings measured; {len(charts.failed):,} failed")
+    return shown
 
 
 def _setting(row: Row) -> str:
@@ -490,7 +505,8 @@ def run_design(
     """Compare prisms and speeds for a camera, and recommend one with the reasons.
 
     Event rates are predicted from simulations of small parts of the image. Blur, window and models are predicted from
-    the optics. With --compare, other optics are compared with the recommended wedge too.
+    the optics. With --compare, other optics are compared with the recommended wedge too. A prism, a simulation or an
+    optic that fails is reported and does not stop the others.
     """
     optics.check()
     seen = _camera_of_design(camera, size)
@@ -537,6 +553,7 @@ def run_design(
     _write_csv(files["optics_csv"], optics_data["optics"])
     save_png_and_svg(optics_comparison.chart(compared), out / "optics")
     lines = [*design_lines(made, {}), *comparison_lines(compared), "", *files.values()]
+    lines += _failed_names({**made.failed, **compared.failed})
     cli.report(common, {**data, "comparison": optics_data, "files": files, "device": device}, lines)
 
 
@@ -581,6 +598,7 @@ def design_summary(design: Design) -> dict[str, Any]:
         "recommended": None if design.chosen is None else _fields(design.chosen),
         "headline": headline(design),
         "reasons": reasons(design),
+        "failed": design.failed,
     }
 
 
@@ -620,7 +638,12 @@ def design_lines(design: Design, files: dict[str, str]) -> list[Any]:
     ]  # fmt: skip
     shown = cli.table(rows, "apex", "rpm", "events", "orbit", "error", "model", "window", "misses")
     said = [tuple(line.split(": ", 1)) for line in reasons(design)]
-    return [shown, "", headline(design), cli.table(said), "", *files.values()]
+    return [shown, "", headline(design), cli.table(said), "", *files.values(), *_failed_names(design.failed)]
+
+
+def _failed_names(failed: Mapping[str, str]) -> list[str]:
+    """Return a line of text with the names of what failed in a study; none if nothing did."""
+    return [f"failed, and left out: {'; '.join(failed)}"] if failed else []
 
 
 def comparison_summary(comparison: Comparison) -> dict[str, Any]:
@@ -639,6 +662,7 @@ def comparison_summary(comparison: Comparison) -> dict[str, Any]:
         "optics": [_optic_fields(r) for r in comparison.results],
         "recommended": {a.task: None if a.chosen is None else a.chosen.setting.name for a in comparison.advice},
         "reasons": reasons(comparison),
+        "failed": dict(comparison.failed),
     }
 
 
@@ -759,7 +783,8 @@ def run_stability(
     """Calibrate simulated recordings under growing disturbances, and draw where calibration works and fails.
 
     Each axis varies one disturbance, such as noise. A cell holds one recording and the results of all methods on it.
-    Finished cells are saved in OUT/cells: the same command continues a stopped run and skips finished cells.
+    Finished cells are saved in OUT/cells: the same command continues a stopped run and skips finished cells. A cell
+    that fails is reported, does not stop the others, and is run again by the same command.
     """
     device = cli.choose_device(common.device)
     from amiwarp.studies.stability.cells import DRAWS, Store, cells_of, identity
@@ -788,10 +813,14 @@ def run_stability(
         with cli.progress("drawing"), own_folder(out) if earlier else contextlib.nullcontext():
             files = atlas.write(out) | draw(atlas, out)
     speed = {"cells": atlas.cells, "new_cells": new, "cells_left": left, "seconds": took, "cells_per_s": new / took}
+    speed |= {"cells_failed": atlas.failed_cells}
     data = {"aims": atlas.aims.to_json(), "files": {name: str(path) for name, path in files.items()}, **speed}
     damaged = [f"damaged, and left out: {what}" for what in store.damaged] if redraw else cli.made_again(store.damaged)
     shown = [*damaged, *stability_lines(atlas, files, new, left, took)]
-    cli.report(common, data | {"device": device, "damaged": store.damaged}, shown)
+    failed = [asdict(failure) for failure in atlas.failures]
+    cli.report(common, data | {"device": device, "damaged": store.damaged, "failed": failed}, shown)
+    if not atlas.measured:
+        raise typer.Exit(1)
 
 
 def _axes(names: Sequence[str], quick: bool) -> tuple[Axis, ...]:
@@ -861,10 +890,13 @@ def stability_lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, t
         shown += [cli.table([d.row() for d in atlas.stated], *STATED_HEADINGS), ""]
     listed = ("overview", "pages", "summary", "data", "table")
     shown += [f"{name}: {files[name]}" for name in listed]
+    failed = {f"{f.where}, seed {f.name.rpartition('_')[2]}, {', '.join(f.methods)}": f.message for f in atlas.failures}
+    shown += failed_lines(failed, files["summary"])
     speed = f"{new:,} cells in {took:,.0f} s, {new / took:.3g} per second; " if new else ""
+    without = f"; {atlas.failed_cells:,} failed: run the same command again to try them again" if failed else ""
     if left:
         shown.append(f"{left:,} cells remain after the time limit; run the same command again to continue")
-    return [*shown, f"{speed}{atlas.cells:,} cells in all, in {files['data'].parent / 'cells'}"]
+    return [*shown, f"{speed}{atlas.cells:,} cells in all, in {files['data'].parent / 'cells'}{without}"]
 
 
 # ``amiwarp evaluate``: the AMI-EV against a plain event camera, as its paper evaluates it, on simulated worlds.
@@ -904,7 +936,8 @@ def run_evaluate(
     """Check the AMI-EV paper's results: compare with a plain event camera on simulated worlds, and write a report.
 
     The report is OUT/report.html, with its tables and figures next to it. Finished cells are saved in OUT/cells: the
-    same command continues a stopped run. --device cuda uses all GPUs.
+    same command continues a stopped run. A cell that fails is reported, does not stop the others, and is run again by
+    the same command. --device cuda uses all GPUs.
     """
     from amiwarp.studies.cluster import ANY_GPU
     from amiwarp.studies.evaluate.evaluation import evaluate
@@ -923,17 +956,20 @@ def run_evaluate(
         raise
     files = {name: str(path) for name, path in done.files.items()}
     cli.report(common, asdict(done) | {"files": files, "device": device}, _evaluate_lines(done))
+    if done.failed == done.cells:
+        raise typer.Exit(1)
 
 
 def _evaluate_lines(done: EvaluationSummary) -> list[str]:
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in done.verdicts.items())
     lines = [f"claims: {verdicts or 'none'}"]
-    if done.failed:
-        lines.append(f"{done.failed:,} cells failed; the report says why")
+    lines += failed_lines(done.failures, done.files["report"])
     lines += cli.made_again(done.damaged)
     lines += [f"{name}: {path}" for name, path in done.files.items()]
-    return [
-        *lines,
+    last = (
         f"{done.new_cells:,} of {done.cells:,} cells in {done.seconds:,.0f} s, {done.processor_seconds:,.0f} s of "
-        "processor time",
-    ]
+        "processor time"
+    )
+    if done.failed:
+        last += f"; {done.failed:,} failed: run the same command again to try them again"
+    return [*lines, last]

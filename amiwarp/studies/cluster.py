@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.kernels import launch
+from amiwarp.studies.failures import failure_text
 from amiwarp.tasks import cpu_threads, no_garbage_collection
 from amiwarp.validation import whole
 
@@ -186,15 +187,21 @@ def run_jobs(
             future.cancel()
 
 
-def result_of(future: Future[Result]) -> Result:
-    """Return the result of a finished job. Raises :class:`AmiwarpError` if the job was dropped or its workers died."""
+def failure_of(future: Future[Any]) -> str:
+    """Return why a finished job has no result, as one line of text; empty if it has one.
+
+    Raises :class:`AmiwarpError` if the scheduler stopped or dropped the job, because no other job can run then.
+    """
     if future.cancelled():
         raise AmiwarpError("the scheduler stopped or dropped the work; run the same command again to continue")
     error = future.exception()
+    if error is None:
+        return ""
+    if isinstance(error, KeyboardInterrupt):
+        raise error
     if type(error).__name__ == "KilledWorker":  # of Dask, which need not be installed
-        raise AmiwarpError(f"workers died during a single run (cell), out of memory or killed: {error}; "
-                           "run the same command again to continue") from error  # fmt: skip
-    return future.result()
+        return f"its worker died, out of memory or killed: {failure_text(error)}"
+    return failure_text(error)
 
 
 # Description of the machine of a measurement: processor or GPU, and versions of the relevant packages.

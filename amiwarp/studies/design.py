@@ -1,8 +1,8 @@
 """Design study: the choice of a prism and its speed for a camera, before either is bought, and its chart."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -20,6 +20,7 @@ from amiwarp.simulation.description import PrismMotion, Scene
 from amiwarp.simulation.scenery import place_scene, seen_bearings
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
+from amiwarp.studies.failures import noted
 from amiwarp.tasks import Progress, part, silent
 
 # Effect of a prism on a camera's image: radii of the pixels' orbits, and error of each refraction model.
@@ -166,6 +167,8 @@ class Volume:
     """Noise rate of each pixel [events/s]."""
     simulated: int
     """Number of pixels that were simulated, summed over the tiles."""
+    failed: Mapping[str, str] = field(default_factory=dict)
+    """Error of each simulation that failed, by apex angle and speed. The law leaves it out."""
 
     def events_per_s(self, orbit: Orbit, rpm: float) -> float:
         """Return the event rate of the whole image [events/s]."""
@@ -209,7 +212,8 @@ def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float]
     reference levels of the pixels settle, the second is counted. The events of the tiles are scaled to the image by the
     gradient along their orbits, which is known everywhere, so that the choice of tiles matters little.
 
-    Raises :class:`AmiwarpError` for a scene without texture.
+    A simulation that fails is noted, and the law is measured by the others. Raises :class:`AmiwarpError` for a scene
+    without texture, and if too few simulations succeed for a law.
     """
     sensor, camera = template.sensor, template.camera
     gradient = np.hypot(*slopes_of(template.log_view()))
@@ -220,20 +224,42 @@ def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float]
     contrast = 2.0 / (1.0 / sensor.contrast_on + 1.0 / sensor.contrast_off)
     noise = noise_hz(sensor)
     cameras = tiles(camera, template.seed)
-    yields, spread = np.empty((len(nodes), len(speeds))), []
+    yields, errors = np.full((2, len(nodes), len(speeds)), np.nan)
+    simulated = np.zeros(yields.shape, np.bool_)
+    failed: dict[str, str] = {}
     for k, (i, j) in enumerate(np.ndindex(yields.shape)):
         report("simulating", k / yields.size)
-        rpm = float(speeds[j])
-        prism = replace(template.glass, apex=float(nodes[i]))
-        case = replace(template, prism=prism, motion=PrismMotion(rpm), duration_s=120.0 / rpm)
-        radius = orbit_radii(camera, prism)[0]
-        likely = texture_of(gradient, radius, camera, cameras) * 4.0 * radius / contrast
-        yields[i, j], error = simulated_yield(case, cameras, likely, case.duration_us // 2, noise * 60.0 / rpm)
-        spread.append(error)
+        rpm, apex = float(speeds[j]), float(nodes[i])
+        with noted(failed, f"simulation of apex {degrees(apex)} at {rpm:g} rpm"):
+            prism = replace(template.glass, apex=apex)
+            case = replace(template, prism=prism, motion=PrismMotion(rpm), duration_s=120.0 / rpm)
+            radius = orbit_radii(camera, prism)[0]
+            likely = texture_of(gradient, radius, camera, cameras) * 4.0 * radius / contrast
+            half, by_noise = case.duration_us // 2, noise * 60.0 / rpm
+            yields[i, j], errors[i, j] = simulated_yield(case, cameras, likely, half, by_noise)
+            simulated[i, j] = True
+    kept = _complete(simulated)
+    if kept is None:
+        name, said = next(iter(failed.items()))
+        raise AmiwarpError(f"too few simulations succeeded for the event volume; {name}: {said}")
+    nodes, speeds, yields, errors = nodes[kept[0]], speeds[kept[1]], yields[np.ix_(*kept)], errors[np.ix_(*kept)]
     pixels = camera.width * camera.height
-    simulated = sum(tile.width * tile.height for tile in cameras)
-    return Volume(nodes, speeds, yields, float(np.mean(spread)), float(gradient.mean()), contrast, pixels, noise,
-                  simulated)  # fmt: skip
+    small = sum(tile.width * tile.height for tile in cameras)
+    return Volume(nodes, speeds, yields, float(errors.mean()), float(gradient.mean()), contrast, pixels, noise,
+                  small, failed)  # fmt: skip
+
+
+def _complete(there: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
+    """Return the rows and columns of a table that leave out what is missing and keep most; None if nothing remains."""
+    rows, columns = there.all(axis=1), there.all(axis=0)
+    options = [
+        (np.flatnonzero(rows), np.arange(there.shape[1])),
+        (np.arange(there.shape[0]), np.flatnonzero(columns)),
+        # one speed may have failed everywhere and the other for some apexes
+        *((np.flatnonzero(there[:, [k]].all(axis=1)), np.array([k])) for k in range(there.shape[1])),
+    ]
+    best = max(options, key=lambda option: len(option[0]) * len(option[1]))
+    return best if len(best[0]) and len(best[1]) else None
 
 
 def slopes_of(log: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -413,6 +439,13 @@ class Design:
     """Errors of event times and encoder angles."""
     limits: Limits
     """Requirements on prism and speed."""
+    lost: Mapping[str, str] = field(default_factory=dict)
+    """Error of each apex angle that could not be evaluated, by its name. It is no choice."""
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Errors of all that failed, by name: apex angles, and simulations of the event volume."""
+        return {**self.lost, **self.volume.failed}
 
     @cached_property
     def choices(self) -> tuple[Choice, ...]:
@@ -475,22 +508,29 @@ def design(
 ) -> Design:
     """Evaluate every apex angle [rad] and speed [turns/min] for a camera in front of a scene.
 
-    ``glass`` gives refractive index and flat side. Raises :class:`AmiwarpError` for empty lists, and for a prism or
-    camera that is impossible.
+    ``glass`` gives refractive index and flat side. An apex angle or a simulation that fails is noted, and the others
+    are evaluated. Raises :class:`AmiwarpError` for empty lists, for a prism or camera that is impossible, and if every
+    apex angle fails.
     """
     apexes, rpms = sorted(set(apexes)), sorted(set(rpms))
     if not (apexes and rpms and apexes[0] > 0.0 and 0.0 < rpms[0] <= rpms[-1] < math.inf):
         raise AmiwarpError(f"apexes {apexes} rad or speeds {rpms} rpm: give at least one of each, all above 0")
     timing, limits, sensor = timing or Timing(), limits or Limits(), sensor or SensorModel()
     report = progress or silent
-    orbits = []
-    for k, apex in enumerate(apexes):
-        report("fitting models", 0.5 * k / len(apexes))
-        orbits.append(orbit_of(camera, replace(glass, apex=apex), device))
-    template = Simulation(filled(scene, camera, replace(glass, apex=apexes[-1])), camera, glass, 1.0, sensor=sensor,
-                          seed=seed, device=device)  # fmt: skip
-    volume = measure(template, apexes, rpms, part(report, 0.5, 1.0))
-    return Design(camera, glass, tuple(orbits), tuple(rpms), volume, timing, limits)
+    prisms = [replace(glass, apex=apex) for apex in apexes]
+    orbits: list[Orbit] = []
+    lost: dict[str, str] = {}
+    for k, prism in enumerate(prisms):
+        report("fitting models", 0.5 * k / len(prisms))
+        with noted(lost, f"apex {degrees(prism.apex)}"):
+            orbits.append(orbit_of(camera, prism, device))
+    if not orbits:
+        raise AmiwarpError("; ".join(f"{name}: {said}" for name, said in lost.items()))
+    largest = replace(glass, apex=orbits[-1].apex)
+    template = Simulation(filled(scene, camera, largest), camera, glass, 1.0, sensor=sensor, seed=seed,
+                          device=device)  # fmt: skip
+    volume = measure(template, [orbit.apex for orbit in orbits], rpms, part(report, 0.5, 1.0))
+    return Design(camera, glass, tuple(orbits), tuple(rpms), volume, timing, limits, lost)
 
 
 # Recommendation of a design study in words: the chosen prism and speed, and why others are rejected.
@@ -539,7 +579,12 @@ def reasons(design: Design) -> list[str]:
     low, high = design.range_at(chosen.rpm)
     ends = f"from {degrees(low)}" + (f" to {degrees(high)}" if high <= design.orbits[-1].apex else " upwards")
     ends += " keeps the limits of edges and blur, also off the grid"
-    return [*lines, f"range: at {chosen.rpm:g} rpm every apex {ends}"]
+    return [*lines, f"range: at {chosen.rpm:g} rpm every apex {ends}", *_failures(design)]
+
+
+def _failures(design: Design) -> list[str]:
+    """Return a line of text for each part of the study that failed."""
+    return [f"failed: {name}: {said}" for name, said in design.failed.items()]
 
 
 def _refusals(design: Design) -> list[str]:
@@ -568,7 +613,7 @@ def _refusals(design: Design) -> list[str]:
         if out:
             why = text if out == count else text.rpartition("; ")[2]
             lines.append(f"{name}: rules out {out} of {count}: {why}")
-    return lines
+    return [*lines, *_failures(design)]
 
 
 def degrees(angle: float) -> str:
@@ -640,6 +685,8 @@ def _words(figure: Any, design: Design, height: float) -> None:
         f"Events: simulated (rings) on {100 * volume.simulated / volume.pixels:.0f} % of the pixels, "
         f"± {100 * volume.uncertainty:.1g} %, threshold {volume.contrast:g}; interpolated between the rings."
     )
+    if design.failed:
+        note += f" Failed, and left out: {', '.join(design.failed)}."
     figure.text(EDGE / WIDTH, 0.1 / height, note, fontsize=TINY, color="#404040", va="bottom", linespacing=1.35)
 
 

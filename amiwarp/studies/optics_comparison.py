@@ -5,8 +5,8 @@ come from their exact models.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from textwrap import fill
@@ -53,6 +53,7 @@ from amiwarp.studies.design import (
     texture_of,
     tiles,
 )
+from amiwarp.studies.failures import noted
 from amiwarp.tasks import Progress, silent
 
 # The optics and their motions.
@@ -129,12 +130,14 @@ class Setting:
         return np.array([1.0, float(self.ratio)][: model.ANGLES]) * math.tau * self.hz
 
 
-def settings(camera: Camera, glass: Prism, apex: float, hz: float, depths: Sequence[float]) -> list[Setting]:
+def settings(
+    camera: Camera, glass: Prism, apex: float, hz: float, depths: Sequence[float], failed: dict[str, str]
+) -> list[Setting]:
     """Return a wedge, and all other optics in sizes that move the image as far as the wedge, rms over the image.
 
     ``glass``: index and flat side; ``apex``: apex angle of the wedge [rad]; ``hz``: its speed [turns/s]; ``depths``:
     depths of the scene for the plate [m]. The plate moves the scene at the nearest of them as far as the wedge.
-    Raises :class:`AmiwarpError` if no plate does so.
+    Optics of which no size does so are noted in ``failed``. Raises :class:`AmiwarpError` if no plate does so.
     """
 
     def wedges(*apexes: float) -> Prism:
@@ -176,20 +179,20 @@ def settings(camera: Camera, glass: Prism, apex: float, hz: float, depths: Seque
     unit = Plate(1e-3, PLATE_TILT, glass.index).shift * 1e3
     nearest = min(depths)
     quarter = 0.5 * math.pi
-    found = [
-        _sized(make, start, camera, radius)
-        for make, start in (
-            (pair("opposite", Fraction(-1)), apex / math.sqrt(2.0)),
-            (pair("unequal", UNEQUAL), apex / math.sqrt(2.0)),
-            (mirror("circle", Fraction(1), quarter), 0.5 * angle),
-            (mirror(f"{LISSAJOUS.denominator}:{LISSAJOUS.numerator}", LISSAJOUS, quarter), 0.5 * angle),
-            (vibration, angle),
-            (plate(nearest), angle * nearest / unit),
-        )
-    ]
-    glass_plate = found[-1].optic
+    found = [wedge]
+    lissajous = f"{LISSAJOUS.denominator}:{LISSAJOUS.numerator}"
+    for name, make, start in (
+        ("pair, opposite", pair("opposite", Fraction(-1)), apex / math.sqrt(2.0)),
+        ("pair, unequal", pair("unequal", UNEQUAL), apex / math.sqrt(2.0)),
+        ("mirror, circle", mirror("circle", Fraction(1), quarter), 0.5 * angle),
+        (f"mirror, {lissajous}", mirror(lissajous, LISSAJOUS, quarter), 0.5 * angle),
+        ("vibration", vibration, angle),
+    ):
+        with noted(failed, name):
+            found.append(_sized(make, start, camera, radius))
+    glass_plate = _sized(plate(nearest), angle * nearest / unit, camera, radius).optic
     assert isinstance(glass_plate, Plate)
-    return [wedge, *found[:-1], *(plate(depth)(glass_plate.thickness) for depth in sorted(depths))]
+    return [*found, *(plate(depth)(glass_plate.thickness) for depth in sorted(depths))]
 
 
 def _sized(make: Callable[[float], Setting], size: float, camera: Camera, radius: float) -> Setting:
@@ -450,6 +453,8 @@ class Comparison:
     """Wedge and speed whose radius and speed the optics have."""
     results: tuple[Compared, ...]
     """The optics, simplest first."""
+    failed: Mapping[str, str] = field(default_factory=dict)
+    """Error of each optic that could not be compared, by its name."""
 
     @cached_property
     def advice(self) -> tuple[Advice, ...]:
@@ -483,7 +488,7 @@ class Comparison:
             return Advice(task, None, "no optic keeps all limits")
 
         def words(r: Compared) -> str:
-            other = "" if r.setting.hz == self.results[0].setting.hz else f" at {r.setting.hz:g} turns/s"
+            other = "" if r.setting.hz == self.reference.rpm / 60.0 else f" at {r.setting.hz:g} turns/s"
             return text(r) + other
 
         ranked = sorted(kept, key=cost)
@@ -499,6 +504,8 @@ class Comparison:
         plates = [r for r in self.results if r.setting.kind == "plate"]
         able = [r for r in plates if r.depth_deviation is not None]
         turning = "all other optics turn rays, which moves near and far points alike, and leave depth undetermined"
+        if not plates:
+            return Advice("depth", None, f"no plate could be compared; {turning}")
         if not able:
             return Advice("depth", None, f"at every depth the orbit is under {SMALLEST_PX:g} px; {turning}")
         values = []
@@ -522,25 +529,30 @@ def compare(
 ) -> Comparison:
     """Compare moving optics for the camera of a design study, in front of the same scene and with the same sensor.
 
-    Size and speed are those of :func:`reference_of`. ``depths`` are those of the scene for the plate [m]. Raises
-    :class:`AmiwarpError` for impossible depths.
+    Size and speed are those of :func:`reference_of`. ``depths`` are those of the scene for the plate [m]. An optic that
+    fails is noted, and the others are compared. Raises :class:`AmiwarpError` for impossible depths, and if every optic
+    fails.
     """
     depths = sorted(set(depths))
     if not (depths and depths[0] >= 1.0 / LARGEST_INVERSE_DEPTH and depths[-1] < math.inf):
         raise AmiwarpError(f"depths {depths} m: give at least one, each {1.0 / LARGEST_INVERSE_DEPTH:g} m or more")
     camera, report, sensor = design.camera, progress or silent, sensor or SensorModel()
     reference = reference_of(design)
-    found = settings(camera, design.glass, reference.orbit.apex, reference.rpm / 60.0, depths)
+    failed: dict[str, str] = {}
+    found = settings(camera, design.glass, reference.orbit.apex, reference.rpm / 60.0, depths, failed)
     largest = Prism(design.orbits[-1].apex, design.glass.index, design.glass.flat_side)
     template = Simulation(filled(scene, camera, largest), camera, design.glass, 1.0, sensor=sensor, seed=seed,
                           device=device)  # fmt: skip
     change = float(change_of(_velocity(found[0], camera), slopes_of(template.log_view()), camera).mean())
     scale = 4.0 * reference.orbit.radius * design.volume.texture * found[0].hz / change
-    results = []
+    results: list[Compared] = []
     for k, setting in enumerate(found):
         report(f"simulating {setting.name}", k / len(found))
-        results.append(_compared(design, reference, setting, template, scale))
-    return Comparison(design, reference, tuple(results))
+        with noted(failed, setting.name):
+            results.append(_compared(design, reference, setting, template, scale))
+    if not results:
+        raise AmiwarpError("; ".join(f"{name}: {said}" for name, said in failed.items()))
+    return Comparison(design, reference, tuple(results), failed)
 
 
 def _velocity(setting: Setting, camera: Camera) -> NDArray[np.float64]:
@@ -647,7 +659,7 @@ def reasons(comparison: Comparison) -> list[str]:
         f"{a.task}: {'none' if a.chosen is None else a.chosen.setting.name.replace(', ', ' ')}: {a.why}"
         for a in comparison.advice
     ]
-    return [same, kept, *advice]
+    return [same, kept, *advice, *(f"failed: {name}: {said}" for name, said in comparison.failed.items())]
 
 
 def _violation(result: Compared) -> str:
@@ -736,6 +748,7 @@ def _notes(comparison: Comparison) -> list[str]:
     advice = [f"{a.task}: {'none' if a.chosen is None else a.chosen.setting.name}" for a in comparison.advice]
     return [
         f"Recommended for {';  '.join(advice)}",
+        *([f"Failed, and left out: {'; '.join(comparison.failed)}."] if comparison.failed else []),
         f"Paths: middle of the image; thick: {design.limits.window_ms:g} ms. Blur: across an edge; clock "
         f"± {design.timing.clock_us:g} µs, angles ± {math.degrees(design.timing.encoder):.3g}°. Events: law of the "
         f"event volume, threshold {design.volume.contrast:g}.",

@@ -18,8 +18,9 @@ from sphinx.application import Sphinx
 from amiwarp.cli.app import app as application
 
 INDEX = """
-Angles are degrees on the command line. The exit code is 0 for done, 1 for bad input (one line on stderr says which),
-2 for wrong usage and 130 after an interrupt. Every command has ``--help``.
+Angles are degrees on the command line. The exit code is 0 for done, 1 for bad input (one line on stderr says which)
+or failed work, 2 for wrong usage and 130 after an interrupt. A study of which some parts failed exits with 0, and names
+them. Every command has ``--help``.
 
 """
 

@@ -6,8 +6,8 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -217,7 +217,7 @@ def _panels(figure: Any, rows: Sequence[Row], bottom: float) -> list[ChartPanel]
     shown = [(min(x) / 1.4, max(x) * 1.4)]
     timed = rows[0].chart == "calibration"
     if not timed:
-        close = [_across(r) for r in rows if r.job == rows[0].job and r.comparable and r.family != NAMED]
+        close = [_across(r) for r in rows if r.job == rows[0].job and r.comparable and r.family != NAMED] or x
         shown.append((min(close) / 1.04, max(close) * 1.04))
     sides = {"left": LEFT / WIDTH, "right": 1.0 - RIGHT / WIDTH, "wspace": 0.05, "bottom": bottom,
              "top": bottom + PANEL / figure.get_figheight()}  # fmt: skip
@@ -327,6 +327,8 @@ class Charts:
     """Notes on settings that could not be measured or were refused."""
     about: dict[str, Any]
     """Description of the machine, the versions, the date and the recording."""
+    failed: Mapping[str, str] = field(default_factory=dict)
+    """Error of each setting that could not be measured because it failed, by its label."""
 
     @classmethod
     def load(cls, data: Path) -> Charts:
@@ -336,27 +338,38 @@ class Charts:
             held = json.loads(read_text(data, noted=False))
             rows = {k: tuple(Row(**{n: r[n] for n in names}) for r in held[k]["rows"]) for k in REPEATS}
             about = {name: held[name] for name in ABOUT}
-        except (OSError, ValueError, TypeError, LookupError) as error:
+            failed = {str(label): str(error) for label, error in held.get("failed", {}).items()}
+        except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:
             raise AmiwarpError(
                 f"{data}: cannot be read as the data of charts ({error!r}); measure the charts again"
             ) from error
-        return cls(rows["compensation"], rows["calibration"], {"data": data}, tuple(held["notes"]), about)
+        return cls(rows["compensation"], rows["calibration"], {"data": data}, tuple(held["notes"]), about, failed)
 
     def draw(self, out: Path) -> Charts:
         """Draw both figures into the folder ``out``; add a note if Matplotlib or Pillow is missing."""
         try:
-            files = {name: path for chart in REPEATS for name, path in self._draw(chart, out).items()}
+            measured = [chart for chart in REPEATS if any(chosen for _, chosen in measurement.fronts(self.rows(chart)))]
+            files = {name: path for chart in measured for name, path in self._draw(chart, out).items()}
         except ModuleNotFoundError as missing:
             later = "python -m benchmarks.chart --from chart.json --out FOLDER"
             return replace(self, notes=(*self.notes, f"charts: not drawn, {missing}; install it and run: {later}"))
-        return replace(self, files=self.files | files)
+        notes = [f"{chart}: not drawn, no setting was measured" for chart in REPEATS if chart not in measured]
+        return replace(self, files=self.files | files, notes=(*self.notes, *notes))
+
+    def rows(self, chart: str) -> tuple[Row, ...]:
+        """Return the measured settings of a chart."""
+        found: tuple[Row, ...] = getattr(self, chart)
+        return found
 
     def _draw(self, chart: str, out: Path) -> dict[str, Path]:
         """Draw one figure, and return the paths of its files."""
-        rows: tuple[Row, ...] = getattr(self, chart)
+        rows = self.rows(chart)
         events = self.about["recording"]["events"] / 1e6
         title = f"{chart.capitalize()} on {self.about['machine']}: {events:.1f} M events"
-        draw(out / chart, rows, title, _share_note(rows) if chart == "compensation" else _guess_note(rows))
+        note = _share_note(rows) if chart == "compensation" else _guess_note(rows)
+        if self.failed:
+            note += f" {len(self.failed)} settings failed: see chart.json."
+        draw(out / chart, rows, title, note)
         return _drawn(chart, out)
 
     def answer(
@@ -430,7 +443,8 @@ def make(
 ) -> Charts:
     """Measure a recording with ground truth; write both charts and their data into the folder ``out``.
 
-    ``quick`` measures a few settings, once each. ``libraries`` adds rows of other libraries. Raises
+    A setting that fails is named in the results, and does not stop the others. ``quick`` measures a few settings, once
+    each. ``libraries`` adds rows of other libraries. Raises
     :class:`AmiwarpError` for a recording without ground truth, a folder that cannot be created or that holds these
     files, and a wrong image.
     """
@@ -440,6 +454,7 @@ def make(
     for path in (*files.values(), *(path for chart in REPEATS for path in _drawn(chart, out).values())):
         check_output(path)
     report = progress or silent
+    failed: dict[str, str] = {}
     repeats = dict.fromkeys(REPEATS, 1) if quick else REPEATS
     compensated, notes = measurement.compensation_rows(
         known,
@@ -448,13 +463,21 @@ def make(
         quick=quick,
         folder=out,
         progress=part(report, 0.0, 0.3),
+        failed=failed,
         libraries=libraries,
     )
     calibrated, more = measurement.calibration_rows(
-        known, device, repeats=repeats["calibration"], quick=quick, seed=seed, progress=part(report, 0.3, 0.97)
+        known,
+        device,
+        repeats=repeats["calibration"],
+        quick=quick,
+        seed=seed,
+        progress=part(report, 0.3, 0.97),
+        failed=failed,
     )
     report("drawing", 0.97)
-    charts = Charts(tuple(compensated), tuple(calibrated), files, (*notes, *more), _about(known, device))
+    about = _about(known, device)
+    charts = Charts(tuple(compensated), tuple(calibrated), files, (*notes, *more), about, failed)
     # figures come last, because a GPU machine may lack their packages
     write_text(files["data"], json.dumps({**charts.about, **_data(charts)}, indent=1, allow_nan=False) + "\n")
     _write_csv(files["table"], [*compensated, *calibrated])
@@ -502,9 +525,9 @@ def _about(known: KnownRecording, device: str) -> dict[str, Any]:
 
 def _data(charts: Charts) -> dict[str, Any]:
     """Return as JSON data the rows, those on the Pareto fronts, and rows that are better than a default."""
-    out: dict[str, Any] = {"notes": list(charts.notes)}
-    for name in ("compensation", "calibration"):
-        rows: tuple[Row, ...] = getattr(charts, name)
+    out: dict[str, Any] = {"notes": list(charts.notes), "failed": dict(charts.failed)}
+    for name in REPEATS:
+        rows = charts.rows(name)
         out[name] = {
             "rows": [{**asdict(r), **_measured(r)} for r in rows],
             "fronts": {job: [r.label for r in chosen] for job, chosen in measurement.fronts(rows)},

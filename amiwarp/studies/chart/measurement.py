@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import random
@@ -34,6 +35,7 @@ from amiwarp.io.files import scratch_folder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel, Model, axis_rotation, rungs, wrap_angle
 from amiwarp.optics.prism import FlatSide, as_wedge
+from amiwarp.studies.failures import failure_text, noted
 from amiwarp.tasks import Progress, only_new_garbage, release_memory
 
 # Ground truth of the charts: the recording's true parameters, and the exact model in float64.
@@ -293,6 +295,8 @@ class Timed:
     """How slow the machine was in the round of each run; 1 is usual."""
     result: Any
     """Part of the first timed run's result that was kept."""
+    failure: str = ""
+    """Error that a run raised, with its place; empty if none did."""
 
     def row(self, error_px: float, **more: Any) -> Row:
         """Return the row of the measured setting, with its error and further fields."""
@@ -318,15 +322,17 @@ def measure(
     """Measure all tasks in rounds, so that a temporary slowdown of the machine affects all of them and can be removed.
 
     Each timed round after the first has another order, because a run may depend on the one before it.
-    ``warm_up`` adds an untimed first round, in which kernels are compiled. No new round begins after ``limit_s`` [s].
-    ``rest_s`` [s] is a pause before each run, in which threads of the previous run may still be busy. ``again`` decides
-    from tasks that were timed once which of them to repeat. Memory that earlier work freed is released first; with
-    ``release`` before each run, for runs that need much memory. All runs then start with an equally empty heap.
+    A task that raises an error is not run again; the others go on. ``warm_up`` adds an untimed first round, in which
+    kernels are compiled. No new round begins after ``limit_s`` [s]. ``rest_s`` [s] is a pause before each run, in which
+    threads of the previous run may still be busy. ``again`` decides from tasks that were timed once which of them to
+    repeat. Memory that earlier work freed is released first; with ``release`` before each run, for runs that need much
+    memory. All runs then start with an equally empty heap.
     """
     release_memory()
     times: list[list[float]] = [[] for _ in tasks]
     results: list[Any] = [None] * len(tasks)
     repeated: Sequence[bool] = [True] * len(tasks)
+    failed: dict[int, str] = {}
     first = int(warm_up)  # the first timed round
     rounds, began = repeats + first, time.perf_counter()
     order, rng = list(enumerate(tasks)), random.Random(0)
@@ -335,31 +341,36 @@ def measure(
             if time.perf_counter() - began > limit_s:
                 break
             if turn == first + 1 and again is not None:
-                repeated = again(_timed(tasks, times, results))
+                repeated = again(_timed(tasks, times, results, failed))
             rng.shuffle(order)
         for done, (k, task) in enumerate(order):
-            if not repeated[k]:
+            if not repeated[k] or k in failed:
                 continue
             if release:
                 release_memory()
             time.sleep(rest_s)
-            start = time.perf_counter()
-            result = task.run()
-            took = time.perf_counter() - start
-            if turn == first:
-                results[k] = task.keep(result)
-            if turn >= first:
-                times[k].append(took)
+            try:
+                start = time.perf_counter()
+                result = task.run()
+                took = time.perf_counter() - start
+                if turn == first:
+                    results[k] = task.keep(result)
+                if turn >= first:
+                    times[k].append(took)
+            except Exception as error:
+                failed[k] = failure_text(error)
             progress(what, (turn * len(tasks) + done + 1) / (rounds * len(tasks)))
-    return _timed(tasks, times, results)
+    return _timed(tasks, times, results, failed)
 
 
-def _timed(tasks: Sequence[Task], times: list[list[float]], results: list[Any]) -> list[Timed]:
-    """Return the tasks together with their times and results."""
-    slow = slowness(times)
+def _timed(
+    tasks: Sequence[Task], times: list[list[float]], results: list[Any], failed: Mapping[int, str]
+) -> list[Timed]:
+    """Return the tasks together with their times and results, or with their failures, by the number of the task."""
+    slow = slowness([each for k, each in enumerate(times) if k not in failed])
     return [
-        Timed(task, tuple(each), slow[: len(each)], result)
-        for task, each, result in zip(tasks, times, results, strict=True)
+        Timed(task, (), (), None, failed[k]) if k in failed else Timed(task, tuple(each), slow[: len(each)], result)
+        for k, (task, each, result) in enumerate(zip(tasks, times, results, strict=True))
     ]
 
 
@@ -369,7 +380,9 @@ def slowness(times: Sequence[Sequence[float]]) -> tuple[float, ...]:
     ``times``: run times of each task [s]. Tasks that were not repeated in every round do not count. The slowness of a
     round is the median over tasks of the run time relative to the task's median.
     """
-    rounds = max(map(len, times))
+    rounds = max(map(len, times), default=0)
+    if not rounds:
+        return ()
     whole = np.array([each for each in times if len(each) == rounds])
     relative = whole / np.median(whole, axis=1, keepdims=True)
     return tuple(np.median(relative, axis=0).tolist())
@@ -586,9 +599,19 @@ def _mixed() -> Iterator[CalibrationSetting]:
 
 
 def calibration_rows(
-    known: KnownRecording, device: str, *, repeats: int, quick: bool, seed: int, progress: Progress
+    known: KnownRecording,
+    device: str,
+    *,
+    repeats: int,
+    quick: bool,
+    seed: int,
+    progress: Progress,
+    failed: dict[str, str],
 ) -> tuple[list[Row], list[str]]:
-    """Measure all settings; return their rows, and notes on settings that the calibration refuses on this recording."""
+    """Measure all settings; return their rows, and notes on settings that the calibration refuses on this recording.
+
+    Settings that fail are noted in ``failed`` by their labels, with the error.
+    """
     ways = calibration_settings(known, quick=quick)
 
     def run(s: Settings) -> Calibration | AmiwarpError:
@@ -599,24 +622,46 @@ def calibration_rows(
 
     progress("calibrating", 0.0)
     for s in _kinds(ways):
-        short = run(_shortened(s))
-        if isinstance(short, AmiwarpError) or (s.stages == STAGES and short.photometric is None):
-            run(s)  # the short run may have ended before it used every kernel
+        with contextlib.suppress(Exception):  # what fails here fails in its measurement too, and is noted there
+            short = run(_shortened(s))
+            if isinstance(short, AmiwarpError) or (s.stages == STAGES and short.photometric is None):
+                run(s)  # the short run may have ended before it used every kernel
     tasks = [Task(partial(run, way.settings), len(known.events), way.fields(device)) for way in ways]
 
     def row(t: Timed) -> Row | None:
-        found: Calibration | AmiwarpError = t.result
-        return None if isinstance(found, AmiwarpError) else t.row(model_error(found.model, known.model).rms)
+        found: Calibration | AmiwarpError | None = t.result
+        if found is None or isinstance(found, AmiwarpError):
+            return None
+        return _row(t, failed, lambda: (model_error(found.model, known.model).rms, None))
 
     timed = measure(tasks, repeats, progress, "calibrating", warm_up=False, release=True,
                     again=lambda once: near_front([row(t) for t in once]))  # fmt: skip
     notes = []
     for t, way in zip(timed, ways, strict=True):
-        if isinstance(t.result, AmiwarpError):
+        if t.failure:
+            failed[way.label] = t.failure
+        elif isinstance(t.result, AmiwarpError):
             notes.append(f"{way.label}: refused, {t.result}")
         elif way.settings.stages == STAGES and (t.result.photometric is None or not t.result.photometric.accepted):
             notes.append(f"{way.label}: the photometric stage kept the result of sharpness")
     return [found for found in map(row, timed) if found is not None], notes
+
+
+def _row(t: Timed, failed: dict[str, str], error: Callable[[], tuple[float, float | None]]) -> Row | None:
+    """Return the row of a measured setting; None if it failed, which is noted in ``failed`` by its label.
+
+    ``error`` returns the row's error [px] and the error of its image.
+    """
+    label = str(t.task.fields["label"])
+    if t.failure:
+        failed[label] = t.failure
+        return None
+    try:
+        error_px, image_error = error()
+        return t.row(error_px, image_error=image_error)
+    except Exception as raised:
+        failed[label] = failure_text(raised)
+        return None
 
 
 def _kinds(ways: list[CalibrationSetting]) -> list[Settings]:
@@ -801,22 +846,31 @@ def compensation_rows(
     quick: bool,
     progress: Progress,
     folder: Path,
+    failed: dict[str, str],
     libraries: Libraries | None = None,
 ) -> tuple[list[Row], list[str]]:
     """Measure all settings and return their rows, with notes on settings that could not be measured.
 
-    Temporary files go to ``folder``. Raises :class:`AmiwarpError` if the exact model's image differs from the float64
-    image.
+    Settings that fail are noted in ``failed`` by their labels, with the error. Temporary files go to ``folder``. Raises
+    :class:`AmiwarpError` if the exact model's image differs from the float64 image.
     """
     progress("measuring images of events: the truth", 0.0)
     sample = ErrorSample.of(known)
-    images, notes = _image_rows(sample, device, repeats, quick, progress, libraries)
-    files, missing = _file_rows(sample, device, repeats, quick, progress, folder)
+    images, notes = _image_rows(sample, device, repeats, quick, progress, failed, libraries)
+    files, missing = list[Row](), list[str]()
+    with noted(failed, FILE):
+        files, missing = _file_rows(sample, device, repeats, quick, progress, failed, folder)
     return images + files, notes + missing
 
 
 def _image_rows(
-    sample: ErrorSample, device: str, repeats: int, quick: bool, progress: Progress, libraries: Libraries | None
+    sample: ErrorSample,
+    device: str,
+    repeats: int,
+    quick: bool,
+    progress: Progress,
+    failed: dict[str, str],
+    libraries: Libraries | None,
 ) -> tuple[list[Row], list[str]]:
     """Measure the images of events.
 
@@ -828,15 +882,21 @@ def _image_rows(
     others, notes = libraries(sample, uploads, device) if libraries is not None else ([], [])
     tasks = [*_image_tasks(ways, models, uploads, device), *(other.task for other in others)]
     timed = measure(tasks, repeats, progress, "measuring images of events", rest_s=REST_S)
-    out = []
-    for t, way in zip(timed, ways, strict=False):
+
+    def error(t: Timed, way: ImageSetting) -> tuple[float, float]:
         places = _places(models[way.model], sample, way.angles, device)
-        image = _image_error(t.result, truth, uploads.copies / way.share)
-        out.append(t.row(sample.error(places, way.vote), image_error=image))
-    for t, other in zip(timed[len(ways) :], others, strict=True):
+        return sample.error(places, way.vote), _image_error(t.result, truth, uploads.copies / way.share)
+
+    def error_of_other(t: Timed, other: LibraryTask) -> tuple[float, float]:
         places = other.places(slice(0, len(known.events), sample.step)).astype(np.float64)
         image = _image_error(t.result, truth, t.task.events / len(known.events))
-        out.append(t.row(sample.error(places, Vote.BILINEAR), image_error=image))
+        return sample.error(places, Vote.BILINEAR), image
+
+    rows = [_row(t, failed, partial(error, t, way)) for t, way in zip(timed, ways, strict=False)]
+    rows += [
+        _row(t, failed, partial(error_of_other, t, other)) for t, other in zip(timed[len(ways) :], others, strict=True)
+    ]
+    out = [row for row in rows if row is not None]
     _check(out)
     return out, notes
 
@@ -875,8 +935,10 @@ def _image_error(image: NDArray[Any], truth: NDArray[np.float64], times: float) 
 
 
 def _check(rows: list[Row]) -> None:
-    """Raise :class:`AmiwarpError` if the image by the default setting is wrong."""
-    default = next(row for row in rows if row.default)
+    """Raise :class:`AmiwarpError` if the image by the default setting is wrong, unless the setting failed."""
+    default = next((row for row in rows if row.default), None)
+    if default is None:
+        return
     if default.image_error is None or not default.image_error < WRONG:
         raise AmiwarpError(
             f"the image by {default.label} differs from the float64 one by {default.image_error} of its contrast; "
@@ -892,7 +954,13 @@ def circle(sample: ErrorSample) -> tuple[float, float]:
 
 
 def _file_rows(
-    sample: ErrorSample, device: str, repeats: int, quick: bool, progress: Progress, folder: Path
+    sample: ErrorSample,
+    device: str,
+    repeats: int,
+    quick: bool,
+    progress: Progress,
+    failed: dict[str, str],
+    folder: Path,
 ) -> tuple[list[Row], list[str]]:
     """Measure the compensation of whole files with each model, reading and writing included.
 
@@ -921,4 +989,5 @@ def _file_rows(
                       "default": model == "exact"}  # fmt: skip
             tasks.append(Task(partial(run, calibration), len(known.events), fields, error))
         timed = measure(tasks, repeats, progress, "measuring files")
-        return [t.row(t.result) for t in timed], []
+        rows = [_row(t, failed, lambda t=t: (t.result, None)) for t in timed]  # type: ignore[misc]
+        return [row for row in rows if row is not None], []

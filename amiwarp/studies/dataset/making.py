@@ -19,7 +19,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -48,6 +48,7 @@ from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.simulation.worlds.world_files import POSE_FILES, open_world
 from amiwarp.studies import cluster
 from amiwarp.studies.dataset import specification as spec
+from amiwarp.studies.failures import failure_text, noted
 from amiwarp.tasks import Progress, cpu_threads, limited_cpu_threads, silent
 from amiwarp.translation.translator import translation
 from amiwarp.validation import guarded, real, shown, whole
@@ -343,8 +344,7 @@ def make(job: Job) -> Made | Failed:
         with limited_cpu_threads(job.threads):
             return _make(job)
     except Exception as error:  # whatever one recording raises must not stop the others
-        what = str(error) if isinstance(error, AmiwarpError) else f"{type(error).__name__}: {error}"
-        return Failed(job.item.key, " ".join(what.split())[:500])
+        return Failed(job.item.key, failure_text(error))
 
 
 def _make(job: Job) -> Made:
@@ -539,8 +539,12 @@ class Journal:
     def is_intact(self, item: Item) -> bool:
         """Return whether the file of a recording that is there has the checksum of the journal."""
         made = self.made[item.key]
-        if spec.content_digest(self._out / made.file, noted=False) == made.sha256:
-            return True
+        try:
+            if spec.content_digest(self._out / made.file, noted=False) == made.sha256:
+                return True
+        except AmiwarpError as error:  # a file that cannot be read is made again, as a damaged one
+            self.damaged.append(str(error))
+            return False
         self.damaged.append(f"{self._out / made.file}: does not have the checksum of {JOURNAL}")
         return False
 
@@ -867,11 +871,14 @@ def _local_workers(scheduler: str | None, workers: int | None, device: str) -> i
 
 
 def _result(job: Job, future: Future[Made | Failed]) -> Made | Failed:
-    """Return the result of a job. A worker that dies, for example for want of memory, is a failure of its recording."""
-    error = None if future.cancelled() else future.exception()
-    if error is None or isinstance(error, AmiwarpError):
-        return cluster.result_of(future)
-    return Failed(job.item.key, f"the worker died or lost its connection: {type(error).__name__}: {error}"[:500])
+    """Return the result of a job. A worker that dies, for example for want of memory, is a failure of its recording.
+
+    Raises :class:`AmiwarpError` if the worker does not see the folder of the data set.
+    """
+    message = cluster.failure_of(future)
+    if not message or isinstance(future.exception(), AmiwarpError):
+        return future.result()
+    return Failed(job.item.key, message)
 
 
 def _line(done: int, failed: int, total: int, events: int, seconds: float) -> str:
@@ -935,6 +942,8 @@ class DatasetPlan:
     """Number of workers."""
     device: str
     """Device of the samples."""
+    failed: Mapping[str, str] = field(default_factory=dict)
+    """Error message of each sample that could not be made, by its file. The estimate leaves these samples out."""
 
     @property
     def seconds(self) -> float:
@@ -993,7 +1002,7 @@ def plan_dataset(
     Raises
     ------
     AmiwarpError
-        If the specification is wrong, a source is not found, or a sample cannot be made.
+        If the specification is wrong, a source is not found, or no sample of a kind of source can be made.
 
     Examples
     --------
@@ -1022,7 +1031,9 @@ def plan_dataset(
         by_kind[item.kind].append(item)
     count = cluster.worker_count(workers, device)
     threads = cluster.threads_of_worker(device, count)
-    total, samples, variance = _sample_all(list(by_kind.values()), out, device, threads, progress or silent)
+    failed: dict[str, str] = {}
+    groups = list(by_kind.values())
+    total, samples, variance = _sample_all(groups, out, device, threads, progress or silent, failed)
     return DatasetPlan(
         recordings=len(items),
         missing=len(todo),
@@ -1035,22 +1046,29 @@ def plan_dataset(
         worker_seconds=total.seconds,
         workers=count,
         device=device,
+        failed=failed,
     )
 
 
 def _sample_all(
-    groups: Sequence[Sequence[Item]], out: Path, device: str, threads: int | None, progress: Progress
+    groups: Sequence[Sequence[Item]],
+    out: Path,
+    device: str,
+    threads: int | None,
+    progress: Progress,
+    failed: dict[str, str],
 ) -> tuple[_Cost, int, float]:
     """Return the expected cost of all recordings, the number of samples, and the variance of the expected time [s²].
 
-    Each group holds the recordings of one kind of source.
+    Each group holds the recordings of one kind of source. Samples that cannot be made are noted in ``failed``.
     """
     total, samples, variance = _Cost(), 0, 0.0
     # The samples are written to the disk of the data set, whose folder may not exist yet.
     near = next(folder for folder in (out.resolve(), *out.resolve().parents) if folder.is_dir())
     with scratch_folder(near) as scratch:
         for group in groups:
-            found = _sample(group, scratch, "cuda:0" if device == cluster.ANY_GPU else device, threads, progress)
+            one_device = "cuda:0" if device == cluster.ANY_GPU else device
+            found = _sample(group, scratch, one_device, threads, progress, failed)
             for cost in found:
                 total = total.plus(cost, len(group) / len(found))
             samples += len(found)
@@ -1058,21 +1076,27 @@ def _sample_all(
     return total, samples, variance
 
 
-def _sample(items: Sequence[Item], scratch: Path, device: str, threads: int | None, progress: Progress) -> list[_Cost]:
+def _sample(
+    items: Sequence[Item],
+    scratch: Path,
+    device: str,
+    threads: int | None,
+    progress: Progress,
+    failed: dict[str, str],
+) -> list[_Cost]:
     """Return the costs of sampled recordings. The order of the items is random.
 
-    A recording that fails is left out. If all fail, the last error is raised.
+    A recording that fails is noted in ``failed`` and left out. Raises :class:`AmiwarpError` if all fail.
     """
     chosen, began, costs = items[:SAMPLES], time.perf_counter(), list[_Cost]()
     with limited_cpu_threads(threads):
         for count, item in enumerate(chosen, 1):
-            try:
+            with noted(failed, item.file):
                 if not costs:  # compiles the kernels
                     _cost(item, scratch, device, 1e-3)
                 costs.append(_whole_cost(item, scratch, device))
-            except AmiwarpError:
-                if not costs and count == len(chosen):
-                    raise
+            if not costs and count == len(chosen):
+                raise AmiwarpError(f"no sample of {item.kind} can be made; {item.file}: {failed[item.file]}")
             progress(f"sampling {item.kind}", count / len(chosen))
             if costs and time.perf_counter() - began > SAMPLING_S:
                 break

@@ -10,7 +10,7 @@ import json
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -24,11 +24,12 @@ from amiwarp.io.files import NewFile, check_output, only_writer, own_folder, wri
 from amiwarp.io.formats import make_folder
 from amiwarp.io.json_files import CellStore, fields_of, value_of
 from amiwarp.kernels.launch import load_all, load_kernels
-from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs, start_workers, versions, worker_count
+from amiwarp.studies.cluster import Workers, failure_of, machine, run_jobs, start_workers, versions, worker_count
 from amiwarp.studies.demo import EXACT_KERNELS
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.claims import PAPER, Claim
 from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Table, Value
+from amiwarp.studies.failures import failure_text
 from amiwarp.tasks import Progress, cpu_threads, limited_cpu_threads, release_memory, silent
 from amiwarp.translation.sources import limited_opencv
 from amiwarp.validation import guarded, real, whole
@@ -277,7 +278,7 @@ def section(name: str, results: Sequence[CellResult]) -> Section:
     """Return the section of an evaluation from the results of its cells."""
     evaluation = load(name)
     good = [r for r in results if not r.error]
-    errors = [f"{r.condition}: {r.error}" for r in results if r.error]
+    errors = [f"{r.condition.text}: {r.error}" for r in results if r.error]
     shown = evaluation.tables(good) if good else []
     pictures: list[study.Picture] = getattr(evaluation, "pictures", lambda _: [])(good)
     return Section(
@@ -301,7 +302,8 @@ def write(out: Path, sections: Sequence[Section], settings: Settings, processor_
     for picture in (p for s in sections for p in s.pictures):
         with NewFile(out / "figures" / f"{picture.name}.{_kind(picture)}") as new:
             new.part.write_bytes(films[picture.name])
-    about = _about(settings, processor_s)
+    counts = {"cells": sum(s.cells for s in sections), "failed": sum(len(s.errors) for s in sections)}
+    about = _about(settings, processor_s) | counts
     files = dict(zip(("report", "data"), (out / name for name in REPORT_FILES), strict=True))
     write_text(files["report"], _page(sections, figures, films, about))
     data = {"about": about, "evaluations": [_json(s) for s in sections]}
@@ -447,6 +449,11 @@ def run_job(job: Job) -> JobResult:
     return JobResult(cells, time.process_time() - began)
 
 
+def failed(job: Job, message: str) -> list[CellResult]:
+    """Return the results of a job's evaluations that failed for one reason."""
+    return [CellResult(name, job.condition, error=message) for name in job.evaluations]
+
+
 def _run_cells(job: Job) -> list[CellResult]:
     """Simulate the condition of a job once, or open its recording, and run its evaluations."""
     with limited_cpu_threads(job.threads), limited_opencv(study.library("cv2"), cpu_threads()):
@@ -456,8 +463,8 @@ def _run_cells(job: Job) -> list[CellResult]:
             else:
                 streams = study.RecordedStreams(open_recording(job.condition.path), job.settings.device)
             return [_run_cell(name, streams, job) for name in job.evaluations]
-        except AmiwarpError as error:
-            return [CellResult(name, job.condition, error=str(error)) for name in job.evaluations]
+        except Exception as error:  # whatever one recording raises must not stop the others
+            return failed(job, failure_text(error))
 
 
 def run_setup(job: Job) -> tuple[study.Setup, float]:
@@ -482,12 +489,12 @@ def compile_kernels(names: Sequence[str], device: str) -> float:
 
 
 def _run_cell(name: str, streams: study.RecordedStreams, job: Job) -> CellResult:
-    """Run one evaluation. An error becomes part of the result, as a refused calibration does."""
+    """Run one evaluation. An error of any kind, such as a refused calibration, becomes its result."""
     began = time.process_time()
     try:
         values, error = _as_stored(name, load(name).measure(streams, job.settings)), ""
-    except AmiwarpError as refusal:
-        values, error = {}, str(refusal)
+    except Exception as raised:
+        values, error = {}, failure_text(raised)
     return CellResult(name, job.condition, values, error, time.process_time() - began)
 
 
@@ -572,7 +579,7 @@ class EvaluationSummary:
     new_cells: int
     """Number of cells that were run; the others were there already."""
     failed: int
-    """Number of cells that ended with an error, which the report states."""
+    """Number of cells that ended with an error, which the report states. The next call runs them again."""
     verdicts: dict[str, int]
     """Number of tested parts of the paper's claims, by the verdict on them."""
     files: dict[str, Path]
@@ -583,6 +590,8 @@ class EvaluationSummary:
     """Processor time of all workers [s]."""
     damaged: tuple[str, ...] = ()
     """What was wrong with each damaged cell, which was run again."""
+    failures: Mapping[str, str] = field(default_factory=dict)
+    """Error message of each cell that failed, by its evaluation and condition."""
 
 
 @guarded
@@ -601,7 +610,8 @@ def evaluate(
 ) -> EvaluationSummary:
     """Evaluate the AMI-EV against a plain event camera as its paper does, and write a report.
 
-    Finished cells in ``out`` are kept: the same call continues a stopped run.
+    Finished cells in ``out`` are kept: the same call continues a stopped run. A cell that fails is reported, and does
+    not stop the others; the same call runs it again.
 
     Parameters
     ----------
@@ -671,42 +681,83 @@ def evaluate(
     return EvaluationSummary(
         len(results), new, sum(bool(r.error) for r in results), {v: verdicts.count(v) for v in dict.fromkeys(verdicts)},
         files, time.perf_counter() - began, processor_s, tuple(store.damaged),
+        {f"{r.evaluation}, {r.condition.text}": r.error for r in results if r.error},
     )  # fmt: skip
 
 
 def _run(
     jobs: Sequence[Job], store: Store, workers: Workers, progress: Progress
 ) -> tuple[list[CellResult], int, float]:
-    """Run the missing cells of the jobs. Return all cells, the number of new ones, and the processor time [s]."""
+    """Run the missing cells of the jobs, and those that failed before.
+
+    Return all cells, the number of new ones, and the processor time [s]. A cell that fails, or whose worker dies, does
+    not stop the others.
+    """
     results: list[CellResult] = []
     todo: list[Job] = []
     for job in jobs:
         known = {name: store.load(name, job.condition, job.settings) for name in job.evaluations}
-        results += [cell for cell in known.values() if cell is not None]
-        if missing := tuple(name for name, cell in known.items() if cell is None):
+        finished = {name: cell for name, cell in known.items() if cell is not None and not cell.error}
+        results += finished.values()
+        if missing := tuple(name for name in known if name not in finished):
             todo.append(replace(job, evaluations=missing))
     processor_s, done, new = 0.0, 0, 0
     if len(todo) > 1 and workers.count() > 1:
         progress("compiling kernels", 0.0)
         names = dict.fromkeys(name for job in todo for name in job.evaluations)
         compiling = workers.executor.submit(compile_kernels, tuple(names), todo[0].settings.device)
-        processor_s = compiling.result()
+        # if it fails, each worker compiles its kernels, and the cells say what fails then
+        processor_s = compiling.result() if not failure_of(compiling) else 0.0
     setups: dict[Condition | None, study.Setup | None] = {None: None}
     needed = {job.setup_condition: job for job in todo if job.setup_condition is not None}
     share = max(1, workers.count() // max(1, len(needed)))  # they are few, and take the threads of idle workers, too
     first = [replace(job, threads=job.threads and job.threads * share) for job in needed.values()]
+    refused: dict[Condition | None, str] = {}
     for begun, calibrated in run_jobs(workers, run_setup, first):
-        setups[begun.setup_condition], seconds = result_of(calibrated)
+        if message := failure_of(calibrated):
+            refused[begun.setup_condition] = f"calibration of the prism: {message}"
+            continue
+        setups[begun.setup_condition], seconds = calibrated.result()
         processor_s += seconds
         progress(f"calibrated {len(setups) - 1} of {len(needed)} prisms", 0.0)
+    todo, lost = _without_setups(todo, refused)
+    for job, message in lost:
+        results += _kept(failed(job, message), job, store)
+        new += len(job.evaluations)
     todo = [replace(job, setup=setups[job.setup_condition]) for job in todo]
     with contextlib.closing(run_jobs(workers, run_job, todo)) as running:
         for job, future in running:
-            result = result_of(future)
-            for cell in result.cells:
-                store.save(cell, job.settings)
-            results += result.cells
+            message = failure_of(future)
+            result = JobResult(failed(job, message), 0.0) if message else future.result()
+            results += _kept(result.cells, job, store)
             processor_s, done, new = processor_s + result.processor_s, done + 1, new + len(result.cells)
             progress(f"{done:,} of {len(todo):,} recordings", done / len(todo))
     order = {(job.condition, name): k for k, job in enumerate(jobs) for name in job.evaluations}
     return sorted(results, key=lambda r: order[r.condition, r.evaluation]), new, processor_s
+
+
+def _without_setups(
+    jobs: Sequence[Job], refused: Mapping[Condition | None, str]
+) -> tuple[list[Job], list[tuple[Job, str]]]:
+    """Return the jobs that can be run although the calibration of some prisms failed, and the others with the reason.
+
+    A job is divided if some of its evaluations need no calibration.
+    """
+    able, lost = list[Job](), list[tuple[Job, str]]()
+    for job in jobs:
+        if job.setup_condition not in refused:
+            able.append(job)
+            continue
+        without = tuple(name for name in job.evaluations if name in UNCALIBRATED)
+        needing = tuple(name for name in job.evaluations if name not in UNCALIBRATED)
+        lost.append((replace(job, evaluations=needing), refused[job.setup_condition]))
+        if without:
+            able.append(replace(job, evaluations=without))
+    return able, lost
+
+
+def _kept(cells: list[CellResult], job: Job, store: Store) -> list[CellResult]:
+    """Return new results of a job after writing them to the store."""
+    for cell in cells:
+        store.save(cell, job.settings)
+    return cells

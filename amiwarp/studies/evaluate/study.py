@@ -10,7 +10,7 @@ import io
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -231,6 +231,15 @@ class Condition:
         return float(np.random.default_rng(self.seed).uniform(0.0, 2.0 * math.pi))
 
     @property
+    def text(self) -> str:
+        """Description in words: world, motion, prism and seed, and what else differs from the defaults."""
+        said = {"world", "trajectory", "apex", "rpm", "seed"}
+        others = [f"{f.name} {getattr(self, f.name)}" for f in fields(self)
+                  if f.name not in said and getattr(self, f.name) != f.default]  # fmt: skip
+        prism = f"apex {math.degrees(self.apex):.4g}°, {self.rpm:g} rpm"
+        return ", ".join([f"{self.world} {self.trajectory}", prism, f"seed {self.seed}", *others])
+
+    @property
     def setup(self) -> Condition:
         """Recording of a still scene by the usual lens that the same prism and sensor are calibrated from."""
         return replace(self, world="room", trajectory="still", seed=SETUP_SEED, duration_s=SETUP_S, focal_px=FOCAL_PX)
@@ -271,6 +280,11 @@ class RecordedCondition:
     """File of the recording."""
     seed: int = 0
     """Seed of the calibration."""
+
+    @property
+    def text(self) -> str:
+        """Name of the file."""
+        return str(self.path)
 
     @property
     def key(self) -> str:

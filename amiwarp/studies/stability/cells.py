@@ -33,7 +33,8 @@ from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, Still
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs
+from amiwarp.studies.cluster import Workers, failure_of, machine, run_jobs
+from amiwarp.studies.failures import failure_text
 from amiwarp.tasks import Progress
 from amiwarp.validation import instance, real, whole
 
@@ -423,7 +424,7 @@ class SimulatedSample:
     recording: Recording
     """Simulated recording with its ground truth."""
     hardware: dict[str, float]
-    """Approximate phase that the hardware states [rad]."""
+    """Approximate phase that the hardware states [rad]; empty without an encoder."""
     truth: ExactModel
     """Optical model with the true parameters."""
     motion: PrismMotion
@@ -471,6 +472,8 @@ def make(condition: Condition, seed: int, device: str = "cpu") -> SimulatedSampl
     )
     stated_phase = motion.phase + math.radians(HARDWARE_DEG) * rng.standard_normal()
     known = {"phase": stated_phase + (math.pi / 2 if condition.start == "wrong" else 0.0)}
+    if condition.no_encoder:
+        known = {}  # nothing tells the angle that the mounted phase refers to
     truth = cast("ExactModel", simulation.true_model)
     return SimulatedSample(stated, known, truth, motion, plain)
 
@@ -823,6 +826,8 @@ class Outcome(enum.StrEnum):
     """Refusal: the method raised an error that names the cause."""
     SILENT = "silent failure"
     """Silent failure: the result is wrong and there was no error. A crash counts as a silent failure too."""
+    FAILED = "failed"
+    """The study failed: recording or comparison could not be made, or a worker died. It says nothing of the method."""
 
 
 @dataclass(frozen=True)
@@ -885,13 +890,14 @@ class Result:
     outcome: Outcome
     """Outcome: success, refusal or silent failure."""
     error_px: Annotated[float, partial(real, low=0.0, high=LARGEST_PX)] | None
-    """Model error relative to the ground truth [px rms]; None if the method refused the recording."""
+    """Model error relative to the ground truth [px rms]; None if the method refused the recording, or the study failed.
+    """
     limit_px: Annotated[float, partial(real, low=0.0, high=LARGEST_PX)]
     """Largest model error with which this calibration counts as a success [px rms]."""
     seconds: Annotated[float, partial(real, low=0.0, high=1e9)]
     """Run time of the calibration [s]."""
     message: str = ""
-    """Error message of a refusal, or warnings of the calibration."""
+    """Error message of a refusal or of what failed, or warnings of the calibration."""
     machine: str = ""
     """Description of the machine that ran the calibration."""
     deviations: dict[str, Annotated[float, partial(real, low=0.0, high=MOST_DEVIATION)]] = field(default_factory=dict)
@@ -901,9 +907,8 @@ class Result:
     def __post_init__(self) -> None:
         """Raise :class:`AmiwarpError` for an outcome that does not follow from the error."""
         within = self.error_px is not None and self.error_px <= self.limit_px
-        if within != (self.outcome is Outcome.SUCCESS) or (
-            self.outcome is Outcome.REFUSAL and self.error_px is not None
-        ):
+        without_error = self.outcome in (Outcome.REFUSAL, Outcome.FAILED)
+        if within != (self.outcome is Outcome.SUCCESS) or (without_error and self.error_px is not None):
             raise AmiwarpError(f"outcome {self.outcome} does not fit error_px = {self.error_px} and {self.limit_px}")
 
 
@@ -933,6 +938,11 @@ class Stored:
     results: dict[str, Result] = field(default_factory=dict)
     """Results by :func:`identity` of the method."""
 
+    def lacks(self, method: Method) -> bool:
+        """Return whether a method is still to be run: it has no result, or failed in an earlier run."""
+        result = self.results.get(identity(method))
+        return result is None or result.outcome is Outcome.FAILED
+
 
 def identity(method: Method) -> str:
     """Return a text that identifies a method's results by its settings and the package version."""
@@ -941,13 +951,34 @@ def identity(method: Method) -> str:
 
 
 def run_cell(cell: Cell, methods: tuple[Method, ...], device: str) -> Stored:
-    """Simulate the recording of a cell, run the methods on it, and return their results."""
-    sample = make(cell.condition, cell.seed, device)
+    """Simulate the recording of a cell, run the methods on it, and return their results.
+
+    What raises an error outside of a method has the outcome ``failed``.
+    """
+    began = time.perf_counter()
+    try:
+        where = machine(device)
+        sample = make(cell.condition, cell.seed, device)
+    except Exception as error:
+        return failed(cell, methods, failure_text(error), time.perf_counter() - began)
     done = Stored(cell, len(sample.recording.events))
-    where = machine(device)
     for method in methods:
-        done.results[identity(method)] = replace(_judge(cell, method, sample, device), machine=where)
+        began = time.perf_counter()
+        try:
+            result = _judge(cell, method, sample, device)
+        except Exception as error:
+            result = _failed_result(failure_text(error), time.perf_counter() - began)
+        done.results[identity(method)] = replace(result, machine=where)
     return done
+
+
+def failed(cell: Cell, methods: Sequence[Method], message: str, seconds: float = 0.0) -> Stored:
+    """Return the cell of which no result is known because it failed with a message, after some time [s]."""
+    return Stored(cell, results={identity(method): _failed_result(message, seconds) for method in methods})
+
+
+def _failed_result(message: str, seconds: float) -> Result:
+    return Result(Outcome.FAILED, None, LIMIT_PX, seconds, message)
 
 
 def _judge(cell: Cell, method: Method, sample: SimulatedSample, device: str) -> Result:
@@ -958,6 +989,8 @@ def _judge(cell: Cell, method: Method, sample: SimulatedSample, device: str) -> 
         found = method.run(sample, cell.condition, cell.seed, device)
     except AmiwarpError as error:
         return Result(Outcome.REFUSAL, None, limit, time.perf_counter() - began, str(error))
+    except MemoryError:  # says something of the machine, not of the method
+        raise
     except Exception as error:  # a crash is no clear error, so it is no refusal
         return Result(Outcome.SILENT, None, limit, time.perf_counter() - began, f"crashed: {error!r}")
     took = time.perf_counter() - began
@@ -1141,17 +1174,19 @@ def run(
 ) -> list[Stored]:
     """Run cells in their order, and return their results.
 
-    Cells in ``store`` are reused; if a cell lacks a method, only that method is run. No new cell starts after
-    ``until`` returns True.
+    Cells in ``store`` are reused; if a cell lacks a method, or the method failed there, only that method is run. A cell
+    that fails, or whose worker dies, does not stop the others. No new cell starts after ``until`` returns True.
     """
     known = {cell: store.load(cell) for cell in cells}
-    missing = {cell: tuple(m for m in methods if identity(m) not in known[cell].results) for cell in cells}
+    missing = {cell: tuple(m for m in methods if known[cell].lacks(m)) for cell in cells}
     todo = [(cell, lacking) for cell, lacking in missing.items() if lacking]
     done = len(cells) - len(todo)
     with contextlib.closing(run_jobs(workers, partial(_run_missing, device), todo)) as running:
-        for (cell, _), future in running:
-            found = result_of(future)
-            known[cell] = replace(found, results={**known[cell].results, **found.results})
+        for (cell, lacking), future in running:
+            message = failure_of(future)
+            found = failed(cell, lacking, message) if message else future.result()
+            events = found.events or known[cell].events
+            known[cell] = Stored(cell, events, {**known[cell].results, **found.results})
             store.save(known[cell])
             done += 1
             if progress is not None:

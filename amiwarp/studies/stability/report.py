@@ -6,7 +6,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -24,6 +24,8 @@ from amiwarp.studies.stability.cells import Axis, Cell, Condition, Method, Outco
 
 # Points of the stability study: rates and errors of one method at one value of an axis, and their text.
 
+JUDGED = (Outcome.SUCCESS, Outcome.REFUSAL, Outcome.SILENT)
+"""Outcomes that say something of a method, of which the rates are."""
 QUANTILES = (5, 25, 50, 75, 95)
 """Quantiles of the model error that are reported [%]."""
 
@@ -80,7 +82,9 @@ class AxisPoint:
     method: str
     """Name of the calibration method."""
     results: tuple[Result, ...]
-    """Results of the method for all seeds."""
+    """Results of the method for all seeds, except those where the study failed."""
+    failed: int = 0
+    """Number of recordings for which the study failed. They are part of no rate."""
 
     @property
     def errors(self) -> list[float]:
@@ -89,13 +93,13 @@ class AxisPoint:
 
     @property
     def limit_px(self) -> float:
-        """Median over the seeds of the largest model error that counts as a success [px rms]."""
-        return float(np.median([r.limit_px for r in self.results]))
+        """Median over the seeds of the largest model error that counts as a success [px rms]; NaN without results."""
+        return _median([r.limit_px for r in self.results])
 
     @property
     def seconds(self) -> float:
-        """Median time of a calibration [s]."""
-        return float(np.median([r.seconds for r in self.results]))
+        """Median time of a calibration [s]; NaN without results."""
+        return _median([r.seconds for r in self.results])
 
     @property
     def quantiles(self) -> dict[int, float]:
@@ -115,11 +119,21 @@ class AxisPoint:
         """Return the point as JSON data."""
         return {
             "axis": self.axis.name, "field": self.axis.field, "value": self.value, "unit": self.axis.unit,
-            "method": self.method, **{o.name.lower(): self.rate(o).to_json() for o in Outcome},
+            "method": self.method, **{o.name.lower(): self.rate(o).to_json() for o in JUDGED}, "failed": self.failed,
             "error_px": {f"{q} %": float(f"{e:.4g}") for q, e in self.quantiles.items()},
-            "limit_px": float(f"{self.limit_px:.4g}"), "seconds": float(f"{self.seconds:.4g}"),
-            "messages": {o.name.lower(): text for o in Outcome if (text := self.common_message(o))},
+            "limit_px": _rounded(self.limit_px), "seconds": _rounded(self.seconds),
+            "messages": {o.name.lower(): text for o in JUDGED if (text := self.common_message(o))},
         }  # fmt: skip
+
+
+def _median(values: Sequence[float]) -> float:
+    """Return the median of values; NaN if there are none."""
+    return float(np.median(values)) if values else math.nan
+
+
+def _rounded(value: float) -> float | None:
+    """Return a value with four digits for JSON; None for NaN."""
+    return None if math.isnan(value) else float(f"{value:.4g}")
 
 
 def most_common_message(messages: Iterable[str]) -> str:
@@ -274,6 +288,24 @@ def _stated(cells: Iterable[Stored], default: str | None) -> tuple[StatedDeviati
 
 
 @dataclass(frozen=True)
+class Failure:
+    """Recording of the study for which a method has no result, because the study failed."""
+
+    name: str
+    """Name of the cell."""
+    where: str
+    """Values of the axes that the recording belongs to, in words."""
+    methods: tuple[str, ...]
+    """Names of the methods without result."""
+    message: str
+    """Error, and where it was raised."""
+
+    def row(self) -> tuple[str, ...]:
+        """Return the values as a row of a table."""
+        return (self.name, self.where, ", ".join(self.methods), self.message)
+
+
+@dataclass(frozen=True)
 class Atlas:
     """Results of the study as points, one per axis, method and value, in the order of axes and values.
 
@@ -290,6 +322,18 @@ class Atlas:
     """Description of the machine, the versions and the date."""
     stated: tuple[StatedDeviations, ...] = ()
     """How often the truth lies within the stated standard deviations."""
+    failures: tuple[Failure, ...] = ()
+    """What failed in the study, recording by recording."""
+
+    @property
+    def measured(self) -> bool:
+        """Whether there is any result."""
+        return any(s.results for s in self.spots)
+
+    @property
+    def failed_cells(self) -> int:
+        """Number of cells (single recordings) that lack the result of a method because the study failed."""
+        return len({failure.name for failure in self.failures})
 
     @property
     def axes(self) -> list[Axis]:
@@ -308,7 +352,10 @@ class Atlas:
     def works(self, axis: Axis, method: str) -> str:
         """Return the values at which a method works, as text; runs of neighbours are written as from ... to."""
         spots = self.of(axis)
-        values = [v for v in axis.values if any(value == v for _, value in spots)]
+        unknown = {value for (name, value), spot in spots.items() if name == method and not spot.results}
+        values = [v for v in axis.values if v not in unknown and any(value == v for _, value in spots)]
+        if not values:
+            return "not measured"
         good = [(s := spots.get((method, v))) is not None and s.rate(Outcome.SUCCESS).share >= WORKS for v in values]
         if all(good) or not any(good):
             return "everywhere" if all(good) else "nowhere"
@@ -349,15 +396,38 @@ def aggregate(cells: Sequence[Stored], axes: Sequence[Axis], methods: Sequence[M
             stored_cells = by_condition.get(condition, [])
             met.update({s.cell: s for s in stored_cells if any(key in s.results for key in names.values())})
             for name, key in names.items():
-                if results := tuple(s.results[key] for s in stored_cells if key in s.results):
-                    spots.append(AxisPoint(axis, value, name, results))
+                if results := [s.results[key] for s in stored_cells if key in s.results]:
+                    judged = tuple(r for r in results if r.outcome in JUDGED)
+                    spots.append(AxisPoint(axis, value, name, judged, len(results) - len(judged)))
             worse += _worse(axis, value, stored_cells, names)
     if not spots:
         raise AmiwarpError(
             "found no results of single runs (cells) for these axes and methods; run without --redraw first"
         )
     default = names.get(DEFAULT)
-    return Atlas(tuple(spots), _aims(met.values(), default, worse), len(met), about, _stated(cells, default))
+    drawn = {s.cell: s for s in cells if s.cell.condition == study.mild(s.cell.seed)}
+    return Atlas(
+        tuple(spots), _aims(met.values(), default, worse), len(met), about, _stated(cells, default),
+        _failures((met | drawn).values(), axes, names),
+    )  # fmt: skip
+
+
+def _failures(cells: Iterable[Stored], axes: Sequence[Axis], names: dict[str, str]) -> tuple[Failure, ...]:
+    """Return what failed, recording by recording; methods that failed for the same reason are listed together."""
+    places: dict[Condition, list[str]] = {}
+    for axis in axes:
+        for value, condition in zip(axis.values, axis.conditions(), strict=True):
+            places.setdefault(condition, []).append(f"{axis.name} {value_label(axis, value)}")
+    found = []
+    for stored in cells:
+        where = ", ".join(places.get(stored.cell.condition, ["random combination"]))
+        methods: dict[str, list[str]] = {}
+        for name, key in names.items():
+            result = stored.results.get(key)
+            if result is not None and result.outcome is Outcome.FAILED:
+                methods.setdefault(result.message, []).append(name)
+        found += [Failure(stored.cell.name, where, tuple(each), message) for message, each in methods.items()]
+    return tuple(found)
 
 
 def _aims(cells: Iterable[Stored], default: str | None, worse: Sequence[WorseThanPaper]) -> Aims:
@@ -365,9 +435,10 @@ def _aims(cells: Iterable[Stored], default: str | None, worse: Sequence[WorseTha
     inside: list[Outcome] = []
     outside: list[Outcome] = []
     for stored in cells:
-        if default in stored.results:
+        result = stored.results.get(default or "")
+        if result is not None and result.outcome in JUDGED:
             here = inside if study.sensible(stored.cell.condition, stored.events) else outside
-            here.append(stored.results[default].outcome)
+            here.append(result.outcome)
     return Aims(
         Rate(inside.count(Outcome.SUCCESS), len(inside)),
         Rate(outside.count(Outcome.SILENT), len(outside)),
@@ -382,8 +453,9 @@ def _worse(axis: Axis, value: Any, stored_cells: Sequence[Stored], names: dict[s
     """
     if not {DEFAULT, PAPER} <= names.keys():
         return []
-    both = [[s.results[names[n]].outcome is Outcome.SUCCESS for n in (DEFAULT, PAPER)]
-            for s in stored_cells if names[DEFAULT] in s.results and names[PAPER] in s.results]  # fmt: skip
+    outcomes = [[s.results[names[n]].outcome for n in (DEFAULT, PAPER)]
+                for s in stored_cells if names[DEFAULT] in s.results and names[PAPER] in s.results]  # fmt: skip
+    both = [[outcome is Outcome.SUCCESS for outcome in pair] for pair in outcomes if Outcome.FAILED not in pair]
     lost, won = sum(p and not d for d, p in both), sum(d and not p for d, p in both)
     if lost <= won:
         return []
@@ -395,7 +467,8 @@ def _worse(axis: Axis, value: Any, stored_cells: Sequence[Stored], names: dict[s
 def _json(atlas: Atlas) -> str:
     """Return the study's results as JSON, one line per point."""
     data = {"format": "amiwarp-atlas", "version": 1, **atlas.about, "cells": atlas.cells, "aims": atlas.aims.to_json(),
-            "stated_deviations": [d.to_json() for d in atlas.stated]}  # fmt: skip
+            "stated_deviations": [d.to_json() for d in atlas.stated],
+            "failures": [asdict(f) for f in atlas.failures]}  # fmt: skip
     head = json.dumps(data, indent=1, allow_nan=False).removesuffix("\n}")
     lines = (json.dumps(s.to_json(), allow_nan=False, ensure_ascii=False) for s in atlas.spots)
     return head + ',\n "spots": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n"
@@ -406,14 +479,15 @@ def _write_csv(path: Path, spots: Sequence[AxisPoint]) -> None:
 
     def line(s: AxisPoint) -> dict[str, Any]:
         out: dict[str, Any] = {"axis": s.axis.name, "field": s.axis.field, "value": s.value, "unit": s.axis.unit,
-                               "method": s.method, "n": len(s.results)}  # fmt: skip
-        for outcome in Outcome:
+                               "method": s.method, "n": len(s.results), "failed": s.failed}  # fmt: skip
+        for outcome in JUDGED:
             rate, name = s.rate(outcome), outcome.name.lower()
             low, high = rate.interval
             out |= {name: rate.count, f"{name}_low": f"{low:.4f}", f"{name}_high": f"{high:.4f}"}
         out |= {f"error_px_{q}": f"{e:.4g}" for q, e in s.quantiles.items()}
-        return out | {"limit_px": f"{s.limit_px:.4g}", "seconds": f"{s.seconds:.4g}",
-                      "message": s.common_message(Outcome.REFUSAL, Outcome.SILENT)}  # fmt: skip
+        medians = {"limit_px": s.limit_px, "seconds": s.seconds}
+        out |= {name: "" if math.isnan(value) else f"{value:.4g}" for name, value in medians.items()}
+        return out | {"message": s.common_message(Outcome.REFUSAL, Outcome.SILENT)}
 
     lines = [line(s) for s in spots]
     names = dict.fromkeys(n for each in sorted(lines, key=len, reverse=True) for n in each)
@@ -432,7 +506,8 @@ def _markdown(atlas: Atlas) -> str:
     silent, refused = atlas.failing(Outcome.SILENT), atlas.failing(Outcome.REFUSAL)
     parts = [
         "# Atlas of failures",
-        f"{atlas.cells:,} recordings, {len(atlas.axes)} axes, {len(atlas.methods)} methods; "
+        f"{atlas.cells:,} recordings, {atlas.failed_cells:,} failed in the study itself, "
+        f"{len(atlas.axes)} axes, {len(atlas.methods)} methods; "
         + "; ".join(str(atlas.about[k]) for k in ("machine", "date") if k in atlas.about) + ".",
         "## Aims",
         "\n".join(f"- {line}" for line in atlas.aims.lines()),
@@ -448,6 +523,8 @@ def _markdown(atlas: Atlas) -> str:
         _grid(("axis", "value", "silent failures", "most common message"), rows_of(silent, Outcome.SILENT)),
         "## Refusals of the default",
         _grid(("axis", "value", "refusals", "most common message"), rows_of(refused, Outcome.REFUSAL)),
+        "## Recordings that failed in the study itself\n\nThey are part of no rate. The same command tries them again.",
+        _grid(("cell", "values", "methods", "error"), [f.row() for f in atlas.failures]),
     ]  # fmt: skip
     return "\n\n".join(parts) + "\n"
 
@@ -537,7 +614,14 @@ def _page(atlas: Atlas, axis: Axis) -> Any:
     middle = {"ha": "center", "va": "center"}
     for (method, value), spot in spots.items():
         x, y = values.index(value), atlas.methods.index(method)
-        heat.text(x, y - 0.13, f"{_share(spot)} %", fontsize=NORMAL, fontweight="bold", **middle)
+        heat.text(
+            x,
+            y - 0.13,
+            f"{_share(spot)} %" if spot.results else _share(spot),
+            fontsize=NORMAL,
+            fontweight="bold",
+            **middle,
+        )
         heat.text(x, y + 0.27, _count(spot), fontsize=SMALL, **middle)
     _heat_grid(heat, len(values), atlas.methods, NORMAL)
     heat.tick_params(axis="x", labelbottom=False)
@@ -577,7 +661,8 @@ def _overview(atlas: Atlas) -> Any:
 def _headline(atlas: Atlas) -> str:
     """Return the title of the overview."""
     most = max(len(s.results) for s in atlas.spots)
-    return f"Where calibration works: {atlas.cells:,} simulated recordings, up to {most} for each value"
+    title = f"Where calibration works: {atlas.cells:,} simulated recordings, up to {most} for each value"
+    return f"{title}; {atlas.failed_cells:,} failed" if atlas.failed_cells else title
 
 
 def _strips(ax: Any, axis: Axis, spots: dict[tuple[str, Any], AxisPoint], methods: Sequence[str]) -> None:
@@ -610,7 +695,8 @@ def _shares(ax: Any, spots: dict[tuple[str, Any], AxisPoint], values: Sequence[A
     parts: dict[str, list[list[tuple[float, float]]]] = {colour: [] for colour in COLOURS.values()}
     for k, method in enumerate(methods):
         for column, value in enumerate(values):
-            if spot := spots.get((method, value)):
+            spot = spots.get((method, value))
+            if spot is not None and spot.results:
                 edges = np.cumsum([0.0, *(spot.rate(o).share for o in COLOURS)]) + column - 0.5
                 for part, (x0, x1) in zip(parts.values(), pairwise(edges), strict=True):
                     part.append([(x0, k - 0.5), (x1, k - 0.5), (x1, k + 0.5), (x0, k + 0.5)])
@@ -619,13 +705,17 @@ def _shares(ax: Any, spots: dict[tuple[str, Any], AxisPoint], values: Sequence[A
 
 
 def _share(spot: AxisPoint) -> str:
-    """Return the share of successful calibrations in per cent, as text."""
-    return f"{100 * spot.rate(Outcome.SUCCESS).share:.0f}"
+    """Return the share of successful calibrations in per cent, as text; a dash if the study failed for all."""
+    return f"{100 * spot.rate(Outcome.SUCCESS).share:.0f}" if spot.results else "–"
 
 
 def _count(spot: AxisPoint) -> str:
-    """Return the number of successes, the total, and the median time, as text."""
+    """Return the number of successes, the total, and the median time, as text, or how many failed in the study."""
+    if not spot.results:
+        return f"{spot.failed} failed"
     success = spot.rate(Outcome.SUCCESS)
+    if spot.failed:
+        return f"{success.count}/{success.total}, {spot.failed} failed"
     return f"{success.count}/{success.total}, {spot.seconds:.2g} s"
 
 
