@@ -302,6 +302,23 @@ def test_tasks_take_turns_in_changing_order() -> None:
     assert [len(t.times) for t in measure(tasks, 9, progress, "measuring", warm_up=False, limit_s=0.0)] == [1] * 4
 
 
+def test_a_task_that_fails_is_not_run_again_and_the_others_are() -> None:
+    runs: list[str] = []
+
+    def run_task(name: str) -> None:
+        runs.append(name)
+        if name == "early" or (name == "late" and runs.count("late") == 3):
+            raise MemoryError("too large")
+
+    names = ("early", "good", "late")
+    timed = measure([Task(lambda name=name: run_task(name), 1) for name in names], 3, silent, "measuring")
+    assert [runs.count(name) for name in names] == [1, 4, 3]
+    assert [(len(t.times), len(t.slowness)) for t in timed] == [(0, 0), (3, 3), (0, 0)]
+    assert [t.failure[:22] for t in timed] == ["MemoryError: too large", "", "MemoryError: too large"]
+    (gone,) = measure([Task(lambda: run_task("early"), 1)], 3, silent, "measuring")
+    assert gone.failure
+
+
 def test_quick_chart_writes_everything(charted: tuple[Path, dict[str, Any]]) -> None:
     folder, data = charted
     names = {"chart.json", "chart.csv", "preset_calibration.json", "preset_compensation.json"}

@@ -162,7 +162,10 @@ def test_recordings_that_failed_are_named_and_part_of_no_rate(tmp_path: Path) ->
     spot = atlas.of(NOISE)["default", 0.25]
     assert (spot.failed, str(spot.rate(Outcome.SUCCESS))) == (3, "100 % (56.6 % to 100 %; 5 of 5)")
     assert (atlas.failed_cells, atlas.cells, atlas.measured) == (11, 48, True)
-    assert atlas.works(SCENE, "default") == "dense texture"
+    assert (atlas.works(SCENE, "default"), atlas.works(SCENE, "paper")) == ("dense texture", "dense texture")
+    hard = [s for s in every if s.cell.condition == SCENE.conditions()[2]]
+    partial = aggregate([s for s in every if s not in hard], AXES, METHODS[:2], {})
+    assert partial.works(SCENE, "default") == "everywhere measured"
     assert sum(rate.total for rate in (atlas.aims.inside, atlas.aims.outside)) == 48 - 11
     assert all(w.default.total in (5, 8) for w in atlas.aims.worse)
     files = atlas.write(tmp_path)

@@ -350,7 +350,10 @@ class Atlas:
         return {(s.method, s.value): s for s in self.spots if s.axis == axis}
 
     def works(self, axis: Axis, method: str) -> str:
-        """Return the values at which a method works, as text; runs of neighbours are written as from ... to."""
+        """Return the values at which a method works, as text; runs of neighbours are written as from ... to.
+
+        "measured" is added to "everywhere" and "nowhere" if not all values of the axis are measured.
+        """
         spots = self.of(axis)
         unknown = {value for (name, value), spot in spots.items() if name == method and not spot.results}
         values = [v for v in axis.values if v not in unknown and any(value == v for _, value in spots)]
@@ -358,7 +361,8 @@ class Atlas:
             return "not measured"
         good = [(s := spots.get((method, v))) is not None and s.rate(Outcome.SUCCESS).share >= WORKS for v in values]
         if all(good) or not any(good):
-            return "everywhere" if all(good) else "nowhere"
+            where = "everywhere" if all(good) else "nowhere"
+            return where if len(values) == len(axis.values) else f"{where} measured"
         runs: list[list[Any]] = []
         for k, value in enumerate(values):
             if good[k]:
