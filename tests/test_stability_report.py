@@ -184,7 +184,9 @@ def test_recordings_that_failed_are_named_and_part_of_no_rate(tmp_path: Path) ->
     words = [t.get_text() for t in _page(atlas, SCENE).axes[0].texts]
     assert words.count("8 failed") == words.count("–") == 2
     assert "5/5, 3 failed" in [t.get_text() for t in _page(atlas, NOISE).axes[0].texts]
-    assert _overview(atlas).texts[-1].get_text().endswith("; 11 failed")
+    sheet = _overview(atlas)
+    assert sheet.texts[-1].get_text().endswith("; 11 failed")
+    assert sheet.legends[0].get_texts()[-1].get_text().endswith("–: failed in the study")
 
 
 def test_worse_than_the_paper_is_told_by_the_same_recordings() -> None:

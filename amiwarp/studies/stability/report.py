@@ -658,7 +658,9 @@ def _overview(atlas: Atlas) -> Any:
         figure.text(x / SHEET, 1.0 - (top - 0.32) / height, axis_label(axis), fontsize=NORMAL, fontweight="bold",
                     va="center")  # fmt: skip
     figure.text(left / SHEET, 1.0 - 0.22 / height, _headline(atlas), fontsize=LARGE, va="center")
-    _legend(figure, SHEET, height, 0.52, left=left, text="numbers: successes [%]")
+    lost = any(not spot.results for spot in atlas.spots)
+    text = "numbers: successes [%]; –: failed in the study" if lost else "numbers: successes [%]"
+    _legend(figure, SHEET, height, 0.52, left=left, text=text)
     return figure
 
 
