@@ -283,7 +283,8 @@ def guarded(target: Target) -> Target:
 
     Objects, functions, mappings, NumPy arrays, paths, truth values, devices, and the numbers of functions, methods and
     records are checked. Ranges, choices and shapes are the function's own business. An annotation is resolved when a
-    value first needs it, because its types may be imported for type checkers only. Raises :class:`AmiwarpError`.
+    value first needs it, because its types may be imported for type checkers only. Raises :class:`AmiwarpError`, also
+    if NumPy or SciPy finds no solution of a system of equations.
     """
     if not isinstance(target, type):
         return cast(Target, _checked_call(target, target.__name__, 0))
@@ -322,7 +323,13 @@ def _checked_call(function: Any, label: str, first: int, numbers_too: bool = Tru
         for name, value in kwargs.items():
             if name in named and type(value) not in named[name].known:
                 kwargs[name] = named[name].check(value)
-        return function(*given, **kwargs)
+        try:
+            return function(*given, **kwargs)
+        except np.linalg.LinAlgError as error:
+            raise AmiwarpError(
+                f"{label}: a system of equations has no solution ({error}): the given data do not determine the "
+                "result; give more data, or data without values that are not finite"
+            ) from error
 
     return call
 

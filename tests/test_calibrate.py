@@ -36,8 +36,10 @@ from amiwarp import (
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.calibration_events import RUN, thin
 from amiwarp.calib.first_guess import estimate_rpm
+from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.calib.parameters import make_space
 from amiwarp.calib.sharpness_search import PARTS
+from amiwarp.calib.start_burst import LaterEvents, burst_size, without_start_burst
 from amiwarp.optics.models import MODELS, rungs, wrap_angle
 from tests.conftest import NOMINAL_PRISM, TRUE_PRISM
 
@@ -245,6 +247,54 @@ def test_thinning_is_even_and_complete(recording: Recording) -> None:
     kept = np.arange(n) // RUN % -(-n // (n // 7)) == 0
     np.testing.assert_array_equal(few.t, whole.t[kept])
     assert PARTS > 1
+
+
+def test_a_burst_at_the_first_time_stamp_is_left_out_and_said(recording: Recording) -> None:
+    (width, height), events = recording.events.size, recording.events[:]
+    y, x = np.divmod(np.arange(5000), width)
+    start = int(events.t[0]) - 3
+    burst = Events.from_arrays(x, y, np.full(5000, start), np.ones(5000))
+    started = MemoryEvents(Events.concatenate([burst, events]), width, height)
+    plain = calibrate(recording)
+    found = calibrate(replace(recording, events=started))
+    assert found.parameters == plain.parameters
+    assert found.events == plain.events
+    assert found.warnings[:-1] == plain.warnings
+    assert found.warnings[-1].startswith(f"5,000 events carry the first time stamp ({start} us)")
+    by_paper = calibrate_as_paper(replace(recording, events=started))
+    assert by_paper.parameters == calibrate_as_paper(recording).parameters
+    assert by_paper.warnings == found.warnings[-1:]
+
+
+def test_a_coarse_clock_is_no_burst(recording: Recording) -> None:
+    events = recording.events[:]
+    ticks = Events(events.x, events.y, events.t // 5000 * 5000, events.p)
+    source = MemoryEvents(ticks, *recording.events.size)
+    assert source.find(source.t_first + 1) > 1000
+    assert without_start_burst(replace(recording, events=source))[0].events is source
+    assert burst_size(MemoryEvents(ticks[:1000], *source.size)) == 0  # all have the same time
+
+
+def test_events_after_a_burst_are_a_whole_source() -> None:
+    t = np.concatenate([np.zeros(300, np.int64), np.arange(7, 4000)])
+    zeros = np.zeros(len(t), np.uint16)
+    events = Events(zeros, zeros, t, (t % 2).astype(np.uint8))
+    source = MemoryEvents(events, 4, 3)
+    later, expected = LaterEvents(source, 300), MemoryEvents(events[300:], 4, 3)
+    assert burst_size(source) == 300
+    assert (len(later), later.t_first, later.t_last, later.size) == (3993, 7, 3999, (4, 3))
+    assert [later.find(at) for at in (-5, 0, 7, 8, 9000)] == [expected.find(at) for at in (-5, 0, 7, 8, 9000)]
+    for one, other in (
+        (later.slice(-2, 5), expected.slice(-2, 5)),
+        (later[-3:], expected[-3:]),
+        (later.between(-5, 9), expected.between(-5, 9)),
+        (later.between(10, 20), expected.between(10, 20)),
+        (Events.concatenate([*later.blocks()]), expected[:]),
+    ):
+        np.testing.assert_array_equal(one.t, other.t)
+    for size in ({"count": 1000}, {"duration_us": 900}):
+        blocks = [block.t.tolist() for block in later.blocks(**size)]
+        assert blocks == [block.t.tolist() for block in expected.blocks(**size)]
 
 
 # -- refusals, each with its reason

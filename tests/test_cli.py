@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner, Result
 
-from amiwarp import AmiwarpError, Calibration, PrismMotion, open_recording
+from amiwarp import AmiwarpError, Calibration, Events, MemoryEvents, PrismMotion, open_recording, save_recording
 from amiwarp.calib.parameters import LINEAR_UNKNOWNS, units
 from amiwarp.cli.app import COMMANDS, app, function_of
 from amiwarp.cli.common import number
@@ -236,6 +237,20 @@ def test_calibrate_takes_every_setting(place: Path) -> None:
     assert 60.0 <= data["parameters"]["phase"]["degrees"] <= 140.0
     assert np.asarray(Image.open("cost.png")).shape[1] > 1000
     assert left_behind(place) == {"recording.calibration.json", "cost.png"}
+
+
+def test_calibrate_says_that_a_burst_was_left_out(place: Path) -> None:
+    recording = open_recording("recording.h5")
+    y, x = np.divmod(np.arange(2000), 160)
+    burst = Events.from_arrays(x, y, np.full(2000, -20_000), np.ones(2000))
+    events = MemoryEvents(Events.concatenate([burst, recording.events[:]]), *recording.events.size)
+    save_recording("burst.h5", replace(recording, events=events, truth=None))
+    given = ("calibrate", "burst.h5", "burst.json", "--stages", "sharpness")
+    found = ok(*given)
+    said = "2,000 events carry the first time stamp (-20000 us), far more than any later one"
+    assert found["warnings"][-1].startswith(said)
+    assert Calibration.load("burst.json").warnings[-1].startswith(said)
+    assert f"warning: {said}" in run(*given, "--force").stdout
 
 
 def test_calibrate_prints_a_table(made: tuple[Path, str]) -> None:

@@ -14,6 +14,7 @@ from amiwarp import (
     Calibration,
     Camera,
     Encoder,
+    Events,
     ExactModel,
     MemoryEvents,
     Prism,
@@ -56,6 +57,15 @@ def error_px(recording: Recording, motion: PrismMotion, found: Calibration) -> f
     return float(np.sqrt(np.nanmean((error**2).sum(axis=1))))
 
 
+def with_burst(recording: Recording, count: int, before: int, t: int) -> Recording:
+    """Return the recording with ``count`` more events before the event ``before``, all at the time ``t`` [us]."""
+    events, rng = recording.events[:], np.random.default_rng(0)
+    at = rng.integers(0, (120, 90), (count, 2)).T
+    burst = Events.from_arrays(at[0], at[1], np.full(count, t), np.ones(count))
+    whole = Events.concatenate([events[:before], burst, events[before:]])
+    return replace(recording, events=MemoryEvents(whole, 120, 90))
+
+
 def ramp(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return 900.0 * np.clip(t / SECONDS, 0.0, 1.0)
 
@@ -75,6 +85,38 @@ def test_a_prism_that_starts_is_followed(spun_up: tuple[Recording, PrismMotion],
     assert error_px(*spun_up, calibrated) < 0.05
     assert "rpm" not in calibrated.parameters
     assert any("speed is not constant: it rose from" in w for w in calibrated.warnings)
+
+
+def test_a_burst_of_the_starting_camera_is_left_out(
+    spun_up: tuple[Recording, PrismMotion], calibrated: Calibration
+) -> None:
+    start = spun_up[0].events.t_first - 50_000
+    recording = with_burst(spun_up[0], 20_000, 0, start)
+    found = calibrate(recording, photometric=COARSE)
+    assert found.parameters == calibrated.parameters
+    assert found.warnings[:-1] == calibrated.warnings
+    assert f"20,000 events carry the first time stamp ({start} us)" in found.warnings[-1]
+    encoder = found.encoder_for(None, start, recording.events.t_last)
+    assert encoder.covers(start, recording.events.t_last)
+    assert calibrated.path is not None
+    np.testing.assert_allclose(encoder.angle_at(calibrated.path.t), calibrated.path.angle, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_many_events_of_one_time_leave_paths_of_finite_angles(
+    spun_up: tuple[Recording, PrismMotion], share: float
+) -> None:
+    events = spun_up[0].events[:]
+    before = int(share * (len(events) - 1))
+    paths = varying_paths(with_burst(spun_up[0], 30_000, before, int(events.t[before])))
+    assert len(paths) == 2
+    assert all(np.isfinite(path.angle).all() for path in paths)
+
+
+def test_events_of_one_time_have_no_path(spun_up: tuple[Recording, PrismMotion]) -> None:
+    events = spun_up[0].events[:]
+    same = Events(events.x, events.y, np.zeros_like(events.t), events.p)
+    assert varying_paths(replace(spun_up[0], events=MemoryEvents(same, 120, 90))) == []
 
 
 def test_the_file_keeps_the_path(

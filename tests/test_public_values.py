@@ -1,5 +1,7 @@
 """Public functions, classes and methods with any values: a result, or an AmiwarpError of one line."""
 
+from __future__ import annotations
+
 import contextlib
 import copy
 import inspect
@@ -14,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import amiwarp
 from amiwarp import (
@@ -33,7 +36,7 @@ from amiwarp.events.encoder import LARGEST_ANGLE
 from amiwarp.events.recording import check_events
 from amiwarp.io.native_format import LiveWriter
 from amiwarp.optics.camera import LARGEST_FOCAL
-from amiwarp.validation import TIME_LIMIT, shown
+from amiwarp.validation import TIME_LIMIT, guarded, shown
 from tests.public_calls import CAMERA, RECORDING, REFUSED, PublicCall, public_calls, write_files
 
 
@@ -331,6 +334,15 @@ def test_a_recording_at_the_limit_of_time_opens_again(first: int, tmp_path: Any)
 def test_encoders_beyond_the_limits(t: list[int], angle: list[float], message: str) -> None:
     with pytest.raises(AmiwarpError, match=message):
         Encoder(np.array(t, np.int64), np.array(angle))
+
+
+def test_equations_without_a_solution_are_a_plain_error() -> None:
+    @guarded
+    def solve(matrix: NDArray[np.float64]) -> Any:
+        return np.linalg.inv(matrix)
+
+    with pytest.raises(AmiwarpError, match=r"solve: a system of equations has no solution \(Singular matrix\)"):
+        solve(np.zeros((2, 2)))
 
 
 def test_an_unsized_prism_has_a_valid_index() -> None:

@@ -51,6 +51,7 @@ from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX,
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
 from amiwarp.calib.settings import AUTO, CalibrationOptions, Settings
 from amiwarp.calib.sharpness_search import Search
+from amiwarp.calib.start_burst import reaching_back, without_start_burst
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
 from amiwarp.events.encoder import Encoder, check_prisms
@@ -131,6 +132,15 @@ def calibrate(
         )
     if best != ExactModel.NAME:
         settings = replace(settings, model=best)
+    used, warnings = without_start_burst(recording)
+    found = _calibration(used, settings, device, progress)
+    if found.path is not None and len(recording.events):
+        found = replace(found, path=reaching_back(found.path, recording.events.t_first))
+    return _warning(found, *warnings)
+
+
+def _calibration(recording: Recording, settings: Settings, device: Any, progress: Progress | None) -> Calibration:
+    """Return the calibration of a recording with checked settings."""
     if isinstance(recording.prism, Plate) or settings.model == PlateModel.NAME:
         return _plate(recording, settings, device, progress)
     if settings.model != AUTO:

@@ -18,6 +18,7 @@ from amiwarp.calib.nlopt_solver import SearchStage, best_of
 from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.settings import STAGES, Settings
 from amiwarp.calib.sharpness_search import Search
+from amiwarp.calib.start_burst import without_start_burst
 from amiwarp.choices import Sharpness
 from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.tasks import Progress, part, silent
@@ -49,6 +50,7 @@ def calibrate_as_paper(
     not suit a calibration: too few events, or an encoder that does not cover them.
     """
     began = time.perf_counter()
+    recording, warnings = without_start_burst(recording)
     source = recording.events
     cut = source.between(source.t_first, source.t_first + WINDOW_US)
     given = dict(start or {})
@@ -78,6 +80,7 @@ def calibrate_as_paper(
         path=path_of(used, search),
         events=len(cut),
         seconds=time.perf_counter() - began,
+        warnings=warnings,
     )
 
 

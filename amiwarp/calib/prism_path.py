@@ -79,6 +79,8 @@ def varying_paths(recording: Recording) -> list[Encoder]:
         t, u, counts = _count(recording)
     except AmiwarpError:
         return []
+    if t[-1] <= t[0]:  # all events have the same time
+        return []
     theta, left = _follow(u, counts)
     constant = np.asarray(np.polyval(np.polyfit(t, theta, 1), t), np.float64)
     if float(np.std(theta - constant)) < LEAST_VARIATION:
@@ -178,11 +180,19 @@ def _encoder(recording: Recording, t: Vector, theta: Vector) -> Encoder:
     """Return the path through the angles ``theta`` at times ``t`` after the first event [us] as regular samples."""
     first, last = recording.events.t_first, recording.events.t_last
     times = np.arange(-SAMPLE_US, last - first + 2 * SAMPLE_US, SAMPLE_US, dtype=np.int64)
-    begin, end = (np.polyfit(t[part], theta[part], 1) for part in (slice(ENDS), slice(-ENDS, None)))
+    begin = _on_line(t[:ENDS], theta[:ENDS], times[0])
+    end = _on_line(t[-ENDS:], theta[-ENDS:], times[-1])
     t = np.concatenate([times[:1], t, times[-1:]])
-    theta = np.concatenate([[np.polyval(begin, t[0])], theta, [np.polyval(end, t[-1])]])
+    theta = np.concatenate([[begin], theta, [end]])
     theta -= np.interp(middle_time(recording) - first, t, theta)
     return Encoder(times + first, np.interp(times, t, theta))
+
+
+def _on_line(t: Vector, theta: Vector, at: float) -> float:
+    """Return the angle at the time ``at`` on the line fitted to some angles; the mean if they have the same time."""
+    from_mean = t - t.mean()
+    speed = float(from_mean @ theta) / max(float(from_mean @ from_mean), 1e-30)
+    return float(theta.mean()) + speed * (at - float(t.mean()))
 
 
 # Cubic splines whose knots are equally far apart in the prism's angle.
@@ -363,7 +373,13 @@ class PathFit:
 
         normal: Vector = (columns.T @ diags(weight) @ columns).toarray()
         ridge = 1e-4 * float(np.median(np.diag(normal))) + 1e-12
-        factor = cho_factor(normal + ridge * np.eye(len(normal)))
+        try:
+            factor = cho_factor(normal + ridge * np.eye(len(normal)))
+        except np.linalg.LinAlgError as error:  # knots without events
+            raise AmiwarpError(
+                f"{self._recording.name}: the events do not determine the path of the prism's angle at all times; use "
+                "an encoder, or record a scene with more edges"
+            ) from error
         left = -(columns.T @ (weight * unexplained(residual)))
         x, direction = np.zeros(len(left)), cho_solve(factor, left)
         first = power = float(left @ direction)

@@ -28,6 +28,7 @@ from amiwarp.calib.photometric.stage import LARGEST_COST, Equations
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import PhotometricSettings, Settings
 from amiwarp.calib.sharpness_search import Search
+from amiwarp.calib.start_burst import without_start_burst
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.lens.board import Board, Corners, opencv
@@ -156,7 +157,7 @@ class LensCalibration:
     left_out: Mapping[str, str]
     """Reason by name of each pose that was left out."""
     notes: tuple[str, ...]
-    """What the recordings do not determine, one sentence each."""
+    """What the recordings do not determine, and events that were left out, one sentence each."""
     advice: tuple[str, ...]
     """What would improve the calibration most, one sentence each; the most helpful first."""
     seconds: float
@@ -248,8 +249,13 @@ def calibrate_lens(
     if len(sizes) > 1:
         raise AmiwarpError(f"the recordings have sensors of {sorted(sizes)} px; give recordings of one camera")
     camera = first_camera(given[0].events.size, given[0].camera, fov, fisheye=fisheye)
+    notes = list[str]()
+    for k, recording in enumerate(given):
+        given[k], warnings = without_start_burst(recording)
+        notes += [f"{recording.name}: {text}" for text in warnings]
     poses, reasons = still_poses(given)
-    return LensWork(board, camera, poses, device, progress or silent, reasons).run()
+    found = LensWork(board, camera, poses, device, progress or silent, reasons).run()
+    return replace(found, notes=(*found.notes, *notes))
 
 
 def first_camera(size: tuple[int, int], known: Camera | None, fov: float | None, *, fisheye: bool) -> Camera:
@@ -744,7 +750,7 @@ class JointPrism:
         for unit in np.eye(2):
             moved = _total(self._slopes(some, v + PROBE_PX * unit))
             changes.append((moved.gradient - at.gradient) / PROBE_PX)
-        shares = np.linalg.eigvals(np.linalg.solve(at.hessian, np.stack(changes, axis=1))).real
+        shares = np.linalg.eigvals(np.linalg.lstsq(at.hessian, np.stack(changes, axis=1), rcond=None)[0]).real
         self._longer = 1.0 / float(np.clip(shares.mean(), 1.0 / LARGEST_GAIN, 1.0))
         costs = self._costs(camera, names).values()
         self._each = self._slopes(costs, self.space.to_vector(self.values))

@@ -1,0 +1,109 @@
+"""Burst of events at the first time stamp, which some event cameras emit when they start.
+
+These events show no edge of the scene. Without an encoder they also look like turns of the prism in no time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.recording import Events, EventSource, MemoryEvents, Recording, regroup
+
+FEWEST_EVENTS = 200
+"""Smallest number of events at the first time stamp that may be a burst."""
+LEAST_RATIO = 10
+"""Smallest ratio of the number of events at the first time stamp to the number at any later one that is compared.
+Where many events share each time stamp because a clock is coarse, the first one has no more than the others."""
+COMPARED, MOST_COMPARED = 4, 1 << 20
+"""Number of later events that are compared, as a multiple of the events at the first time stamp, and its limit."""
+
+
+def without_start_burst(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
+    """Return the recording without a burst at its first time stamp, and a warning that says so.
+
+    Without such a burst, these are the recording itself and no warning.
+    """
+    source = recording.events
+    count = burst_size(source)
+    if not count:
+        return recording, ()
+    later: EventSource = LaterEvents(source, count)
+    if isinstance(source, MemoryEvents):
+        later = MemoryEvents(later[:], *source.size)
+    said = (
+        f"{count:,} events carry the first time stamp ({source.t_first} us), far more than any later one, as cameras "
+        "emit when they start: they were left out of the calibration"
+    )
+    return replace(recording, events=later), (said,)
+
+
+def burst_size(source: EventSource) -> int:
+    """Return the number of events at the first time stamp if it is far larger than at later ones, else 0."""
+    if not len(source):
+        return 0
+    count = source.find(source.t_first + 1)
+    if count < FEWEST_EVENTS:
+        return 0
+    t = source.slice(count, count + min(COMPARED * count, MOST_COMPARED)).t
+    if not len(t):
+        return 0
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(t)) + 1, [len(t)]])
+    most = int(np.diff(starts).max())
+    return count if count >= LEAST_RATIO * most else 0
+
+
+def reaching_back(path: Encoder, t: int) -> Encoder:
+    """Return a path of the prism's angle that also covers the time ``t`` [us] before it, at the speed of its start."""
+    first = int(path.t[0])
+    if t >= first:
+        return path
+    speed = (path.angle[1] - path.angle[0]) / (path.t[1] - path.t[0])
+    angle = path.angle[0] - speed * (first - t)
+    return replace(path, t=np.concatenate([[t], path.t]), angle=np.concatenate([[angle], path.angle]))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LaterEvents(EventSource):
+    """Events of a source from an index on. All earlier events have the first time stamp."""
+
+    source: EventSource
+    """Source of which these are the later events."""
+    first: int
+    """Index of the first of these events in the source."""
+
+    def __len__(self) -> int:
+        return len(self.source) - self.first
+
+    @property
+    def t_first(self) -> int:
+        return int(self.source.slice(self.first, self.first + 1).t[0])
+
+    @property
+    def t_last(self) -> int:
+        return self.source.t_last
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.source.size
+
+    def slice(self, start: int, stop: int) -> Events:
+        return self.source.slice(self.first + max(start, 0), self.first + max(stop, 0))
+
+    def find(self, t: int) -> int:
+        return max(self.source.find(t) - self.first, 0)
+
+    def between(self, t_start: int, t_end: int) -> Events:
+        return self.source.between(max(t_start, self.source.t_first + 1), t_end)
+
+    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+        return regroup(self._chunks(), count=count, duration_us=duration_us)
+
+    def _chunks(self) -> Iterator[Events]:
+        left = self.first
+        for block in self.source.blocks():
+            yield block[min(left, len(block)) :]
+            left = max(left - len(block), 0)
