@@ -55,7 +55,32 @@ NEARER = 1e-3
 OUTSIDE = 2
 """Value of :attr:`amiwarp.FrameTruth.occlusion` for points outside the image."""
 MOMENT_S = 1e-4
-"""Half of the time over which optical flow is computed as a difference quotient [s]."""
+"""Time between the moments whose difference quotient is the optical flow [s]."""
+
+
+def rate_of_change(
+    value_at: Callable[[float], NDArray[np.float64]], t: float, duration_s: float
+) -> NDArray[np.float64]:
+    """Return the rate at which a value changes at the time ``t`` [s], from its values at two or three moments.
+
+    ``value_at`` returns the value at a moment [s]. All moments lie within the recording, because cameras, bodies and
+    optics may rest before and after it. At its ends the rate is that of the parabola through three moments on one side,
+    elsewhere the central difference quotient.
+    """
+    step = min(MOMENT_S, duration_s / 2.0)
+    centre = t
+    if 0.0 <= t <= duration_s:
+        centre = min(max(t, step), duration_s - step)
+    after_t = (centre - t) + step * np.array([-1.0, 0.0, 1.0])
+    first = value_at(t + float(after_t[0]))
+    rate = np.zeros_like(first)
+    for k in (1, 2):
+        others = np.delete(after_t, k)
+        weight = float(-others.sum() / np.prod(after_t[k] - others))
+        if weight:
+            # the weights of all three sum to 0, and a value that does not change has no rate, not even a rounding error
+            rate += weight * (value_at(t + float(after_t[k])) - first)
+    return rate
 
 
 @guarded
@@ -171,13 +196,12 @@ class TruthRenderer:
 
         ``seen``: surfaces that appear at ``pixels`` [px] in the image without the prism.
         """
-        rays = [self._ray_at(seen, pixels, t, t + h)[0] for h in (-MOMENT_S, MOMENT_S)]
-        change = (rays[1] - rays[0]) / (2.0 * MOMENT_S)
-        middle = (rays[0] + rays[1]) / 2.0
+        change = rate_of_change(lambda at: self._ray_at(seen, pixels, t, at)[0], t, self._simulation.duration_s)
         rate = np.linalg.norm(change, axis=1, keepdims=True)
         aside = ANGLE * change / np.maximum(rate, 1e-12)
         camera = self._simulation.camera
-        ends = [camera.rays_to_pixels(middle + sign * aside).astype(np.float64) for sign in (-1.0, 1.0)]
+        rays = camera.pixels_to_rays(pixels).astype(np.float64)
+        ends = [camera.rays_to_pixels(rays + sign * aside).astype(np.float64) for sign in (-1.0, 1.0)]
         return np.asarray((ends[1] - ends[0]) / (2.0 * ANGLE) * rate)
 
     def _ray_at(
@@ -249,8 +273,8 @@ class TruthRenderer:
         size = np.linalg.norm(speed, axis=1, keepdims=True)
         aside = speed / np.maximum(size, 1e-9)
         along = [model.deflect_points(places + sign * aside, theta) for sign in (-1.0, 1.0)]
-        before, after = self._simulation.motion.angles([t_us - 50.0, t_us + 50.0])
-        rates = np.atleast_1d((after - before) / 1e-4)
+        motion, duration_s = self._simulation.motion, self._simulation.duration_s
+        rates = np.atleast_1d(rate_of_change(lambda at: motion.angles([1e6 * at])[0], t_us * 1e-6, duration_s))
         flow = (along[1] - along[0]) / 2.0 * size
         for rate, alone in zip(rates, np.eye(len(rates)), strict=True):
             step = ANGLE * (alone if len(rates) > 1 else 1.0)
@@ -294,10 +318,11 @@ class TruthRenderer:
 
         ``seen``, ``places``: from :meth:`_through_plate`.
         """
-        before, after = (
-            self._plate_pixels(model, *self._ray_at(seen, places, t, at), at) for at in (t - MOMENT_S, t + MOMENT_S)
-        )
-        return np.asarray((after - before) / (2.0 * MOMENT_S))
+
+        def pixels_at(at: float) -> NDArray[np.float64]:
+            return self._plate_pixels(model, *self._ray_at(seen, places, t, at), at)
+
+        return rate_of_change(pixels_at, t, self._simulation.duration_s)
 
     def _intensity(self, t_us: int, *, prism: bool) -> NDArray[np.float32]:
         """Return the luminance of all pixels at a time, through the prism or without the prism, shape (n,)."""
