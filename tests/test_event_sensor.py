@@ -121,6 +121,36 @@ def test_a_ramp_crosses_thresholds_at_analytic_times_for_any_steps(device: str) 
             assert set(events.p[(events.x == column) & (events.y == row)].tolist()) <= {int(slope > 0)}
 
 
+@pytest.mark.parametrize(
+    "model",
+    [
+        replace(SensorModel.ideal(), leak_hz=30.0, leak_jitter_fraction=0.3),
+        replace(SensorModel.ideal(), leak_hz=30.0, leak_jitter_fraction=0.3, refractory_us=5000.0, cutoff_hz=300.0),
+        replace(NOISY, leak_hz=30.0, leak_jitter_fraction=0.3, latency_us=0.0, latency_jitter_us=0.0),
+    ],
+    ids=["leak", "refractory", "noise"],
+)
+def test_leak_events_are_the_same_for_any_steps(device: str, model: SensorModel) -> None:
+    """In a step of a second, each pixel draws its leak anew at each of its 30 events, as in a hundred steps."""
+    image = np.full((1, 24, 32), -1.0, np.float32)
+    made = []
+    for count in (1, 7, 100):
+        sensor = EventSensor(1, 24, 32, model, seed=3, device=device)
+        times = np.linspace(0, 1_000_000, count + 1).astype(int)
+        events = of_camera([sensor.step(image, int(t)) for t in times], 0)
+        made.append(events[np.lexsort((events.t, events.x, events.y))])
+    for found in made[:2]:
+        assert len(found) == pytest.approx(len(made[2]), rel=2e-3)
+    by_pixel = [np.bincount(e.y.astype(int) * 32 + e.x, minlength=768) for e in made]
+    assert by_pixel[2].mean() > 20.0
+    for events, counts in zip(made[:2], by_pixel[:2], strict=True):
+        assert np.abs(counts - by_pixel[2]).max() <= 1  # an event at the end may be just before or after it
+        same_count = counts == by_pixel[2]
+        assert same_count.mean() > 0.98
+        one, other = (e.t[same_count[e.y.astype(int) * 32 + e.x]] for e in (events, made[2]))
+        np.testing.assert_allclose(one, other, rtol=0, atol=20.0)  # us; float32 resolves 0.1 us of a step of a second
+
+
 def textures(steps: int, cameras: int = 3) -> NDArray[np.float32]:
     return np.random.default_rng(0).uniform(-2.0, 0.0, (steps, cameras, 8, 10)).astype(np.float32)
 

@@ -32,6 +32,7 @@ SHOT_NOISE = wp.constant(1)
 LEAK = wp.constant(2)
 HOT_PIXEL = wp.constant(3)
 LEAK_SHARE = wp.constant(1.5)  # an ON event is a leak if the level rises by less than this multiple of the drift
+SMALLEST_LEAK = wp.constant(0.1)  # smallest leak relative to the mean leak, so that jitter cannot stop the leak
 LARGEST_LAG = wp.constant((1 << 19) - 1)
 LAG_ZERO = wp.constant(16)  # ticks added to the lag, because rounding a time stamp may make the lag slightly negative
 NEVER = wp.constant(wp.int64(-(1 << 60)))
@@ -85,7 +86,8 @@ class Interval:
 
     ticks: int  # length of the interval [ticks]
     per_tick: float  # length of a tick in units of the interval
-    drift: float  # change of the reference in the interval, caused by the leak [log intensity]
+    share: float  # length of the interval [steps]
+    drift: float  # change of the reference in the interval at the present leak [log intensity]
     shift: int  # bit position of the time in a key
 
 
@@ -103,11 +105,22 @@ class Sink:
 
 
 @wp.func
+def jittered_leak(p: Pixel, s: SensorParams) -> float:
+    """Return a pixel's leak [thresholds per step]. It changes with the generator's state, hence at every event."""
+    leak = s.leak * p.leak
+    if s.leak_jitter > 0.0:
+        rng = wp.rand_init(int(p.rng), 1)
+        leak *= wp.max(1.0 + s.leak_jitter * wp.randn(rng), SMALLEST_LEAK)
+    return leak
+
+
+@wp.func
 def whole_step(steps: Steps, s: SensorParams, p: Pixel) -> Interval:
     """Return one step of a chunk as a time interval, in which the pixel leaks without jitter."""
     span = Interval()
     span.ticks = steps.ticks
     span.per_tick = steps.per_tick
+    span.share = 1.0
     span.drift = s.leak * p.leak * p.on
     span.shift = steps.shift
     return span
@@ -214,25 +227,35 @@ def fire_event(
 @wp.func
 def generate_events(
     p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, slope: float, quiet: bool
-) -> Pixel:
+):
     """Generate all events of a step in which the level, minus the leaking reference, rises by ``slope``.
+
+    Return the pixel, and the change of the reference in the whole step at the leak at its end. If jitter changes the
+    leak at an event, the line of the level gets another slope. The reference is then shifted such that their distance
+    at the event stays the same.
 
     The struct is changed field by field or unconditionally: a conditional assignment of the whole struct would move it
     out of the registers.
     """
+    rise = float(slope)
     f = wp.where(quiet, PAST_STEP, 0.0)
     while f < 1.0:
         if p.blind_until > NEVER:  # the reference is reset at the end of the refractory period
             f = wp.max(f, float(p.blind_until - t0) * span.per_tick)
             if f < 1.0:
-                p.reference = p.level + f * slope
+                p.reference = p.level + f * rise
                 p.blind_until = NEVER
-        signal = wp.max(crossing(p.reference, p.on, p.off, p.level, slope), f)
+        signal = wp.max(crossing(p.reference, p.on, p.off, p.level, rise), f)
         due = p.next_noise
         f = wp.min(signal, wp.max(float(due - t0) * span.per_tick, f))
-        p = thin_noise(p, s, slope, f, f < signal)
-        p = fire_event(p, s, sink, index, t0, span, slope, wp.where(p.next_noise == due, f, PAST_STEP), f < signal)
-    return p
+        p = thin_noise(p, s, rise, f, f < signal)
+        p = fire_event(p, s, sink, index, t0, span, rise, wp.where(p.next_noise == due, f, PAST_STEP), f < signal)
+        if s.leak_jitter > 0.0 and f < 1.0:
+            change = span.share * jittered_leak(p, s) * p.on - span.drift
+            span.drift += change
+            rise += change
+            p.reference += f * change
+    return p, span.drift
 
 
 @wp.func_native("""
@@ -327,9 +350,9 @@ def advance_pixel(
     end = level + span.drift
     within = end < p.reference + p.on and end > p.reference - p.off
     quiet = within and p.blind_until == NEVER and p.next_noise >= t0 + wp.int64(span.ticks)
-    p = generate_events(p, s, sink, index, t0, span, end - p.level, quiet)
+    p, drift = generate_events(p, s, sink, index, t0, span, end - p.level, quiet)
     p.level = level
-    p.reference -= span.drift
+    p.reference -= drift
     return p
 
 
@@ -392,7 +415,6 @@ def run_pixels_ahead(
 
 MOST_PIECES = wp.constant(16)  # largest number of pieces per step; divides the ticks of a step, a multiple of 16
 LARGEST_BEND = wp.constant(0.01)  # largest deviation of the level from a straight line within a piece [ON thresholds]
-SMALLEST_LEAK = wp.constant(0.1)  # smallest leak relative to the mean leak, so that jitter cannot stop the leak
 SMALL_ANGLE = wp.constant(0.1)  # duration [time constants] below which a series is more precise in float32
 SMALL_CHANGE = wp.constant(0.3)  # change of the log intensity below which a series is more precise in float32
 
@@ -462,16 +484,6 @@ def piece_count(level: float, before: float, after: float, angle: float, toleran
 
 
 @wp.func
-def jittered_leak(p: Pixel, s: SensorParams) -> float:
-    """Return a pixel's leak [thresholds per step]. It changes with the generator's state, hence at every event."""
-    leak = s.leak * p.leak
-    if s.leak_jitter > 0.0:
-        rng = wp.rand_init(int(p.rng), 1)
-        leak *= wp.max(1.0 + s.leak_jitter * wp.randn(rng), SMALLEST_LEAK)
-    return leak
-
-
-@wp.func
 def advance_filtered(
     p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, before: Input, after: Input
 ) -> Pixel:
@@ -481,16 +493,17 @@ def advance_filtered(
     piece.ticks = span.ticks / n
     piece.per_tick = span.per_tick * float(n)
     piece.shift = span.shift
-    share = 1.0 / float(n)
+    piece.share = 1.0 / float(n)
     x0 = before
     j = int(0)
     while j < n:
         j += 1
-        x1 = next_input(wp.where(j == n, after.level, wp.lerp(before.level, after.level, share * float(j))), after)
+        between = wp.lerp(before.level, after.level, piece.share * float(j))
+        x1 = next_input(wp.where(j == n, after.level, between), after)
         level = x1.level
         if s.bandwidth > 0.0:
-            level = filter_level(p.level, x0.level, x1.level, s.bandwidth * share * mean_light(x0, x1))
-        piece.drift = share * jittered_leak(p, s) * p.on
+            level = filter_level(p.level, x0.level, x1.level, s.bandwidth * piece.share * mean_light(x0, x1))
+        piece.drift = piece.share * jittered_leak(p, s) * p.on
         p = advance_pixel(p, s, sink, index, t0 + wp.int64((j - 1) * piece.ticks), piece, level)
         x0 = x1
     return p
