@@ -159,6 +159,14 @@ def packed(values: NDArray[Any]) -> NDArray[Any]:
     return np.require(values, requirements=["C", "A"]).reshape(-1).reshape(values.shape)
 
 
+def finite(values: NDArray[Any], what: str, hint: str = "give finite numbers") -> NDArray[Any]:
+    """Return an array without NaN and infinite values; raise :class:`AmiwarpError` that names the first one."""
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        at = int(np.argmax(~np.isfinite(values)))
+        raise AmiwarpError(f"{what} hold {values.flat[at]} (number {at}); {hint}")
+    return values
+
+
 TIME_LIMIT = 2**62
 """Limit of the magnitude of times of events, encoder samples and index pulses [us]: 146,000 years.
 
@@ -274,6 +282,8 @@ _NUMBERS = frozenset(("int", "float", "None"))
 """Names in the annotation of one number."""
 _PLAIN = _NUMBERS | {"str", "Any", "ArrayLike", "Literal", "us", "s", "tuple", "slice"}
 """Names in annotations of values that functions check themselves, because they know ranges, choices and shapes."""
+_SOME_NUMBERS = {"tuple", "float"}, {"tuple", "float", "None"}
+"""Names in annotations of a tuple of numbers."""
 _TEXT, _TEXTS = ({"str"}, {"str", "None"}), ({"str", "tuple"}, {"str", "Sequence"})
 """Names in annotations of a text, and of a sequence of texts."""
 
@@ -344,8 +354,11 @@ class _Parameter:
         assert isinstance(annotation, str), f"{function.__module__} needs: from __future__ import annotations"
         words = frozenset(re.findall(r"[A-Za-z]\w*", annotation))
         self._number = numbers_too and words <= _NUMBERS
-        self._text = numbers_too and words in _TEXT and function.__name__ == "__init__"
-        plain = words <= _PLAIN and not (self._number or self._text or (numbers_too and words in _TEXTS))
+        of_record = numbers_too and function.__name__ == "__init__"
+        self._text = of_record and words in _TEXT
+        self._numbers = of_record and words in _SOME_NUMBERS
+        texts = numbers_too and words in _TEXTS
+        plain = words <= _PLAIN and not (self._number or self._numbers or self._text or texts)
         self.guarded = name == "device" or not plain
         self._arrays = "NDArray" in words and words.isdisjoint(("Callable", "Mapping", "dict", "tuple"))
         last = (function.__kwdefaults__ or {}).get(name, ...)

@@ -167,7 +167,7 @@ COPIED = {
     "x": [np.arange(4, dtype=np.int32), np.array([0.0, np.nan, 1.5, -2.0])],
     "y": [np.arange(4, dtype=np.int64)],
     "t": [np.array([-3, 0, 5, 7], np.int32), np.array([0.0, 1.0, 2.0, 1e15])],
-    "p": [np.array([-1, 1, 0, 1], np.int8), np.array([0.0, 2.0, -1.0, 1.0])],
+    "p": [np.array([-1, 1, -1, 1], np.int8), np.array([0.0, 1.0, 0.0, 1.0])],
 }
 
 
@@ -192,7 +192,7 @@ def test_other_types_are_converted_on_the_device_as_on_the_host(name: str, devic
         ("x", np.array([0.0, 1e300]), "x holds a coordinate that float32 cannot hold"),
         ("t", np.array([0.0, np.nan]), "t is not finite"),
         ("t", np.array([0.0, -(2.0**62)]), "t is not finite"),
-        ("p", np.array([0.0, np.nan]), "p holds NaN"),
+        ("p", np.array([0.0, np.nan]), r"p holds nan \(number 1\)"),
     ],
 )
 def test_values_that_do_not_fit_are_refused_on_the_device(
@@ -212,7 +212,7 @@ def test_values_that_do_not_fit_are_refused_on_the_device(
         ({"x": [1.0, 2.0]}, "both uint16.* or both float32"),
         ({"t": [0.0, np.nan]}, "not finite"),
         ({"t": [0, 2**62]}, "expected microseconds"),
-        ({"p": [0.0, np.nan]}, "p holds NaN"),
+        ({"p": [0.0, np.nan]}, r"p holds nan \(number 1\)"),
         ({"y": ["a", "b"]}, "expected numbers"),
         ({"y": None}, "expected numbers"),
     ],
@@ -298,11 +298,31 @@ def test_bad_arrays_on_a_gpu_are_refused(changed: dict[str, np.ndarray], message
 
 
 @pytest.mark.usefixtures("all_on_gpu")
-def test_polarities_beyond_one_are_on_events() -> None:
-    given = [PlainArray(np.arange(4).astype(dtype)) for dtype in (np.uint16, np.uint16, np.int64, np.uint8)]
-    events = DeviceEvents.from_arrays(*given)
-    assert events.p.numpy().tolist() == [0, 1, 1, 1]
-    assert given[3].values.tolist() == [0, 1, 2, 3]
+@pytest.mark.parametrize(
+    ("values", "dtype", "wrong"),
+    [
+        ([0, 1, 1, 0], np.uint8, ""),
+        ([-1, 1, 1, -1], np.int8, ""),
+        ([-1.0, 1.0, 1.0, -1.0], np.float32, ""),
+        ([0.0, 1.0, 1.0, 0.0], np.float64, ""),
+        ([0, 1, 2, 3], np.uint8, r"holds 2 \(number 2\)"),
+        ([0, 1, 255, 0], np.uint8, r"holds 255 \(number 2\); .*give p > 0"),
+        ([1, 0, -1, 0], np.int16, r"holds -1 \(number 2\), but also 0"),
+        ([1, -1, -1, 0], np.int64, r"holds 0 \(number 3\), but also -1"),
+        ([0.2, 1, 0, 0], np.float64, r"holds 0.2 \(number 0\)"),
+        ([1, 1e30, 0, 0], np.float64, r"holds 1e\+30 \(number 1\)"),
+        ([1, 0, 0, np.inf], np.float64, r"holds inf \(number 3\)"),
+        ([1, np.nan, 0, 0], np.float32, r"holds nan \(number 1\)"),
+    ],
+)
+def test_polarities_on_a_gpu_are_of_a_known_coding(values: list[float], dtype: type, wrong: str) -> None:
+    given = [PlainArray(np.arange(4).astype(kind)) for kind in (np.uint16, np.uint16, np.int64)]
+    p = PlainArray(np.array(values, dtype))
+    if wrong:
+        with pytest.raises(AmiwarpError, match=f"events' p {wrong}"):
+            DeviceEvents.from_arrays(*given, p)
+    else:
+        assert DeviceEvents.from_arrays(*given, p).p.numpy().tolist() == [int(value > 0) for value in values]
 
 
 def test_arrays_with_gaps_are_copied(device: str) -> None:
@@ -611,8 +631,8 @@ def test_a_source_on_a_device_takes_compensated_events_that_left_the_frame(devic
         DeviceMemoryEvents(DeviceEvents(*arrays), WIDTH, HEIGHT)
 
 
-@pytest.mark.parametrize("on", [1, 2, 255])
-def test_any_positive_polarity_is_on(on: int, device: str) -> None:
+@pytest.mark.parametrize("on", [2, 255])
+def test_other_polarities_than_0_and_1_are_refused(on: int, device: str) -> None:
     place = wp.array(np.arange(3, dtype=np.uint16), device=device)
     columns = (
         place,
@@ -620,7 +640,10 @@ def test_any_positive_polarity_is_on(on: int, device: str) -> None:
         wp.array(np.arange(3), device=device),
         wp.array(np.array([0, on, 0], np.uint8), device=device),
     )
-    assert DeviceEvents.from_arrays(*columns).p.numpy().tolist() == [0, 1, 0]
+    with pytest.raises(AmiwarpError, match=rf"events' p holds {on} \(number 1\)"):
+        DeviceEvents.from_arrays(*columns)
+    with pytest.raises(AmiwarpError, match=rf"events' p holds {on} \(number 1\)"):
+        DeviceMemoryEvents(DeviceEvents(*columns), WIDTH, HEIGHT)
 
 
 def streamed(encoder: Encoder) -> EncoderStream:

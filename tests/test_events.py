@@ -38,7 +38,7 @@ times = st.lists(st.integers(0, 2000), max_size=80).map(sorted)
 
 
 def test_from_arrays_converts_without_touching_what_it_is_given():
-    p = np.array([-1, 0, 1, 2])
+    p = np.array([-1, -1, 1, 1])
     events = Events.from_arrays([0, 1, 2, 65535], np.arange(4), [1, 2, 3, 4], p)
     assert [array.dtype for array in (events.x, events.y, events.t, events.p)] == [
         np.uint16,
@@ -47,7 +47,7 @@ def test_from_arrays_converts_without_touching_what_it_is_given():
         np.uint8,
     ]
     assert events.p.tolist() == [0, 0, 1, 1]
-    assert p.tolist() == [-1, 0, 1, 2]
+    assert p.tolist() == [-1, -1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -245,19 +245,23 @@ def test_empty_source_has_no_first_time():
 def test_check_names_the_first_bad_event():
     good = make([1, 2, 3])
     check_events(good, 3, 3, where="here", after_t=1)
-    bad_p = Events(good.x, good.y, good.t, np.array([0, 1, 2], np.uint8))
     nan = floating(x=np.array([1.0, np.nan], np.float32))
     for events, options, message in (
         (good, {"width": 2}, r"here: event 12 \(x=2, y=2, t=3 us\) lies outside the 2x3 frame"),
         (good[np.array([0, 2, 1])], {}, "event 12 .* earlier than the one before"),
         (good, {"after_t": 2}, r"event 10 .* earlier than the one before \(2 us\)"),
-        (bad_p, {}, "event 12 .* polarity"),
         (nan, {}, "event 11 .* not finite"),
     ):
         with pytest.raises(AmiwarpError, match=message):
             check_events(events, **{"width": 3, "height": 3, "where": "here", "first_index": 10, **options})
     check_events(nan, 3, 3, where="here", allow_nan=True)
     check_events(floating(), 3, 3, where="compensated events may leave the frame")
+
+
+def test_events_refuse_other_polarities_than_0_and_1():
+    good = make([1, 2, 3])
+    with pytest.raises(AmiwarpError, match=r"events' p holds 255 \(number 2\); expected .* if ON is 255 .*give p > 0"):
+        Events(good.x, good.y, good.t, np.array([0, 1, 255], np.uint8))
 
 
 def test_memory_source_refuses_unsorted_events():

@@ -470,14 +470,22 @@ def test_noise_that_does_not_compress(tmp_path):
         for dataset in columns_of(file):
             values = dataset[:]
             noise = rng.integers(0, 256, values.size).astype(np.uint8) if dataset.name.endswith("p") else values
+            noise[[0, -1]] = values[[0, -1]]  # which are read on opening
             blosc = hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)
             copy.create_dataset(dataset.name, data=noise, chunks=(CHUNK,), fletcher32=True, compression=blosc)
         assert copy["events/p"].id.get_chunk_info(0).filter_mask == 1
         np.testing.assert_array_equal(file["events/x"][:], x)
-    for path in (ours, theirs):
-        got = open_recording(path).events.slice(0, t.size)
-        np.testing.assert_array_equal(got.x, x)
-        np.testing.assert_array_equal(got.t, t)
+    got = open_recording(ours).events.slice(0, t.size)
+    np.testing.assert_array_equal(got.x, x)
+    np.testing.assert_array_equal(got.t, t)
+    with h5py.File(theirs) as copy:
+        noise = copy["events/p"][:]
+    source = open_recording(theirs).events
+    for name, values in (("x", x), ("t", t), ("p", noise)):
+        np.testing.assert_array_equal(source._read(name, 0, t.size), values)
+    at = int(np.argmax(noise > 1))
+    with pytest.raises(AmiwarpError, match=rf"theirs\.h5: events 0 .* p holds {noise[at]} \(number {at}\)"):
+        source.slice(0, t.size)
 
 
 @given(st.binary(max_size=3000), st.integers(0, 3))

@@ -296,6 +296,28 @@ def test_inputs_with_gaps_are_taken(tmp_path: Path, device: str) -> None:
     np.testing.assert_array_equal(network(EVENTS, WIDTH, HEIGHT), values.numpy())
 
 
+@pytest.mark.parametrize("kind", ["float", "double"])
+@pytest.mark.parametrize(("value", "shown"), [("nan", "nan"), ("inf", "inf"), ("-inf", "-inf")])
+def test_a_network_that_gives_no_number_is_named(
+    tmp_path: Path, kind: str, value: str, shown: str, device: str
+) -> None:
+    """The picture is a sum over the bins, and at one pixel of the second row and third column a bad value."""
+    text = f"""<ir_version: 8, opset_import: ["": 18]> sum ({kind}[1,5,h,w] grid) => ({kind}[1,1,h,w] picture) {{
+        axes = Constant <value_ints: ints = [1]> ()
+        sums = ReduceSum (grid, axes)
+        picture = Add (sums, extra)
+    }}"""
+    model = onnx.parser.parse_model(text)
+    extra = np.zeros((1, 1, HEIGHT, WIDTH), np.float32 if kind == "float" else np.float64)
+    extra[0, 0, 1, 2] = float(value)
+    model.graph.initializer.append(onnx.numpy_helper.from_array(extra, "extra"))
+    onnx.save(model, tmp_path / "n.onnx")
+    network = Network(tmp_path / "n.onnx", multiple=1, device=device)
+    where = f"its first output 'picture' holds {shown} in channel 0 at row 1, column 2"
+    with pytest.raises(AmiwarpError, match=rf"n\.onnx: {where}; expected finite numbers"):
+        network(EVENTS, WIDTH, HEIGHT)
+
+
 def test_states_of_onnx_files_of_any_size(tmp_path: Path) -> None:
     path = onnx_file(tmp_path / "n.onnx", "rows", "columns")
     with pytest.raises(AmiwarpError, match=r"before has the shape \[1, 1, 'rows', 'columns'\]; give .* in states"):
@@ -473,6 +495,22 @@ def test_the_command_makes_a_picture(files: Network, calibrated: bool) -> None:
         assert run(f"{tone}.png", "--network", "n.onnx", *more, *grey).exit_code == 0
         values = np.asarray(Image.open(f"{tone}.png")) / 65535.0
         np.testing.assert_allclose(values, np.clip((last - dark) / (bright - dark), 0.0, 1.0), rtol=0, atol=2e-5)
+
+
+def test_the_command_writes_no_picture_without_numbers(files: Network) -> None:
+    model = onnx.load("n.onnx")
+    first = model.graph.output[0].name
+    for node in model.graph.node:
+        node.output[:] = ["sound" if name == first else name for name in node.output]
+    model.graph.node.append(onnx.helper.make_node("Log", ["negative"], ["nothing"]))
+    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array([-1.0], np.float32), "negative"))
+    model.graph.node.append(onnx.helper.make_node("Mul", ["sound", "nothing"], [first]))
+    onnx.save(model, "bad.onnx")
+    more = ("--bins", str(BINS), "--multiple", "8", "--start", "0.02", "--length", "0.005")
+    done = run("p.png", "--network", "bad.onnx", *more)
+    assert done.exit_code == 1
+    assert f"bad.onnx: its first output '{first}' holds nan in channel 0" in done.stderr
+    assert not Path("p.png").exists()
 
 
 def test_the_command_makes_a_video(files: Network) -> None:

@@ -10,6 +10,7 @@ import math
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ from amiwarp.events.recording import check_events
 from amiwarp.io.native_format import LiveWriter
 from amiwarp.optics.camera import LARGEST_FOCAL
 from amiwarp.validation import TIME_LIMIT, guarded, shown
-from tests.public_calls import CAMERA, RECORDING, REFUSED, PublicCall, public_calls, write_files
+from tests.public_calls import CAMERA, FRAME, RECORDING, REFUSED, PublicCall, public_calls, write_files
 
 
 class Odd:
@@ -143,6 +144,88 @@ def test_public_calls_return_or_say_what_is_wrong(call: PublicCall) -> None:
             assert f"{name} is unknown" not in message
             if before is not None:
                 np.testing.assert_array_equal(junk, before)
+
+
+POINTS = ("compensate_points", "deflect_points", "compensate_at", "rotations", "all_angles")
+MEANT: dict[tuple[str, str], str] = {
+    ("FrameTruth", "depth"): "infinite",
+    **{("FrameTruth", f"{what}{seen}"): "NaN" for what in ("flow", "displacement") for seen in ("", "_with_prism")},
+    ("Truth.known_at", "xy"): "NaN",
+    ("edge_blur", "sharp_xy"): "NaN",
+    **{("DepthMap", name): "NaN" for name in ("inverse_depth", "points")},
+    **{("PixelMap", name): "NaN" for name in ("on", "off", "on_std", "off_std")},
+    ("Camera.pixels_to_rays", "xy"): "NaN",
+    ("Camera.rays_to_pixels", "rays"): "NaN",
+    **{("EllipseModel", name): "NaN" for name in ("offset", "cosine", "sine")},
+    **{("EllipseModel.fit", name): "NaN" for name in ("xy", "theta", "compensated")},
+    ("Parameter", "limits"): "infinite",
+    ("Picture", "log"): "not checked",
+    ("Picture", "unknowns"): "not checked",
+}
+"""Parameters for which NaN or infinity means something, and a word of the description that says so. The functions of
+points, whose names are :data:`POINTS`, give NaN for them."""
+
+
+def spoiled(value: Any, bad: float) -> Iterator[Any]:
+    """Yield the value with one of its floating numbers replaced, if it has any."""
+    if isinstance(value, float | np.floating):
+        yield bad
+    elif isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.size:
+        changed = value.copy()
+        changed.flat[value.size // 2] = bad
+        yield changed
+    elif isinstance(value, dict | list | tuple):
+        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
+            for changed in spoiled(entry, bad):
+                if isinstance(value, dict):
+                    yield {**value, key: changed}
+                else:
+                    yield type(value)([*value[:key], changed, *value[key + 1 :]])
+
+
+def described(call: PublicCall) -> str:
+    """Return the description of a public function, method or class, with those of a class's fields."""
+    thing, function = call.target()
+    if isinstance(thing, RecordingWriter):
+        thing.__exit__(ValueError, None, None)
+    return inspect.getsource(function) if inspect.isclass(function) else str(inspect.getdoc(function))
+
+
+@pytest.mark.parametrize("call", [call for call in CALLS if call.label not in REFUSED], ids=lambda call: call.label)
+@pytest.mark.usefixtures("folder")
+def test_nan_and_infinity_are_refused_or_have_a_meaning(call: PublicCall) -> None:
+    if call.label == "Network.quarter_turn":
+        pytest.importorskip("torch")
+    thing, function = call.target()
+    given = call.arguments(function)
+    if isinstance(thing, RecordingWriter):
+        thing.__exit__(ValueError, None, None)
+    for name, one in inspect.signature(function).parameters.items():
+        for bad in (math.nan, math.inf, -math.inf):
+            for changed in spoiled(given.get(name, one.default), bad):
+                message = outcome(call, **{name: changed})
+                if message:
+                    continue
+                word = "NaN" if call.label.endswith(POINTS) else MEANT.get((call.label, name))
+                assert word is not None, f"{call.label} takes {name} with {bad}"
+                assert word in described(call), f"{call.label}: {name}"
+
+
+def test_truth_is_of_whole_numbers_and_finite_poses(tmp_path: Path) -> None:
+    size = CAMERA.height, CAMERA.width
+    for name in ("instance", "occlusion", "occlusion_with_prism"):
+        with pytest.raises(AmiwarpError, match=f"truth's {name} is float64; give uint"):
+            replace(FRAME, **{name: np.full(size, math.nan)})
+    with (
+        pytest.raises(AmiwarpError, match="mask at 0 us is float64; give truth values"),
+        RecordingWriter(tmp_path / "a.h5", width=size[1], height=size[0]) as writer,
+    ):
+        writer.append_known(0, np.full(size, math.nan))
+    pose = np.array([[0.0, 0, 0, 0, 0, 0, 1]])
+    for where in ("bodies", "joints"):
+        table = np.full((1, 7), math.nan) if where == "bodies" else np.full((1, 3), math.inf)
+        with pytest.raises(AmiwarpError, match=r"poses of 'hand' hold (nan|inf) \(number 0\)"):
+            amiwarp.Poses(np.array([0]), pose, **{where: {"hand": table}})
 
 
 FRACTIONS = {"PrismMotion.angle", "PrismMotion.angles", "Trajectory", "Trajectory.poses"}
@@ -269,11 +352,42 @@ def test_frames_that_uint16_cannot_index(size: tuple[Any, Any]) -> None:
 
 
 def test_polarities_that_are_taken() -> None:
-    for p, expected in (([0, 1], [0, 1]), ([-1, 1], [0, 1]), ([False, True], [0, 1]), ([0.0, 1.0], [0, 1])):
+    for p, expected in (
+        ([0, 1], [0, 1]), ([-1, 1], [0, 1]), ([False, True], [0, 1]), ([0.0, 1.0], [0, 1]), ([-1.0, -1.0], [0, 0]),
+    ):  # fmt: skip
         assert Events.from_arrays([0, 0], [0, 0], [0, 1], p).p.tolist() == expected
     for wrong in ([math.nan, 1.0], ["0", "1"], [None, 1], [1j, 0]):
         with pytest.raises(AmiwarpError, match="events' p"):
             Events.from_arrays([0, 0], [0, 0], [0, 1], wrong)
+
+
+@pytest.mark.parametrize(
+    ("p", "message"),
+    [
+        ([1, 0.2, 0], r"holds 0\.2 \(number 1\); expected 1 for ON, and 0 or -1 for OFF$"),
+        ([1.0, 0.0, 1e30], r"holds 1e\+30 \(number 2\)"),
+        ([math.inf, 0.0, 1.0], r"holds inf \(number 0\)"),
+        ([0.0, -math.inf, 1.0], r"holds -inf \(number 1\)"),
+        ([1.0, 0.0, math.nan], r"holds nan \(number 2\)"),
+        (np.array([0, 255, 255], np.uint8), r"holds 255 \(number 1\); .*; if ON is 255 and OFF is 0, give p > 0"),
+        (np.array([0, 1, 2], np.uint16), r"holds 2 \(number 2\)"),
+        (np.array([0, 1, 2**63], np.uint64), r"holds 9223372036854775808 \(number 2\)"),
+        ([1, -2, 0], r"holds -2 \(number 1\)"),
+        ([1, 1, 0, -1], r"holds -1 \(number 3\), but also 0; OFF is either 0 or -1"),
+        ([1, -1, 0, -1], r"holds 0 \(number 2\), but also -1; OFF is either 0 or -1"),
+    ],
+)
+def test_polarities_of_unknown_coding_are_refused(p: Any, message: str) -> None:
+    place, t = np.arange(len(p)), np.arange(len(p))
+    row = np.zeros(len(p), [("t", "i8"), ("x", "u2"), ("y", "u2"), ("p", np.asarray(p).dtype)])
+    row["p"] = p
+    for make in (
+        lambda: Events.from_arrays(place, place, t, p),
+        lambda: amiwarp.DeviceEvents.from_arrays(place, place, t, p),
+        lambda: Events.from_structured(row),
+    ):
+        with pytest.raises(AmiwarpError, match=f"events' p {message}"):
+            make()
 
 
 def test_coordinates_that_are_taken() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import guarded, one_of
+from amiwarp.validation import INT64, finite, guarded, instance, one_of, real, whole
 
 GLOBAL_ALGORITHMS = (
     "GN_DIRECT",
@@ -70,6 +70,15 @@ class SearchStage:
     """All evaluated points in order [px], shape ``(evaluations, n)``."""
     scores: NDArray[np.float64] = field(repr=False)
     """Score of each evaluated point, shape ``(evaluations,)``."""
+
+    def __post_init__(self) -> None:
+        for name in ("algorithm", "ended"):
+            instance(getattr(self, name), str, f"search stage's {name}")
+        whole(self.evaluations, "search stage's evaluations", 0, INT64[1])
+        for name in ("score", "seconds"):
+            real(getattr(self, name), f"search stage's {name}")
+        for name in ("x", "points", "scores"):
+            finite(getattr(self, name), f"search stage's {name}")
 
 
 def best_of(

@@ -20,7 +20,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.optics import mirror, models, vibration  # noqa: F401  # models in files of their own, which enter themselves in MODELS
 from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
 from amiwarp.optics.prism import NominalPrism, Plate, Prism, UnsizedPrism, as_wedge
-from amiwarp.validation import guarded, instance, one_of, real, shown, vector
+from amiwarp.validation import finite, guarded, instance, one_of, real, shown, vector
 
 NOMINAL_APEX = math.radians(2.0)
 """Apex angle assumed if a recording does not give it [rad]. The search goes up to twice this value."""
@@ -238,6 +238,7 @@ class ParameterSpace:
         """
         if v.shape != (len(self.names),):
             raise AmiwarpError(f"v has shape {v.shape}; give one entry for each of {', '.join(self.names)}")
+        finite(v, "entries of the search vector")
         values, entries = dict(self.start), v.tolist()
         for name, entry in zip(self.names, entries, strict=True):
             values[name] = entry / self.pixels[name]
@@ -269,6 +270,7 @@ class ParameterSpace:
         """
         if covariance.shape != (len(self.names), len(self.names)):
             raise AmiwarpError(f"covariance has shape {covariance.shape}; give {(len(self.names), len(self.names))}")
+        finite(covariance, "entries of the covariance")
         jacobian = np.empty((len(self.names), len(self.names)))
         for k in range(len(self.names)):
             h = np.zeros(len(self.names))

@@ -71,7 +71,7 @@ def converted(name: str, values: Any, t_unit: str = "us") -> Any:
     if name == "p":
         if values.dtype is wp.uint8:
             return values  # the caller checks that it is 0 or 1
-        return _checked(kernels.mark_positive, values, wp.float64, wp.uint8, "p holds NaN; expected 1 for ON, else 0")
+        return polarities(values)
     if values.dtype in (wp.uint16, wp.float32):
         return values
     if integers:
@@ -81,9 +81,19 @@ def converted(name: str, values: Any, t_unit: str = "us") -> Any:
     return _checked(kernels.narrow_floats, values, wp.float64, wp.float32, what)
 
 
-def positive(values: Any) -> Any:
-    """Return polarities as uint8: 1 if positive, else 0."""
-    return _checked(kernels.mark_positive, values, wp.float64, wp.uint8, "p holds NaN")
+def polarities(values: Any) -> Any:
+    """Return polarities as uint8, checked as by :func:`amiwarp.events.recording.as_polarity`."""
+    out = wp.empty(values.shape, dtype=wp.uint8, device=values.device)
+    if values.ndim != 1 or not values.size:  # the caller names the shapes
+        return out
+    none = len(values)
+    first = wp.full(3, none, dtype=int, device=values.device)
+    given = [cast(values, wp.float64)]
+    wp.launch(kernels.narrow_polarities, len(values), inputs=given, outputs=[out, first], device=values.device)
+    minus, zero, other = first.numpy().tolist()
+    if other < none or max(minus, zero) < none:  # the check on the host names the value
+        raise checks.wrong_polarity(values.numpy())
+    return out
 
 
 def _times(values: Any, scale: float, integers: bool) -> Any:
@@ -131,7 +141,24 @@ def _checked(
 
 
 THREADS = 1 << 15
-"""Number of CUDA threads that look for the limits of events."""
+"""Number of CUDA threads that look for the limits of events, or for a bad value."""
+
+
+def first_beyond(values: Any, most: float) -> int:
+    """Return the index of the first value of a flat float32 array that is NaN or not within ``most`` of 0.
+
+    The result is the number of values if there is none.
+    """
+    count = values.size
+    if not count:
+        return 0
+    found = wp.full(1, count, dtype=int, device=values.device)
+    threads = min(count, THREADS) if values.device.is_cuda else 1
+    inputs = [values, most, threads]
+    wp.launch(kernels.find_beyond, threads, inputs=inputs, outputs=[found], device=values.device)
+    return int(found.numpy()[0])
+
+
 NAMES = ("x", "y", "t", "p")
 COORDINATES = (("uint16", "uint16"), ("float32", "float32"))
 """Types of x and y: of a sensor, or compensated."""
@@ -203,7 +230,7 @@ class DeviceEvents:
         t : array
             Times [us], shape (n,), in ascending order. Floating times must be whole.
         p : array
-            Polarities, shape (n,): ON if above 0 or true, else OFF.
+            Polarities, shape (n,): truth values, 0 and 1, or -1 and 1. ON is true or 1.
         t_unit : {"us", "s"}, default "us"
             Unit of ``t``. Times in seconds are rounded to microseconds.
         device : str or warp.Device, optional
@@ -229,7 +256,9 @@ class DeviceEvents:
         if max(right, bottom) >= int(kernels.BEYOND):
             raise AmiwarpError("events' x or y holds an infinite coordinate; drop that event")
         check_order(events)
-        return cls(events.x, events.y, events.t, positive(events.p)) if polarity > 1 else events
+        if polarity > 1:
+            raise checks.wrong_polarity(events.p.numpy())
+        return events
 
     @classmethod
     def concatenate(cls, blocks: Sequence[DeviceEvents]) -> DeviceEvents:
@@ -457,7 +486,8 @@ class DeviceMemoryEvents(EventSource):
     Raises
     ------
     AmiwarpError
-        If an event lies outside the frame or is out of order, or if the size is not in 1 .. 65536 px.
+        If an event lies outside the frame or is out of order, a polarity is neither 0 nor 1, or the size is not in
+        1 .. 65536 px.
 
     Examples
     --------
@@ -471,8 +501,8 @@ class DeviceMemoryEvents(EventSource):
         instance(events, DeviceEvents, "events on a device")
         width, height = (whole(size, "frame size", 1, LARGEST_SIZE, " pixels") for size in (width, height))
         if len(events):
-            _, _, right, bottom, _, decreases = limits(events)
-            if right >= width or bottom >= height or decreases:  # the check on the host names the event
+            _, _, right, bottom, polarity, decreases = limits(events)
+            if right >= width or bottom >= height or polarity > 1 or decreases:  # the check on the host names the event
                 checks.check_events(events.to_host(), width, height, where="events on a device", allow_nan=True)
         self._events = events
         self._size = (width, height)

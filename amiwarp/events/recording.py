@@ -50,15 +50,36 @@ def as_coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
 
 
 def as_polarity(values: ArrayLike) -> NDArray[np.uint8]:
-    """Return polarities as uint8: 1 if positive or true, else 0. Truth values, and 0 and 1 as uint8, are not copied."""
+    """Return polarities as uint8: 1 if 1 or true, 0 if 0, -1 or false. Truth values, and uint8, are not copied.
+
+    Raises :class:`AmiwarpError` for any other value, and for 0 and -1 in one array.
+    """
     array = as_numbers(values, "events' p", "iufb")
     if array.dtype == np.bool_:
         return array.view(np.uint8)
-    if array.dtype == np.uint8 and array.size and array.max() <= 1:
+    if not array.size:
+        return array.astype(np.uint8)
+    if array.dtype == np.uint8 and array.max() <= 1:
         return array
-    if array.dtype.kind == "f" and np.isnan(array).any():
-        raise AmiwarpError("events' p holds NaN; expected 1 for ON, 0 or -1 for OFF")
-    return (array > 0).astype(np.uint8)
+    on = array == 1
+    off = -1 if array.min() == -1 else 0
+    if np.count_nonzero(on) + np.count_nonzero(array == off) < array.size:
+        raise wrong_polarity(array)
+    return on.view(np.uint8)
+
+
+def wrong_polarity(values: NDArray[Any]) -> AmiwarpError:
+    """Return the error for an array that holds other polarities than 0 and 1, or -1 and 1. It names the first one."""
+    bad = ~np.isin(values, (-1, 0, 1))
+    mixed = not bad.any()
+    if mixed:
+        bad = values == (0 if values.flat[int(np.argmax(values != 1))] == -1 else -1)
+    at = int(np.argmax(bad))
+    given = f"events' p holds {shown(values.flat[at].item())} (number {at})"
+    if mixed:
+        return AmiwarpError(f"{given}, but also {'0' if values.flat[at] == -1 else '-1'}; OFF is either 0 or -1")
+    hint = "; if ON is 255 and OFF is 0, give p > 0" if values.flat[at] == 255 else ""
+    return AmiwarpError(f"{given}; expected 1 for ON, and 0 or -1 for OFF{hint}")
 
 
 def check_order(events: Events, *, where: str, first_index: int = 0) -> None:
@@ -79,7 +100,7 @@ def check_events(
     allow_nan: bool = False,
     after_t: int | None = None,
 ) -> None:
-    """Check one block of events: coordinates, as :func:`check_coordinates`, order, time limits and polarities.
+    """Check one block of events: coordinates, as :func:`check_coordinates`, order and time limits.
 
     ``after_t`` is the time of the last event before the block [us].
     """
@@ -92,8 +113,6 @@ def check_events(
         fail(np.ones(1, np.bool_), f"is earlier than the one before ({after_t} us); sort by time")
     if not (events.t[0] > -TIME_LIMIT and events.t[-1] < TIME_LIMIT):  # the times are sorted here
         fail(np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; drop this event")
-    if int(events.p.max()) > 1:
-        fail(events.p > 1, "has a polarity that is neither 0 nor 1")
 
 
 def check_coordinates(
@@ -174,7 +193,7 @@ class Events:
     Raises
     ------
     AmiwarpError
-        If the arrays differ in length, or have other types than those below.
+        If the arrays differ in length, or have other types than those below, or if a polarity is neither 0 nor 1.
 
     Examples
     --------
@@ -206,6 +225,8 @@ class Events:
             raise AmiwarpError(
                 f"events' x is {self.x.dtype}, y is {self.y.dtype}; expected both uint16 or both float32"
             )
+        if self.p.size and self.p.max() > 1:
+            raise wrong_polarity(self.p)
 
     @classmethod
     def from_arrays(
@@ -225,7 +246,7 @@ class Events:
         t : array_like
             Times [us], shape (n,), in ascending order. Floating times must be whole.
         p : array_like
-            Polarities, shape (n,): ON if above 0 or true, else OFF. Both 0/1 and -1/1 are understood.
+            Polarities, shape (n,): truth values, 0 and 1, or -1 and 1. ON is true or 1.
         t_unit : {"us", "s"}, default "us"
             Unit of ``t``. Times in seconds are rounded to microseconds.
 
@@ -239,7 +260,7 @@ class Events:
         AmiwarpError
             If a coordinate does not fit its type; if a time has a fraction of a microsecond, is not finite, beyond
             2**62 us, earlier than the one before, or floating and too late for its type to resolve 1 us; if a polarity
-            is NaN; or if an array has masked values.
+            is another number, such as 255, or 0 and -1 both occur; or if an array has masked values.
 
         Examples
         --------

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import array, as_times, check_ascending, guarded, instance, shown
+from amiwarp.validation import INT64, array, as_times, check_ascending, finite, guarded, instance, shown, whole
 
 Item = TypeVar("Item", covariant=True)
 """What a store returns: an array, or a record."""
@@ -141,7 +141,8 @@ class FrameTruth:
     """Ground truth of all pixels at one instant.
 
     Depth, normals and instances are given for the view without the prism. The arrays cover the camera's image of
-    (height, width) pixels.
+    (height, width) pixels. Raises :class:`AmiwarpError` for arrays of other types, and for values that are not finite,
+    except as below.
     """
 
     t_us: int
@@ -183,6 +184,16 @@ class FrameTruth:
     """Position of the camera in the world [m], shape ``(3,)``."""
     joints: dict[str, NDArray[np.float64]]
     """Positions of the named points of the world, such as the joints of a figure [m], shape ``(3,)`` each."""
+
+    def __post_init__(self) -> None:
+        whole(self.t_us, "truth's t_us", *INT64)
+        for name, (dtype, _) in MAPS.items():
+            values = getattr(self, name)
+            if not np.can_cast(values.dtype, dtype, "same_kind"):
+                raise AmiwarpError(f"truth's {name} is {values.dtype}; give {np.dtype(dtype)}")
+            check_truth(f"truth/frames/{name}", values)
+        for name, values in {"rotation": self.rotation, "position": self.position, **self.joints}.items():
+            finite(values, f"truth's {shown(name)}")
 
 
 MAPS = {
@@ -245,7 +256,8 @@ class Poses:
     """Poses of a camera and of moving bodies, and positions of joints, at several times.
 
     A pose has seven numbers: the position x, y, z in the world [m], and the orientation as a unit quaternion x, y, z,
-    w. The quaternion rotates from the frame of the camera or body to the world's frame.
+    w. The quaternion rotates from the frame of the camera or body to the world's frame. Raises :class:`AmiwarpError`
+    for other shapes, times that do not increase, and values that are not finite.
 
     Examples
     --------
@@ -277,6 +289,7 @@ class Poses:
                     f"poses of {shown(name)} have shape {rows.shape} for {self.t.size} times; give shape "
                     f"({self.t.size}, {columns})"
                 )
+            finite(rows, f"poses of {shown(name)}")
 
     @classmethod
     def concatenate(cls, blocks: Sequence[Poses]) -> Poses:

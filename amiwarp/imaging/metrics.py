@@ -84,7 +84,8 @@ def edge_blur(
     Parameters
     ----------
     sharp_xy : ndarray
-        Event coordinates from which edges are found [px], shape ``(n, 2)``.
+        Event coordinates from which edges are found [px], shape ``(n, 2)``. NaN and infinite
+        ones do not count.
     width, height : int
         Sensor size [px].
     of : ndarray, optional

@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError, optional_module
-from amiwarp.events.device_events import DeviceEvents, device_for, find_indices, time_span, wait
+from amiwarp.events.device_events import DeviceEvents, device_for, find_indices, first_beyond, time_span, wait
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.tensors import ToTensor, Windows, on_device, polarity_histogram, voxel_grid
@@ -184,7 +184,8 @@ class Network:
         Raises
         ------
         AmiwarpError
-            If the events are on another device, or the network does not fit its input or gives no such output.
+            If the events are on another device, or the network does not fit its input, gives no such output, or gives
+            NaN or infinity.
         """
         options = {"t_start": t_start, "t_end": t_end, "model": model, "encoder": encoder}
         out, self._states = self._run(events, width, height, self._states, options)
@@ -282,8 +283,27 @@ class Network:
                 f"({n}, channels, {rows}, {columns}), the size of the input"
             )
         result = wp.clone(out[:, :, top : top + height, left : left + width])
+        self._check_finite(result)
         wait(self._device)
         return result, states
+
+    def _check_finite(self, result: wp.array) -> None:
+        """Raise :class:`AmiwarpError` if the result of windows, (n, channels, height, width), has NaN or infinity."""
+        if not wp.types.type_is_float(result.dtype):
+            return
+        values = result.flatten()
+        if values.dtype is not wp.float32:
+            values = wp.empty(result.size, dtype=float, device=self._device)
+            wp.utils.array_cast(result.flatten(), values)
+        place = first_beyond(values, float(np.finfo(np.float32).max))
+        if place < result.size:
+            value = float(values[place : place + 1].numpy()[0])
+            _, channel, row, column = (int(k) for k in np.unravel_index(place, result.shape))
+            raise AmiwarpError(
+                f"{self._file.path}: its first output{self._file.output} holds {value:g} in channel {channel} at row "
+                f"{row}, column {column}; expected finite numbers: check the network's weights, its input, and states; "
+                "reset() forgets the states"
+            )
 
 
 class _QuarterTurn(Network):
@@ -431,7 +451,7 @@ def _cause(error: Exception) -> str:
 class _TorchFile:
     """TorchScript file, run by PyTorch."""
 
-    dtype = wp.float32
+    dtype, output = wp.float32, ""
 
     def __init__(self, path: Path, device: Any) -> None:
         torch = optional_module("torch", "torch", f"{path}: a TorchScript file needs PyTorch")
@@ -488,6 +508,7 @@ class _OnnxFile:
             raise AmiwarpError(f"{path}: onnxruntime has no CUDA here; install onnxruntime-gpu, or give device='cpu'")
         self._session, self._inputs = session, session.get_inputs()
         self._outputs = [output.name for output in session.get_outputs()]
+        self.output = f" '{self._outputs[0]}'"
         self.extra = len(self._inputs) - 1
         if len(self._outputs) <= self.extra:
             raise AmiwarpError(

@@ -58,9 +58,10 @@ class DepthMap(ArrayMap):
             expected = (*shape, 3) if name == "points" else shape
             if values.shape != expected or len(shape) != 2 or not all(1 <= n <= LARGEST_SIZE for n in shape):
                 raise AmiwarpError(f"depth map's {name} has shape {values.shape}; expected (height, width), points x 3")
-            if name != "points" and ((values < 0.0) | np.isinf(values)).any():
+            if np.isinf(values).any() or (name != "points" and (values < 0.0).any()):
+                bounds = "" if name == "points" else " of 0 or above"
                 raise AmiwarpError(
-                    f"depth map's {name} has a negative or infinite value; expected finite values of 0 or above, or NaN"
+                    f"depth map's {name} has a negative or infinite value; expected finite values{bounds}, or NaN"
                 )
             object.__setattr__(self, name, values.astype(np.float32, copy=False))
         if np.isnan(self.std[self.known]).any():

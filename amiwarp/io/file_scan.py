@@ -26,6 +26,7 @@ from amiwarp.events.recording import (
     ImuSamples,
     MetadataValue,
     as_coordinate,
+    as_polarity,
     regroup,
 )
 from amiwarp.io.files import errors_name, open_input, register_reader
@@ -313,7 +314,7 @@ class FileEvents(EventSource):
             as_coordinate(name, values) if compensated else values.astype(np.uint16)
             for name, values in (("x", x), ("y", y))
         )
-        return Events(x, y, ordered, (p > 0).astype(np.uint8))
+        return Events(x, y, ordered, np.array(as_polarity(p)))
 
 
 def _copied(blocks: list[Events]) -> Events:

@@ -1008,6 +1008,8 @@ class RecordingWriter:
             if mask.shape != self._size[::-1]:
                 what = f"mask at {t_us} us has shape {mask.shape}"
                 raise AmiwarpError(f"{self.path}: {what}; expected {self._size[::-1]}")
+            if mask.dtype != np.bool_:
+                raise AmiwarpError(f"{self.path}: mask at {t_us} us is {mask.dtype}; give truth values (bool)")
             rows = {"truth/known/t": np.array([t_us], np.int64)}
             self._append(rows, {"truth/known/mask": np.asarray(mask, np.uint8)[None]})
 

@@ -104,12 +104,20 @@ def narrow_times(values: wp.array(dtype=wp.uint64), out: wp.array(dtype=wp.int64
 
 
 @wp.kernel
-def mark_positive(values: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.uint8), bad: wp.array(dtype=int)):
-    """Convert polarities to 1 if they are positive, else 0, and set ``bad`` if one is NaN."""
+def narrow_polarities(values: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.uint8), first: wp.array(dtype=int)):
+    """Convert polarities to 1 if they are 1, else 0, and find where others than 0 and 1 occur.
+
+    ``first``: lowest index of -1, of 0, and of any other number than these and 1; not changed for none.
+    """
     i = wp.tid()
-    out[i] = wp.uint8(wp.where(values[i] > wp.float64(0.0), 1, 0))
-    if wp.isnan(values[i]):
-        bad[0] = 1
+    value = values[i]
+    out[i] = wp.uint8(wp.where(value == wp.float64(1.0), 1, 0))
+    if value == wp.float64(-1.0):
+        wp.atomic_min(first, 0, i)
+    elif value == wp.float64(0.0):
+        wp.atomic_min(first, 1, i)
+    elif value != wp.float64(1.0):
+        wp.atomic_min(first, 2, i)
 
 
 @wp.kernel
@@ -200,3 +208,11 @@ def find_times(t: wp.array(dtype=wp.int64), times: wp.array(dtype=wp.int64), sta
         else:
             high = middle
     out[i] = wp.int64(low)
+
+
+@wp.kernel
+def find_beyond(values: wp.array(dtype=float), most: float, step: int, bad: wp.array(dtype=int)):
+    """Find the first value that is NaN or not within ``most`` of 0. Thread k looks at every ``step``-th value."""
+    for i in range(wp.tid(), values.shape[0], step):
+        if not wp.abs(values[i]) <= most:
+            wp.atomic_min(bad, 0, i)

@@ -699,11 +699,3 @@ def run_filtered_camera_pixels(
         reconverge()
     pixels[i] = shift_times(p, t0)
     seen[i] = before.level
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)
-def find_bad_level(levels: wp.array(dtype=float), most: float, step: int, bad: wp.array(dtype=int)):
-    """Find the first log intensity that is not within ``most`` of 0. Thread k looks at every ``step``-th value."""
-    for i in range(wp.tid(), levels.shape[0], step):
-        if not wp.abs(levels[i]) <= most:
-            wp.atomic_min(bad, 0, i)

@@ -14,7 +14,7 @@ from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.io.files import NewFile
 from amiwarp.io.formats import check_ending
 from amiwarp.simulation.worlds.world import Body, Material, Mesh, Trajectory, World
-from amiwarp.validation import array, guarded, instance, one_of, real, whole
+from amiwarp.validation import array, finite, guarded, instance, one_of, real, whole
 
 MOST_SQUARES = 100
 """Largest number of squares of a board along a side."""
@@ -291,6 +291,7 @@ class Corners:
         ids, xy = array(self.ids, "corners' ids", "iu"), array(self.xy, "corners' xy")
         if ids.ndim != 1 or xy.shape != (len(ids), 2):
             raise AmiwarpError(f"corners have ids {ids.shape} and xy {xy.shape}; give shapes (n,) and (n, 2)")
+        finite(xy, "corners' xy")
 
 
 def _checked(picture: object) -> NDArray[np.uint8]:

@@ -39,7 +39,7 @@ from amiwarp.optics.models import ExactModel, rms
 from amiwarp.optics.prism import Prism, as_wedge
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.tasks import Progress, Result, in_order, silent
-from amiwarp.validation import array, guarded, instance, real
+from amiwarp.validation import array, finite, guarded, instance, real
 
 Vector = NDArray[np.float64]
 
@@ -134,6 +134,8 @@ class BoardPose:
         shape = array(self.residuals, "pose's residuals").shape
         if shape != self.corners.xy.shape:
             raise AmiwarpError(f"pose's residuals have shape {shape}; give {self.corners.xy.shape}, as its corners")
+        for name in ("residuals", "rotation", "translation"):
+            finite(array(getattr(self, name), f"pose's {name}"), f"pose's {name}")
 
     @property
     def rms(self) -> float:
@@ -168,6 +170,7 @@ class LensCalibration:
             raise AmiwarpError("a lens calibration has no poses; give those of the fit")
         for pose in self.poses:
             instance(pose, BoardPose, "lens calibration's pose")
+        real(self.seconds, "lens calibration's seconds")
 
     @property
     def rms(self) -> float:

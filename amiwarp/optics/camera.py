@@ -293,7 +293,8 @@ class Camera:
         Returns
         -------
         numpy.ndarray or warp.array
-            Unit vectors, shape (n, 3), or vec3 of shape (n,). A row is NaN if no ray reaches that pixel.
+            Unit vectors, shape (n, 3), or vec3 of shape (n,). A row holds NaN if no ray reaches that pixel, or if the
+            pixel is NaN or infinite.
 
         Raises
         ------
@@ -320,7 +321,7 @@ class Camera:
         -------
         numpy.ndarray or warp.array
             Pixels [px], shape (n, 2), or vec2 of shape (n,). A row is NaN if the ray lies behind the image plane, or
-            beyond the radius at which the distortion stops increasing.
+            beyond the radius at which the distortion stops increasing, or is NaN or infinite.
 
         Raises
         ------

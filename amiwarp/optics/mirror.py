@@ -171,7 +171,7 @@ class MirrorModel(Model):
         -------
         numpy.ndarray
             Rotations from the directions in which the camera sees points to those in which it would see them in the
-            mirror at rest, shape (n, 3, 3).
+            mirror at rest, shape (n, 3, 3); NaN for angles that are NaN or infinite.
 
         Raises
         ------
@@ -183,7 +183,7 @@ class MirrorModel(Model):
         theta = array(theta, "theta")
         if theta.ndim != 2 or theta.shape[1] != 2:
             raise AmiwarpError(f"theta has shape {theta.shape}; give the angles of both commands, shape (n, 2)")
-        angles = theta + np.array([self.phase, self.second_phase])
+        angles = np.where(np.isfinite(theta), theta, np.nan) + np.array([self.phase, self.second_phase])
         tilts = np.cos(angles) * np.array([self.amplitude, self.second_amplitude])
         return np.asarray(Rotation.from_rotvec(-2.0 * tilts @ self.axes).as_matrix())
 

@@ -33,7 +33,7 @@ from amiwarp.optics.prism import (
     check_phase,
     deflection_from_apex,
 )
-from amiwarp.validation import array, choice, guarded, instance, one_of, real, whole
+from amiwarp.validation import array, choice, guarded, instance, one_of, real, shown, whole
 
 # Base class of the optical models: what a model knows of itself, and the displacement of points on any device.
 
@@ -63,7 +63,7 @@ class Parameter:
     like_size: bool = False
     """Whether its effect on the sharpness is nearly that of the size, so that sharpness alone hardly finds it."""
     limits: tuple[float, float] = (-math.inf, math.inf)
-    """Smallest and largest value in an address of ``amiwarp view``, angles in degrees."""
+    """Smallest and largest value in an address of ``amiwarp view``, angles in degrees; infinite for none."""
     label: str = ""
     """Text of its slider in ``amiwarp view``; empty without a slider."""
     slider: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -71,6 +71,15 @@ class Parameter:
     value."""
     fine: bool = False
     """Whether its effect is so small that the global search keeps its start value."""
+
+    def __post_init__(self) -> None:
+        for name in ("name", "unit", "label"):
+            instance(getattr(self, name), str, f"parameter's {name}")
+        real(self.half_range, f"parameter {shown(self.name)}: half_range", 0.0)
+        for value in self.slider:
+            real(value, f"parameter {shown(self.name)}: slider")
+        if not self.limits[0] <= self.limits[1]:
+            raise AmiwarpError(f"parameter {shown(self.name)}: limits are {self.limits}; give the smaller one first")
 
 
 PHASE = Parameter("phase", "rad")
@@ -438,7 +447,7 @@ class Model:
         Returns
         -------
         numpy.ndarray
-            The angles [rad], with one more axis.
+            The angles [rad], with one more axis; NaN and infinite ones stay so.
         """
         return np.asarray(theta, np.float64)[..., None]
 
@@ -457,7 +466,7 @@ class Model:
         -------
         numpy.ndarray or warp.array
             Compensated pixels [px], of the same shape as ``xy``. A row is NaN if it has no ray: total internal
-            reflection, or a ray behind the image plane.
+            reflection, or a ray behind the image plane; or if its pixel or angle is NaN or infinite.
 
         Raises
         ------
@@ -481,7 +490,7 @@ class Model:
         Returns
         -------
         numpy.ndarray or warp.array
-            Observed pixels [px], of the same shape as ``xy``. A row is NaN if it has no ray.
+            Observed pixels [px], of the same shape as ``xy``. A row is NaN as in :meth:`compensate_points`.
 
         Raises
         ------
@@ -590,7 +599,8 @@ def points_on_host(xy: NDArray[Any], theta: NDArray[Any]) -> tuple[Any, Any]:
 
 def wrap_angle(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Wrap an angle [rad] to [-pi, pi) in float64. Wrap angles before they are rounded to float32."""
-    return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+    with np.errstate(invalid="ignore"):  # an infinite angle becomes NaN
+        return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def model_camera(model: Model, device: Any) -> Any:
@@ -934,7 +944,8 @@ class RisleyModel(Model):
 def both_angles(theta: NDArray[Any], ratio: float) -> NDArray[np.float64]:
     """Return two angles [rad], shape (..., 2): those of the first, and the same times the ratio of their speeds."""
     first = np.asarray(theta, np.float64)
-    return np.stack([first, ratio * first], axis=-1)
+    with np.errstate(invalid="ignore"):  # infinity times 0 is NaN
+        return np.stack([first, ratio * first], axis=-1)
 
 
 def axis_rotation(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:
@@ -980,7 +991,7 @@ class EllipseModel(Model):
     camera: Camera
     """Camera intrinsics."""
     offset: NDArray[np.float32] = field(repr=False)
-    """Mean displacement [px], shape ``(height, width, 2)``."""
+    """Mean displacement [px], shape ``(height, width, 2)``. In all tables, NaN marks a pixel without a ray."""
     cosine: NDArray[np.float32] = field(repr=False)
     """Cosine term of the displacement [px], shape ``(height, width, 2)``."""
     sine: NDArray[np.float32] = field(repr=False)
@@ -996,6 +1007,8 @@ class EllipseModel(Model):
             shape = (self.camera.height, self.camera.width, 2)
             if table.shape != shape:
                 raise AmiwarpError(f"{name} has shape {table.shape}; expected {shape}, the camera's rows and columns")
+            if np.isinf(table).any():
+                raise AmiwarpError(f"{name} holds an infinite displacement; give NaN for a pixel without a ray")
             object.__setattr__(self, name, table.astype(np.float32, copy=False))
 
     @classmethod
@@ -1272,7 +1285,8 @@ class PlateModel(Model):
         Returns
         -------
         numpy.ndarray
-            Compensated pixels [px], shape (n, 2).
+            Compensated pixels [px], shape (n, 2). A row is NaN as in :meth:`compensate_points`, or if its inverse depth
+            is NaN or infinite.
         """
         xy, theta, rho = array(xy, "xy"), array(theta, "theta"), array(inverse_depth, "inverse_depth")
         if xy.ndim != 2 or xy.shape[1] != 2 or not theta.shape == rho.shape == xy.shape[:1]:

@@ -155,7 +155,8 @@ class VibrationModel(Model):
         Returns
         -------
         numpy.ndarray
-            Matrices from the camera's frame to that of the camera at rest, shape (n, 3, 3).
+            Matrices from the camera's frame to that of the camera at rest, shape (n, 3, 3); NaN for an angle that is
+            NaN or infinite.
 
         Raises
         ------
@@ -169,6 +170,7 @@ class VibrationModel(Model):
             raise AmiwarpError(f"theta has shape {theta.shape}; give angles of shape (n,)")
         circles = {1: cmath.rect(self.amplitude, self.phase), -1: complex(*self.backward),
                    2: complex(*self.second), -2: complex(*self.second_backward)}  # fmt: skip
+        theta = np.where(np.isfinite(theta), theta, np.nan)
         vector = sum(size * np.exp(1j * k * theta) for k, size in circles.items())
         roll = self.roll[0] * np.cos(theta) + self.roll[1] * np.sin(theta)
         return np.asarray(Rotation.from_rotvec(np.stack([vector.real, vector.imag, roll], axis=1)).as_matrix())

@@ -281,7 +281,8 @@ ARRAYS = ("log", "known", "unknowns")
 class Picture:
     """Picture of the scene over a time window, without the prism.
 
-    Its arrays are NumPy arrays, or Warp arrays on a device if the events are there (:class:`DeviceMemoryEvents`).
+    Its arrays are NumPy arrays, or Warp arrays on a device if the events are there (:class:`DeviceMemoryEvents`). Their
+    values are not checked.
     PyTorch, CuPy and JAX read Warp arrays through DLPack without a copy.
 
     Examples

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import NAMES, DeviceEvents, import_array, wait
+from amiwarp.events.device_events import NAMES, DeviceEvents, first_beyond, import_array, wait
 from amiwarp.imaging.tensors import Windows
 from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.optics.camera import LARGEST_SIZE
@@ -27,8 +27,6 @@ EVENTS_PER_PIXEL = 4
 LARGEST_LEVEL = 100.0
 """Largest magnitude of a log intensity."""
 LARGEST_SEED = (1 << 31) - 1
-THREADS = 1 << 15
-"""Number of CUDA threads that check the images."""
 
 
 @guarded
@@ -236,10 +234,7 @@ class EventSensor:
         if isinstance(levels, np.ndarray):
             levels = wp.array(levels, dtype=float, device=self._device, copy=not self._device.is_cpu)
         levels = levels.reshape((1, -1))
-        bad = wp.full(1, LARGEST_SEED, dtype=int, device=self._device)
-        threads = 1 if self._device.is_cpu else min(THREADS, levels.size)
-        wp.launch(pixels.find_bad_level, threads, [levels[0], LARGEST_LEVEL, threads], [bad], device=self._device)
-        place = int(bad.numpy()[0])
+        place = first_beyond(levels[0], LARGEST_LEVEL)
         if place < levels.size:
             camera, row, column = (int(k) for k in np.unravel_index(place, self._shape))
             raise AmiwarpError(
