@@ -526,6 +526,7 @@ SETTINGS = {
         "interpolation",
         "fps",
         "fov",
+        "blur",
         "camera",
         "duration_s",
         "motion",

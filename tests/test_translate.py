@@ -7,8 +7,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from typer.testing import CliRunner
 
-from amiwarp import AmiwarpError, Camera, Events, ExactModel, Prism, Recording, SensorModel, translate
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Events,
+    ExactModel,
+    PictureStack,
+    Prism,
+    Recording,
+    SensorModel,
+    open_recording,
+    translate,
+)
+from amiwarp.cli.app import app
 from amiwarp.simulation import pictures
 from amiwarp.simulation.pictures import DARK, open_pictures
 from amiwarp.translation.translator import translation
@@ -46,6 +59,47 @@ def test_events_fire_where_log_intensity_crosses_between_pictures(tmp_path: Path
         assert events.p[chosen].tolist() == [p for _, p in expected]
         np.testing.assert_allclose(events.t[chosen], [t for t, _ in expected], rtol=0, atol=3.0)  # us
     assert recording.camera == Camera.from_fov(16, 12, math.radians(60.0))
+
+
+@pytest.mark.parametrize("blur", [None, 0.0, 1.0])
+def test_a_still_picture_gives_the_events_of_simulate(blur: float | None, tmp_path: Path) -> None:
+    """The optical blur is the same, also by default, and so are the options of the commands."""
+    picture = np.kron(np.random.default_rng(0).integers(20, 255, (15, 20), np.uint8), np.ones((8, 8), np.uint8))
+    Image.fromarray(picture).save(tmp_path / "picture.png")
+    np.save(tmp_path / "stack.npy", np.stack([picture] * 3))
+    made = []
+    for command, source in (("simulate", ["--picture", "picture.png"]), ("translate", ["stack.npy", "--fps", "40"])):
+        out = tmp_path / f"{command}.h5"
+        given = [str(tmp_path / word) if "." in word else word for word in source]
+        given = [*given, str(out)] if command == "translate" else [str(out), *given]
+        more = ["--size", "40x30", "--fov-deg", "50", "--duration", "0.05", "--apex-deg", "1", "--seed", "3"]
+        more += [] if blur is None else ["--blur-px", str(blur)]
+        done = CliRunner().invoke(app, [command, *given, *more, "--device", "cpu"])
+        assert done.exit_code == 0, done.output
+        events = open_recording(out).events[:]
+        made.append(events[np.lexsort((events.t, events.x, events.y))])
+    assert len(made[0]) > 500
+    for name in ("x", "y", "p"):
+        np.testing.assert_array_equal(getattr(made[0], name), getattr(made[1], name))
+    np.testing.assert_allclose(made[0].t, made[1].t, rtol=0, atol=1.0)  # us; the pictures are interpolated
+    scene = {} if blur is None else {"blur": blur}
+    stack = PictureStack(np.stack([picture] * 3), 40.0, "stack")
+    camera = Camera.from_fov(40, 30, math.radians(50.0))
+    by_function = translate(stack, Prism(math.radians(1.0)), camera=camera, duration_s=0.05, seed=3, **scene)
+    assert len(by_function.events) == len(made[0])
+
+
+def test_events_are_fewer_with_more_blur() -> None:
+    picture = np.kron(np.random.default_rng(0).integers(20, 255, (15, 20), np.uint8), np.ones((8, 8), np.uint8))
+    stack = PictureStack(np.stack([picture] * 3), 40.0, "stack")
+    camera = Camera.from_fov(40, 30, math.radians(50.0))
+    counts = [
+        len(translate(stack, Prism(math.radians(1.0)), camera=camera, duration_s=0.05, blur=blur).events)
+        for blur in (0.0, 0.5, 1.0)
+    ]
+    assert counts[0] > 1.2 * counts[1] > 1.4 * counts[2]
+    with pytest.raises(AmiwarpError, match=r"scene blur = -1\.0"):
+        translate(stack, Prism(0.01), blur=-1.0)
 
 
 def test_folder_takes_its_times_from_the_table(tmp_path: Path) -> None:

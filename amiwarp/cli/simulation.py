@@ -27,7 +27,7 @@ from amiwarp.optics.prism import FlatSide, Plate, Prism
 from amiwarp.optics.vibration import LARGEST_AMPLITUDE
 from amiwarp.simulation.description import CameraMotion, EncoderModel, Mirror, Moved, PrismMotion, Scene, Vibration
 from amiwarp.simulation.sensor_model import SensorModel
-from amiwarp.simulation.worlds.world import WorldScene
+from amiwarp.simulation.worlds.world import BLUR_PX, WorldScene
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
@@ -541,7 +541,7 @@ class SceneOptions:
         float | None,
         _in_scene(help="Horizontal extent of the picture (deg). Default: it fills the field of view at all times."),
     ] = None
-    blur_px: Annotated[float, _in_scene(help="Standard deviation of the optical blur (px).")] = 0.5
+    blur_px: Annotated[float, _in_scene(help="Standard deviation of the optical blur (px).")] = BLUR_PX
 
     rotate_deg_s: Annotated[
         str, _in_scene(help="Angular velocity of the camera about its x, y and z axes (deg/s).", metavar="X,Y,Z")
@@ -680,6 +680,13 @@ def run_translate(
         float | None,
         typer.Option(help="Horizontal extent of the pictures (deg). Default: they fill the view through the prism."),
     ] = None,
+    blur_px: Annotated[
+        float,
+        typer.Option(
+            help="Standard deviation of the optical blur (px). 0 for pictures of a camera with the same resolution, "
+            "which has blurred them already."
+        ),
+    ] = BLUR_PX,
     duration: Annotated[
         float | None, typer.Option(help="Length of the recording (s). Default: length of the source.")
     ] = None,
@@ -711,6 +718,7 @@ def run_translate(
         given,
         rig.build_prism(),
         fov=None if picture_fov_deg is None else cli.fov_from(picture_fov_deg, "--picture-fov-deg"),
+        blur=blur_px,
         camera=None if chosen else rig.build_camera(given.frames.size),
         duration_s=duration,
         motion=rig.build_motion(),

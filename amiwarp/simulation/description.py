@@ -24,7 +24,7 @@ from amiwarp.optics.prism import Plate, Prism, check_angles, check_phase
 from amiwarp.optics.vibration import VibrationModel
 from amiwarp.simulation.pictures import linear_luminance, read_picture
 from amiwarp.simulation.sensor_model import SensorModel
-from amiwarp.simulation.worlds.world import WorldScene
+from amiwarp.simulation.worlds.world import BLUR_PX, WorldScene
 from amiwarp.validation import INT64, array, guarded, instance, real, vector, whole
 
 # Motion of the prism and of the camera, and the encoder that measures the prism.
@@ -550,7 +550,7 @@ class Scene:
 
     None: the picture is just large enough to cover everything that the camera sees through the turning prism.
     """
-    blur: float = 0.5
+    blur: float = BLUR_PX
     """Standard deviation of the optical blur [sensor px], which includes the pixel's aperture."""
 
     def __post_init__(self) -> None:
@@ -561,7 +561,9 @@ class Scene:
         object.__setattr__(self, "blur", real(self.blur, "scene blur", 0.0, 20.0, " px"))
 
     @classmethod
-    def from_picture(cls, picture: str | Path | NDArray[Any], *, fov: float | None = None, blur: float = 0.5) -> Scene:
+    def from_picture(
+        cls, picture: str | Path | NDArray[Any], *, fov: float | None = None, blur: float = BLUR_PX
+    ) -> Scene:
         """Make a still scene from a picture.
 
         Parameters

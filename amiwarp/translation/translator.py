@@ -28,6 +28,7 @@ from amiwarp.simulation.description import CameraMotion, EncoderModel, Frames, P
 from amiwarp.simulation.pictures import PICTURE_SUFFIXES, Pictures, open_pictures, read_picture
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.worlds.world import BLUR_PX
 from amiwarp.tasks import Progress
 from amiwarp.translation import sources
 from amiwarp.translation.sources import DataSet, EventPictures, Interpolation, KnownPictures, MotionPictures
@@ -517,6 +518,7 @@ def translation(
     interpolation: Interpolation | str = Interpolation.AUTO,
     fps: float | None = None,
     fov: float | None = None,
+    blur: float = BLUR_PX,
     camera: Camera | None = None,
     duration_s: float | None = None,
     motion: PrismMotion | float = 720.0,
@@ -538,7 +540,7 @@ def translation(
     if not duration > 0.0:
         raise AmiwarpError("the source does not state its duration; give duration_s")
     return Simulation(
-        Scene(given.frames, fov, blur=0.0),  # the camera that took the pictures has blurred them
+        Scene(given.frames, fov, blur),
         given.camera,
         prism,
         duration,
@@ -583,11 +585,13 @@ def translate(
         Called with the stage and the finished share.
     **settings : dict
         Optional settings: ``interpolation`` (:class:`Interpolation`), ``fps`` (pictures per second, required for
-        .npy stacks), ``fov`` (horizontal field of view of the pictures [rad]; pixels beyond it are unknown),
-        ``camera``, ``duration_s``, ``motion``, ``sensor``, ``encoder``, ``nominal_prism``, ``seed`` and ``device``, as
-        for :func:`simulate`. By default, the pictures are just large enough to cover everything that the camera sees
-        through the turning prism. The camera has the size of the pictures, and the horizontal field of view of the
-        recording's camera, or 60 degrees. The recording lasts as long as the source.
+        .npy stacks), ``fov`` (horizontal field of view of the pictures [rad]; pixels beyond it are unknown), ``blur``
+        (standard deviation of the optical blur [sensor px], by default 0.5 as in :func:`simulate`; 0 for pictures of a
+        camera with the same resolution, which has blurred them already), ``camera``, ``duration_s``, ``motion``,
+        ``sensor``, ``encoder``, ``nominal_prism``, ``seed`` and ``device``, as for :func:`simulate`. By default, the
+        pictures are just large enough to cover everything that the camera sees through the turning prism. The camera
+        has the size of the pictures, and the horizontal field of view of the recording's camera, or 60 degrees. The
+        recording lasts as long as the source.
 
     Returns
     -------

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 LARGEST_SPEED = 1e3
 """Largest speed of a body or camera [m/s]. A higher speed is refused as a jump."""
+BLUR_PX = 0.5
+"""Default standard deviation of the optical blur, including the area of the pixel [sensor px]."""
 LARGEST_TURN_RATE = 1e3
 """Largest angular velocity of a body or camera [rad/s]. A higher angular velocity is refused as a jump."""
 MOST_POSES = 500_000
@@ -563,7 +565,7 @@ class WorldScene:
     """World that the camera sees."""
     trajectory: Trajectory
     """Pose of the camera over time."""
-    blur: float = 0.5
+    blur: float = BLUR_PX
     """Standard deviation of the optical blur, including the area of the pixel [px].
 
     The blur has no effect with ``seeing="rays"`` and ``samples=1``.
