@@ -1,11 +1,16 @@
 """Verdicts on the paper's claims: paired differences, their interval, and limits, with made-up numbers."""
 
+import importlib
+import json
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from amiwarp.studies.evaluate.claims import (
+    NO_RESULT,
     PAPER,
     Interval,
     Verdict,
@@ -14,7 +19,11 @@ from amiwarp.studies.evaluate.claims import (
     judge_number,
     ranges,
     untestable,
+    untestable_as_stated,
 )
+
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results" / "evaluate"
+"""Folder of the stored reports."""
 
 T_975 = {1: 12.7062, 2: 4.30265, 4: 2.77645, 9: 2.26216}
 """Quantiles of Student's t for a two-sided interval of 95 %, by degrees of freedom, as printed tables have them."""
@@ -111,6 +120,30 @@ def test_claims_without_results() -> None:
     assert judge_number(12, "", 1.9, "the error", below=2.0, unit="px").verdict is Verdict.REPRODUCED
     assert judge_number(12, "", 2.1, "the error", below=2.0, unit="px").ours == "2.1 px, computed"
     assert untestable(9, "Pose.", "no network").verdict is Verdict.NOT_TESTABLE
+
+
+def test_a_claim_that_leaves_open_what_decides_counts_its_readings() -> None:
+    readings = [judge_number(None, f"Within 2 px at {at}.", at, "the error", below=2.0, unit="px") for at in (1.0, 3.0)]
+    readings.append(judge(None, "Without results.", {}, "the error", below=2.0))
+    claim, *given = untestable_as_stated(12, "Within 2 px.", "the place", readings)
+    assert (claim.number, claim.verdict, claim.ours) == (12, Verdict.NOT_TESTABLE, "1 of 2 readings hold")
+    assert claim.rule == "the paper does not state the place, which decides; its readings are checks"
+    assert given == readings
+    assert untestable_as_stated(12, "", "", readings[2:])[0].ours == NO_RESULT
+
+
+@pytest.mark.parametrize("name", ["cpu", "gpu"])
+def test_stored_reports_state_claims_as_the_program_does(name: str) -> None:
+    report = json.loads((RESULTS / f"{name}.json").read_text())
+    for section in report["evaluations"]:
+        evaluation = importlib.import_module(f"amiwarp.studies.evaluate.{section['name']}")
+        stored = {(c["number"], c["text"], c["rule"]) for c in section["claims"]}
+        assert {(c.number, c.text, c.rule) for c in evaluation.claims([])} <= stored
+        for at, claim in enumerate(section["claims"]):
+            found = re.fullmatch(r"(\d+) of (\d+) readings hold", claim["ours"])
+            if found:
+                verdicts = [c["verdict"] for c in section["claims"][at + 1 : at + 1 + int(found[2])]]
+                assert verdicts.count("reproduced") == int(found[1])
 
 
 def test_the_paper_has_seventeen_claims() -> None:

@@ -30,7 +30,7 @@ class Verdict(enum.StrEnum):
     UNDECIDED = "undecided"
     """The interval spans the limit, or there are fewer than two seeds."""
     NOT_TESTABLE = "not testable"
-    """There are no results to judge it by."""
+    """There are no results to judge it by, or the paper leaves open what decides it."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ PAPER = {
     10: PaperClaim("Optical flow of static objects gets slightly worse.", "+0.19 px"),
     11: PaperClaim("Events are compensated with a small error, in real time.", "1.5 to 2.0 px"),
     12: PaperClaim("The circle's error is within 2 px in a field of view of 90°.", "2 px"),
-    13: PaperClaim("The error surges above 720 rpm at 0.5° and 1.0°, because of small synchronisation errors, and more "
-                   "with a larger apex."),
+    13: PaperClaim("The error surges dramatically above 720 rpm at 0.5° and 1.0°, because of small synchronisation "
+                   "errors, and more with a larger apex."),
     14: PaperClaim("A prism of 2° gives the most data, but its compensation error is too high to be practical."),
     15: PaperClaim("A larger apex and a higher speed give more events and more error; a quarter turn must fit the "
                    "window.", "455 rpm at least"),
@@ -166,7 +166,7 @@ def judge(
     return Claim(number, text, ours, verdict, rule, cases)
 
 
-def judge_number(number: int, text: str, value: float, what: str, *, below: float, unit: str) -> Claim:
+def judge_number(number: int | None, text: str, value: float, what: str, *, below: float, unit: str) -> Claim:
     """Return the claim that a number lies below a limit, which is computed without recordings and has no spread."""
     verdict = Verdict.REPRODUCED if value < below else Verdict.NOT_REPRODUCED
     return Claim(number, text, f"{value:.3g} {unit}, computed", verdict, f"{what} is below {below:g} {unit}")
@@ -175,6 +175,18 @@ def judge_number(number: int, text: str, value: float, what: str, *, below: floa
 def untestable(number: int, text: str, reason: str) -> Claim:
     """Return a claim that cannot be tested, with the reason."""
     return Claim(number, text, "–", Verdict.NOT_TESTABLE, reason)
+
+
+def untestable_as_stated(number: int, text: str, missing: str, readings: Sequence[Claim]) -> list[Claim]:
+    """Return a claim that cannot be tested as it is stated, and its readings, which are checks with their verdicts.
+
+    ``missing``: what the paper does not state.
+    """
+    judged = [reading for reading in readings if reading.verdict is not Verdict.NOT_TESTABLE]
+    hold = sum(reading.verdict is Verdict.REPRODUCED for reading in judged)
+    ours = f"{hold} of {len(judged)} readings hold" if judged else NO_RESULT
+    reason = f"the paper does not state {missing}, which decides; its readings are checks"
+    return [Claim(number, text, ours, Verdict.NOT_TESTABLE, reason), *readings]
 
 
 def differences(

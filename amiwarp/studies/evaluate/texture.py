@@ -70,8 +70,9 @@ PROTOCOL = (
     "The events of a window are a sample of points in the image. A Gaussian kernel of standard deviation h estimates "
     "their density ρ at the place of each event; places are rounded to half pixels. The measure is "
     "the variance of ρ / mean ρ over the events, averaged over up to four windows of a recording. Lower "
-    "is more even. It cannot see compensation: raw and compensated events have nearly the same variance, see both in "
-    "the table. The paper's values are marked at h = 3 px and windows of 33 ms, our choice."
+    "is more even. Random noise is as even as can be, so the measure says nothing about a camera that records noise "
+    "alone, as an S-EV at rest. It cannot see compensation: raw and compensated events have nearly the same variance, "
+    "see both in the table. The paper's values are marked at h = 3 px and windows of 33 ms, our choice."
 )
 DIFFERENCES = (
     "The paper's main text gives neither kernel width nor window nor normalisation, and its scenes are real. Absolute"
@@ -187,7 +188,8 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
     # at rest the S-EV records noise alone, which is even
     spread = differences(ranges(moving, "variance"), "variance", ami, {"stream": Stream.PLAIN}, by=("scene",))
     return [
-        less(1, "The density of events is more even than the S-EV's (moving camera).", moving, Stream.PLAIN),
+        less(1, "The density of events is more even than the S-EV's (moving camera; at rest an S-EV records noise "
+             "alone: see the table).", moving, Stream.PLAIN),
         judge(1, "It depends less on the camera's motion.", spread, "the range of the variance over the camera's "
               f"motions of '{Stream.CALIBRATED}' less that of '{Stream.PLAIN}'", below=0.0),
         *(less(None, f"More even with h = {h:g} px and windows of {window:g} ms.",
