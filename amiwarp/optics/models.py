@@ -33,7 +33,7 @@ from amiwarp.optics.prism import (
     check_phase,
     deflection_from_apex,
 )
-from amiwarp.validation import array, choice, guarded, instance, one_of, real, shown, whole
+from amiwarp.validation import array, choice, guarded, instance, one_of, real, shown, vector, whole
 
 # Base class of the optical models: what a model knows of itself, and the displacement of points on any device.
 
@@ -76,10 +76,15 @@ class Parameter:
         for name in ("name", "unit", "label"):
             instance(getattr(self, name), str, f"parameter's {name}")
         real(self.half_range, f"parameter {shown(self.name)}: half_range", 0.0)
-        for value in self.slider:
-            real(value, f"parameter {shown(self.name)}: slider")
-        if not self.limits[0] <= self.limits[1]:
+        vector(self.slider, 3, f"parameter {shown(self.name)}: slider", real)
+        low, high = vector(self.limits, 2, f"parameter {shown(self.name)}: limits", _limit)
+        if low > high:
             raise AmiwarpError(f"parameter {shown(self.name)}: limits are {self.limits}; give the smaller one first")
+
+
+def _limit(value: object, what: str) -> float:
+    """Return a number that may be infinite."""
+    return value if isinstance(value, float) and math.isinf(value) else real(value, what)
 
 
 PHASE = Parameter("phase", "rad")
