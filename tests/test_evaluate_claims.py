@@ -123,13 +123,15 @@ def test_claims_without_results() -> None:
 
 
 def test_a_claim_that_leaves_open_what_decides_counts_its_readings() -> None:
-    readings = [judge_number(None, f"Within 2 px at {at}.", at, "the error", below=2.0, unit="px") for at in (1.0, 3.0)]
+    readings = [
+        judge_number(None, f"Within 2 px at {at}.", at, "the error", below=2.0, unit="px") for at in (1.0, 1.5, 3.0)
+    ]
     readings.append(judge(None, "Without results.", {}, "the error", below=2.0))
     claim, *given = untestable_as_stated(12, "Within 2 px.", "the place", readings)
-    assert (claim.number, claim.verdict, claim.ours) == (12, Verdict.NOT_TESTABLE, "1 of 2 readings hold")
+    assert (claim.number, claim.verdict, claim.ours) == (12, Verdict.NOT_TESTABLE, "2 of 3 readings hold")
     assert claim.rule == "the paper does not state the place, which decides; its readings are checks"
     assert given == readings
-    assert untestable_as_stated(12, "", "", readings[2:])[0].ours == NO_RESULT
+    assert untestable_as_stated(12, "", "", readings[3:])[0].ours == NO_RESULT
 
 
 @pytest.mark.parametrize("name", ["cpu", "gpu"])

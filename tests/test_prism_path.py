@@ -25,6 +25,7 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.calib.prism_path import speed_in_words, varying_paths
+from amiwarp.calib.start_burst import reaching_back
 from amiwarp.optics.models import compensate_by_each
 from amiwarp.viewer.inspector import Inspector
 from tests.conftest import COARSE
@@ -100,6 +101,14 @@ def test_a_burst_of_the_starting_camera_is_left_out(
     assert encoder.covers(start, recording.events.t_last)
     assert calibrated.path is not None
     np.testing.assert_allclose(encoder.angle_at(calibrated.path.t), calibrated.path.angle, rtol=0, atol=1e-12)
+
+
+def test_a_path_reaches_back_at_the_speed_of_its_start() -> None:
+    path = Encoder(np.array([1000, 2000, 3000]), np.array([0.5, 0.7, 1.5]))
+    longer = reaching_back(path, -4000)
+    assert float(longer.angle_at([-4000])[0]) == pytest.approx(-0.5)
+    np.testing.assert_allclose(longer.angle_at(path.t), path.angle, rtol=0, atol=1e-12)
+    assert reaching_back(path, 1000) is path
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
