@@ -116,6 +116,13 @@ def whole(value: object, what: str, low: int, high: int, hint: str = "") -> int:
     return int(plain)
 
 
+def as_words(value: object) -> object:
+    """Return a single text, member of an enumeration or path as a tuple of it, and a list as a tuple."""
+    if isinstance(value, str | Path):
+        return (value,)
+    return tuple(value) if isinstance(value, list) else value
+
+
 def vector(value: object, count: int, what: str, check: Callable[[object, str], Number]) -> tuple[Number, ...]:
     """Return a sequence of ``count`` numbers, each checked by the function ``check``.
 
@@ -284,8 +291,10 @@ _PLAIN = _NUMBERS | {"str", "Any", "ArrayLike", "Literal", "us", "s", "tuple", "
 """Names in annotations of values that functions check themselves, because they know ranges, choices and shapes."""
 _SOME_NUMBERS = {"tuple", "float"}, {"tuple", "float", "None"}
 """Names in annotations of a tuple of numbers."""
-_TEXT, _TEXTS = ({"str"}, {"str", "None"}), ({"str", "tuple"}, {"str", "Sequence"})
-"""Names in annotations of a text, and of a sequence of texts."""
+_TEXT = {"str"}, {"str", "None"}
+"""Names in annotations of a text."""
+_WORDS = re.compile(r"(tuple\[str, \.\.\.\]|Sequence\[str( \| Path)?\])( \| None)?")
+"""Annotation of a sequence of texts or paths."""
 
 
 def guarded(target: Target) -> Target:
@@ -357,8 +366,8 @@ class _Parameter:
         of_record = numbers_too and function.__name__ == "__init__"
         self._text = of_record and words in _TEXT
         self._numbers = of_record and words in _SOME_NUMBERS
-        texts = numbers_too and words in _TEXTS
-        plain = words <= _PLAIN and not (self._number or self._numbers or self._text or texts)
+        self._words = _WORDS.fullmatch(annotation) is not None
+        plain = words <= _PLAIN and not (self._number or self._numbers or self._text or self._words)
         self.guarded = name == "device" or not plain
         self._arrays = "NDArray" in words and words.isdisjoint(("Callable", "Mapping", "dict", "tuple"))
         last = (function.__kwdefaults__ or {}).get(name, ...)
@@ -371,7 +380,12 @@ class _Parameter:
         return eval(self._function.__annotations__[self._name], names, _PublicNames(names))
 
     def check(self, value: Any) -> Any:
-        """Return the value, NumPy's numbers as plain ones; raise :class:`AmiwarpError` if it is not of the type."""
+        """Return the value, or raise :class:`AmiwarpError` if it is not of the type.
+
+        NumPy's numbers become plain ones. Where a sequence of words is expected, one word or a list becomes a tuple.
+        """
+        if self._words:
+            value = as_words(value)
         if (value is None and self._optional) or (self._arrays and _fits_array(value)):
             return value
         kind = self._kind

@@ -384,9 +384,20 @@ def test_bad_settings(recording: Recording, changes: dict[str, object], text: st
         calibrate(recording, **changes)
 
 
+def test_one_word_is_enough_where_a_setting_takes_several() -> None:
+    assert Settings(stages="sharpness", free="apex") == Settings(stages=("sharpness",), free=("apex",))
+    assert Settings(stages=["sharpness", "photometric"], free=["apex"]) == Settings(free=("apex",))
+    Settings(stages="sharpness").check()
+    with pytest.raises(AmiwarpError, match=r"stages is \('photometric',\); expected 'sharpness' or \('sharpness', 'ph"):
+        Settings(stages="photometric").check()
+    with pytest.raises(AmiwarpError, match="Settings: stages is 3; expected tuple or list"):
+        Settings(stages=3)
+
+
 def test_the_typed_options_are_the_settings() -> None:
-    """A type checker knows every keyword argument of ``calibrate``, with the type of the field."""
-    assert get_type_hints(CalibrationOptions) == get_type_hints(Settings)
+    """A type checker knows every keyword argument of ``calibrate``, with the type of the field, or one word of it."""
+    fields = get_type_hints(Settings)
+    assert get_type_hints(CalibrationOptions) == fields | {name: str | fields[name] for name in ("free", "stages")}
     assert not CalibrationOptions.__required_keys__
 
 

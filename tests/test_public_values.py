@@ -38,7 +38,7 @@ from amiwarp.events.recording import check_events
 from amiwarp.io.native_format import LiveWriter
 from amiwarp.optics.camera import LARGEST_FOCAL
 from amiwarp.validation import TIME_LIMIT, guarded, shown
-from tests.public_calls import CAMERA, FRAME, RECORDING, REFUSED, PublicCall, public_calls, write_files
+from tests.public_calls import CAMERA, FRAME, RECORDING, REFUSED, SPACE, PublicCall, public_calls, write_files
 
 
 class Odd:
@@ -282,6 +282,22 @@ def test_unknown_keywords_and_too_many_arguments(call: PublicCall) -> None:
 def test_common_mistakes(wrong: Callable[[], Any], message: str) -> None:
     with pytest.raises((AmiwarpError, TypeError), match=message):
         wrong()
+
+
+@pytest.mark.usefixtures("folder")
+def test_one_word_does_as_a_tuple_of_it() -> None:
+    """One text or path is neither taken for its letters nor refused for its type, in any public call."""
+    seen = set()
+    for call in CALLS:
+        for name, annotation in call.parameters().items():
+            if re.match(r"tuple\[str, \.\.\.|Sequence\[str", annotation):
+                seen.add(f"{call.label}.{name}")
+                for word in ("apex", Path("apex")):
+                    assert outcome(call, **{name: word}) == outcome(call, **{name: (word,)})
+    assert seen >= {"Settings.free", "Settings.stages", "evaluate.only", "evaluate.recordings"}
+    labels = amiwarp.WorldLabels("room", "wall", amiwarp.Cause.SIGNAL)
+    assert (labels.instances, labels.categories) == (("wall",), ("signal",))
+    assert SPACE.without("apex").names == ()
 
 
 @pytest.mark.parametrize(

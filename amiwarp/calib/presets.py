@@ -73,8 +73,6 @@ class Preset:
 def settings_from(values: Mapping[str, Any]) -> Settings:
     """Return the calibration settings for a preset's values, which have types that JSON can store."""
     plain: dict[str, Any] = {n: values[n] for n in CALIBRATION if n in values}
-    if "stages" in plain:
-        plain["stages"] = tuple(plain["stages"])
     return Settings(**plain, photometric=PhotometricSettings(**values.get("photometric", {})))
 
 

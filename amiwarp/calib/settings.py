@@ -8,7 +8,7 @@ from typing import TypedDict
 
 from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
-from amiwarp.calib.parameters import check_names
+from amiwarp.calib.parameters import check_values
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS
@@ -99,7 +99,7 @@ class Settings:
     local_algorithm: str = "LN_BOBYQA"
     """NLopt algorithm of the local search that follows the global search."""
     free: tuple[str, ...] | None = None
-    """Names of the free parameters; None: size and phase, and without an encoder ``rpm``."""
+    """Names of the free parameters, or one name; None: size and phase, and without an encoder ``rpm``."""
     start: Mapping[str, float] = field(default_factory=dict)
     """Known or start values by parameter name, in rad, us, 1/min or px. A value of a parameter that is not free stays
     fixed."""
@@ -122,7 +122,7 @@ class Settings:
     seed: int = 0
     """Seed of the algorithms that use random numbers."""
     stages: tuple[str, ...] = STAGES
-    """Stages to run: ``("sharpness",)`` or ``("sharpness", "photometric")``."""
+    """Stages to run: ``"sharpness"`` or ``("sharpness", "photometric")``."""
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
     """Settings of the photometric stage."""
 
@@ -141,15 +141,15 @@ class Settings:
         if self.global_algorithm is not None:
             one_of(self.global_algorithm, GLOBAL_ALGORITHMS, "algorithm")
         one_of(self.local_algorithm, LOCAL_ALGORITHMS, "algorithm")
-        if not isinstance(self.stages, tuple) or [*map(str, self.stages)] not in ([*STAGES], [*STAGES[:1]]):
-            raise AmiwarpError(f"stages is {shown(self.stages)}; expected 'sharpness' or 'sharpness, photometric'")
+        if self.stages not in (STAGES, STAGES[:1]):
+            raise AmiwarpError(f"stages is {shown(self.stages)}; expected 'sharpness' or {STAGES}")
         for name in ("global_evaluations", "local_evaluations", "events"):
             whole(getattr(self, name), name, 1, LARGEST_BUDGET)
         whole(self.fold, "fold", 0, LARGEST_FOLD)
         whole(self.seed, "seed", 0, 2**31 - 1)
         real(self.tolerance_px, "tolerance_px", 0.0, 1e3, " px")
         real(self.smoothing_px, "smoothing_px", 0.0, 1e3, " px")
-        check_names(self.free, self.start, self.bounds)
+        check_values(self.start, self.bounds)
         self.photometric.check()
 
 
@@ -170,7 +170,7 @@ class CalibrationOptions(TypedDict, total=False):
     sharpness: Sharpness
     global_algorithm: str | None
     local_algorithm: str
-    free: tuple[str, ...] | None
+    free: str | tuple[str, ...] | None
     start: Mapping[str, float]
     bounds: Mapping[str, tuple[float, float]]
     global_evaluations: int
@@ -181,7 +181,7 @@ class CalibrationOptions(TypedDict, total=False):
     events: int
     fold: int
     seed: int
-    stages: tuple[str, ...]
+    stages: str | tuple[str, ...]
     photometric: PhotometricSettings
 
 
