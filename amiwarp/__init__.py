@@ -5,6 +5,7 @@ milliseconds only.
 """
 
 import gc
+import typing
 from typing import Any
 
 import lazy_loader
@@ -15,11 +16,19 @@ _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name, without garbage collections, which would take a quarter of the time of the imports."""
+    """Load a public name, without garbage collections, which would take a quarter of the time of the imports.
+
+    A type that is no class, such as a union, gets a name that can be called, to say what to call instead.
+    """
     collects = gc.isenabled()
     gc.disable()
     try:
-        return _load(name)
+        found = _load(name)
+        if typing.get_args(found):
+            from amiwarp.validation import NamedType
+
+            found = globals()[name] = NamedType(name, found)
+        return found
     finally:
         if collects:
             gc.enable()

@@ -1,12 +1,23 @@
 """Options with a fixed set of values, for images, pictures, event clouds and simulated worlds."""
 
 import enum
+from typing import NoReturn
+
+from amiwarp.errors import AmiwarpError
 
 OPTICAL_MODELS = ("circle", "exact", "radial", "ellipse", "risley", "plate", "mirror", "vibration")
 """Names of the optical models, for programs that do not load them."""
 
 
-class Optic(enum.StrEnum):
+class Option(enum.StrEnum):
+    """Base of options with a fixed set of values: a value that none of them has is answered with all of them."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> NoReturn:
+        raise AmiwarpError(f"{cls.__name__} is {value!r}; choose among {', '.join(cls)}")
+
+
+class Optic(Option):
     """What moves the image of a simulated camera.
 
     Examples
@@ -28,7 +39,7 @@ class Optic(enum.StrEnum):
 # Choices for images of warped events: how to vote, what to do with polarity, which sharpness to measure.
 
 
-class Vote(enum.StrEnum):
+class Vote(Option):
     """How an event's vote is shared among pixels.
 
     Examples
@@ -43,7 +54,7 @@ class Vote(enum.StrEnum):
     """The vote is shared among the four nearest pixels, by bilinear weights."""
 
 
-class Layers(enum.StrEnum):
+class Layers(Option):
     """How polarity appears in an image of warped events.
 
     Examples
@@ -60,7 +71,7 @@ class Layers(enum.StrEnum):
     """Two images: number of OFF events, then number of ON events, shape ``(2, height, width)``."""
 
 
-class Sharpness(enum.StrEnum):
+class Sharpness(Option):
     """Sharpness measures of an image of warped events. For each of them, higher is sharper.
 
     Examples
@@ -83,7 +94,7 @@ class Sharpness(enum.StrEnum):
     """Minus the entropy of the distribution of votes over pixels [nat]."""
 
 
-class CornerMethod(enum.StrEnum):
+class CornerMethod(Option):
     """Methods that find corners among events.
 
     Both look at the times of the latest events on two circles of pixels around an event.
@@ -108,7 +119,7 @@ CONTRAST = 0.25
 """Default value of the ON threshold [natural log intensity]."""
 
 
-class Fill(enum.StrEnum):
+class Fill(Option):
     """How to fill the parts of a reconstructed picture that the events do not determine.
 
     Examples
@@ -125,7 +136,7 @@ class Fill(enum.StrEnum):
     """Undetermined parts are interpolated by an edge-preserving prior: flat regions with sharp edges between them."""
 
 
-class Tone(enum.StrEnum):
+class Tone(Option):
     """Mapping of intensity to pixel values."""
 
     MAPPED = "mapped"
@@ -137,7 +148,7 @@ class Tone(enum.StrEnum):
 # Options of the event clouds: colour, third axis and view.
 
 
-class Colour(enum.StrEnum):
+class Colour(Option):
     """Quantity that the colour of a point in the event clouds shows."""
 
     POLARITY = "polarity"
@@ -155,14 +166,14 @@ class Colour(enum.StrEnum):
     """Depth of the surface that the event saw in a simulated world [m], from the ground truth; logarithmic scale."""
 
 
-class Axis(enum.StrEnum):
+class Axis(Option):
     """Quantity along the third axis of the event clouds, next to x and y."""
 
     ANGLE = "angle"
     TIME = "time"
 
 
-class View(enum.StrEnum):
+class View(Option):
     """Direction from which the event clouds are viewed."""
 
     FREE = "free"
@@ -174,7 +185,7 @@ class View(enum.StrEnum):
 # Options of simulations that have a fixed set of values.
 
 
-class Seeing(enum.StrEnum):
+class Seeing(Option):
     """Method by which the simulator computes the light that each pixel receives from a world."""
 
     MAPS = "maps"

@@ -11,6 +11,7 @@ import contextlib
 import difflib
 import enum
 import functools
+import inspect
 import math
 import numbers
 import os
@@ -22,7 +23,7 @@ import typing
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from types import FunctionType
-from typing import Any, TypeVar, cast
+from typing import Any, NoReturn, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -297,6 +298,59 @@ _WORDS = re.compile(r"(tuple\[str, \.\.\.\]|Sequence\[str( \| Path)?\])( \| None
 """Annotation of a sequence of texts or paths."""
 
 
+def not_called(instead: str) -> Callable[[Target], Target]:
+    """Decorate a protocol or base class, so that a call of it says what to do ``instead``. Derived classes are free."""
+
+    def decorate(target: Target) -> Target:
+        kind: Any = target
+
+        def init(self: Any, *args: Any, **options: Any) -> None:
+            if type(self) is kind:
+                raise AmiwarpError(f"{kind.__name__} is a type for annotations and for own classes; {instead}")
+            super(kind, self).__init__(*args, **options)
+
+        init.__signature__ = inspect.signature(lambda self: None)  # type: ignore[attr-defined]  # as it was
+        type.__setattr__(kind, "__init__", init)
+        return target
+
+    return decorate
+
+
+class NamedType:
+    """Public name of a type that is no class, for annotations and ``isinstance``; a call says what to call instead.
+
+    The name may also be joined with other types by ``|``.
+    """
+
+    def __init__(self, name: str, value: Any) -> None:
+        self.__name__ = name
+        self.__value__ = value
+
+    def __call__(self, *_: object, **__: object) -> NoReturn:
+        parts = typing.get_args(self.__value__)
+        if isinstance(parts[0], list):  # the types of a function's arguments
+            instead = f"give a function of ({', '.join(part.__name__ for part in parts[0])})"
+        else:
+            *others, last = [part.__name__ for part in parts]
+            instead = f"use {', '.join(others)} or {last}"
+        raise AmiwarpError(f"{self.__name__} is a type for annotations; {instead}")
+
+    def __instancecheck__(self, value: object) -> bool:
+        return isinstance(value, self.__value__)
+
+    def __subclasscheck__(self, kind: type) -> bool:
+        return issubclass(kind, self.__value__)
+
+    def __or__(self, other: Any) -> Any:
+        return self.__value__ | other
+
+    def __ror__(self, other: Any) -> Any:
+        return other | self.__value__
+
+    def __repr__(self) -> str:
+        return f"amiwarp.{self.__name__}"
+
+
 def guarded(target: Target) -> Target:
     """Decorate a public function or class, so that calls check the kinds of objects by the annotations.
 
@@ -366,6 +420,7 @@ class _Parameter:
         of_record = numbers_too and function.__name__ == "__init__"
         self._text = of_record and words in _TEXT
         self._numbers = of_record and words in _SOME_NUMBERS
+        self._numbers_too = numbers_too
         self._words = _WORDS.fullmatch(annotation) is not None
         plain = words <= _PLAIN and not (self._number or self._numbers or self._text or self._words)
         self.guarded = name == "device" or not plain
@@ -386,6 +441,8 @@ class _Parameter:
         """
         if self._words:
             value = as_words(value)
+            if not self._numbers_too:  # the record checks its words, which it knows
+                return value
         if (value is None and self._optional) or (self._arrays and _fits_array(value)):
             return value
         kind = self._kind
@@ -431,7 +488,7 @@ class _PublicNames(dict[str, Any]):
 def _unmet(kind: Any, value: Any) -> str:
     """Return what a type expects, in words, if a value does not fit; else an empty text."""
     origin, parts = typing.get_origin(kind) or kind, typing.get_args(kind)
-    if hasattr(origin, "__value__"):  # an alias, as NDArray and ArrayLike are from NumPy 2.5 on
+    if hasattr(origin, "__value__"):  # a named type, as NDArray and ArrayLike are from NumPy 2.5 on
         return _unmet(origin.__value__, value)
     if origin in (typing.Union, types.UnionType):
         paths = {os.PathLike, Path} & {typing.get_origin(part) or part for part in parts}

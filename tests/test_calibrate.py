@@ -390,8 +390,8 @@ def test_one_word_is_enough_where_a_setting_takes_several() -> None:
     Settings(stages="sharpness").check()
     with pytest.raises(AmiwarpError, match=r"stages is \('photometric',\); expected 'sharpness' or \('sharpness', 'ph"):
         Settings(stages="photometric").check()
-    with pytest.raises(AmiwarpError, match="Settings: stages is 3; expected tuple or list"):
-        Settings(stages=3)
+    with pytest.raises(AmiwarpError, match="free is 3; expected a tuple of parameter names, or None"):
+        Settings(free=3).check()
 
 
 def test_the_typed_options_are_the_settings() -> None:

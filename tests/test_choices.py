@@ -170,11 +170,20 @@ def test_names_that_are_no_enums(name: str, known: tuple[str, ...], use: Callabl
 
 
 def test_stages_are_one_of_two_tuples() -> None:
-    for good in (STAGES, STAGES[:1]):
-        assert settled(stages=good).stages == good
-    for wrong in ("sharpness", ("photometric",), ("sharpness", "sharpness"), None, 3, (np.arange(2),), ["sharpness"]):
-        with pytest.raises(AmiwarpError, match="sharpness, photometric"):
+    for good, expected in ((STAGES, STAGES), ([*STAGES], STAGES), (STAGES[:1], STAGES[:1]), ("sharpness", STAGES[:1])):
+        assert settled(stages=good).stages == expected
+    for wrong in ("photometric", ("photometric",), ("sharpness", "sharpness"), None, 3, (np.arange(2),), [], ""):
+        with pytest.raises(AmiwarpError, match=r"expected 'sharpness' or \('sharpness', 'photometric'\)"):
             settled(stages=wrong)
+
+
+PUBLIC_ENUMS = [kind for name in amiwarp.__all__ if isinstance(kind := getattr(amiwarp, name), enum.EnumType)]
+
+
+@pytest.mark.parametrize("kind", PUBLIC_ENUMS, ids=lambda kind: kind.__name__)
+def test_an_enum_called_with_another_value_names_its_values(kind: type[enum.StrEnum]) -> None:
+    with pytest.raises(AmiwarpError, match=f"{kind.__name__} is 'nothing'; choose among .*{[*kind][-1].value}"):
+        kind("nothing")
 
 
 def test_simplified_names_its_models() -> None:

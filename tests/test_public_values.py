@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
@@ -282,6 +282,61 @@ def test_unknown_keywords_and_too_many_arguments(call: PublicCall) -> None:
 def test_common_mistakes(wrong: Callable[[], Any], message: str) -> None:
     with pytest.raises((AmiwarpError, TypeError), match=message):
         wrong()
+
+
+NOT_CALLED = {
+    "NominalPrism": "use Prism, UnsizedPrism or Plate",
+    "Distortion": "use RadialTangential or Fisheye",
+    "Pictures": "use PictureFolder, PictureStack or VideoFile",
+    "MetadataValue": "use str, int, float or bool",
+    "Progress": r"give a function of \(str, float\)",
+    "EventSource": "wrap events as amiwarp.MemoryEvents",
+    "EventValues": "a NumPy array",
+    "PointStore": "a NumPy array",
+    "FrameStore": "simulate",
+    "KnownStore": "translate",
+    "PoseStore": "amiwarp.Poses",
+    "ImageStore": "amiwarp.MemoryImages",
+    "Frames": "amiwarp.Scene.from_picture",
+    "Model": "amiwarp.ExactModel",
+}
+"""Public names of types that users annotate with or derive from, and what a call of them says."""
+
+
+@pytest.mark.parametrize("name", amiwarp.__all__)
+def test_names_that_are_not_called_say_what_is(name: str) -> None:
+    public = getattr(amiwarp, name)
+    made = isinstance(public, type) and not getattr(public, "_is_protocol", False)
+    if name in NOT_CALLED:
+        for arguments in ((), (1, "two")):
+            with pytest.raises(AmiwarpError, match=f"{name} is a type for annotations.*; .*{NOT_CALLED[name]}"):
+                public(*arguments)
+    else:
+        assert made or inspect.isfunction(public) or name == "__version__"
+
+
+def test_names_of_unions_serve_in_checks_and_annotations() -> None:
+    named, union = amiwarp.NominalPrism, Prism | UnsizedPrism | amiwarp.Plate
+    assert isinstance(Prism(0.02), named)
+    assert not isinstance(CAMERA, named)
+    assert issubclass(amiwarp.Plate, named)
+    assert not issubclass(Camera, named)
+    assert (named | None, None | named, named | int) == (union | None, None | union, union | int)
+    assert named is amiwarp.NominalPrism
+
+    def use(one: amiwarp.NominalPrism, other: "amiwarp.Progress | None") -> None: ...
+
+    assert get_type_hints(use)["one"] is named
+    assert repr(named) == "amiwarp.NominalPrism"
+
+    class Own(amiwarp.EventSource):
+        def __init__(self, count: int) -> None:
+            self.count = count
+
+        def __len__(self) -> int:
+            return self.count
+
+    assert len(Own(3)) == 3
 
 
 @pytest.mark.usefixtures("folder")

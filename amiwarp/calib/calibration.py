@@ -117,7 +117,8 @@ def calibrate(
     0.03
     """
     check_names(changes, [entry.name for entry in fields(Settings)], "calibrate: setting ")
-    settings = replace(settings or Settings(), **changes)
+    given: dict[str, Any] = {**changes}  # one word may stand for a tuple of it
+    settings = replace(settings or Settings(), **given)
     settings.check()
     best = best_model(recording) if settings.model == AUTO else settings.model
     if best is None:

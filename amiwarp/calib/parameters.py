@@ -20,7 +20,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.optics import mirror, models, vibration  # noqa: F401  # models in files of their own, which enter themselves in MODELS
 from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
 from amiwarp.optics.prism import NominalPrism, Plate, Prism, UnsizedPrism, as_wedge
-from amiwarp.validation import finite, guarded, one_of, real, shown, vector
+from amiwarp.validation import finite, guarded, instance, one_of, real, shown, vector
 
 NOMINAL_APEX = math.radians(2.0)
 """Apex angle assumed if a recording does not give it [rad]. The search goes up to twice this value."""
@@ -326,8 +326,14 @@ class ParameterSpace:
         return float(sum((values if n in self.names else self.start)[n] - x for n, x in self.undrifted.items()))
 
 
-def check_values(start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]) -> None:
+def check_names(
+    free: tuple[str, ...] | None, start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+) -> None:
     """Check that parameter names are strings and their values finite numbers; else raise :class:`AmiwarpError`."""
+    if free is not None and not isinstance(free, tuple | list):
+        raise AmiwarpError(f"free is {shown(free)}; expected a tuple of parameter names, or None")
+    for name in free or ():
+        instance(name, str, "free parameter")
     for given, what in ((start, "start"), (bounds, "bounds")):
         if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
             raise AmiwarpError(f"{what} is {shown(given)}; expected values by parameter name")

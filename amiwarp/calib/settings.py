@@ -8,7 +8,7 @@ from typing import TypedDict
 
 from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
-from amiwarp.calib.parameters import check_values
+from amiwarp.calib.parameters import check_names
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS
@@ -141,7 +141,8 @@ class Settings:
         if self.global_algorithm is not None:
             one_of(self.global_algorithm, GLOBAL_ALGORITHMS, "algorithm")
         one_of(self.local_algorithm, LOCAL_ALGORITHMS, "algorithm")
-        if self.stages not in (STAGES, STAGES[:1]):
+        words = isinstance(self.stages, tuple) and all(isinstance(stage, str) for stage in self.stages)
+        if not words or self.stages not in (STAGES, STAGES[:1]):
             raise AmiwarpError(f"stages is {shown(self.stages)}; expected 'sharpness' or {STAGES}")
         for name in ("global_evaluations", "local_evaluations", "events"):
             whole(getattr(self, name), name, 1, LARGEST_BUDGET)
@@ -149,7 +150,7 @@ class Settings:
         whole(self.seed, "seed", 0, 2**31 - 1)
         real(self.tolerance_px, "tolerance_px", 0.0, 1e3, " px")
         real(self.smoothing_px, "smoothing_px", 0.0, 1e3, " px")
-        check_values(self.start, self.bounds)
+        check_names(self.free, self.start, self.bounds)
         self.photometric.check()
 
 

@@ -20,7 +20,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.truth import StoredInstants, Truth
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import NominalPrism
-from amiwarp.validation import INT64, TIME_LIMIT, as_times, guarded, instance, packed, shown, whole
+from amiwarp.validation import INT64, TIME_LIMIT, as_times, guarded, instance, not_called, packed, shown, whole
 from amiwarp.validation import array as as_numbers
 
 # Conversion and checks of event arrays: types, time limits, frame and order.
@@ -413,6 +413,7 @@ class Events:
         return described("Events", *facts, span=span, count=len(self))
 
 
+@not_called("wrap events as amiwarp.MemoryEvents(events, width, height)")
 @runtime_checkable
 class EventSource(Protocol):
     """Source of sorted events: arrays in memory, an indexed file, or a file that is read from its start.
@@ -702,6 +703,7 @@ def mean_rate(t: NDArray[np.int64]) -> float | None:
     return (len(t) - 1) * 1e6 / span if span > 0 else None
 
 
+@not_called("wrap frames as amiwarp.MemoryImages(t, images)")
 class ImageStore(StoredInstants[NDArray[Any]], Protocol):
     """Protocol of the frames of a recording: grey levels, uint8 or uint16, shape ``(height, width)``.
 

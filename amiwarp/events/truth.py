@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
@@ -10,14 +9,15 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from amiwarp.choices import Option
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import INT64, array, as_times, check_ascending, finite, guarded, instance, shown, whole
+from amiwarp.validation import INT64, array, as_times, check_ascending, finite, guarded, instance, not_called, shown, whole
 
 Item = TypeVar("Item", covariant=True)
 """What a store returns: an array, or a record."""
 
 
-class Cause(enum.StrEnum):
+class Cause(Option):
     """Cause of a simulated event. Arrays and files hold the code of a cause: its position in this list, from 0.
 
     Examples
@@ -61,10 +61,12 @@ class StoredInstants(Protocol[Item]):
         """Return the record at ``t[index]``."""
 
 
+@not_called("a NumPy array with one row per event serves")
 class EventValues(StoredRows[NDArray[Any]], Protocol):
     """Protocol of arrays with one row per event, shape ``(n,)`` or ``(n, k)``."""
 
 
+@not_called("a NumPy array of shape (n, 2) serves")
 class PointStore(StoredRows[NDArray[np.float32]], Protocol):
     """Protocol of one point per event [px], shape ``(n, 2)``, float32."""
 
@@ -231,6 +233,7 @@ def check_truth(name: str, values: NDArray[Any]) -> None:
         raise AmiwarpError(f"'{name}' holds {values[bad][0]}, which has no meaning there; give finite numbers")
 
 
+@not_called("simulate(..., truth_hz=...) makes one, recording.truth.frames")
 class FrameStore(StoredInstants[FrameTruth], Protocol):
     """Protocol of the ground truth of all pixels at several instants, at increasing times."""
 
@@ -358,6 +361,7 @@ def rotation_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
 
 
+@not_called("translate makes one, recording.truth.known")
 class KnownStore(StoredInstants[NDArray[np.bool_]], Protocol):
     """Protocol of masks of the pixels whose scene is known, shape ``(height, width)``.
 
@@ -379,6 +383,7 @@ class MemoryMasks:
         return np.unpackbits(self._bits[index], count=rows * columns).reshape(self._shape).astype(np.bool_)
 
 
+@not_called("make poses as amiwarp.Poses(t, camera)")
 class PoseStore(StoredRows[Poses], Protocol):
     """Protocol of tables of poses: :class:`amiwarp.Poses`, or a file that is read on demand."""
 

@@ -5,7 +5,6 @@ A new format is a module with its functions, and its rows in the tables of this 
 
 from __future__ import annotations
 
-import enum
 import importlib
 import os
 import re
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.choices import Option
 from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.recording import Recording
 from amiwarp.io.files import check_regular, errors_name, name_kind, note_folders, open_input
@@ -28,7 +28,7 @@ from amiwarp.validation import choice, guarded, instance, shown, whole
 # Formats that are read.
 
 
-class Format(enum.StrEnum):
+class Format(Option):
     """File formats of recordings that amiwarp reads."""
 
     HDF5 = "hdf5"
@@ -249,7 +249,7 @@ def check_topic(path: Path, topic: str | None, found: Format) -> None:
 # Formats that are written.
 
 
-class OutputFormat(enum.StrEnum):
+class OutputFormat(Option):
     """Formats of recordings that can be written.
 
     Examples
@@ -274,7 +274,7 @@ class OutputFormat(enum.StrEnum):
     """ROS 2 bag of event_camera_msgs packets in EVT 3.0 (.mcap or .db3)."""
 
 
-class Rounding(enum.StrEnum):
+class Rounding(Option):
     """Ways to round the sub-pixel coordinates of compensated events, for formats that hold whole pixels.
 
     Examples
@@ -289,7 +289,7 @@ class Rounding(enum.StrEnum):
     """Up or down at random: up with the fractional part as probability, so that the mean coordinate is unbiased."""
 
 
-class Codec(enum.StrEnum):
+class Codec(Option):
     """Compression of native recordings.
 
     Examples

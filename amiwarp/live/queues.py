@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from amiwarp.choices import Option
 from amiwarp.events.recording import OVERHEAD, Events
 from amiwarp.validation import choice, whole
 
@@ -154,7 +155,7 @@ class BackgroundWorker:
 # Policies of a full queue of events.
 
 
-class Policy(enum.StrEnum):
+class Policy(Option):
     """What a full queue does with further events."""
 
     BLOCK = "block"

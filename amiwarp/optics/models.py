@@ -33,7 +33,7 @@ from amiwarp.optics.prism import (
     check_phase,
     deflection_from_apex,
 )
-from amiwarp.validation import array, choice, guarded, instance, one_of, real, shown, vector, whole
+from amiwarp.validation import array, choice, guarded, instance, not_called, one_of, real, shown, vector, whole
 
 # Base class of the optical models: what a model knows of itself, and the displacement of points on any device.
 
@@ -95,6 +95,7 @@ AMPLITUDE = Parameter(
 """Size of a motion that no glass makes."""
 
 
+@not_called("make a model such as amiwarp.ExactModel(camera, prism)")
 class Model:
     """Optical model: displaces the pixels of a camera by the angle of its prism, and knows its parameters.
 

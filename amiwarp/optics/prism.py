@@ -5,11 +5,11 @@ This is the glass only. Its motion is that of the encoder, :mod:`amiwarp.events.
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import dataclass
 from typing import TypeAlias, overload
 
+from amiwarp.choices import Option
 from amiwarp.errors import AmiwarpError
 from amiwarp.validation import choice, guarded, instance, real, vector
 
@@ -28,7 +28,7 @@ _ABOVE_ONE, _BELOW_LARGEST_INDEX = math.nextafter(1.0, 2.0), math.nextafter(LARG
 _BELOW_RIGHT_ANGLE = math.nextafter(math.pi / 2.0, 0.0)
 
 
-class FlatSide(enum.StrEnum):
+class FlatSide(Option):
     """The side that the flat face of the prism points to."""
 
     SCENE = "scene"

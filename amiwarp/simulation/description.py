@@ -25,7 +25,7 @@ from amiwarp.optics.vibration import VibrationModel
 from amiwarp.simulation.pictures import linear_luminance, read_picture
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.world import BLUR_PX, WorldScene
-from amiwarp.validation import INT64, array, guarded, instance, real, vector, whole
+from amiwarp.validation import INT64, array, guarded, instance, not_called, real, vector, whole
 
 # Motion of the prism and of the camera, and the encoder that measures the prism.
 
@@ -488,6 +488,7 @@ class EncoderModel:
 # Scene, and all values of a simulation.
 
 
+@not_called("derive a class for amiwarp.Scene, or make a scene of one picture with amiwarp.Scene.from_picture")
 class Frames(Protocol):
     """Pictures with times, which are read one after the other (protocol)."""
 

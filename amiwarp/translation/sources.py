@@ -1,7 +1,6 @@
 """What is translated: data sets by name, and pictures between the pictures of a sequence, by flow or by events."""
 
 import contextlib
-import enum
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.choices import CONTRAST
+from amiwarp.choices import CONTRAST, Option
 from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.recording import Events, EventSource
 from amiwarp.io.files import errors_name, input_path
@@ -32,7 +31,7 @@ MVSEC_PICTURES = "davis/left/image_raw"
 """Pictures of the left camera in the HDF5 files of MVSEC; their times have the suffix ``_ts`` [s]."""
 
 
-class DataSet(enum.StrEnum):
+class DataSet(Option):
     """Data sets whose motion, or whose file layout, is known.
 
     Examples
@@ -205,7 +204,7 @@ LEAST_CONSISTENT = 0.5
 """Smallest share of pixels whose flow is consistent; with fewer, the flow is meaningless and pictures are blended."""
 
 
-class Interpolation(enum.StrEnum):
+class Interpolation(Option):
     """How the light changes between two pictures.
 
     Examples

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import enum
 import hashlib
 import importlib
 import io
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from amiwarp._version import __version__
+from amiwarp.choices import Option
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import formats
 from amiwarp.io.export import export
@@ -42,7 +42,7 @@ MOST_EVENTS = 2**31 - 1
 """Largest number of events of a recording in Parquet, whose lists have 32-bit offsets."""
 
 
-class ExportFormat(enum.StrEnum):
+class ExportFormat(Option):
     """Layouts to which data sets are exported.
 
     Examples
