@@ -409,6 +409,19 @@ def test_written_recording_is_the_one_in_memory(tmp_path: Path) -> None:
 # -- motion and encoder
 
 
+@pytest.mark.parametrize("speed", [-500.0, 600, np.float32(90.0)])
+def test_a_constant_speed_stands_for_a_motion(speed: Any) -> None:
+    scene = Scene.from_picture(np.random.default_rng(0).random((64, 64)))
+    by_speed = Simulation(scene, CAMERA, Prism(0.03), 0.01, motion=speed)
+    by_motion = Simulation(scene, CAMERA, Prism(0.03), 0.01, motion=PrismMotion(speed))
+    assert isinstance(by_speed.motion, PrismMotion)
+    assert by_speed.prism_motion is by_speed.motion
+    assert same(by_speed.run(), by_motion.run())
+    assert same(by_speed.run(), simulate(scene, CAMERA, Prism(0.03), duration_s=0.01, motion=speed))
+    with pytest.raises(AmiwarpError, match=r"prism speed is 'fast'.*expected numbers"):
+        replace(by_speed, motion="fast")
+
+
 def test_prism_angle_is_the_integral_of_the_speed() -> None:
     table = np.array([[-0.1, 100.0], [0.2, 700.0], [0.5, 700.0], [0.6, -300.0]])
     motion = PrismMotion(table)

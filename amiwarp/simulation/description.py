@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -605,8 +605,11 @@ class SimulationValues:
     A plate needs a world, which is seen by rays."""
     duration_s: float
     """Duration of the recording [s]."""
-    motion: PrismMotion = field(default_factory=PrismMotion)
-    """Motion of the prism: speed, phase, tilt, cylinder power and wobble. Vibrations and mirrors have their own."""
+    motion: PrismMotion | float = field(default_factory=PrismMotion)
+    """Motion of the prism: speed, phase, tilt, cylinder power and wobble; or its constant speed [turns/min].
+
+    A speed becomes a :class:`PrismMotion`. Vibrations and mirrors have their own motion.
+    """
     camera_motion: CameraMotion = field(default_factory=CameraMotion)
     """Rotation of the camera; by default none."""
     sensor: SensorModel = field(default_factory=SensorModel)
@@ -630,10 +633,12 @@ class SimulationValues:
             instance(self.scene, Scene, "simulation's scene")
         if isinstance(self.prism, Moved):
             object.__setattr__(self, "motion", self.prism.motion)
+        elif not isinstance(self.motion, PrismMotion):
+            object.__setattr__(self, "motion", PrismMotion(self.motion))
         if isinstance(self.prism, Vibration):
             object.__setattr__(self, "encoder_model", None)
         kinds: dict[str, type] = {
-            "camera": Camera, "motion": PrismMotion, "sensor": SensorModel, "camera_motion": CameraMotion,
+            "camera": Camera, "sensor": SensorModel, "camera_motion": CameraMotion,
         }  # fmt: skip
         if not isinstance(self.prism, Plate | Moved):
             kinds["prism"] = Prism
@@ -652,9 +657,14 @@ class SimulationValues:
             given, expected = (f"{width}x{height}" for width, height in (self.pixels.size, size))
             raise AmiwarpError(f"the pixel map has {given} pixels, the camera {expected}; give the map of this camera")
         whole(self.seed, "seed", 0, (1 << 31) - 1)
-        if not isinstance(self.prism, Mirror) and (self.glass.second is None) != (self.motion.second is None):
-            has, lacks = ("prism", "motion") if self.motion.second is None else ("motion", "prism")
+        if not isinstance(self.prism, Mirror) and (self.glass.second is None) != (self.prism_motion.second is None):
+            has, lacks = ("prism", "motion") if self.prism_motion.second is None else ("motion", "prism")
             raise AmiwarpError(f"the {has} has a second prism, the {lacks} has none; give both or neither")
+
+    @property
+    def prism_motion(self) -> PrismMotion:
+        """Motion of the prism; that of the vibration or mirror, if there is one."""
+        return cast(PrismMotion, self.motion)
 
     @property
     def duration_us(self) -> int:
@@ -665,7 +675,7 @@ class SimulationValues:
         """Let a world be seen by rays; raise :class:`AmiwarpError` for what a plate cannot show."""
         if not isinstance(self.scene, WorldScene):
             raise AmiwarpError("a plate does not move a picture, which is at infinity; give a world (--world room)")
-        if any((*self.motion.tilt, *self.motion.cylinder, *self.motion.wobble)):
+        if any((*self.prism_motion.tilt, *self.prism_motion.cylinder, *self.prism_motion.wobble)):
             raise AmiwarpError("tilt, cylinder and wobble are those of a prism; leave them out for a plate")
         object.__setattr__(self, "scene", replace(self.scene, seeing=Seeing.RAYS))
 
@@ -684,13 +694,13 @@ class SimulationValues:
         """The same values with a prism that bends no ray, or a mirror that is not tilted."""
         if isinstance(self.prism, Mirror):
             return replace(self, prism=replace(self.prism, amplitude=(0.0, 0.0)))
-        motion = replace(self.motion, cylinder=(0.0, 0.0), second=None)
+        motion = replace(self.prism_motion, cylinder=(0.0, 0.0), second=None)
         return replace(self, prism=replace(self.glass, apex=0.0, second=None), motion=motion)
 
     @property
     def bending(self) -> ExactModel | RisleyModel:
         """True model of how a prism changes the direction of rays; with other optics, of one that does not."""
-        motion, second, prism = self.motion, self.motion.second, self.glass
+        motion, second, prism = self.prism_motion, self.prism_motion.second, self.glass
         if second is None or prism.second is None:
             return ExactModel(self.camera, prism, motion.phase, motion.tilt, motion.cylinder, motion.wobble)
         turned, by = second.angle([1e6 * self.duration_s])[0], motion.angle([1e6 * self.duration_s])[0]
@@ -699,7 +709,7 @@ class SimulationValues:
     @property
     def plate(self) -> PlateModel | None:
         """True model of the plate, for a scene at infinity; None for a prism."""
-        return PlateModel(self.camera, self.prism, self.motion.phase) if isinstance(self.prism, Plate) else None
+        return PlateModel(self.camera, self.prism, self.prism_motion.phase) if isinstance(self.prism, Plate) else None
 
     @property
     def moving_model(self) -> Model:

@@ -103,7 +103,9 @@ def step_us(
     """
     motion = image_motion(simulation, inverse_depth)
     rates = simulation.camera_motion.largest_rates
-    turning = np.array([each.largest_speed for each in (simulation.motion, simulation.motion.second) if each])
+    turning = np.array(
+        [each.largest_speed for each in (simulation.prism_motion, simulation.prism_motion.second) if each]
+    )
     speed = float(motion.prisms @ turning) + float(motion.camera @ rates) + world_speed
     bend = float(motion.bends @ turning**2) / 8.0  # [px/s²]: the distance from the chord, per squared step
     step = 1e6 * min(LARGEST_MOTION / max(speed, 1e-9), math.sqrt(LARGEST_BEND / max(bend, 1e-9)))
@@ -127,7 +129,7 @@ def shake(simulation: SimulationValues, t_us: NDArray[np.float64]) -> NDArray[np
     if not isinstance(simulation.prism, Moved):
         return np.eye(3)
     model = simulation.prism.model(simulation.camera)
-    return mirrored(simulation) @ model.rotations(simulation.motion.angles(t_us))
+    return mirrored(simulation) @ model.rotations(simulation.prism_motion.angles(t_us))
 
 
 def mirrored(simulation: SimulationValues) -> NDArray[np.float64]:
@@ -206,7 +208,7 @@ def seen_bearings(simulation: SimulationValues) -> NDArray[np.float64]:
         [np.stack([x * right, y * bottom], 1) for x, y in ((along, zero), (along, one), (zero, along), (one, along))]
     )
     border = np.round(border)
-    motion, moved = simulation.motion, simulation.prism if isinstance(simulation.prism, Moved) else None
+    motion, moved = simulation.prism_motion, simulation.prism if isinstance(simulation.prism, Moved) else None
     turns = moved is not None or simulation.glass.apex > 0.0 or any(motion.cylinder) or motion.second is not None
     turn = np.arange(24) * (2.0 * np.pi / 24) if turns else np.zeros(1)
     others = turn if motion.second is not None else np.zeros(1)

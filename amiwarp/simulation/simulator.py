@@ -227,7 +227,7 @@ class TruthRenderer:
 
     def _angles(self, t_us: int) -> NDArray[np.float64]:
         """Return the prism angle of all pixels at a time [rad], shape (n,), or (n, 2) for two prisms."""
-        return np.repeat(wrap_angle(self._simulation.motion.angles([t_us])), len(self._rays), axis=0)
+        return np.repeat(wrap_angle(self._simulation.prism_motion.angles([t_us])), len(self._rays), axis=0)
 
     def _moved(
         self, seen: scenery.SurfaceView, places: NDArray[np.float64], t_us: int, next_us: int | None, *, prism: bool
@@ -273,7 +273,7 @@ class TruthRenderer:
         size = np.linalg.norm(speed, axis=1, keepdims=True)
         aside = speed / np.maximum(size, 1e-9)
         along = [model.deflect_points(places + sign * aside, theta) for sign in (-1.0, 1.0)]
-        motion, duration_s = self._simulation.motion, self._simulation.duration_s
+        motion, duration_s = self._simulation.prism_motion, self._simulation.duration_s
         rates = np.atleast_1d(rate_of_change(lambda at: motion.angles([1e6 * at])[0], t_us * 1e-6, duration_s))
         flow = (along[1] - along[0]) / 2.0 * size
         for rate, alone in zip(rates, np.eye(len(rates)), strict=True):
@@ -295,7 +295,7 @@ class TruthRenderer:
 
     def _plate_centres(self, rays: NDArray[np.float64], t: float) -> NDArray[np.float32]:
         """Return where rays of the camera begin through the plate at time ``t`` [s]: places [m], shape (n, 3)."""
-        motion = self._simulation.motion
+        motion = self._simulation.prism_motion
         return self._sight.centres(rays, motion.phase + float(motion.angle([t * 1e6])[0]))
 
     def _plate_pixels(
@@ -305,7 +305,7 @@ class TruthRenderer:
 
         ``rays``, ``depth``: directions and depths [m] of the points from the camera at this time.
         """
-        theta = np.full(len(rays), float(self._simulation.motion.angle([later * 1e6])[0]))
+        theta = np.full(len(rays), float(self._simulation.prism_motion.angle([later * 1e6])[0]))
         at, observed = self._simulation.camera.rays_to_pixels(rays), self._pixels
         for _ in range(DEFLECTING_STEPS):
             observed = observed - (model.compensate_at(observed, theta, 1.0 / depth) - at)
@@ -333,7 +333,7 @@ class TruthRenderer:
             simulation = cast("Simulation", simulation).without_prism()
         sight.set_instants(np.array([float(t_us)]), scenery.prism_view_of(simulation, device))
         table: NDArray[Any] = np.zeros(1, cast("Any", prism_view.Step).numpy_dtype())
-        first, second = true_angles(simulation.motion, np.array([float(t_us)]))
+        first, second = true_angles(simulation.prism_motion, np.array([float(t_us)]))
         table["azimuth"], table["second"] = azimuths_of(first), azimuths_of(second)
         steps = prism_view.Steps()
         steps.at = wp.array(table, dtype=prism_view.Step, device=device)
@@ -766,7 +766,7 @@ class Engine:
         self._margin = int(pixels.LARGEST_LAG) // (int(pixels.TICKS) * self._step) + 2
         self._shift = int(pixels.LOW_BITS) + (self._pixels - 1).bit_length()
         self._chunk_steps = self._steps_per_chunk(chunk_us, longest_chunk)
-        self._axis = axis_rotation(*simulation.motion.tilt)
+        self._axis = axis_rotation(*simulation.prism_motion.tilt)
         self._sensor = sensor_params(simulation.sensor, self._step)
         self._view = scenery.prism_view_of(simulation, self._device)
         if self._maps is not None:
@@ -820,7 +820,7 @@ class Engine:
         """
         simulation, margin = self._simulation, self._margin
         t = np.arange(first - margin, first + count + 1, dtype=np.float64) * self._step
-        angle, second = true_angles(simulation.motion, t)
+        angle, second = true_angles(simulation.prism_motion, t)
         steps = prism_view.Steps()
         table: NDArray[Any] = np.zeros(len(t), cast("Any", prism_view.Step).numpy_dtype())
         table["azimuth"], table["second"] = azimuths_of(angle), azimuths_of(second)
@@ -1024,7 +1024,7 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
     uneven = {
         f"{name}_{axis}": angle
         for name in ("tilt", "cylinder", "wobble")
-        for axis, angle in zip("xy", getattr(simulation.motion, name), strict=True)
+        for axis, angle in zip("xy", getattr(simulation.prism_motion, name), strict=True)
     }
     size = (
         {"apex": glass.apex} if isinstance(glass, Prism) else {"thickness": glass.thickness, "plate_tilt": glass.tilt}
@@ -1032,7 +1032,7 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
     return {
         **size,
         "index": glass.index,
-        "phase": simulation.motion.phase,
+        "phase": simulation.prism_motion.phase,
         **of_second_prism(simulation),
         **clock,
         **(uneven if isinstance(glass, Prism) else {}),
@@ -1122,7 +1122,7 @@ class Simulation(SimulationValues):
         """
         if self.encoder_model is None:
             return None
-        return self.encoder_model.sample(self.motion, self.duration_us, self.seed)
+        return self.encoder_model.sample(self.prism_motion, self.duration_us, self.seed)
 
     def truth_parameters(self) -> dict[str, float]:
         """Return the true values of the parameters of prism, encoder, camera motion and sensor.
@@ -1391,7 +1391,7 @@ def simulate(
         camera=camera,
         prism=prism,
         duration_s=duration_s,
-        motion=motion if isinstance(motion, PrismMotion) else PrismMotion(motion),
+        motion=motion,
         camera_motion=camera_motion or CameraMotion(),
         sensor=sensor or SensorModel(),
         pixels=pixels,

@@ -448,7 +448,7 @@ def make(condition: Condition, seed: int, device: str = "cpu") -> SimulatedSampl
     if condition.readout_us:
         events = scanned(events, condition.readout_us)
     events = skewed(events, condition)
-    motion = simulation.motion
+    motion = simulation.prism_motion
     if condition.lost_part:
         begin = rng.uniform(0.0, TWO_PI)
         events = events[(motion.angle(events.t) - begin) % TWO_PI >= condition.lost_part * TWO_PI]
