@@ -283,6 +283,7 @@ _REMEDIES = {
     ("Recording", "path"): "write it with amiwarp.save_recording, and give the file",
     ("Events", "Recording"): "make one with amiwarp.Recording(amiwarp.MemoryEvents(events, width, height))",
     ("Events", "EventSource"): "wrap them as amiwarp.MemoryEvents(events, width, height)",
+    ("DeviceEvents", "EventSource"): "wrap them as amiwarp.DeviceMemoryEvents(events, width, height)",
 }
 """What to do with a value of one kind where an object of a class is expected."""
 

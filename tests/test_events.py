@@ -1,5 +1,6 @@
 """Events, blocks and sources in memory."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -232,6 +233,24 @@ def test_representations_are_short(tmp_path):
     assert repr(amiwarp.Recording(source)).endswith("events only)")
     amiwarp.save_recording(tmp_path / "a.h5", recording)
     assert repr(amiwarp.open_recording(tmp_path / "a.h5").events) == repr(source).replace("Memory", "Native")
+
+
+def test_a_recording_wraps_events_in_the_size_of_its_camera():
+    events = amiwarp.Events.from_arrays([1, 7], [0, 5], [0, 10], [1, 0])
+    camera = amiwarp.Camera.from_fov(8, 6, 1.0)
+    recording = amiwarp.Recording(events, camera, name="wall")
+    assert isinstance(recording.events, MemoryEvents)
+    assert recording.events.size == (8, 6)
+    assert_equal(recording.events[:], events)
+    again = dataclasses.replace(recording, metadata={"a": 1})
+    assert (again.events, again.camera, again.name, again.metadata) == (recording.events, camera, "wall", {"a": 1})
+    with pytest.raises(AmiwarpError, match=r"no sensor size; give the camera too, or .*MemoryEvents\(events, width"):
+        amiwarp.Recording(events)
+    with pytest.raises(AmiwarpError, match=r"event 1 \(x=7, y=5, t=10 us\) lies outside the 6x8 frame"):
+        amiwarp.Recording(events, amiwarp.Camera.from_fov(6, 8, 1.0))
+    on_device = DeviceEvents.from_arrays(events.x, events.y, events.t, events.p)
+    with pytest.raises(AmiwarpError, match=r"wrap them as amiwarp.DeviceMemoryEvents\(events, width, height\)"):
+        amiwarp.Recording(on_device, camera)
 
 
 def test_empty_source_has_no_first_time():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence, Sized
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
 
@@ -793,10 +793,12 @@ class Recording:
     >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4), name="example")
     >>> len(recording.events), recording.camera
     (2, None)
+    >>> amiwarp.Recording(events, amiwarp.Camera.from_fov(4, 4, 1.0)).events.size
+    (4, 4)
     """
 
     events: EventSource
-    """Events of the recording, in order of time."""
+    """Events of the recording, in order of time. :class:`amiwarp.Events` may be given with a camera, for their size."""
     camera: Camera | None = None
     """Camera intrinsics, or None if unknown."""
     encoder: Encoder | None = None
@@ -813,6 +815,31 @@ class Recording:
     """Samples of the camera's inertial measurement unit, or None."""
     frames: ImageStore | None = None
     """Frames that the camera recorded with the events, read on demand, or None."""
+
+    def __init__(
+        self,
+        events: EventSource | Events,
+        camera: Camera | None = None,
+        encoder: Encoder | None = None,
+        prism: NominalPrism | None = None,
+        truth: Truth | None = None,
+        metadata: dict[str, MetadataValue] | None = None,
+        name: str = "recording",
+        imu: ImuSamples | None = None,
+        frames: ImageStore | None = None,
+    ) -> None:
+        """Store the fields. Events in memory become :class:`amiwarp.MemoryEvents` of the camera's size."""
+        if isinstance(events, Events):
+            if camera is None:
+                raise AmiwarpError(
+                    "Recording: events have no sensor size; give the camera too, or give "
+                    "amiwarp.MemoryEvents(events, width, height)"
+                )
+            events = MemoryEvents(events, camera.width, camera.height)
+        metadata = {} if metadata is None else metadata
+        values = (events, camera, encoder, prism, truth, metadata, name, imu, frames)
+        for one, value in zip(fields(self), values, strict=True):
+            object.__setattr__(self, one.name, value)
 
     def __repr__(self) -> str:
         others = ("camera", "encoder", "prism", "truth", "imu", "frames")

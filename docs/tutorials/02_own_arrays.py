@@ -76,9 +76,8 @@ print(f"{encoder.rpm:.1f} turns/min, largest slip {slip:.2f} deg")
 # A :class:`amiwarp.Recording` joins the events with the camera, the encoder and the
 # prism. The file has amiwarp's HDF5 format, which every command reads.
 
-source = amiwarp.MemoryEvents(events, camera.width, camera.height)
 recording = amiwarp.Recording(
-    source, camera, encoder, prism, metadata={"lens": "8 mm"}
+    events, camera, encoder, prism, metadata={"lens": "8 mm"}
 )
 
 with TemporaryDirectory() as folder:
