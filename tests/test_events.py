@@ -13,6 +13,7 @@ import amiwarp
 from amiwarp import AmiwarpError, DeviceEvents, Events, EventSource, MemoryEvents, Truth
 from amiwarp.events.device_events import device_for
 from amiwarp.events.recording import check_events, regroup
+from amiwarp.events.truth import MemoryMasks
 
 
 def make(t: list[int]) -> Events:
@@ -293,6 +294,45 @@ def test_truth_points():
     truth = Truth({"apex": 0.03}, points)
     np.testing.assert_array_equal(truth.points(1, 3), points[1:3])
     assert Truth({}).points(0, 4) is None
+
+
+def test_a_printed_truth_is_short():
+    glass = {"bus_queue": 4096.0, "phase": 1.0, "apex": 0.03, "index": 1.5}
+    assert repr(Truth(glass, np.zeros((4, 2), np.float32), np.zeros(4, np.uint8))) == (
+        "Truth(apex 1.7189 deg, index 1.5, phase 57.296 deg, 1 more parameters;\n      points, causes of events)"
+    )
+    labels = amiwarp.WorldLabels("room", ("wall", "chair"), ("", ""))
+    masks = MemoryMasks([3, 9], [np.ones((2, 3), np.bool_)] * 2)
+    assert repr(Truth({"x_hz": 30.0}, labels=labels, known=masks)) == (
+        "Truth(x_hz 30;\n      2 masks, labels of 2 instances)"
+    )
+    assert repr(Truth()) == "Truth(no parameters;\n      nothing else)"
+
+
+def test_records_at_several_times_are_a_sequence():
+    """Frames, ground truth of all pixels and masks, in memory: tests of files compare with these."""
+    images = np.arange(24, dtype=np.uint8).reshape(4, 2, 3)
+    frames = amiwarp.MemoryImages(np.array([5, 6, 8, 9]), images)
+    assert len(frames) == 4
+    np.testing.assert_array_equal(list(frames), images)
+    np.testing.assert_array_equal(frames[-1], images[3])
+    for which in (slice(1, 3), slice(-2, None), slice(None, None, -1), slice(3, 1), slice(None, None, 2)):
+        part = frames[which]
+        assert part.t.tolist() == frames.t[which].tolist()
+        assert part.size == (3, 2)
+        assert len(part) == len(images[which])
+        assert [image.tolist() for image in part] == images[which].tolist()
+    assert frames[1:][:2][-1].tolist() == images[2].tolist()
+    masks = MemoryMasks([3, 9], [np.ones((2, 3), np.bool_), np.zeros((2, 3), np.bool_)])
+    assert [mask.all() for mask in masks[::-1]] == [False, True]
+    assert repr(frames) == "MemoryImages(4 records, t 5 .. 9 us)"
+    assert repr(frames[:1]) == "Slice(1 record, t 5 .. 5 us)"
+    for index in (4, -5):
+        with pytest.raises(IndexError, match=f"index {index} is not one of 4 records"):
+            frames[index]
+    for index in ("a", 1.5, None, slice("a", 2)):
+        with pytest.raises(AmiwarpError, match=r"index of a record is .*; give a whole number or a slice"):
+            frames[index]
 
 
 def test_blocks_on_a_device_are_joined_in_order():

@@ -298,7 +298,14 @@ def test_many_faults_are_refused(tmp_path, name):
     with pytest.raises(AmiwarpError, match=r"backwards: \d+ of 600 events are out of order"):
         open_recording(path)
     path = write_unsound(tmp_path / "wide", name, Events(EVENTS.x + np.uint16(100), EVENTS.y, EVENTS.t, EVENTS.p))
-    with pytest.raises(AmiwarpError, match=r"wide: \d+ of 600 events lie outside the frame \(320, 240\)"):
+    with pytest.raises(AmiwarpError, match=r"wide: \d+ of 600 events lie outside the 320x240 frame"):
+        open_recording(path)
+
+
+def test_pixels_that_no_sensor_has_are_named_without_a_size(tmp_path):
+    path = tmp_path / "left.txt"
+    path.write_text("".join(f"{k * 1e-3} -1 5 1\n" for k in range(20)))
+    with pytest.raises(AmiwarpError, match=r"left.txt: 20 of 20 events lie outside pixels 0 .. 65535; the file"):
         open_recording(path)
 
 

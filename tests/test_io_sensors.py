@@ -59,7 +59,14 @@ def test_native_recordings_keep_both_bit_for_bit(tmp_path: Path, dtype: Any) -> 
     plain = Recording(MemoryEvents(EVENTS, *SIZE))
     whole = replace(plain, imu=make_imu(), frames=make_images(dtype))
     save_recording(tmp_path / "a.h5", whole)
-    assert_same_sensors(open_recording(tmp_path / "a.h5"), whole)
+    stored = open_recording(tmp_path / "a.h5")
+    assert_same_sensors(stored, whole)
+    assert stored.frames is not None
+    save_recording(tmp_path / "part.h5", replace(stored, frames=stored.frames[1:3]))
+    part = open_recording(tmp_path / "part.h5").frames
+    assert part is not None
+    assert (len(part), part.t.tolist()) == (2, whole.frames.t[1:3].tolist())
+    np.testing.assert_array_equal(list(part), list(whole.frames[1:3]))
     assert convert(tmp_path / "a.h5", tmp_path / "b.h5", codec="gzip").left_out == ()
     assert_same_sensors(open_recording(tmp_path / "b.h5"), whole)
     assert {"IMU samples", "frames"} <= set(convert(tmp_path / "a.h5", tmp_path / "c.npz").left_out)
@@ -77,11 +84,14 @@ def test_frames_in_order_take_one_pass_over_the_file(data_dir: Path, monkeypatch
     frames: Any = open_recording(data_dir / "aedat/aedat4_davis346_cars.aedat4").frames
     passes, start = [], frames._images
     monkeypatch.setattr(frames, "_images", lambda: passes.append(start()) or passes[-1])
-    seen = [frames[index] for index in range(len(frames.t))]
+    seen = list(frames)
     assert len(passes) == 1
+    assert len(seen) == len(frames) == len(frames.t) == 4
     assert passes[0].gi_frame is None
     np.testing.assert_array_equal(frames[1], seen[1])
     assert len(passes) == 2
+    np.testing.assert_array_equal(frames[-1], seen[3])
+    np.testing.assert_array_equal(list(frames[1:3]), seen[1:3])
 
 
 def test_wrong_arrays_are_refused(tmp_path: Path) -> None:

@@ -107,8 +107,7 @@ def same_truth(a: amiwarp.Recording, b: amiwarp.Recording) -> None:
         np.testing.assert_array_equal(getattr(of_a, name), getattr(of_b, name), strict=True)
     assert truth_of(a).labels == truth_of(b).labels
     np.testing.assert_array_equal(frames_of(a).t, frames_of(b).t)
-    for index in range(len(frames_of(a).t)):
-        one, other = frames_of(a)[index], frames_of(b)[index]
+    for one, other in zip(frames_of(a), frames_of(b), strict=True):
         for name in MAPS:
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name), strict=True)
         np.testing.assert_allclose(one.rotation, other.rotation, rtol=0, atol=1e-14)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.truth import StoredInstants, Truth
+from amiwarp.events.truth import Instants, StoredInstants, Truth
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import NominalPrism
 from amiwarp.validation import INT64, TIME_LIMIT, as_times, guarded, instance, not_called, packed, shown, whole
@@ -716,7 +716,7 @@ class ImageStore(StoredInstants[NDArray[Any]], Protocol):
 
 
 @guarded
-class MemoryImages:
+class MemoryImages(Instants[NDArray[Any]]):
     """Frames of a recording that are held in memory.
 
     Parameters
@@ -735,8 +735,8 @@ class MemoryImages:
     --------
     >>> import numpy as np
     >>> frames = amiwarp.MemoryImages(np.array([0, 40_000]), np.zeros((2, 3, 4), np.uint8))
-    >>> frames.size, frames[1].shape
-    ((4, 3), (3, 4))
+    >>> frames.size, len(frames), frames[-1].shape, frames[1:].t.tolist()
+    ((4, 3), 2, (3, 4), [40000])
     """
 
     def __init__(self, t: NDArray[np.int64], images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
@@ -749,12 +749,8 @@ class MemoryImages:
         first = images[0]
         for image in images:
             check_image(image, first.shape, first.dtype)
-        self._t, self._images = t, images
-
-    @property
-    def t(self) -> NDArray[np.int64]:
-        """Times of the frames [us], shape ``(k,)``."""
-        return self._t
+        super().__init__(t)
+        self._images = images
 
     @property
     def size(self) -> tuple[int, int]:
@@ -762,7 +758,7 @@ class MemoryImages:
         height, width = self._images[0].shape
         return width, height
 
-    def __getitem__(self, index: int, /) -> NDArray[Any]:
+    def _read(self, index: int) -> NDArray[Any]:
         return self._images[index]
 
 

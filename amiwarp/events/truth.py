@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,8 +58,80 @@ class StoredInstants(Protocol[Item]):
     def t(self) -> NDArray[np.int64]:
         """Times of the records, on the clock of the events, in order [us], shape ``(k,)``."""
 
-    def __getitem__(self, index: int, /) -> Item:
-        """Return the record at ``t[index]``."""
+    def __len__(self) -> int:
+        """Return the number of records."""
+
+    def __iter__(self) -> Iterator[Item]:
+        """Yield the records in order, one at a time."""
+
+    @overload
+    def __getitem__(self, which: int, /) -> Item: ...
+    @overload
+    def __getitem__(self, which: slice, /) -> StoredInstants[Item]: ...
+    def __getitem__(self, which: int | slice, /) -> Item | StoredInstants[Item]:
+        """Return the record at ``t[which]``, or the records of a slice, which are read on demand too.
+
+        Negative indices count from the end.
+        """
+
+
+class Instants(Generic[Item]):
+    """Records at several times: one by index, some by slice, or all one after the other."""
+
+    def __init__(self, t: NDArray[np.int64]) -> None:
+        """Take the times of the records [us], shape ``(k,)``."""
+        self._t = t
+
+    @property
+    def t(self) -> NDArray[np.int64]:
+        """Times of the records [us], shape ``(k,)``."""
+        return self._t
+
+    def _read(self, index: int) -> Item:
+        """Return the record at ``t[index]``, where 0 <= index < k."""
+        raise NotImplementedError
+
+    def __len__(self) -> int:
+        return len(self._t)
+
+    def __iter__(self) -> Iterator[Item]:
+        return map(self._read, range(len(self)))
+
+    @overload
+    def __getitem__(self, which: int, /) -> Item: ...
+    @overload
+    def __getitem__(self, which: slice, /) -> Instants[Item]: ...
+    def __getitem__(self, which: int | slice, /) -> Item | Instants[Item]:
+        every = range(len(self))
+        try:
+            found = every[which]
+        except TypeError as error:
+            raise AmiwarpError(f"index of a record is {shown(which)}; give a whole number or a slice") from error
+        except IndexError as error:
+            raise IndexError(f"index {which} is not one of {len(every)} records") from error
+        return self._read(found) if isinstance(found, int) else _Slice(self, found)
+
+    def __repr__(self) -> str:
+        count = len(self)
+        span = f", t {self._t[0]} .. {self._t[-1]} us" if count else ""
+        return f"{type(self).__name__.lstrip('_')}({count:,} record{'s'[: count != 1]}{span})"
+
+
+class _Slice(Instants[Item]):
+    """Some of the records of a store."""
+
+    def __init__(self, store: Instants[Item], which: range) -> None:
+        super().__init__(store.t[np.array(which, np.int64)])
+        self._store, self._which = store, which
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Size (width, height) of the frames [px], if the store has one."""
+        size: tuple[int, int] = self._store.size  # type: ignore[attr-defined]
+        return size
+
+    def _read(self, index: int) -> Item:
+        return self._store._read(self._which[index])
 
 
 @not_called("a NumPy array with one row per event serves")
@@ -238,18 +311,14 @@ class FrameStore(StoredInstants[FrameTruth], Protocol):
     """Protocol of the ground truth of all pixels at several instants, at increasing times."""
 
 
-class MemoryFrames:
+class MemoryFrames(Instants[FrameTruth]):
     """Ground truth of several instants, held in memory."""
 
     def __init__(self, frames: list[FrameTruth]) -> None:
+        super().__init__(np.array([frame.t_us for frame in frames], np.int64))
         self._frames = frames
 
-    @property
-    def t(self) -> NDArray[np.int64]:
-        """Times of the instants [us], shape ``(k,)``."""
-        return np.array([frame.t_us for frame in self._frames], np.int64)
-
-    def __getitem__(self, index: int, /) -> FrameTruth:
+    def _read(self, index: int) -> FrameTruth:
         return self._frames[index]
 
 
@@ -369,16 +438,15 @@ class KnownStore(StoredInstants[NDArray[np.bool_]], Protocol):
     """
 
 
-class MemoryMasks:
-    """Masks of known pixels that are held in memory, as bits."""
+class MemoryMasks(Instants[NDArray[np.bool_]]):
+    """Masks of known pixels that are held in memory, as bits. Each holds from its time."""
 
     def __init__(self, t: Sequence[int], masks: Sequence[NDArray[np.bool_]]) -> None:
-        self.t = np.array(t, np.int64)
-        """Times from which the masks hold [us], shape ``(k,)``."""
+        super().__init__(np.array(t, np.int64))
         self._shape = masks[0].shape if masks else (0, 0)
         self._bits = [np.packbits(mask) for mask in masks]
 
-    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
+    def _read(self, index: int) -> NDArray[np.bool_]:
         rows, columns = self._shape
         return np.unpackbits(self._bits[index], count=rows * columns).reshape(self._shape).astype(np.bool_)
 
@@ -389,6 +457,10 @@ class PoseStore(StoredRows[Poses], Protocol):
 
     def __len__(self) -> int:
         """Return the number of times."""
+
+
+GLASS = {"apex": "rad", "thickness": "m", "plate_tilt": "rad", "index": "", "phase": "rad"}
+"""True parameters of a prism or plate that a printed :class:`Truth` shows, with their units."""
 
 
 @guarded
@@ -427,6 +499,28 @@ class Truth:
     """Poses of the camera, the moving bodies and the joints over time, or None."""
     known: KnownStore | None = None
     """Pixels without the prism whose scene the source of a translated recording determines, over time; None for all."""
+
+    def __repr__(self) -> str:
+        glass = [name for name in GLASS if name in self.parameters]
+        shown_names = glass or list(self.parameters)[:3]
+        values = [f"{name} {self._in_words(name)}" for name in shown_names]
+        if len(self.parameters) > len(shown_names):
+            values.append(f"{len(self.parameters) - len(shown_names)} more parameters")
+        per_event = ("points", "causes", "instances", "depths", "places")
+        held = [name for name in per_event if getattr(self, f"stored_{name}") is not None]
+        parts = [f"{', '.join(held)} of events"] if held else []
+        stores = (("frames", self.frames), ("poses", self.poses), ("masks", self.known))
+        parts += [f"{len(store)} {name}" for name, store in stores if store is not None]
+        if self.labels is not None:
+            parts.append(f"labels of {len(self.labels.instances)} instances")
+        return f"Truth({', '.join(values) or 'no parameters'};\n      {', '.join(parts) or 'nothing else'})"
+
+    def _in_words(self, name: str) -> str:
+        """Return a parameter's value, with its unit if it is of the glass; angles in degrees."""
+        value, unit = self.parameters[name], GLASS.get(name, "")
+        if unit == "rad":
+            return f"{math.degrees(value):.5g} deg"
+        return f"{value:.5g} {unit}".rstrip()
 
     def points(self, start: int, stop: int) -> NDArray[np.float32] | None:
         """Return the true points of the events with ``start <= index < stop``.

@@ -29,6 +29,7 @@ from amiwarp.events.recording import (
     as_polarity,
     regroup,
 )
+from amiwarp.events.truth import Instants
 from amiwarp.io.files import errors_name, open_input, register_reader
 from amiwarp.io.reading_process import packets
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
@@ -200,7 +201,8 @@ class FileEvents(EventSource):
     def _check_counts(self) -> None:
         """Raise :class:`AmiwarpError` if the file has no events, or too many faulty events."""
         counts = self._counts
-        for bad, what in ((counts.outside, f"lie outside the frame {self._size}"), (counts.late, "are out of order")):
+        frame = "the {}x{} frame".format(*self._size) if self._size else f"pixels 0 .. {LARGEST_SIZE - 1}"
+        for bad, what in ((counts.outside, f"lie outside {frame}"), (counts.late, "are out of order")):
             if bad * 100 > counts.count + counts.outside:
                 total = counts.count + counts.outside
                 raise AmiwarpError(f"{self.path}: {bad} of {total} events {what}; the file is damaged or mislabelled")
@@ -411,7 +413,7 @@ def imu_of(path: Path, columns: Packets) -> ImuSamples:
         return ImuSamples(times[order], rows[:, :3].copy(), rows[:, 3:].copy())
 
 
-class StreamedImages:
+class StreamedImages(Instants[NDArray[Any]]):
     """Frames of a file without an index, read on demand.
 
     Frames that are read in order take one pass over the file. An earlier frame starts a new pass.
@@ -429,8 +431,7 @@ class StreamedImages:
             kinds = set(zip(width.tolist(), height.tolist(), depth.tolist(), strict=True))
             if len(kinds) != 1 or (np.diff(t) < 0).any():
                 raise AmiwarpError("frames differ in size or bits, or their times decrease")
-        self.t = rounded_times(t)
-        """Times of the frames [us], shape ``(k,)``."""
+        super().__init__(rounded_times(t))
         self._size, self._dtype = (int(width[0]), int(height[0])), np.dtype(f"u{int(depth[0])}")
         self._lock = threading.Lock()
         self._pass: Generator[NDArray[Any], None, None] | None = None
@@ -441,15 +442,14 @@ class StreamedImages:
         """Size (width, height) of the frames [px]."""
         return self._size
 
-    def __getitem__(self, index: int, /) -> NDArray[Any]:
-        at = range(len(self.t))[index]
+    def _read(self, index: int) -> NDArray[Any]:
         with self._lock, errors_name(self._path, lambda: f"frame {index}"):
-            if self._pass is None or at < self._next:
+            if self._pass is None or index < self._next:
                 self.close()
                 self._pass = self._images()
             for image in self._pass:
                 self._next += 1
-                if self._next == at + 1:
+                if self._next == index + 1:
                     if self._next == len(self.t):
                         self.close()
                     return image

@@ -25,7 +25,17 @@ from amiwarp.events import recording as checks
 from amiwarp.events import truth as ground_truth
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, ImuSamples, MetadataValue, Recording, regroup
-from amiwarp.events.truth import EVENT_COLUMNS, MAPS, EventTruth, FrameTruth, Poses, Truth, WorldLabels, check_truth
+from amiwarp.events.truth import (
+    EVENT_COLUMNS,
+    MAPS,
+    EventTruth,
+    FrameTruth,
+    Instants,
+    Poses,
+    Truth,
+    WorldLabels,
+    check_truth,
+)
 from amiwarp.io import hdf5_files
 from amiwarp.io.file_scan import head_limit, smallest_sensor
 from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place, register_reader
@@ -442,23 +452,21 @@ class _StoredRows:
             return self._read(start, stop)
 
 
-class _StoredImages:
+class _StoredImages(Instants[Any]):
     """Images, or ground truth of all pixels, at several times, read on demand."""
 
     def __init__(
         self, path: Path, name: str, t: NDArray[np.int64], size: tuple[int, int], read: Callable[[int], Any],
         file: Hdf5File,
     ) -> None:  # fmt: skip
-        self._path, self._name, self._read, self._file = path, name, read, file
-        self.t = t
-        """Times of the images [us], shape ``(k,)``."""
+        super().__init__(t)
+        self._path, self._name, self._image, self._file = path, name, read, file
         self.size = size
         """Size (width, height) of the images [px]."""
 
-    def __getitem__(self, index: int, /) -> Any:
-        at = range(len(self.t))[index]
+    def _read(self, index: int) -> Any:
         with errors_name(self._path, lambda: f"{self._name} {index}"):
-            return self._read(at)
+            return self._image(index)
 
 
 # IMU samples and frames of native recordings.
