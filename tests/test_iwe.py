@@ -6,7 +6,18 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp import AmiwarpError, Camera, CameraRotation, Encoder, Events, ExactModel, Prism, Vote, iwe
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    CameraRotation,
+    DeviceEvents,
+    Encoder,
+    Events,
+    ExactModel,
+    Prism,
+    Vote,
+    iwe,
+)
 from amiwarp.imaging import iwe as pixel_votes
 from amiwarp.imaging.iwe import FIRST_BATCH, CanvasShape, Image, Votes, upload_events
 from amiwarp.optics.models import MODELS, rungs
@@ -64,6 +75,19 @@ def test_nearest_votes_equal_a_histogram(device: str) -> None:
     expected = np.zeros((48, 64))
     np.add.at(expected, (events.y.astype(int), events.x.astype(int)), 1)
     np.testing.assert_array_equal(iwe(events, 64, 48, vote=Vote.NEAREST, device=device), expected)
+
+
+def test_raw_events_outside_the_sensor_are_refused(device: str) -> None:
+    """Compensated ones, before or here, may leave the image."""
+    events = random_events(5000, 64, 48)
+    for given in (events, DeviceEvents.from_arrays(events.x, events.y, events.t, events.p, device=device)):
+        message = r"event \d+ \(x=\d+, y=\d+, .* outside the 48x64 frame; give width 64 and height 48, if they are"
+        with pytest.raises(AmiwarpError, match=message):
+            iwe(given, 48, 64, device=device)
+        with pytest.raises(AmiwarpError, match="outside the 64x47 frame"):
+            iwe(given, 64, 47, pad=9, device=device)
+    moved = Events(events.x - np.float32(20.5), events.y.astype(np.float32), events.t, events.p)
+    assert 0 < iwe(moved, 64, 48, device=device).sum() < len(events)
 
 
 def test_order_does_not_matter(device: str) -> None:

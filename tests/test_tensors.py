@@ -253,16 +253,70 @@ def test_start_and_end_of_the_window(device: str) -> None:
     assert np.array_equal(found, rvt_histogram(after, BINS, 255, low, events.t[-1]))
 
 
-def test_events_outside_the_image_are_left_out(device: str) -> None:
-    events = some_events()
-    inside = events[(events.x < 10) & (events.y < 8)]
-    for function in (amiwarp.event_count, amiwarp.latest_times, partial(amiwarp.voxel_grid, bins=1)):
-        all_events, only_inside = (host(function(put(e, device), 10, 8)) for e in (events, inside))
-        assert np.array_equal(all_events, only_inside)
+EVERY: dict[str, Any] = {
+    "event_count": amiwarp.event_count,
+    "polarity_histogram": amiwarp.polarity_histogram,
+    "voxel_grid": partial(amiwarp.voxel_grid, bins=3),
+    "stacked_histogram": partial(amiwarp.stacked_histogram, bins=2),
+    "time_surface": partial(amiwarp.time_surface, tau_us=1e4),
+    "latest_times": amiwarp.latest_times,
+}
+"""Every function that makes tensors."""
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_compensated_events_outside_the_image_are_left_out(name: str, device: str) -> None:
+    events = positions(some_events())
+    inside = events[(events.x > -1) & (events.x < 10) & (events.y > -1) & (events.y < 8)]
+    low, high = int(events.t[0]), int(events.t[-1])
+    all_events, only_inside = (
+        host(EVERY[name](put(e, device), 10, 8, t_start=low, t_end=high)) for e in (events, inside)
+    )
+    assert np.array_equal(all_events, only_inside)
     far = Events(np.full(3, 1e9, np.float32), np.full(3, -np.inf, np.float32), np.arange(3), np.ones(3, np.uint8))
-    assert host(amiwarp.event_count(put(far[:0], device), 4, 4)).sum() == 0
-    assert amiwarp.event_count(far, 4, 4).sum() == 0
-    assert (amiwarp.latest_times(far, 4, 4) == NEVER).all()
+    assert host(EVERY[name](put(far[:0], device), 4, 4)).max(initial=0) <= 0
+    if device == "cpu":
+        assert EVERY[name](far, 4, 4).max() <= 0
+
+
+@pytest.mark.parametrize("count", [3, 300, 20_000])
+@pytest.mark.parametrize("name", EVERY)
+def test_raw_events_outside_the_image_are_refused(
+    name: str, count: int, device: str, every_core: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One event is enough, at any place among the others, for each way in which kernels add events."""
+    events = some_events(count)
+    for at in (0, count // 2, count - 1):
+        for axis, (low, high) in {"x": (WIDTH - 1, WIDTH), "y": (HEIGHT - 1, HEIGHT)}.items():
+            for value in (low, high):
+                moved = {"x": events.x.copy(), "y": events.y.copy()}
+                moved[axis][at] = value
+                given = put(Events(moved["x"], moved["y"], events.t, events.p), device)
+                if value == low:
+                    EVERY[name](given, WIDTH, HEIGHT)
+                    continue
+                with pytest.raises(AmiwarpError, match=rf"event {at} \(x.* lies outside the {WIDTH}x{HEIGHT} frame"):
+                    EVERY[name](given, WIDTH, HEIGHT)
+                cut = amiwarp.windows(given, ranges=[(at + 1, count), (0, at)])
+                EVERY[name](given, WIDTH, HEIGHT, windows=cut)  # the event is in none of them
+    monkeypatch.setattr(tensors, "CAPACITY", 1)  # two sums instead of a word
+    with pytest.raises(AmiwarpError, match=f"outside the {WIDTH}x{HEIGHT} frame; "):
+        EVERY[name](given, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_swapped_size_is_named(name: str, device: str) -> None:
+    """Raw events that a model compensates have to fit the sensor, too."""
+    x, t = np.arange(WIDTH), np.arange(WIDTH)
+    given = put(Events.from_arrays(x, x % HEIGHT, t, x % 2), device)
+    message = rf"event {HEIGHT} \(x={HEIGHT}, .*; give width {WIDTH} and height {HEIGHT}, if they are swapped"
+    with pytest.raises(AmiwarpError, match=message):
+        EVERY[name](given, HEIGHT, WIDTH)
+    camera = amiwarp.Camera.from_fov(WIDTH, HEIGHT, 1.0)
+    moved = {"model": amiwarp.CircleModel(camera, 0.05), "encoder": Encoder.constant_speed(900.0, 0, 10**6)}
+    EVERY[name](given, WIDTH, HEIGHT, **moved)
+    with pytest.raises(AmiwarpError, match=message):
+        EVERY[name](given, HEIGHT, WIDTH, **moved)
 
 
 def test_no_events(device: str) -> None:
@@ -288,8 +342,11 @@ def test_intervals_in_parts(burst: int, device: str, every_core: None, monkeypat
     t[5000 : 5000 + burst] = t[5000]
     events = Events(events.x, events.y, t, events.p)
     there = put(events, device)
-    one, (t0, t1) = tensors._batch(there, None, None, None, None, None, device), (int(t[0]), int(t[-1]))
-    parts, fullest = tensors._parts(one, tensors._grid(WIDTH, HEIGHT, steps=BINS - 1, rate=BINS - 1))
+    one, (t0, t1) = (
+        tensors._batch(there, (WIDTH, HEIGHT), None, None, None, None, None, device),
+        (int(t[0]), int(t[-1])),
+    )
+    parts, fullest = tensors._parts(one, tensors._Grid(WIDTH, HEIGHT, steps=BINS - 1, rate=BINS - 1))
     assert (parts > 1) == (fullest < tensors.CAPACITY) == (burst < tensors.CAPACITY)
     found = host(amiwarp.voxel_grid(there, WIDTH, HEIGHT, BINS))
     assert np.abs(found - linear_grid(events, BINS, BINS - 1, t0, t1)).max() < EXACT

@@ -370,6 +370,18 @@ def check_order(events: Events | DeviceEvents, first_index: int = 0) -> None:
         check_order(events.to_host(), first_index)  # it names the event
 
 
+def check_inside(events: Events | DeviceEvents, width: int, height: int) -> None:
+    """Raise :class:`AmiwarpError` with the first event of a sensor outside its frame; compensated ones may be there."""
+    if not len(events) or not events.whole_pixels:
+        return
+    if isinstance(events, DeviceEvents):
+        right, bottom = limits(events)[2:4]
+        if right < width and bottom < height:
+            return
+        events = events.to_host()  # it names the event; the limits may be of more events
+    checks.check_coordinates(events, width, height, where="events")
+
+
 def check_sensor(events: Events | DeviceEvents) -> None:
     """Raise :class:`AmiwarpError` for compensated events; events from a sensor have uint16 coordinates."""
     if not events.whole_pixels:

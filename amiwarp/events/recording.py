@@ -126,8 +126,12 @@ def check_coordinates(
     """
     fail = partial(_fail, events, where, first_index)
     if events.x.dtype == np.uint16:
-        if int(events.x.max()) >= width or int(events.y.max()) >= height:
-            fail((events.x >= width) | (events.y >= height), f"lies outside the {width}x{height} frame; check the size")
+        right, bottom = int(events.x.max()), int(events.y.max())
+        if right >= width or bottom >= height:
+            remedy = "check the size"
+            if right < height and bottom < width:
+                remedy = f"give width {height} and height {width}, if they are swapped"
+            fail((events.x >= width) | (events.y >= height), f"lies outside the {width}x{height} frame; {remedy}")
     elif allow_nan and bool(np.isinf(events.x).any() or np.isinf(events.y).any()):
         fail(np.isinf(events.x) | np.isinf(events.y), "has an infinite coordinate; drop it")
     elif not allow_nan and not bool(np.isfinite(events.x).all() and np.isfinite(events.y).all()):
@@ -828,7 +832,7 @@ class Recording:
         if isinstance(events, Events):
             if camera is None:
                 raise AmiwarpError(
-                    "Recording: events have no sensor size; give the camera too, or give "
+                    "Recording: events have no sensor size; give the camera too, or wrap them as "
                     "amiwarp.MemoryEvents(events, width, height)"
                 )
             events = MemoryEvents(events, camera.width, camera.height)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import CornerMethod
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, check_sensor, device_for, limits, wait
+from amiwarp.events.device_events import DeviceEvents, check_inside, check_sensor, device_for, limits, wait
 from amiwarp.events.recording import Events, check_events
 from amiwarp.kernels import corners as kernels
 from amiwarp.kernels import events as event_kernels
@@ -178,11 +178,8 @@ class CornerDetector:
 
     def _check_limits(self, events: DeviceEvents) -> None:
         """Check events on the device."""
-        first, last, right, bottom, polarity, decreases = limits(events)
-        if right >= self._width or bottom >= self._height:
-            raise AmiwarpError(
-                f"events reach x={right}, y={bottom}, outside the {self._width}x{self._height} frame; check the size"
-            )
+        check_inside(events, self._width, self._height)
+        first, last, _, _, polarity, decreases = limits(events)
         if decreases:
             raise AmiwarpError("events are not in the order of their times; sort by time")
         if self._last_us is not None and first < self._last_us:

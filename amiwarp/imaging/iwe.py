@@ -837,7 +837,8 @@ def iwe(
     Parameters
     ----------
     events : Events or DeviceEvents
-        Events to vote, sorted by time.
+        Events to vote, sorted by time. Those that are compensated, here or before, and lie outside the image are left
+        out.
     width, height : int
         Sensor size [px].
     model : Model, optional
@@ -866,7 +867,8 @@ def iwe(
     ------
     AmiwarpError
         If only one of ``model`` and ``encoder`` is given, or ``camera_rotation`` without them; if the encoder does not
-        cover the events, their times decrease, or they are on another device than ``device``.
+        cover the events, their times decrease, a raw event lies outside the sensor, or they are on another device than
+        ``device``.
 
     Examples
     --------
@@ -884,6 +886,7 @@ def iwe(
     device = device_for(events, device)
     device_events.check_order(events)
     votes = Votes(CanvasShape(width, height, pad, 1.0, per_polarity, vote), device)
+    device_events.check_inside(events, width, height)
     for start in range(0, len(events), PIECE):
         piece = events[start : start + PIECE]
         if model is not None and encoder is not None:

@@ -27,7 +27,7 @@ from amiwarp.events.device_events import (
     wait,
 )
 from amiwarp.events.encoder import Encoder, check_prisms
-from amiwarp.events.recording import Events, Recording
+from amiwarp.events.recording import Events, Recording, check_coordinates
 from amiwarp.kernels import tensors as kernels
 from amiwarp.kernels.compensation import LaunchPlan
 from amiwarp.kernels.events import NEVER
@@ -345,8 +345,10 @@ class _Batch:
     """Whether the result has no axis of windows."""
     on_host: bool
     """Whether the result is a NumPy array."""
-    unsorted: wp.array
-    """Its element becomes 1 if times decrease in a window. Memory of the host, which the device writes to."""
+    size: tuple[int, int]
+    """Width and height of the images [px]."""
+    faults: wp.array
+    """Faults of the events by number, 1 if they occur. Memory of the host, which the device writes to."""
 
     @property
     def device(self) -> Any:
@@ -359,21 +361,30 @@ class _Batch:
         return wp.empty((len(self.windows), *shape), dtype=dtype, device=self.device)
 
     def finish(self, out: wp.array) -> Any:
-        """Return the result of a public function. Raises :class:`AmiwarpError` if times decrease in a window."""
+        """Return the result of a public function.
+
+        Raises :class:`AmiwarpError` if times decrease in a window, or an event of a sensor lies outside the image.
+        """
         wait(self.device)
-        if self.unsorted.numpy()[0]:
-            host = self.events.to_host()
-            for start, stop in zip(self.windows.start.tolist(), self.windows.stop.tolist(), strict=True):
-                _check_order(host[start:stop], start)
-        else:
-            idle_numbers[self.device.is_cpu, wp.int32].append(self.unsorted)
+        found_faults = self.faults.numpy()
+        if found_faults[kernels.DESCENDING] or found_faults[kernels.OUTSIDE]:
+            _check_windows(self.events.to_host(), self.windows, self.size)
+        idle_numbers[self.device.is_cpu, wp.int32].append(self.faults)
         found = out.numpy() if self.on_host else out
         return found[0] if self.single else found
 
 
+def _check_windows(events: Events, cut: Windows, size: tuple[int, int]) -> None:
+    """Raise :class:`AmiwarpError` for the first event that is earlier than the one before, or outside the sensor."""
+    for start, stop in zip(cut.start.tolist(), cut.stop.tolist(), strict=True):
+        if stop > start:
+            _check_order(events[start:stop], start)
+            check_coordinates(events[start:stop], *size, where="events", first_index=start, allow_nan=True)
+
+
 def _batch(
-    events: Any, cut: Windows | None, t_start: int | None, t_end: int | None, model: Model | None,
-    encoder: Encoder | None, device: Any,
+    events: Any, size: tuple[int, int], cut: Windows | None, t_start: int | None, t_end: int | None,
+    model: Model | None, encoder: Encoder | None, device: Any,
 ) -> _Batch:  # fmt: skip
     """Return the events and windows of a public function's arguments, compensated if there is a model."""
     if (model is None) != (encoder is None):
@@ -392,10 +403,12 @@ def _batch(
     cut = _window(events, t_start, t_end) if cut is None else cut
     if len(cut) and int(cut.stop.max()) > n:
         raise AmiwarpError(f"windows reach to event {int(cut.stop.max())} of {n}; give the events that were cut")
+    width = whole(size[0], "width", 1, LARGEST_SIZE, " pixels")
+    height = whole(size[1], "height", 1, LARGEST_SIZE, " pixels")
     found = on_device(events, there)
     if model is not None and encoder is not None:
-        found = _compensated(found, model, encoder)
-    return _Batch(found, cut, single, on_host, host_numbers(1, wp.int32, there))
+        found = _compensated(found, (width, height), cut, model, encoder)
+    return _Batch(found, cut, single, on_host, (width, height), host_numbers(2, wp.int32, there))
 
 
 def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | None) -> Windows:
@@ -419,8 +432,10 @@ def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | Non
     return Windows(*(np.array([value], np.int64) for value in (start, stop, low, high)))
 
 
-def _compensated(events: DeviceEvents, model: Model, encoder: Encoder) -> DeviceEvents:
-    """Return events at their positions without the optic."""
+def _compensated(
+    events: DeviceEvents, size: tuple[int, int], cut: Windows, model: Model, encoder: Encoder
+) -> DeviceEvents:
+    """Return events at their positions without the optic. ``size``: of the images, which the recorded events fit."""
     check_sensor(events)
     check_prisms(encoder, model.ANGLES)
     if not len(events):
@@ -431,6 +446,8 @@ def _compensated(events: DeviceEvents, model: Model, encoder: Encoder) -> Device
     else:
         t_first, t_last, right, bottom, _, _ = limits(events)
         span, largest = (t_first, t_last), (right, bottom)
+    if largest[0] >= size[0] or largest[1] >= size[1]:
+        _check_windows(events.to_host(), cut, size)
     plan = LaunchPlan(model, events.device)
     params = encoder_params(encoder, *span, str(events.device))
     columns = plan.run(plan.device_columns(events), params, *largest)
@@ -449,12 +466,6 @@ class _Grid(NamedTuple):
     low: int = 0
     off: int = 1
     parts: int = 1
-
-
-def _grid(width: int, height: int, **values: int) -> _Grid:
-    """Return the values of the images of each window."""
-    size = whole(width, "width", 1, LARGEST_SIZE, " pixels"), whole(height, "height", 1, LARGEST_SIZE, " pixels")
-    return _Grid(*size, **values)
 
 
 @lru_cache(maxsize=256)
@@ -510,7 +521,7 @@ def _images(
             images.fill_(empty)
         rows, blocks = _rows(cut if number == len(cut) else cut[first : first + number], device)
         inputs = [events.x, events.y, events.t, events.p, rows, _struct(kernels.Grid, *grid)]
-        outputs = [batch.unsorted, images]
+        outputs = [batch.faults, images]
         if device.is_cpu:
             _add_on_cpu(on_cpu, inputs, outputs, blocks, spare, group * sums, trash)
         elif blocks:
@@ -692,8 +703,8 @@ def event_count(
     Parameters
     ----------
     events : Events or DeviceEvents, or a list of them
-        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
-        out.
+        Events, raw or compensated, sorted by time; or those of several recordings. Compensated events outside the
+        image are left out.
     width, height : int
         Size of the image [px].
     windows : Windows, optional
@@ -716,8 +727,8 @@ def event_count(
     Raises
     ------
     AmiwarpError
-        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
-        given, or the events are on another device than ``device``.
+        If a raw event lies outside the image, the times of a window decrease, the windows do not fit the events, only
+        one of ``model`` and ``encoder`` is given, or the events are on another device than ``device``.
 
     Examples
     --------
@@ -726,8 +737,8 @@ def event_count(
     array([[0, 2, 0],
            [0, 0, 1]], dtype=int32)
     """
-    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
-    return batch.finish(_counted(batch, _grid(width, height)).reshape((-1, height, width)))
+    batch = _batch(events, (width, height), windows, t_start, t_end, model, encoder, device)
+    return batch.finish(_counted(batch, _Grid(*batch.size)).reshape((-1, height, width)))
 
 
 @guarded
@@ -748,8 +759,8 @@ def polarity_histogram(
     Parameters
     ----------
     events : Events or DeviceEvents, or a list of them
-        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
-        out.
+        Events, raw or compensated, sorted by time; or those of several recordings. Compensated events outside the
+        image are left out.
     width, height : int
         Size of the image [px].
     windows : Windows, optional
@@ -773,8 +784,8 @@ def polarity_histogram(
     Raises
     ------
     AmiwarpError
-        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
-        given, or the events are on another device than ``device``.
+        If a raw event lies outside the image, the times of a window decrease, the windows do not fit the events, only
+        one of ``model`` and ``encoder`` is given, or the events are on another device than ``device``.
 
     Examples
     --------
@@ -783,8 +794,8 @@ def polarity_histogram(
     array([[0, 1, 0],
            [0, 0, 1]], dtype=int32)
     """
-    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
-    return batch.finish(_counted(batch, _grid(width, height, layers=2)))
+    batch = _batch(events, (width, height), windows, t_start, t_end, model, encoder, device)
+    return batch.finish(_counted(batch, _Grid(*batch.size, layers=2)))
 
 
 def _counted(batch: _Batch, grid: _Grid) -> wp.array:
@@ -819,8 +830,8 @@ def voxel_grid(
     Parameters
     ----------
     events : Events or DeviceEvents, or a list of them
-        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
-        out.
+        Events, raw or compensated, sorted by time; or those of several recordings. Compensated events outside the
+        image are left out.
     width, height : int
         Size of the image [px].
     bins : int
@@ -850,8 +861,8 @@ def voxel_grid(
     Raises
     ------
     AmiwarpError
-        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
-        given, or the events are on another device than ``device``.
+        If a raw event lies outside the image, the times of a window decrease, the windows do not fit the events, only
+        one of ``model`` and ``encoder`` is given, or the events are on another device than ``device``.
 
     Notes
     -----
@@ -870,9 +881,9 @@ def voxel_grid(
     array([-0.5,  0.5], dtype=float32)
     """
     bins = whole(bins, "bins", 1, MOST_BINS)
-    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
+    batch = _batch(events, (width, height), windows, t_start, t_end, model, encoder, device)
     intervals = bins - 1 if end_bin else bins
-    grid = _grid(width, height, steps=max(intervals, 1), rate=intervals, off=-1)
+    grid = _Grid(*batch.size, steps=max(intervals, 1), rate=intervals, off=-1)
     out = _shares(batch, grid, bins)
     if normalize and len(batch.windows):
         _normalise(out.reshape((len(batch.windows), -1)))
@@ -899,8 +910,8 @@ def stacked_histogram(
     Parameters
     ----------
     events : Events or DeviceEvents, or a list of them
-        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
-        out.
+        Events, raw or compensated, sorted by time; or those of several recordings. Compensated events outside the
+        image are left out.
     width, height : int
         Size of the image [px].
     bins : int
@@ -927,8 +938,8 @@ def stacked_histogram(
     Raises
     ------
     AmiwarpError
-        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
-        given, or the events are on another device than ``device``.
+        If a raw event lies outside the image, the times of a window decrease, the windows do not fit the events, only
+        one of ``model`` and ``encoder`` is given, or the events are on another device than ``device``.
 
     Notes
     -----
@@ -947,8 +958,8 @@ def stacked_histogram(
     """
     bins = whole(bins, "bins", 1, MOST_BINS)
     limit = whole(limit, "limit", 1, 255)
-    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
-    grid = _grid(width, height, steps=bins, rate=bins, layers=2)
+    batch = _batch(events, (width, height), windows, t_start, t_end, model, encoder, device)
+    grid = _Grid(*batch.size, steps=bins, rate=bins, layers=2)
     out = batch.empty((2 * bins, height, width), wp.uint8)
     length = width if batch.device.is_cpu else 1
     for first, number, images in _counts(batch, grid):
@@ -980,8 +991,8 @@ def time_surface(
     Parameters
     ----------
     events : Events or DeviceEvents, or a list of them
-        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
-        out.
+        Events, raw or compensated, sorted by time; or those of several recordings. Compensated events outside the
+        image are left out.
     width, height : int
         Size of the image [px].
     tau_us : float
@@ -1013,8 +1024,8 @@ def time_surface(
     Raises
     ------
     AmiwarpError
-        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
-        given, or the events are on another device than ``device``.
+        If a raw event lies outside the image, the times of a window decrease, the windows do not fit the events, only
+        one of ``model`` and ``encoder`` is given, or the events are on another device than ``device``.
 
     Notes
     -----
@@ -1033,8 +1044,8 @@ def time_surface(
            [0. , 1. ]], dtype=float32)
     """
     tau = real(tau_us, "tau_us", 1e-6, hint=" us")
-    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
-    grid = _grid(width, height, layers=2 if per_polarity else 1)
+    batch = _batch(events, (width, height), windows, t_start, t_end, model, encoder, device)
+    grid = _Grid(*batch.size, layers=2 if per_polarity else 1)
     size = grid.layers * height * width
     out = batch.empty((grid.layers, height, width), wp.float32)
     if carry:
@@ -1066,8 +1077,8 @@ def latest_times(
     Parameters
     ----------
     events : Events or DeviceEvents, or a list of them
-        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
-        out.
+        Events, raw or compensated, sorted by time; or those of several recordings. Compensated events outside the
+        image are left out.
     width, height : int
         Size of the image [px].
     per_polarity : bool, default True
@@ -1095,8 +1106,8 @@ def latest_times(
     Raises
     ------
     AmiwarpError
-        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
-        given, or the events are on another device than ``device``.
+        If a raw event lies outside the image, the times of a window decrease, the windows do not fit the events, only
+        one of ``model`` and ``encoder`` is given, or the events are on another device than ``device``.
 
     Examples
     --------
@@ -1104,8 +1115,8 @@ def latest_times(
     >>> amiwarp.latest_times(events, 3, 2, per_polarity=False)[0, 1]
     np.int64(10)
     """
-    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
-    grid = _grid(width, height, layers=2 if per_polarity else 1)
+    batch = _batch(events, (width, height), windows, t_start, t_end, model, encoder, device)
+    grid = _Grid(*batch.size, layers=2 if per_polarity else 1)
     out = batch.empty((grid.layers, height, width), wp.int64)
     if carry:
         _check_carry(events, batch.windows)

@@ -93,6 +93,16 @@ def descends(values: wp.array(dtype=wp.int64), first: int, stop: int) -> bool:
 
 
 @wp.func_native("""
+    const uint16_t* value = (const uint16_t*)values.data;
+    uint16_t most = 0;
+    for (int k = first; k < stop; ++k) most = value[k] > most ? value[k] : most;
+    return most;
+""")
+def largest_of(values: wp.array(dtype=wp.uint16), first: int, stop: int) -> int:
+    """Return the largest of ``values[first : stop]``, or 0 if there are none."""
+
+
+@wp.func_native("""
     typedef uint64_t eight __attribute__((vector_size(64)));
     const uint64_t* t = (const uint64_t*)pairs.data;
     const uint16_t* i = (const uint16_t*)indices.data + first;

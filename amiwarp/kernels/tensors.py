@@ -28,6 +28,7 @@ from amiwarp.kernels.native_code import (
     copy_int64s,
     count_places,
     descends,
+    largest_of,
     load_float,
     load_int,
     load_int64,
@@ -50,6 +51,10 @@ AHEAD = wp.constant(256)  # number of events from a block to those that are fetc
 WHOLE = wp.constant(1 << 30)  # share of a whole event
 EARLIEST = wp.constant(wp.int64(-(2**62)))  # limit of the times of events [us]; without events, a pixel holds less
 LONGEST = wp.constant(wp.int64(1 << 31))  # time of a block from which it is not processed at once [us]
+
+# Numbers of the array of faults, of which each becomes 1 if the fault occurs.
+DESCENDING = wp.constant(0)  # an event is earlier than the one before in its window
+OUTSIDE = wp.constant(1)  # an event of a sensor lies outside the image; compensated events may
 
 # Columns of the array of windows, which has a row for each window.
 START = wp.constant(0)  # index of the first event
@@ -185,17 +190,34 @@ def part_of(share: int, part: wp.float64) -> int:
 
 
 @wp.func
+def check_pixel(grid: Grid, x: wp.uint16, y: wp.uint16, faults: wp.array(dtype=int)):
+    """Check that a sensor's pixel lies in the image."""
+    if is_pixel(grid, int(x), int(y)) == 0:
+        faults[OUTSIDE] = 1
+
+
+@wp.func
+def check_pixel(grid: Grid, x: float, y: float, faults: wp.array(dtype=int)):
+    """Do nothing: compensated events may lie outside the image."""
+    return
+
+
+@wp.func
 def event_of(
-    windows: wp.array2d(dtype=wp.int64), t: wp.array(dtype=wp.int64), unsorted: wp.array(dtype=int), window: int,
-    thread: int,
+    grid: Grid, windows: wp.array2d(dtype=wp.int64), x: wp.array(dtype=Any), y: wp.array(dtype=Any),
+    t: wp.array(dtype=wp.int64), faults: wp.array(dtype=int), window: int, thread: int,
 ) -> int:  # fmt: skip
-    """Return the event of a thread, or -1 if there is none. Check that it is not earlier than the one before."""
+    """Return the event of a thread, or -1 if there is none.
+
+    Check that it is not earlier than the one before, and lies in the image if it is of a sensor.
+    """
     i = first_event(windows, window, thread / BLOCK) + thread % BLOCK
     if wp.int64(i) >= windows[window, STOP]:
         return -1
     if wp.int64(i) > windows[window, START]:
         if t[i] < t[i - 1]:
-            unsorted[0] = 1
+            faults[DESCENDING] = 1
+    check_pixel(grid, x[i], y[i], faults)
     return i
 
 
@@ -229,12 +251,12 @@ def count_event(
 @wp.kernel
 def count_events(
     x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
-    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, faults: wp.array(dtype=int),
     counts: wp.array(dtype=int),
 ):  # fmt: skip
     """Count the event of each thread at its nearest pixel."""
     window = window_of(windows, wp.tid() / BLOCK)
-    i = event_of(windows, t, unsorted, window, wp.tid())
+    i = event_of(grid, windows, x, y, t, faults, window, wp.tid())
     if i >= 0:
         count_event(grid, part, -1, windows, window, i, x, y, t, p, counts)
 
@@ -242,12 +264,12 @@ def count_events(
 @wp.kernel
 def keep_latest(
     x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
-    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, faults: wp.array(dtype=int),
     latest: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Keep the time of each thread's event at its nearest pixel, if it is the latest."""
     window = window_of(windows, wp.tid() / BLOCK)
-    i = event_of(windows, t, unsorted, window, wp.tid())
+    i = event_of(grid, windows, x, y, t, faults, window, wp.tid())
     if i >= 0:
         col, row = nearest(x[i]), nearest(y[i])
         if is_pixel(grid, col, row) == 1:
@@ -282,11 +304,11 @@ def add_event_word(
 def add_event_words(
     x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
     p: wp.array(dtype=wp.uint8), windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part,
-    unsorted: wp.array(dtype=int), words: wp.array(dtype=wp.int64),
+    faults: wp.array(dtype=int), words: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Add the word of each thread's event."""
     window = window_of(windows, wp.tid() / BLOCK)
-    i = event_of(windows, t, unsorted, window, wp.tid())
+    i = event_of(grid, windows, x, y, t, faults, window, wp.tid())
     if i >= 0:
         add_event_word(grid, part, -1, windows, window, i, x, y, t, p, words)
 
@@ -304,12 +326,12 @@ def add_parts(sums: wp.array(dtype=wp.int64), place: int, weight: int, part: wp.
 @wp.kernel
 def share_events(
     x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
-    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, faults: wp.array(dtype=int),
     sums: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Share the event of each thread among the four nearest pixels and the two ends of its time interval."""
     window = window_of(windows, wp.tid() / BLOCK)
-    i = event_of(windows, t, unsorted, window, wp.tid())
+    i = event_of(grid, windows, x, y, t, faults, window, wp.tid())
     if i >= 0:
         u, v = float(x[i]), float(y[i])
         if is_near(grid, u, v) == 1:
@@ -374,18 +396,39 @@ def copy_positions(out: wp.array(dtype=float), values: wp.array(dtype=wp.uint16)
 
 
 @wp.func
+def check_pixels(
+    grid: Grid, x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), first: int, stop: int,
+    faults: wp.array(dtype=int),
+):  # fmt: skip
+    """Check that the pixels of a sensor's events lie in the image."""
+    if is_pixel(grid, largest_of(x, first, stop), largest_of(y, first, stop)) == 0:
+        faults[OUTSIDE] = 1
+
+
+@wp.func
+def check_pixels(
+    grid: Grid, x: wp.array(dtype=float), y: wp.array(dtype=float), first: int, stop: int,
+    faults: wp.array(dtype=int),
+):  # fmt: skip
+    """Do nothing: compensated events may lie outside the image."""
+    return
+
+
+@wp.func
 def start_block(
-    t: wp.array(dtype=wp.int64), windows: wp.array2d(dtype=wp.int64), block: int, unsorted: wp.array(dtype=int)
-):
+    grid: Grid, windows: wp.array2d(dtype=wp.int64), block: int, x: wp.array(dtype=Any), y: wp.array(dtype=Any),
+    t: wp.array(dtype=wp.int64), faults: wp.array(dtype=int),
+):  # fmt: skip
     """Return the window of a block, its first event and the number of its events.
 
-    Check that no event is earlier than the one before in the window.
+    Check that no event is earlier than the one before in the window, and that those of a sensor lie in the image.
     """
     window = window_of(windows, block)
     first = first_event(windows, window, block)
     n = wp.min(BLOCK, int(windows[window, STOP]) - first)
     if descends(t, wp.max(first, int(windows[window, START]) + 1), first + n):
-        unsorted[0] = 1
+        faults[DESCENDING] = 1
+    check_pixels(grid, x, y, first, first + n, faults)
     return window, first, n
 
 
@@ -404,15 +447,34 @@ def time_block(
 
 
 @wp.func
+def place_or_trash(grid: Grid, part: Part, group: int, p: wp.uint8, x: int, y: int) -> int:
+    """Return the number of a pixel in the images of a group, or that of the part's trash."""
+    return wp.where(is_pixel(grid, x, y) == 1, place_of(grid, group, p, x, y), part.trash)
+
+
+# The types of the places are stated, because a generic function would take those of its first call for all calls.
+
+
+@wp.func
 def place_interval(
-    grid: Grid, part: Part, group: int, first: int, x: wp.array(dtype=Any), y: wp.array(dtype=Any),
+    grid: Grid, part: Part, group: int, first: int, x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16),
+    p: wp.array(dtype=wp.uint8), places: wp.array(dtype=int), at: int,
+):  # fmt: skip
+    """Compute the pixel of each event of a whole block in one time interval, from ``places[at]`` on."""
+    for k in range(BLOCK):
+        col, row = load_nearest(x, first + k), load_nearest(y, first + k)
+        store_int(places, at + k, place_or_trash(grid, part, group, load_uint8(p, first + k), col, row))
+
+
+@wp.func
+def place_interval(
+    grid: Grid, part: Part, group: int, first: int, x: wp.array(dtype=float), y: wp.array(dtype=float),
     p: wp.array(dtype=wp.uint8), places: wp.array(dtype=int), at: int,
 ):  # fmt: skip
     """Compute the nearest pixel of each event of a whole block in one time interval, from ``places[at]`` on."""
     for k in range(BLOCK):
         col, row = load_nearest(x, first + k), load_nearest(y, first + k)
-        place = place_of(grid, group, load_uint8(p, first + k), col, row)
-        store_int(places, at + k, wp.where(is_pixel(grid, col, row) == 1, place, part.trash))
+        store_int(places, at + k, place_or_trash(grid, part, group, load_uint8(p, first + k), col, row))
 
 
 @wp.func
@@ -447,11 +509,11 @@ def position_block(
 @wp.kernel
 def count_event_blocks(
     x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
-    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, faults: wp.array(dtype=int),
     counts: wp.array(dtype=int),
 ):  # fmt: skip
     """Count the events of each thread's block at their nearest pixels."""
-    window, first, n = start_block(t, windows, part.block + wp.tid(), unsorted)
+    window, first, n = start_block(grid, windows, part.block + wp.tid(), x, y, t, faults)
     own, group = own_group(grid, windows, t, part), group_of(grid, windows, window, t[first])
     if n == BLOCK and group == group_of(grid, windows, window, t[first + n - 1]):
         places = wp.zeros(shape=(64,), dtype=int)
@@ -465,11 +527,11 @@ def count_event_blocks(
 @wp.kernel
 def keep_latest_blocks(
     x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
-    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, faults: wp.array(dtype=int),
     latest: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Keep the latest times of the events of each thread's block at their nearest pixels."""
-    window, first, n = start_block(t, windows, part.block + wp.tid(), unsorted)
+    window, first, n = start_block(grid, windows, part.block + wp.tid(), x, y, t, faults)
     own, group = own_group(grid, windows, t, part), window * grid.steps
     used = wp.where(group == own, part.spare, group)
     for k in range(first, first + n):
@@ -503,7 +565,7 @@ def store_interval_words(
 def add_event_word_blocks(
     x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
     p: wp.array(dtype=wp.uint8), windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part,
-    unsorted: wp.array(dtype=int), words: wp.array(dtype=wp.int64),
+    faults: wp.array(dtype=int), words: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Add the words of the events of each thread's blocks. Those of a block are added after the next one's are known.
 
@@ -515,7 +577,7 @@ def add_event_word_blocks(
     at, before = int(0), int(0)
     first_block = part.block + wp.tid() * RUN
     for block in range(first_block, wp.min(first_block + RUN, part.stop)):
-        window, first, n = start_block(t, windows, block, unsorted)
+        window, first, n = start_block(grid, windows, block, x, y, t, faults)
         group = group_of(grid, windows, window, t[first])
         t_last = t[first + n - 1]
         if n == BLOCK and group == group_of(grid, windows, window, t_last) and t_last - t[first] < LONGEST:
@@ -534,7 +596,7 @@ def add_event_word_blocks(
 @wp.kernel
 def share_event_blocks(
     x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
-    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, faults: wp.array(dtype=int),
     sums: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Share the events of each thread's block among the four nearest pixels and the ends of their time intervals."""
@@ -546,7 +608,7 @@ def share_event_blocks(
     ends = wp.zeros(shape=(64,), dtype=int)
     places = wp.zeros(shape=(64,), dtype=int)
     shares = wp.zeros(shape=(512,), dtype=wp.int64)
-    window, first, n = start_block(t, windows, part.block + wp.tid(), unsorted)
+    window, first, n = start_block(grid, windows, part.block + wp.tid(), x, y, t, faults)
     copy_int64s(times, t, first, n)
     copy_bytes(signs, p, first, n)
     own = own_group(grid, windows, t, part)
