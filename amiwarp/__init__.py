@@ -5,6 +5,7 @@ milliseconds only.
 """
 
 import gc
+import sys
 import typing
 from typing import Any
 
@@ -18,8 +19,11 @@ _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 def __getattr__(name: str) -> Any:
     """Load a public name, without garbage collections, which would take a quarter of the time of the imports.
 
-    A type that is no class, such as a union, gets a name that can be called, to say what to call instead.
+    Another name is refused as by any module, so that Python suggests the nearest one. A type that is no class, such as
+    a union, gets a name that can be called, to say what to call instead.
     """
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=sys.modules[__name__])
     collects = gc.isenabled()
     gc.disable()
     try:

@@ -280,7 +280,11 @@ _REMEDIES = {
     ("structured array", "Events"): "make events of it with amiwarp.Events.from_structured",
     ("Recording", "Events"): "give its events, recording.events[:]; as a transform, amiwarp.ToTensor(function, ...)",
     ("Compensated", "Events"): "give its events, packet.events",
-    ("Recording", "path"): "write it with amiwarp.save_recording, and give the file",
+    ("EventSource", "Events"): "give its events, source[:]",
+    ("Calibration", "Model"): "give its model, calibration.model",
+    ("Recording", "Camera"): "give its camera, recording.camera",
+    ("Recording", "path"): "write it with amiwarp.save_recording(path, recording), and give the path",
+    ("list", "NumPy"): "make arrays of lists, with numpy.array, or events with amiwarp.Events.from_arrays",
     ("Events", "Recording"): "make one with amiwarp.Recording(amiwarp.MemoryEvents(events, width, height))",
     ("Events", "EventSource"): "wrap them as amiwarp.MemoryEvents(events, width, height)",
     ("DeviceEvents", "EventSource"): "wrap them as amiwarp.DeviceMemoryEvents(events, width, height)",
@@ -458,7 +462,7 @@ class _Parameter:
         else:
             unmet = _unmet("text" if self._text else kind, value)
         if unmet:
-            words, kinds = re.findall(r"\w+", unmet), {type(value).__name__}
+            words, kinds = re.findall(r"\w+", unmet), {base.__name__ for base in type(value).__mro__}
             if isinstance(value, str | os.PathLike):
                 kinds = {"path"}
             elif isinstance(value, np.ndarray) and value.dtype.names is not None:

@@ -38,7 +38,18 @@ from amiwarp.events.recording import check_events
 from amiwarp.io.native_format import LiveWriter
 from amiwarp.optics.camera import LARGEST_FOCAL
 from amiwarp.validation import TIME_LIMIT, guarded, shown
-from tests.public_calls import CAMERA, FRAME, RECORDING, REFUSED, SPACE, PublicCall, public_calls, write_files
+from tests.public_calls import (
+    CALIBRATION,
+    CAMERA,
+    FRAME,
+    PICTURE,
+    RECORDING,
+    REFUSED,
+    SPACE,
+    PublicCall,
+    public_calls,
+    write_files,
+)
 
 
 class Odd:
@@ -277,11 +288,39 @@ def test_unknown_keywords_and_too_many_arguments(call: PublicCall) -> None:
         (lambda: amiwarp.World(1.0, ()), "World|world"),
         (lambda: amiwarp.Recording(RECORDING.events, "davis"), "Recording: camera is 'davis'; expected Camera or None"),
         (lambda: amiwarp.Camera(CAMERA), "missing"),
+        (lambda: amiwarp.event_count(RECORDING.events, 4, 3), r"give its events, source\[:\]"),
+        (lambda: amiwarp.Compensator(CALIBRATION, RECORDING.encoder), "give its model, calibration.model"),
+        (lambda: amiwarp.truth_model(RECORDING, RECORDING), "give its camera, recording.camera"),
+        (lambda: amiwarp.save_recording(RECORDING, "a.h5"), r"amiwarp.save_recording\(path, recording\)"),
+        (lambda: amiwarp.Encoder([0, 1], [0.0, 0.1]), "make arrays of lists, with numpy.array"),
+        (lambda: Events(*np.ones((4, 2), np.int64)), "amiwarp.Events.from_arrays converts"),
+        (
+            lambda: amiwarp.calibrate(amiwarp.Recording(RECORDING.events)),
+            r"in Python dataclasses.replace\(recording, camera=amiwarp.Camera.from_fov",
+        ),
     ],
 )
 def test_common_mistakes(wrong: Callable[[], Any], message: str) -> None:
     with pytest.raises((AmiwarpError, TypeError), match=message):
         wrong()
+
+
+def test_a_misspelt_name_is_refused_with_what_python_needs_to_suggest_one() -> None:
+    with pytest.raises(AttributeError, match="module 'amiwarp' has no attribute 'voxelgrid'") as caught:
+        amiwarp.voxelgrid  # noqa: B018
+    assert (caught.value.name, caught.value.obj) == ("voxelgrid", amiwarp)
+
+
+def test_long_objects_print_on_one_line() -> None:
+    imu = amiwarp.ImuSamples(np.arange(3) * 1000, np.zeros((3, 3)), np.zeros((3, 3)))
+    assert repr(imu) == "ImuSamples(3 samples, t 0 .. 2000 us, 1000 Hz)"
+    assert repr(amiwarp.ImuSamples(np.arange(1), np.zeros((1, 3)), np.zeros((1, 3)))) == (
+        "ImuSamples(1 sample, t 0 .. 0 us)"
+    )
+    cut = amiwarp.windows(RECORDING.events[:], count=1)
+    assert repr(cut) == "Windows(3 windows, 3 events, t 0 .. 900 us)"
+    assert (repr(cut[:1]), repr(cut[:0])) == ("Windows(1 window, 1 event, t 0 .. 0 us)", "Windows(0 windows)")
+    assert repr(PICTURE) == "Picture(4x3 px, t 0 .. 10 us, 4 pairs, residual 0.1)"
 
 
 NOT_CALLED = {

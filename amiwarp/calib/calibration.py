@@ -834,7 +834,10 @@ def _search_on(path: Encoder, search: Search) -> Search:
 
 def _camera(recording: Recording) -> Camera:
     if recording.camera is None:
-        raise AmiwarpError(f"{recording.name}: the camera is unknown; give --camera or --fov-deg (camera=)")
+        raise AmiwarpError(
+            f"{recording.name}: the camera is unknown; give --camera or --fov-deg, or in Python "
+            "dataclasses.replace(recording, camera=amiwarp.Camera.from_fov(width, height, radians))"
+        )
     return recording.camera
 
 

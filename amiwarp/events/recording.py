@@ -224,7 +224,10 @@ class Events:
             shapes = {name: column.shape for name, column in zip(COLUMNS, columns, strict=True)}
             raise AmiwarpError(f"event arrays have shapes {shapes}; expected one length (n,)")
         if self.t.dtype != np.int64 or self.p.dtype != np.uint8:
-            raise AmiwarpError(f"events' t is {self.t.dtype}, p is {self.p.dtype}; expected int64 and uint8")
+            raise AmiwarpError(
+                f"events' t is {self.t.dtype}, p is {self.p.dtype}; expected int64 and uint8, to which "
+                "amiwarp.Events.from_arrays converts"
+            )
         if self.x.dtype != self.y.dtype or self.x.dtype not in (np.dtype(np.uint16), np.dtype(np.float32)):
             raise AmiwarpError(
                 f"events' x is {self.x.dtype}, y is {self.y.dtype}; expected both uint16 or both float32"
@@ -694,6 +697,12 @@ class ImuSamples:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def __repr__(self) -> str:
+        if not len(self):
+            return "ImuSamples(0 samples)"
+        rate = "" if self.rate_hz is None else f", {self.rate_hz:.4g} Hz"
+        return f"ImuSamples({len(self):,} sample{'s'[: len(self) != 1]}, t {self.t[0]} .. {self.t[-1]} us{rate})"
 
     @property
     def rate_hz(self) -> float | None:

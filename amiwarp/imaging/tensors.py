@@ -90,10 +90,20 @@ class Windows:
     def __len__(self) -> int:
         return len(self.start)
 
+    def __repr__(self) -> str:
+        if not len(self):
+            return "Windows(0 windows)"
+        held, span = int((self.stop - self.start).sum()), f"t {self.t_start.min()} .. {self.t_end.max()} us"
+        windows = f"{len(self):,} window{'s'[: len(self) != 1]}"
+        return f"Windows({windows}, {held:,} event{'s'[: held != 1]}, {span})"
+
     def __getitem__(self, which: slice | NDArray[Any]) -> Windows:
         """Return the windows of a slice, or at an index or boolean array."""
         if np.ndim(self.start[which]) == 0:
-            raise AmiwarpError(f"windows are indexed by {which}; give a slice, such as [k : k + 1] for one window")
+            raise AmiwarpError(
+                f"windows are indexed by {which}; give a slice, such as [k : k + 1] for one window; for the events of "
+                "each, events[start:stop] for start, stop in zip(windows.start, windows.stop)"
+            )
         return Windows(self.start[which], self.stop[which], self.t_start[which], self.t_end[which])
 
 

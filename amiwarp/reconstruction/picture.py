@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -318,9 +318,14 @@ class Picture:
     """Number of hot pixels that were excluded."""
     seconds: float
     """Computing time of the picture [s]."""
-    unknowns: Any = field(repr=False)
+    unknowns: Any
     """Solution of the whole map with its margin, flattened, followed by the sensor's unknowns, float32, shape (n,). The
     next window can start from it."""
+
+    def __repr__(self) -> str:
+        height, width = self.log.shape
+        span = f"t {self.start_us} .. {self.start_us + self.length_us} us"
+        return f"Picture({width}x{height} px, {span}, {self.pairs:,} pairs, residual {self.residual:.3g})"
 
     def to_host(self) -> Picture:
         """Return the picture in NumPy arrays: copies from a GPU, views on a CPU.
