@@ -42,13 +42,15 @@ FISHEYE = amiwarp.Camera(320, 240, 150.0, 150.5, 161.0, 118.0, amiwarp.Fisheye(-
 PRISM, PHASE = amiwarp.Prism(math.radians(1.0)), 0.7
 
 
-def placed(rng: np.random.Generator, camera: amiwarp.Camera, count: int, tilt: tuple[float, float]) -> list[tuple]:
-    """Return orientations and middles [m] of boards that lie wholly in the image."""
+def placed(
+    rng: np.random.Generator, camera: amiwarp.Camera, count: int, tilt: tuple[float, float], away: float = 1.0
+) -> list[tuple]:
+    """Return orientations and middles [m] of boards that lie wholly in the image, ``away`` times as far as usual."""
     out: list[tuple] = []
     half = BOARD.points.max(axis=0) / 2.0
     while len(out) < count:
         ray = np.asarray(camera.pixels_to_rays(rng.uniform([60, 50], [260, 190])[None]), np.float64)[0]
-        middle = ray / ray[2] * rng.uniform(0.25, 0.42)
+        middle = ray / ray[2] * rng.uniform(0.25, 0.42) * away
         turn, about = math.radians(rng.uniform(*tilt)), rng.uniform(0.0, math.tau)
         rotation = Rotation.from_rotvec([turn * math.cos(about), turn * math.sin(about), 0.0])
         xy = corners_of(camera, rotation, middle - rotation.apply(half)).xy
@@ -64,10 +66,12 @@ def corners_of(camera: amiwarp.Camera, rotation: Rotation, origin: NDArray[np.fl
     return Corners(np.arange(len(points)), np.asarray(camera.rays_to_pixels(rays), np.float64))
 
 
-def seen(seed: int, camera: amiwarp.Camera, *, noise: float, tilt: tuple[float, float] = (10, 40)) -> list[Corners]:
+def seen(
+    seed: int, camera: amiwarp.Camera, *, noise: float, tilt: tuple[float, float] = (10, 40), away: float = 1.0
+) -> list[Corners]:
     rng = np.random.default_rng(seed)
     half = BOARD.points.max(axis=0) / 2.0
-    true = [corners_of(camera, r, m - r.apply(half)) for r, m in placed(rng, camera, 8, tilt)]
+    true = [corners_of(camera, r, m - r.apply(half)) for r, m in placed(rng, camera, 8, tilt, away)]
     return [replace(c, xy=c.xy + rng.normal(0.0, noise, c.xy.shape)) for c in true]
 
 
@@ -494,6 +498,37 @@ def test_a_moving_board_is_refused(tmp_path: Path) -> None:
 def test_parallel_boards_are_refused() -> None:
     with pytest.raises(amiwarp.AmiwarpError, match=r"do not determine the focal length.*; tilt it by 20 to 40 deg"):
         fit_lens(ROUGH, BOARD, seen(5, CAMERA, noise=0.05, tilt=(0, 0.5)))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_tilted_boards_far_away_are_asked_to_come_nearer(seed: int) -> None:
+    """With every board as much nearer as the message says, the poses determine the focal length."""
+    poses = {"noise": 0.06, "tilt": (15, 35)}
+    with pytest.raises(amiwarp.AmiwarpError, match="do not determine the focal length") as caught:
+        fit_lens(ROUGH, BOARD, seen(seed, CAMERA, **poses, away=2.6))
+    message = (
+        r"tilted by \d+ to \d+ deg and spans (\d+) % of the image; hold it (.*) times nearer, where it spans (\d+) %"
+    )
+    said = re.search(message, str(caught.value))
+    assert said is not None
+    span, nearer, then = (float(value) for value in said.groups())
+    assert then == pytest.approx(span * nearer, rel=0.1)
+    fit = fit_lens(ROUGH, BOARD, seen(seed, CAMERA, **poses, away=2.6 / nearer))
+    assert fit.deviations["fx"] < corner_fit.LARGEST_FOCAL_DEVIATION * fit.camera.fx
+
+
+@pytest.mark.parametrize(
+    ("excess", "tilt_deg", "span", "said"),
+    [
+        (3.0, 5, 0.5, "tilt it by 20 to 40 deg in different directions"),
+        (3.0, 5, 0.2, "tilt it by 20 to 40 deg in different directions, and hold it nearer"),
+        (2.0**0.8, 20, 0.2, "hold it 2.0 times nearer, where it spans 40 %, or record more poses"),
+        (9.0, 20, 0.2, "hold it 4.0 times nearer, where it spans 80 %, or record more poses"),
+        (2.0, 20, 0.79, "record more poses"),
+    ],
+)
+def test_advice_follows_tilt_and_size_of_the_boards(excess: float, tilt_deg: float, span: float, said: str) -> None:
+    assert corner_fit._what_determines_it(excess, math.radians(tilt_deg), span) == said
 
 
 @pytest.fixture(scope="module")

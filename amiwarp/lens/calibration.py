@@ -32,7 +32,7 @@ from amiwarp.calib.start_burst import without_start_burst
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.lens.board import Board, Corners, opencv
-from amiwarp.lens.corner_fit import Fit, fit_lens, lens_values, match_corners, tilt_of, with_lens_values
+from amiwarp.lens.corner_fit import STEEP, Fit, fit_lens, lens_values, match_corners, tilt_of, with_lens_values
 from amiwarp.lens.poses import Pose, still_poses
 from amiwarp.optics.camera import Camera, Fisheye
 from amiwarp.optics.models import ExactModel, rms
@@ -107,8 +107,6 @@ focal length, as a share, and of each coordinate of the principal point [px]. Th
 poses of two lenses as likely as possible, and 50 others give the same; the second was found from 175 sets."""
 REGIONS = (("upper", "middle", "lower"), ("left", "centre", "right"))
 """Names of the nine regions of the image in which corners are counted."""
-STEEP = math.radians(15.0)
-"""Tilt of a board that tells focal length from distance [rad]."""
 TWO_BOARDS = "two boards are seen; leave one of them in the picture"
 
 

@@ -32,6 +32,14 @@ out."""
 LARGEST_FOCAL_DEVIATION = 0.005
 """Largest relative standard deviation of the focal length of an answer."""
 UNDETERMINED, TILT = "the poses do not determine the focal length", "tilt it by 20 to 40 deg in different directions"
+STEEP = math.radians(15.0)
+"""Tilt of a board that tells focal length from distance [rad]."""
+SMALL, FULL = 0.3, 0.8
+"""Shares of the image's width or height: a board is small that spans less, and can hardly be held so as to span more.
+"""
+GAIN_OF_NEARNESS = 0.8
+"""Exponent of the distance by which the deviation of the focal length grows: measured with boards that span 14 to 40 %
+of the image."""
 ENOUGH_TO_LEAVE_ONE = 8
 """Number of poses from which on the lens is determined without any one of them, so that their scatter tells its
 deviation; with fewer, the scatter of the corners does."""
@@ -218,12 +226,29 @@ def fit_lens(camera: Camera, board: Board, seen: Sequence[Corners]) -> Fit:
             left_out += group
     off = best.deviations["fx"] / best.camera.fx
     if not off <= LARGEST_FOCAL_DEVIATION:
-        tilts = [math.degrees(tilt_of(pose)) for pose in best.poses]
+        tilts = np.degrees([tilt_of(pose) for pose in best.poses])
+        span = float(
+            np.median([np.max(np.ptp(corners.xy, axis=0) / [camera.width, camera.height]) for corners in seen])
+        )
         raise AmiwarpError(
             f"{UNDETERMINED} ({100.0 * off:.1f} % standard deviation): the board is tilted by {min(tilts):.0f} to "
-            f"{max(tilts):.0f} deg; {TILT}"
+            f"{max(tilts):.0f} deg and spans {100.0 * span:.0f} % of the image; "
+            f"{_what_determines_it(off / LARGEST_FOCAL_DEVIATION, math.radians(np.median(tilts)), span)}"
         )
     return replace(best, left_out=tuple(left_out))
+
+
+def _what_determines_it(excess: float, tilt: float, span: float) -> str:
+    """Return what to do about a focal length whose deviation is ``excess`` times the largest of an answer.
+
+    ``tilt``: of half of the poses [rad]; ``span``: share of the image's width or height that their boards span.
+    """
+    if tilt < STEEP:
+        return TILT + (", and hold it nearer" if span < SMALL else "")
+    nearer = min(excess ** (1.0 / GAIN_OF_NEARNESS), FULL / span)
+    if nearer < 1.1:
+        return "record more poses"
+    return f"hold it {nearer:.1f} times nearer, where it spans {100.0 * nearer * span:.0f} %, or record more poses"
 
 
 def _gain_is_real(less: Fit, more: Fit, count: int) -> bool:
@@ -293,7 +318,7 @@ def _fit(
                 max_nfev=MOST_STEPS,
             ).x  # fmt: skip
         except AmiwarpError as error:  # a lens that cannot be
-            raise AmiwarpError(f"{UNDETERMINED}: the fit runs away; {TILT}") from error
+            raise AmiwarpError(f"{UNDETERMINED}: the fit runs away; {TILT}, and hold it near") from error
         r = residuals(v)
         limit = HUBER * max(1.4826 * float(np.median(np.abs(r))), 1e-6)
         weight = np.minimum(1.0, limit / np.maximum(np.abs(r), 1e-12))
