@@ -249,6 +249,9 @@ def test_a_recording_wraps_events_in_the_size_of_its_camera():
         amiwarp.Recording(events)
     with pytest.raises(AmiwarpError, match=r"event 1 \(x=7, y=5, t=10 us\) lies outside the 6x8 frame"):
         amiwarp.Recording(events, amiwarp.Camera.from_fov(6, 8, 1.0))
+    for width, height in ((6, 6), (7, 7)):  # neither would hold the event if swapped
+        with pytest.raises(AmiwarpError, match=f"outside the {width}x{height} frame; check the size"):
+            MemoryEvents(events, width, height)
     on_device = DeviceEvents.from_arrays(events.x, events.y, events.t, events.p)
     with pytest.raises(AmiwarpError, match=r"wrap them as amiwarp.DeviceMemoryEvents\(events, width, height\)"):
         amiwarp.Recording(on_device, camera)
