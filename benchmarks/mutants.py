@@ -24,8 +24,6 @@ import json
 import os
 import random
 import re
-import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -45,14 +43,12 @@ from cosmic_ray.mutating import MutationVisitor
 from cosmic_ray.operators.operator import Operator
 from parso.python.tree import Name, PythonNode
 
-ROOT = Path(__file__).parents[1]
+from benchmarks.copies import PATIENCE, ROOT, START_S, make_copy, run_python, write_code
+
 CONFIG = ROOT / "benchmarks" / "mutants.toml"
 
 TESTS_S = 60.0
 """Default of the total duration of the tests of the area, and of other tests, that are run on one mutant [s]."""
-
-PATIENCE, START_S = 8.0, 240.0
-"""A mutant hangs after this multiple of its tests' duration and this time [s], in which kernels are compiled."""
 
 ARITHMETIC, BITS, ORDER = (
     "(Add|Sub|Mul|Div|FloorDiv|Mod)",
@@ -68,9 +64,6 @@ OPERATORS = re.compile(
 
 
 PYTEST = ["-q", "-x", "-p", "no:cacheprovider", "-p", "benchmarks.mutants_plugin"]
-
-CLOCK = itertools.count(10**9)
-"""Times of change of the mutated files [s]."""
 
 
 class DropCall(Operator):
@@ -288,26 +281,10 @@ def record(folder: Path, copy: Path, files: list[str]) -> None:
         "pytest",
         *(f"tests/test_{name}.py" for name in files),
     ]
-    code, output = _run(copy, command, None, environment)
+    code, output = run_python(copy, [*command, *PYTEST], None, environment)
     if code:
         (folder / "tests.json").unlink(missing_ok=True)  # the next run would take it for the record of all tests
         raise SystemExit(f"{output[-3000:]}\nthe tests do not pass without a change")
-
-
-def _run(copy: Path, command: list[str], limit_s: float | None, environment: dict[str, str]) -> tuple[int, str]:
-    """Run Python in a copy of the repository. Return its exit status and its output."""
-    command = [sys.executable, *command, *PYTEST]
-    environment = os.environ | {"PYTHONPATH": str(copy)} | environment
-    with subprocess.Popen(
-        command, cwd=copy, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        start_new_session=True,
-    ) as child:  # fmt: skip
-        try:
-            output, _ = child.communicate(timeout=limit_s)
-        except subprocess.TimeoutExpired:
-            os.killpg(child.pid, signal.SIGKILL)
-            return -9, "timeout"
-    return child.returncode, output
 
 
 class Worker:
@@ -339,8 +316,7 @@ class Worker:
             raise SystemExit("the tests cannot be collected")
         self._ready = True
         original, changed = path.read_text(), path.stat().st_mtime
-        path.write_text(mutant.code)  # also if the function is replaced: other processes import the file
-        os.utime(path, (next(CLOCK),) * 2)  # compiled code is recognised by the second of the change
+        write_code(path, mutant.code)  # also if the function is replaced: other processes import the file
         try:
             for some in filter(None, tests):
                 limit_s = PATIENCE * sum(seconds[test] for test in some) + START_S
@@ -365,10 +341,10 @@ class Worker:
 
     def _imported(self, mutant: Mutant, tests: list[str], limit_s: float) -> str:
         """Run the tests in a new process. Return what failed."""
-        code, output = _run(self.copy, ["-m", "pytest", *tests], limit_s, {})
+        code, output = run_python(self.copy, ["-m", "pytest", *tests, *PYTEST], limit_s, {})
         if code == 4 and "not found:" in output:  # the change renames parametrised tests
             files = sorted({_file_of(test) for test in tests})
-            code, output = _run(self.copy, ["-m", "pytest", *files], 4 * limit_s, {})
+            code, output = run_python(self.copy, ["-m", "pytest", *files, *PYTEST], 4 * limit_s, {})
         reasons = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR", "E  ", "timeout"))]
         return "" if code == 0 else reasons[-1] if reasons else output.strip()[-200:]
 
@@ -415,8 +391,7 @@ def main() -> None:
     names = list(dict.fromkeys(name for area in areas for name in area["tests"]))
     files_of = {area["name"]: area["tests"] for area in areas}
     with tempfile.TemporaryDirectory() as scratch, contextlib.ExitStack() as opened:
-        unneeded = shutil.ignore_patterns(".*", "_build", "results")
-        copies = [Path(shutil.copytree(ROOT, Path(scratch) / str(k), ignore=unneeded)) for k in range(given.jobs)]
+        copies = [make_copy(Path(scratch) / str(k)) for k in range(given.jobs)]
         folder = given.map or Path(scratch) / "map"
         if not (folder / "tests.json").exists():
             record(folder, copies[0], names)

@@ -1,0 +1,46 @@
+"""Copies of the repository in which the code is changed to test its tests."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PATIENCE, START_S = 8.0, 240.0
+"""Tests of changed code hang after this multiple of their duration and this time [s], in which kernels are compiled."""
+CLOCK = itertools.count(10**9)
+"""Times of change of the changed files [s]."""
+
+
+def make_copy(to: Path) -> Path:
+    """Copy the repository, without what tests do not need."""
+    return Path(shutil.copytree(ROOT, to, ignore=shutil.ignore_patterns(".*", "_build", "results")))
+
+
+def write_code(path: Path, code: str) -> None:
+    """Write a module. Python recognises compiled code by the second of the change, so each has its own."""
+    path.write_text(code)
+    os.utime(path, (next(CLOCK),) * 2)
+
+
+def run_python(
+    copy: Path, command: Sequence[str], limit_s: float | None, environment: Mapping[str, str]
+) -> tuple[int, str]:
+    """Run Python in a copy of the repository. Return its exit status and its output."""
+    environment = os.environ | {"PYTHONPATH": str(copy)} | environment
+    with subprocess.Popen(
+        [sys.executable, *command], cwd=copy, env=environment, text=True, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, start_new_session=True,
+    ) as child:  # fmt: skip
+        try:
+            output, _ = child.communicate(timeout=limit_s)
+        except subprocess.TimeoutExpired:
+            os.killpg(child.pid, signal.SIGKILL)
+            return -9, "timeout"
+    return child.returncode, output

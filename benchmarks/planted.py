@@ -1,0 +1,150 @@
+"""Planted defects: do the tests of a module notice what a person could get wrong in it?
+
+    python -m benchmarks.planted [--only AREA …] [--jobs 2] [--again FILE.json] [--out FILE.json]
+
+``benchmarks/planted.toml`` lists defects by hand: a sign, a swapped pair, a lost case, a cache that is not renewed.
+Each is planted alone in a copy of the repository, and the module's own test files run until a test fails, which kills
+it. Without a defect they must pass. A defect whose text is not in the code exactly once is stale. The exit status is 1
+if a defect survives or is stale. ``--again`` judges only those of an earlier ``--out`` that were not killed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+import sys
+import tempfile
+import time
+import tomllib
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import warp as wp
+
+from benchmarks.copies import PATIENCE, ROOT, START_S, make_copy, run_python, write_code
+
+DEFECTS = ROOT / "benchmarks" / "planted.toml"
+
+
+@dataclass(frozen=True)
+class Defect:
+    """One defect, as ``planted.toml`` describes it."""
+
+    round: int
+    area: str
+    file: str
+    before: str
+    after: str
+    wrong: str
+    tests: tuple[str, ...]
+
+    @property
+    def name(self) -> tuple[str, str, str]:
+        """What tells the defect from all others."""
+        return self.file, self.before, self.after
+
+
+def load() -> list[Defect]:
+    """Return all defects."""
+    rows = tomllib.loads(DEFECTS.read_text())["defect"]
+    return [Defect(**{**row, "tests": tuple(row["tests"])}) for row in rows]
+
+
+def is_stale(defect: Defect) -> bool:
+    """Return whether the text that the defect replaces is not in the code exactly once."""
+    path = ROOT / defect.file
+    return not path.is_file() or path.read_text().count(defect.before) != 1
+
+
+def run_tests(copy: Path, tests: Sequence[str], limit_s: float | None, kernels: Path) -> tuple[int, str]:
+    """Run test files until a test fails. Return the exit status and the reason."""
+    files = [f"tests/test_{name}.py" for name in tests]
+    command = ["-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *files]
+    status, output = run_python(copy, command, limit_s, {"WARP_CACHE_PATH": str(kernels)})
+    reasons = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR", "timeout"))]
+    reason = reasons[-1] if reasons else output.strip()[-200:]
+    return status, re.sub(r"(?<![\w.])(/[\w.-]+){2,}/", "", reason)[:300]  # without folders of this machine
+
+
+def judge(defect: Defect, copy: Path, seconds: float, kernels: Path) -> tuple[str, str]:
+    """Plant a defect in a copy. Return ``killed``, ``survived`` or ``stale``, and the reason."""
+    if is_stale(defect):
+        return "stale", f"{defect.file} does not have the text exactly once"
+    path = copy / defect.file
+    code = path.read_text()
+    write_code(path, code.replace(defect.before, defect.after))
+    try:
+        status, reason = run_tests(copy, defect.tests, PATIENCE * seconds + START_S, kernels)
+    finally:
+        write_code(path, code)
+    return ("killed", reason) if status else ("survived", "")
+
+
+def score(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
+    """Return the number of each outcome, by round."""
+    rounds = sorted({row["round"] for row in rows})
+    return {f"round {k}": dict(Counter(row["outcome"] for row in rows if row["round"] == k)) for k in rounds}
+
+
+def main() -> None:
+    """Read the command line, judge the defects and print the outcomes."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", metavar="AREA", help="names of areas")
+    parser.add_argument("--jobs", type=int, default=1, help="defects at the same time")
+    parser.add_argument("--again", type=Path, metavar="FILE.json", help="judge only what an earlier --out did not kill")
+    parser.add_argument("--out", type=Path, help="file of all defects and their outcomes")
+    given = parser.parse_args()
+    chosen = [defect for defect in load() if given.only is None or defect.area in given.only]
+    rows: list[dict[str, Any]] = []
+    first: dict[str, Any] | None = None
+    if given.again:
+        earlier = json.loads(given.again.read_text())
+        first = earlier["first_run"]
+        rows = [row for row in earlier["defects"] if row["outcome"] == "killed"]
+        settled = {(row["file"], row["before"], row["after"]) for row in rows}
+        chosen = [defect for defect in chosen if defect.name not in settled]
+    wp.init()
+    with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(given.jobs) as pool:
+        kernels = Path(scratch) / "kernels"  # those of changed code are of no further use
+        shutil.copytree(wp.config.kernel_cache_dir, kernels)
+        copies: SimpleQueue[Path] = SimpleQueue()
+        for k in range(given.jobs):
+            copies.put(make_copy(Path(scratch) / str(k)))
+
+        def measure(tests: tuple[str, ...]) -> float:
+            copy, began = copies.get(), time.perf_counter()
+            status, reason = run_tests(copy, tests, None, kernels)
+            copies.put(copy)
+            if status:
+                raise SystemExit(f"the tests do not pass without a defect: {reason}")
+            return time.perf_counter() - began
+
+        def one(defect: Defect) -> None:
+            copy = copies.get()
+            outcome, reason = judge(defect, copy, seconds[defect.tests], kernels)
+            copies.put(copy)
+            rows.append(asdict(defect) | {"outcome": outcome, "reason": reason})
+            print(f"{outcome:8} {defect.area}: {defect.wrong}  [{reason}]", flush=True)
+
+        files = sorted({defect.tests for defect in chosen})
+        seconds = dict(zip(files, pool.map(measure, files), strict=True))
+        list(pool.map(one, chosen))
+    order = {defect.name: k for k, defect in enumerate(load())}
+    rows.sort(key=lambda row: order.get((row["file"], row["before"], row["after"]), len(order)))
+    found = score(rows)
+    print(found)
+    if given.out:
+        result = {"first_run": first or found, "now": found, "defects": rows}
+        given.out.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    sys.exit(any(row["outcome"] != "killed" for row in rows))
+
+
+if __name__ == "__main__":
+    main()
