@@ -113,7 +113,7 @@ def main() -> None:
     wp.init()
     with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(given.jobs) as pool:
         kernels = Path(scratch) / "kernels"  # those of changed code are of no further use
-        shutil.copytree(wp.config.kernel_cache_dir, kernels)
+        shutil.copytree(wp.config.kernel_cache_dir, kernels / Path(wp.config.kernel_cache_dir).name)
         copies: SimpleQueue[Path] = SimpleQueue()
         for k in range(given.jobs):
             copies.put(make_copy(Path(scratch) / str(k)))
