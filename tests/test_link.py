@@ -21,7 +21,17 @@ from amiwarp.live.link import link as link_module
 from amiwarp.live.link.clocks import WRAP
 from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, EmulatedFault, Motor, PseudoTerminal
 from amiwarp.live.link.link import Follower, Link, LinkUpdate, open_port, usb_id
-from amiwarp.live.link.protocol import Answer, ControllerStatus, FrameDecoder, Index, Message, Ping, Samples, encode
+from amiwarp.live.link.protocol import (
+    Answer,
+    ControllerStatus,
+    FrameDecoder,
+    Index,
+    Message,
+    Ping,
+    Samples,
+    Sync,
+    encode,
+)
 from tests.rig_world import LONG_S, Wire, World
 
 S = 1_000_000
@@ -146,6 +156,16 @@ def test_a_controller_that_begins_anew(fault: str, at: float) -> None:
     assert np.abs(line.away(after[0])).max() < TOLERANCE
     assert abs(len(after[0].t_us) - 1000 * (4.0 - at)) < 20
     assert sum(len(n.t_us) for n in before) == pytest.approx(1000 * at, abs=20)
+
+
+def test_sync_pulses_before_a_restart_are_not_given_on_the_clock_after_it() -> None:
+    follower = Follower("port")
+    follower.opened(HOST)
+    follower.feed(encode(Sync(5 * S, 7), 0), HOST)
+    follower.feed(encode(Sync(1000, 8), 1), HOST + S)
+    (news,) = taken(follower)
+    assert news.restarted
+    assert news.sync == ((8, 1000, HOST + S),)
 
 
 def test_unplugged_and_switched_off_is_a_restart_though_the_clock_fits() -> None:

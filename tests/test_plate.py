@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import amiwarp
-from amiwarp.brightness.depths import orbit_px
+from amiwarp.brightness.depths import SMALLEST_PX, find_depths, orbit_px
 from amiwarp.cli.app import app
 from reference import optics as reference
 
@@ -154,6 +154,34 @@ def test_phase_is_calibrated_and_stored(calibration: amiwarp.Calibration, tmp_pa
     calibration.save(tmp_path / "c.json")
     again = amiwarp.Calibration.load(tmp_path / "c.json")
     assert (again.prism, again.parameters, again.model_name) == (PLATE, calibration.parameters, "plate")
+
+
+class KnownCosts:
+    """Costs that are parabolas of the inverse depth, with their lowest points at ``truth``; as :class:`PixelCosts`."""
+
+    def __init__(self, truth: np.ndarray) -> None:
+        self.truth, self.count = truth, np.full(truth.shape, 20)
+
+    def of(self, model: amiwarp.PlateModel) -> np.ndarray:
+        return self.count * (0.01 + (model.inverse_depth - self.truth) ** 2)
+
+    def gradient(self, model: amiwarp.PlateModel, plus: object, minus: object, width: float) -> np.ndarray:
+        assert model.depths is not None
+        return self.count * (model.depths - self.truth)
+
+
+def test_depths_beyond_both_ends_of_what_is_tried_are_unknown() -> None:
+    camera = amiwarp.Camera.from_fov(150, 48, 1.0)
+    model = amiwarp.PlateModel(camera, PLATE, PHASE)
+    least, largest = SMALLEST_PX / orbit_px(model), 2.5
+    truth = np.repeat([0.2 * least, 1.5, 1.5 * largest], 50) * np.ones((48, 1))  # far, between, near
+    found = find_depths(KnownCosts(truth), model, largest)  # type: ignore[arg-type]
+    inside = np.abs(np.arange(150) % 50 - 24.5) < 10.0  # away from the borders of the three parts
+    far, between, near = (part & inside for part in np.arange(150) // 50 == np.arange(3)[:, None])
+    assert np.isinf(found.std[:, far]).all()
+    assert np.isinf(found.std[:, near]).all()
+    assert np.isfinite(found.std[:, between]).all()
+    np.testing.assert_allclose(found.inverse_depth[:, between], 1.5, rtol=0, atol=1e-3)  # 1/m
 
 
 def test_depth_is_found(seen: amiwarp.Recording, calibration: amiwarp.Calibration, tmp_path: Path) -> None:

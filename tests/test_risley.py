@@ -103,6 +103,15 @@ def test_the_second_prism_turns_with_the_first_by_their_ratio(device: str) -> No
     np.testing.assert_allclose(states.numpy(), angles + PHASES + np.array([0.3, -0.21]), atol=1e-5)
 
 
+def test_each_single_prism_moves_points_as_the_pair_whose_other_prism_is_flat() -> None:
+    xy, theta = samples(200)
+    singles = RisleyModel(CAMERA, PAIR, *PHASES).singles()
+    flat = replace(PAIR, apex=0.0), replace(PAIR, second=replace(SECOND, apex=0.0))
+    for k, other in enumerate(reversed(flat)):
+        expected = RisleyModel(CAMERA, other, *PHASES).compensate_points(xy, theta)
+        np.testing.assert_allclose(singles[k].compensate_points(xy, theta[:, k]), expected, rtol=0, atol=1e-3)
+
+
 def test_encoders_must_suit_the_model() -> None:
     events = amiwarp.Events.from_arrays([10, 20], [12, 14], [0, 1000], [0, 1])
     one, pair = Encoder.constant_speed(720.0, 0, 400_000), RisleyModel(CAMERA, PAIR)

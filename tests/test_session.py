@@ -32,14 +32,14 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.compensation.streams import EXTRAPOLATED, OUTSIDE
+from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE
 from amiwarp.io.native_format import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.queues import BackgroundWorker, Policy
 from amiwarp.live.stream import session as session_module
 from amiwarp.live.stream import sources
 from amiwarp.live.stream.packets import Packet, make_packet
-from amiwarp.live.stream.session import Session, SessionStatus
+from amiwarp.live.stream.session import IntervalFigures, Session, SessionStatus
 from amiwarp.live.stream.sources import LEAD_US, EmulatedCamera, open_source
 from reference.calibration_sample import exact_calibration
 from tests.rig_world import LONG_S, Counted, Wire, World, has_taken_in
@@ -624,6 +624,17 @@ def test_a_status_tells_rate_latency_coverage_and_sharpness(monkeypatch: pytest.
     assert min(s.sharpness or 0.0 for s in between) > 2.0  # random events have sharpness 1
     assert [s.rpm for s in between] == pytest.approx([720.0] * len(between), rel=1e-3)
     assert not any((p.flags & ~np.uint8(OUTSIDE)).any() for p in out)
+
+
+def test_a_status_counts_each_flag_of_the_events_by_itself() -> None:
+    flags = np.array([0] * 9 + [OUTSIDE] * 5 + [EXTRAPOLATED] * 3 + [OUTSIDE | EXTRAPOLATED] * 2 + [OUTSIDE | NO_ANGLE],
+                     np.uint8)  # fmt: skip
+    events = Events.from_arrays([1] * 20, [2] * 20, np.arange(20), [1] * 20)
+    status, figures = SessionStatus(), IntervalFigures(0)
+    figures.add(Compensated(events, flags), 0, status)
+    assert (status.done, status.outside, status.guessed, status.unknown) == (20, 8, 5, 1)
+    figures.report(1000, status)
+    assert status.covered == pytest.approx(1.0 - 6 / 20)
 
 
 def test_what_runs_beside_keeps_its_order_and_tells_what_failed() -> None:

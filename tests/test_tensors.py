@@ -481,6 +481,9 @@ def test_times_are_carried_only_to_later_windows_of_one_recording() -> None:
         cut = amiwarp.windows(events, count=10)[::-1]
         with pytest.raises(AmiwarpError, match="not in order of time; sort them"):
             function(events, WIDTH, HEIGHT, carry=True, windows=cut)
+        longer = amiwarp.windows(events, ranges=[(0, 20), (5, 10)])  # the first one ends later than the second
+        with pytest.raises(AmiwarpError, match="not in order of time; sort them"):
+            function(events, WIDTH, HEIGHT, carry=True, windows=longer)
 
 
 def test_windows_of_equal_count() -> None:

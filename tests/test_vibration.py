@@ -66,6 +66,17 @@ def test_the_same_motion_by_the_opposite_angle() -> None:
     assert amiwarp.ExactModel.reversed_values({"apex": 0.03, "phase": 0.1}) is None
 
 
+def test_the_same_motion_at_angles_that_are_larger_by_a_constant() -> None:
+    camera = amiwarp.Camera.from_fov(320, 240, 1.0)
+    rng = np.random.default_rng(3)
+    xy, theta = rng.uniform((0, 0), (319, 239), (500, 2)), rng.uniform(-math.pi, math.pi, 500)
+    model = amiwarp.VibrationModel.from_values(camera, NO_PRISM, VALUES)
+    other = amiwarp.VibrationModel.from_values(camera, NO_PRISM, amiwarp.VibrationModel.turned_values(VALUES, 0.9))
+    np.testing.assert_allclose(
+        other.compensate_points(xy, theta), model.compensate_points(xy, theta + 0.9), rtol=0, atol=1e-3
+    )
+
+
 def test_a_still_vibration_moves_nothing() -> None:
     camera = amiwarp.Camera.from_fov(320, 240, 1.0)
     values = amiwarp.VibrationModel.still_values(VALUES)

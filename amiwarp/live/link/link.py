@@ -236,9 +236,8 @@ class UpdateQueue:
         return update.finished()
 
     def _merge_first(self) -> None:
-        """Merge the first update, whose samples are dropped, into the second."""
+        """Merge the first update, whose samples are dropped, into the second, which began with a restart."""
         dropped, update = self._updates.popleft(), self._updates[0]
-        update.restarted |= dropped.restarted
         update.messages.extendleft(reversed(dropped.messages))
 
 
