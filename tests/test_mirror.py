@@ -63,6 +63,37 @@ def test_one_angle_gives_the_other_by_their_ratio() -> None:
     np.testing.assert_allclose(still.compensate_points(xy, both), xy, rtol=0, atol=1e-4)
 
 
+def test_each_single_tilt_moves_points_by_its_own_angle() -> None:
+    camera, theta = amiwarp.Camera.from_fov(320, 240, 1.0), np.linspace(0.0, 3.0, 50)
+    xy = np.tile([[100.0, 50.0]], (50, 1))
+    singles = amiwarp.MirrorModel.from_values(camera, NO_PRISM, VALUES | {"ratio": -1.25}).singles()
+    for single, resting, places in zip(singles, ("second_amplitude", "amplitude"), (0, 1), strict=True):
+        other = amiwarp.MirrorModel.from_values(camera, NO_PRISM, VALUES | {resting: 0.0})
+        both = np.full((50, 2), 0.7)
+        both[:, places] = theta
+        expected = other.compensate_points(xy, both)
+        np.testing.assert_allclose(single.compensate_points(xy, theta), expected, rtol=0, atol=1e-4)  # px
+
+
+def test_directions_are_free_unless_both_tilts_have_one_frequency() -> None:
+    directions = {"direction", "second_direction"}
+    for ratio in (None, 0.8, -1.25, 0.0):
+        assert directions < {*amiwarp.MirrorModel.freed(ratio)}
+    for ratio in (1.0, -1.0, -1.0005):  # two oscillations of one frequency, also to and fro, make one ellipse
+        assert {*amiwarp.MirrorModel.FREED} - {*amiwarp.MirrorModel.freed(ratio)} == directions
+
+
+def test_a_tilt_is_searched_up_to_a_displacement_of_24_px() -> None:
+    camera = amiwarp.Camera.from_fov(320, 240, 1.0)
+    for name in ("amplitude", "second_amplitude"):
+        low, high = amiwarp.MirrorModel.default_bounds(name, 0.01, camera, NO_PRISM)
+        assert low == 0.0
+        model = amiwarp.MirrorModel(camera, **({"amplitude": 0.0} | {name: high}))
+        middle = np.array([[camera.cx, camera.cy]])
+        away = model.compensate_points(middle, np.zeros((1, 2))) - middle
+        assert np.linalg.norm(away) == pytest.approx(24.0, rel=0.01)  # px
+
+
 def test_the_twin_moves_the_image_nearly_alike() -> None:
     camera = amiwarp.Camera.from_fov(320, 240, 1.0)
     rng = np.random.default_rng(3)

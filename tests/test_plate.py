@@ -9,7 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 import amiwarp
-from amiwarp.brightness.depths import SMALLEST_PX, find_depths, orbit_px
+from amiwarp.brightness.depths import SMALLEST_PX, contrast, find_depths, orbit_px
+from amiwarp.brightness.pixel_costs import SCALE, PixelCosts
 from amiwarp.cli.app import app
 from reference import optics as reference
 
@@ -48,6 +49,17 @@ def test_one_depth_for_all_pixels_is_a_map_of_equal_depths(device: str) -> None:
         np.testing.assert_allclose(model.compensate_points(xy, theta), expected, rtol=0, atol=1e-4)
     seen = plane.deflect_points(expected, theta)
     np.testing.assert_allclose(seen, xy, rtol=0, atol=1e-3)  # px
+
+
+def test_a_position_between_pixels_has_the_depth_of_the_nearest_one(device: str) -> None:
+    camera = amiwarp.Camera.from_fov(64, 48, 1.0)
+    xy, theta, _ = random_points(camera)
+    depths = np.random.default_rng(2).uniform(0.5, 3.0, (48, 64)).astype(np.float32)
+    column, row = np.rint(xy).astype(int).T
+    model = amiwarp.PlateModel(camera, PLATE, PHASE)
+    expected = model.compensate_at(xy, theta, depths[row, column])
+    found = model.with_depths(depths).compensate_points(xy, theta)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)  # px
 
 
 def test_on_the_axis_the_orbit_is_the_shift_times_the_inverse_depth() -> None:
@@ -156,6 +168,19 @@ def test_phase_is_calibrated_and_stored(calibration: amiwarp.Calibration, tmp_pa
     assert (again.prism, again.parameters, again.model_name) == (PLATE, calibration.parameters, "plate")
 
 
+def test_a_pair_of_events_that_leaves_the_map_costs_as_much_as_without_a_map() -> None:
+    rng, n = np.random.default_rng(5), 3000
+    t = np.sort(rng.integers(0, 83_000, n))
+    events = amiwarp.Events.from_arrays(rng.integers(0, 12, n), rng.integers(0, 9, n), t, rng.integers(0, 2, n))
+    encoder = amiwarp.Encoder.constant_speed(720.0, -1000, 90_000)
+    costs = PixelCosts(events, (12, 9), encoder, longest_gap_us=20_000, margin_px=0.0, device="cpu")
+    camera = amiwarp.Camera(12, 9, 200.0, 200.0, 5.5, 4.0)
+    far_off = amiwarp.PlateModel(camera, PLATE, PHASE, inverse_depth=15.0)
+    assert orbit_px(far_off) * 15.0 > 25.0  # px; all positions are outside
+    expected = costs.count * SCALE**2 * math.log(1.0 + 1.0 / SCALE**2)  # a residual of 1 threshold
+    np.testing.assert_allclose(costs.of(far_off), expected, rtol=1e-5)
+
+
 class KnownCosts:
     """Costs that are parabolas of the inverse depth, with their lowest points at ``truth``; as :class:`PixelCosts`."""
 
@@ -196,6 +221,15 @@ def test_depth_is_found(seen: amiwarp.Recording, calibration: amiwarp.Calibratio
     away = np.abs(found.inverse_depth - 1.0 / truth)[inside] / found.std[inside]
     assert 0.5 < np.mean(away < 1.0) < 0.95
     np.testing.assert_allclose(found.points[found.known][:, 2], 1.0 / found.inverse_depth[found.known], rtol=1e-5)
+    row, column = np.nonzero(found.known)
+    xy, phase = np.stack([column, row], axis=1).astype(np.float64), calibration.parameters["phase"]
+    inverse = found.inverse_depth[row, column].astype(np.float64)
+    turn = [reference.at_depth(CAMERA, PLATE, phase, xy, np.full(len(xy), k * math.tau / 12), inverse)
+            for k in range(12)]  # fmt: skip
+    places = CAMERA.rays_to_pixels(
+        found.points[row, column] / np.linalg.norm(found.points[row, column], axis=1)[:, None]
+    )
+    np.testing.assert_allclose(places, np.mean(turn, axis=0), rtol=0, atol=0.02)  # px
     found.save(tmp_path / "d.npz")
     again = amiwarp.DepthMap.load(tmp_path / "d.npz")
     np.testing.assert_array_equal(again.inverse_depth, found.inverse_depth)
@@ -242,6 +276,23 @@ def test_unknown_depths_are_filled_by_what_is_known_well_about_them() -> None:
     np.testing.assert_array_equal(found[np.isfinite(inverse)], inverse[np.isfinite(inverse)])
     np.testing.assert_allclose(found[30, 42:60], 2.0, atol=0.05)
     assert found[30, 199] == 9.0  # too far from all: the nearest
+
+
+def test_an_unknown_depth_is_the_mean_of_known_ones_by_their_inverse_variances() -> None:
+    inverse, std = np.full((21, 21), np.nan, np.float32), np.full((21, 21), np.nan, np.float32)
+    inverse[10, 6], std[10, 6] = 2.0, 0.1
+    inverse[10, 14], std[10, 14] = 3.0, 0.2  # as near to the middle
+    found = amiwarp.DepthMap(inverse, std, np.zeros((21, 21, 3), np.float32)).filled()
+    assert found[10, 10] == pytest.approx((2.0 / 0.1**2 + 3.0 / 0.2**2) / (1.0 / 0.1**2 + 1.0 / 0.2**2), abs=1e-5)
+
+
+def test_the_contrast_of_depths_nearby_is_what_their_noise_does_not_explain() -> None:
+    rng = np.random.default_rng(3)
+    std = np.full((80, 160), 0.05)
+    step = np.where(np.arange(160) < 80, 1.0, 2.0) * np.ones((80, 1))
+    found = contrast((step + std * rng.standard_normal(std.shape)).astype(np.float32), std)
+    assert np.median(found[:, 20:50]) < 0.4 * 0.05  # 1/m; one depth
+    assert np.median(found[:, 79:81]) == pytest.approx(math.sqrt(0.5), rel=0.05)  # half of the pixels at each depth
 
 
 @pytest.mark.parametrize(

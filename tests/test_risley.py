@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import amiwarp
 from amiwarp import AmiwarpError, Camera, Encoder, Fisheye, Prism, PrismMotion, RadialTangential, RisleyModel
+from amiwarp.brightness.solver import EventTable, SensorTiming
 from amiwarp.cli.app import app
 from amiwarp.imaging.iwe import CanvasShape, Votes, upload_events
 from amiwarp.kernels.prism_angle import encoder_params
@@ -110,6 +111,29 @@ def test_each_single_prism_moves_points_as_the_pair_whose_other_prism_is_flat() 
     for k, other in enumerate(reversed(flat)):
         expected = RisleyModel(CAMERA, other, *PHASES).compensate_points(xy, theta)
         np.testing.assert_allclose(singles[k].compensate_points(xy, theta[:, k]), expected, rtol=0, atol=1e-3)
+
+
+def test_a_pair_of_parameter_values_keeps_the_glass_of_each_prism() -> None:
+    values = {"apex": 0.02, "phase": PHASES[0], "second_apex": 0.01, "second_phase": PHASES[1], "ratio": -0.5}
+    expected = replace(FIRST, apex=0.02, second=replace(SECOND, apex=0.01))
+    assert RisleyModel.from_values(CAMERA, PAIR, values) == RisleyModel(CAMERA, expected, *PHASES, ratio=-0.5)
+
+
+def test_pairs_of_events_have_both_angles_of_the_time_before_the_latency(device: str) -> None:
+    encoder, rng = encoder_of_pair(), np.random.default_rng(4)
+    t = np.sort(rng.integers(5_000, 390_000, 4000))
+    events = amiwarp.Events.from_arrays(
+        rng.integers(0, 16, 4000), rng.integers(0, 12, 4000), t, rng.integers(0, 2, 4000)
+    )
+    table = EventTable([events], np.zeros((12, 16), np.int32), device)
+    pairs = table.pairs(encoder, longest_gap_us=50_000, sensor=SensorTiming(latency_us=400.0, refractory_us=150.0))
+    assert len(pairs) > 1000
+    angles = pairs.arrays.azimuth.numpy().reshape(4, -1)[:, : len(pairs)]  # both angles of the first and second event
+    times = np.rint(pairs.time.astype(np.float64) * 1e6).astype(np.int64)
+    assert np.isin(times, t).all()
+    for k, late in ((0, 150 - 400), (1, -400)):
+        away = angles[2 * k : 2 * k + 2].T - encoder.angles_at(times[k] + late)
+        np.testing.assert_allclose(np.exp(1j * away), 1.0, rtol=0, atol=2e-4)  # rad; extrapolated within a sample
 
 
 def test_encoders_must_suit_the_model() -> None:
