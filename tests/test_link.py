@@ -20,14 +20,16 @@ from amiwarp.cli import rig as command
 from amiwarp.live.link import link as link_module
 from amiwarp.live.link.clocks import WRAP
 from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, EmulatedFault, Motor, PseudoTerminal
-from amiwarp.live.link.link import Follower, Link, LinkUpdate, open_port, usb_id
+from amiwarp.live.link.link import Follower, Link, LinkUpdate, LossReporter, open_port, usb_id
 from amiwarp.live.link.protocol import (
     Answer,
     ControllerStatus,
+    FrameCounters,
     FrameDecoder,
     Index,
     Message,
     Ping,
+    Pong,
     Samples,
     Sync,
     encode,
@@ -166,6 +168,26 @@ def test_sync_pulses_before_a_restart_are_not_given_on_the_clock_after_it() -> N
     (news,) = taken(follower)
     assert news.restarted
     assert news.sync == ((8, 1000, HOST + S),)
+
+
+def test_round_trips_before_a_restart_do_not_tell_the_clock_after_it() -> None:
+    follower = Follower("port")
+    follower.opened(HOST)
+    for k in range(3):
+        follower.pinged(k, HOST + k * S)
+        follower.feed(encode(Pong(k, 5 * S + k * S), k), HOST + k * S + 400)
+    assert follower.clock() is not None
+    follower.feed(encode(Sync(1000, 0), 3), HOST + 3 * S)  # the clock begins anew
+    assert follower.clock() is None
+
+
+def test_samples_out_of_order_are_reported_once() -> None:
+    losses, received = LossReporter(), FrameCounters()
+    losses.out_of_order = 3
+    assert list(losses.check(received, S)) == ["samples dropped, out of order: 3"]
+    assert list(losses.check(received, 3 * S)) == []
+    losses.out_of_order += 2
+    assert list(losses.check(received, 5 * S)) == ["samples dropped, out of order: 2"]
 
 
 def test_unplugged_and_switched_off_is_a_restart_though_the_clock_fits() -> None:

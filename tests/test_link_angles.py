@@ -66,6 +66,13 @@ def test_a_reversal_is_told_and_the_angle_follows() -> None:
     assert angles.count(0, 1500)[0] == pytest.approx(math.tau * 1.5)
 
 
+def test_after_a_reversal_an_index_that_is_missed_counts_from_there() -> None:
+    angles = AngleTracker(PER_TURN)
+    turned(angles, 0, 4900)
+    found = turned(angles, 4900, 3000, index=False)  # 1.9 turns back, but only 1 turn from the last pulse
+    assert [r.fault for r in found] == [EncoderFault.REVERSED, EncoderFault.MISSED_INDEX]
+
+
 def test_an_encoder_that_stands_on_an_edge_is_no_reversal() -> None:
     angles = AngleTracker(PER_TURN)
     turned(angles, 0, 1500)

@@ -123,5 +123,30 @@ def test_without_pulses_arrivals_tell_within_what_they_say() -> None:
     assert found.offset_std_us > 1000
 
 
+def test_without_pulses_a_controller_that_runs_fast_is_followed() -> None:
+    """The controller's clock gains 0.2 ms per second on the host's, the camera's none; packets need 2 ms."""
+    sent, clock = np.arange(20) * 50_000, CameraClock()
+    host = fit_to_round_trips(sent, np.rint((sent + 150) * 1.0002).astype(np.int64), sent + 300)
+    for t in sent.tolist():
+        clock.packet(t - 2000, t)
+    found = clock.clock(host)
+    assert found is not None
+    for seconds in (0, 10, 20):
+        assert abs(int(found(round(1e6 * seconds * 1.0002))) - (1_000_000 * seconds - 2000)) <= 5
+
+
+def test_a_camera_that_returns_has_no_delay_of_its_former_clock() -> None:
+    host, clock = fit_to_round_trips([0, 1000, 2000], [150, 1150, 2150], [300, 1300, 2300]), CameraClock()
+    for t in (10_000, 20_000, 30_000):
+        clock.packet(t - 1000, t)
+    clock.returned()
+    assert clock.clock(host) is None
+    for t in (50_000_000, 50_010_000, 50_020_000):  # its clock begins anew
+        clock.packet(t - 50_000_000, t)
+    found = clock.clock(host)
+    assert found is not None
+    assert int(found(50_005_000)) == 5000
+
+
 def test_nothing_is_known_at_first() -> None:
     assert CameraClock().clock(None) is None
