@@ -194,6 +194,25 @@ def test_a_packet_waits_for_the_encoder_and_no_longer_than_it_may() -> None:
     np.testing.assert_allclose(np.stack([found.x, found.y], axis=1), expected, atol=2e-3)
 
 
+def test_samples_that_come_after_a_guess_replace_it_for_later_events() -> None:
+    """The prism turns back where its angle was extrapolated; a later packet has events of the same time."""
+    stream = EncoderStream()
+    stream.append([0, 10_000], [0.0, 0.754])
+    compensator = Compensator(MODEL, stream, wait_us=1000)
+    events = Events.from_arrays([30, 40], [20, 30], [15_000, 20_000], [1, 0])
+    compensator.put(events, 0)
+    (guess,) = compensator.take(1000)
+    assert (guess.flags & EXTRAPOLATED).tolist() == [EXTRAPOLATED] * 2
+    stream.append([20_000, 30_000], [0.2, 0.0])
+    compensator.put(events[1:], 2000)
+    (found,) = compensator.take(2000)
+    assert not (found.flags & EXTRAPOLATED).any()
+    expected = compensate_events(
+        events[1:], MODEL, Encoder.from_angles([0, 10_000, 20_000, 30_000], [0, 0.754, 0.2, 0])
+    )
+    np.testing.assert_allclose(np.stack([found.events.x, found.events.y], axis=1), expected, rtol=0, atol=1e-3)
+
+
 def test_too_many_that_wait_are_guessed_at_once() -> None:
     events, stream = random_events(5000, 0.05), EncoderStream()
     stream.append([0, 1000], [0.0, 0.0754])

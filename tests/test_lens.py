@@ -551,6 +551,25 @@ def test_still_spans_of_one_recording_are_found(moved: amiwarp.Recording) -> Non
     assert "s" in poses[0].name
 
 
+def test_a_still_span_has_all_turns_that_repeat_each_other() -> None:
+    """Two turns of the same events, and two of others."""
+    turn_us = round(60e6 / 720.0)
+    parts = list[amiwarp.Events]()
+    for k, seed in enumerate((1, 1, 2, 3)):
+        rng = np.random.default_rng(seed)
+        t = np.sort(rng.integers(0, turn_us, 3000))
+        t[0] = 0
+        xy = rng.integers(0, 64, (2, 3000))
+        parts.append(amiwarp.Events.from_arrays(*xy, k * turn_us + t, rng.integers(0, 2, 3000)))
+    source = amiwarp.MemoryEvents(amiwarp.Events.concatenate(parts), 64, 64)
+    encoder = amiwarp.Encoder.constant_speed(720.0, -1000, 5 * turn_us)
+    (pose,), _ = still_poses([amiwarp.Recording(source, None, encoder)])
+    found = pose.recording.events
+    assert found.t_first == 0
+    assert found.t_last == pytest.approx(2 * turn_us, abs=200)
+    assert len(found) == pytest.approx(6000, abs=10)
+
+
 def test_recordings_of_one_name_are_all_used(recordings: list[amiwarp.Recording]) -> None:
     """The files ``day0/pose.h5`` and ``day1/pose.h5`` have the same name."""
     same = [replace(one, name="pose") for one in recordings[:3]]
@@ -679,6 +698,19 @@ def test_poses_are_enough_only_if_they_determine_the_focal_length(
         poses.add(recordings[0])
     assert poses.enough == (tilt[0] > 0)
     assert any(text.startswith("still missing: the poses do not determine") for text in said) == (tilt[0] == 0)
+
+
+def test_a_pose_that_shows_more_corners_than_an_earlier_one_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, said = seen(5, CAMERA, noise=0.0)[0], list[str]()
+    part = Corners(whole.ids[:12], whole.xy[:12])
+    shown = [part, whole, whole]
+    monkeypatch.setattr(lens_live.LiveLens, "_find", lambda *_: shown.pop(0))
+    live = lens_live.LiveLens(BOARD, ROUGH, "cpu", said.append)
+    events = amiwarp.MemoryEvents(amiwarp.Events.from_arrays([1], [1], [0], [1]), 320, 240)
+    for _ in range(3):
+        live.add(amiwarp.Recording(events))
+    assert [pose.name for pose in live.poses] == ["pose 1", "pose 2"]
+    assert any(text.startswith("pose 3: as pose 2, so it does not count") for text in said)
 
 
 def test_ctrl_c_ends_a_stream_with_the_poses_so_far(

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from amiwarp import (
     Camera,
     Compensated,
     Encoder,
+    EncoderStream,
     Events,
     ExactModel,
     MemoryEvents,
@@ -34,12 +36,13 @@ from amiwarp import (
 )
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE
 from amiwarp.io.native_format import LiveWriter
-from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.link.clocks import fit_to_round_trips, monotonic_us
+from amiwarp.live.link.link import LinkUpdate
 from amiwarp.live.queues import BackgroundWorker, Policy
 from amiwarp.live.stream import session as session_module
 from amiwarp.live.stream import sources
 from amiwarp.live.stream.packets import Packet, make_packet
-from amiwarp.live.stream.session import IntervalFigures, Session, SessionStatus
+from amiwarp.live.stream.session import EncoderFeed, IntervalFigures, Session, SessionStatus
 from amiwarp.live.stream.sources import LEAD_US, EmulatedCamera, open_source
 from reference.calibration_sample import exact_calibration
 from tests.rig_world import LONG_S, Counted, Wire, World, has_taken_in
@@ -635,6 +638,30 @@ def test_a_status_counts_each_flag_of_the_events_by_itself() -> None:
     assert (status.done, status.outside, status.guessed, status.unknown) == (20, 8, 5, 1)
     figures.report(1000, status)
     assert status.covered == pytest.approx(1.0 - 6 / 20)
+
+
+def test_samples_that_wait_while_the_controller_restarts_are_not_used_on_its_new_clock() -> None:
+    def update(t_us: list[int], angle: list[float], *, restarted: bool) -> LinkUpdate:
+        return LinkUpdate(t_us=np.array(t_us), angle=np.array(angle), index_t_us=np.zeros(0, np.int64), sync=(),
+                          restarted=restarted, messages=())  # fmt: skip
+
+    updates = [
+        update([7_000_000, 7_001_000], [70.0, 70.1], restarted=False),
+        update([500, 1500], [0.0, 0.1], restarted=True),
+    ]
+    link = SimpleNamespace(poll=lambda: updates.pop(0), clock=lambda: None)
+    given: list[float] = []
+    encoder = EncoderStream()
+    feed = EncoderFeed(link, encoder, lambda t, angle, index_t, second: given.extend(angle), lambda _: None)  # type: ignore[arg-type]
+    feed.poll()
+    assert given == []  # the camera's clock is not known yet
+    for t in (1000, 2000, 3000):
+        feed.take(make_packet(t + 50, Events.from_arrays([1], [1], [t], [1])))
+    link.clock = lambda: fit_to_round_trips([0, 1000, 2000], [50, 1050, 2050], [100, 1100, 2100])
+    feed.poll()
+    assert given == [0.0, 0.1]
+    assert encoder.first is not None
+    assert encoder.first < 1000
 
 
 def test_what_runs_beside_keeps_its_order_and_tells_what_failed() -> None:

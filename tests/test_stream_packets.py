@@ -218,6 +218,14 @@ def test_a_packet_is_sorted_and_equal_times_keep_their_order():
     assert got.x.tolist() == [1, 3, 0, 2]
 
 
+def test_many_events_of_equal_times_keep_their_order():
+    rng, n = np.random.default_rng(2), 5000
+    t = rng.integers(0, 4, n)
+    x = np.arange(n, dtype=np.uint16)
+    got = EventSorter().put(Events(x, np.zeros(n, np.uint16), t, np.zeros(n, np.uint8)))
+    assert got.x.tolist() == sorted(x.tolist(), key=lambda k: t[k])
+
+
 def test_late_ones_are_raised_once_and_then_waited_for():
     sorter = EventSorter()
     assert sorter.put(at(1000, 2000)).t.tolist() == [1000, 2000]

@@ -69,6 +69,15 @@ def test_thinning_is_even_and_keeps_the_bound() -> None:
     assert set(np.diff(thinned).tolist()) == {1, 2}
 
 
+def test_single_events_are_thinned_as_those_of_large_packets_are() -> None:
+    queue = PacketQueue(100, Policy.THIN)
+    queue.put(packet(0, 50))
+    for start in range(50, 250):
+        queue.put(packet(start, 1))
+    assert 90 <= queue.held <= 100
+    assert queue.held + queue.dropped == queue.received == 250
+
+
 def test_a_full_queue_holds_the_source_back_until_there_is_room() -> None:
     queue = PacketQueue(250, Policy.BLOCK)
     through = threading.Event()

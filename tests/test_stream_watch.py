@@ -35,7 +35,7 @@ from amiwarp import (
 from amiwarp.live.stream import session as ring_module
 from amiwarp.live.stream.adaptive import WINDOW_US, SpeedController, SpeedKeeper, prism_orbit
 from amiwarp.live.stream.packets import EncoderSamples, Packet, PacketDecoder
-from amiwarp.live.stream.session import SECONDS, LiveSource, PhaseCheck, RecentEvents, followed
+from amiwarp.live.stream.session import SECONDS, LiveSource, PhaseCheck, PhaseEstimate, RecentEvents, followed
 from amiwarp.live.stream.sockets import Forward
 from amiwarp.live.stream.sources import FileSource, open_source
 from amiwarp.viewer.inspector import Inspector
@@ -102,6 +102,16 @@ def test_a_watch_sees_that_the_phase_has_moved(recording: Recording) -> None:
     assert len(said) == 1
     assert re.search(r"moved by \+(3\.[5-9]|4\.[0-5]) deg", said[0])
     watch.close()
+
+
+def test_of_two_phases_the_larger_offset_counts_whatever_its_sign(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watch = PhaseCheck(known(recording, 0.0), 1e9, lambda _: None)
+    for first, second in ((0.01, -0.03), (-0.04, 0.02), (0.05, 0.06)):
+        found = [PhaseEstimate("phase", first, 0.001), PhaseEstimate("second_phase", second, 0.001)]
+        monkeypatch.setattr(watch, "result", lambda found=found: found)
+        assert watch.update(EncoderStream()) == max(first, second, key=abs)
 
 
 def test_a_watch_compares_with_the_calibration_by_sharpness(recording: Recording) -> None:
