@@ -112,8 +112,9 @@ def main() -> None:
         chosen = [defect for defect in chosen if defect.name not in settled]
     wp.init()
     with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(given.jobs) as pool:
-        kernels = Path(scratch) / "kernels"  # those of changed code are of no further use
-        shutil.copytree(wp.config.kernel_cache_dir, kernels / Path(wp.config.kernel_cache_dir).name)
+        kernels = Path(scratch) / "kernels"  # a copy without what others compile now; kernels of defects are not kept
+        known, unfinished = Path(wp.config.kernel_cache_dir), shutil.ignore_patterns("*_p[0-9]*_t[0-9]*")
+        shutil.copytree(known, kernels / known.name, ignore=unfinished)
         copies: SimpleQueue[Path] = SimpleQueue()
         for k in range(given.jobs):
             copies.put(make_copy(Path(scratch) / str(k)))
@@ -138,8 +139,7 @@ def main() -> None:
         list(pool.map(one, chosen))
     order = {defect.name: k for k, defect in enumerate(load())}
     rows.sort(key=lambda row: order.get((row["file"], row["before"], row["after"]), len(order)))
-    found = score(rows)
-    print(found)
+    print(found := score(rows))
     if given.out:
         result = {"first_run": first or found, "now": found, "defects": rows}
         given.out.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")

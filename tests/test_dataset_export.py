@@ -112,6 +112,7 @@ def test_parquet_holds_every_event_and_label(made: Path, tmp_path: Path) -> None
     train = [name for name in done.files if "train" in name]
     assert train == [f"data/train-{k:05}-of-{len(train):05}.parquet" for k in range(len(train))]
     assert len(train) > 1
+    assert all(pyarrow.parquet.read_metadata(tmp_path / "out" / name).num_rows > 0 for name in done.files)
     rows = [row for name in done.files for row in pyarrow.parquet.read_table(tmp_path / "out" / name).to_pylist()]
     assert sorted(row["label_k"] for row in rows) == list(range(8))
     for row in rows:

@@ -220,6 +220,9 @@ def test_windows_of_a_recording_raw_and_compensated(recurrent: Network, device: 
     whole = recurrent(compensated, WIDTH, HEIGHT)  # no iteration has left states
     wanted = expected([voxel_grid(EVENTS, WIDTH, HEIGHT, BINS, normalize=True, **optic)])
     np.testing.assert_allclose(whole, wanted[0], rtol=0, atol=2e-5)
+    grid = voxel_grid(EVENTS, WIDTH, HEIGHT, BINS, normalize=True, windows=cut[:1])[0]
+    first_images = next(iter(recurrent.over(recording, cut)))  # an iteration does not begin with the states of a call
+    np.testing.assert_allclose(first_images, expected([grid])[0], rtol=0, atol=2e-5)
     with pytest.raises(AmiwarpError, match="windows reach to event 900 of 500"):
         recurrent.over(Recording(MemoryEvents(EVENTS[:500], WIDTH, HEIGHT)), cut)
 
@@ -611,6 +614,23 @@ def test_own_sums_are_those_of_the_events_in_the_window(quarter: Any) -> None:
         here = DeviceEvents.from_arrays(given.x, given.y, given.t, given.p)
         found.append(networks.quarter_turn_sums(here, 160, 120, **window, **optic).numpy())
     np.testing.assert_array_equal(*found)
+
+
+def test_own_sums_hold_an_event_at_the_end_of_the_window(quarter: Any) -> None:
+    pytest.importorskip("torch")
+    _, events, optic, window = quarter
+    last = Events.from_arrays([80, 80], [60, 60], [window["t_end"], window["t_end"] + 1], [1, 1])
+    totals = []
+    for n in range(3):
+        given = Events.concatenate([events, last[:n]])
+        here = DeviceEvents.from_arrays(given.x, given.y, given.t, given.p)
+        totals.append(float(networks.quarter_turn_sums(here, 160, 120, **window, **optic)[4].sum()))  # per path length
+    path = optic["model"].compensate_points(
+        np.tile([79.5, 59.5], (7, 1)), optic["encoder"].angles_at(np.linspace(*window.values(), 7).astype(np.int64))
+    )
+    length = np.hypot(*np.diff(path, axis=0).T).sum()
+    assert totals[1] - totals[0] == pytest.approx(1.0 / length, rel=0.02)
+    assert totals[2] == totals[1]
 
 
 def test_own_network_shows_the_scene(quarter: Any, device: str) -> None:

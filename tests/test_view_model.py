@@ -598,6 +598,17 @@ def test_a_log_intensity_is_that_of_the_scene(inspector: Inspector) -> None:
     assert np.corrcoef(both.before.ravel(), whole.ravel())[0, 1] < 0.8
 
 
+def test_the_camera_of_a_part_sees_along_the_same_rays(inspector: Inspector) -> None:
+    inspector.open(*inspector.first_window())
+    for most, step in ((math.inf, 1), (12_000.0, 2)):
+        part, _, _, found = drawing.select_part(inspector, inspector.loaded, (30, 20, 110, 80), most=most)
+        assert found == step
+        assert part.camera is not None
+        xy = np.array([[0.0, 0.0], [13.0, 7.0], [39.0, 29.0]])
+        expected = inspector.camera.pixels_to_rays(np.array([30.0, 20.0]) + step * xy)
+        np.testing.assert_allclose(part.camera.pixels_to_rays(xy), expected, rtol=0, atol=1e-6)
+
+
 def test_preparing_a_log_intensity_does_not_change_it(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawing, "_prepared", set())
     expected = make_images(inspector, ImageKind.LOG_INTENSITY).after
@@ -729,7 +740,7 @@ def test_a_state_comes_back_from_its_address(inspector: Inspector, recording: Re
     assert encode_state(default, default) == ""
     assert decode("", default, inspector) == (default, ())
     state = replace(
-        default, start_us=12_345, length_us=40_001, selection=Selection(0, (3, 4, 90, 100), True, 1500),
+        default, start_us=12_345, length_us=40_001, selection=Selection(0, (3, 4, 160, 120), True, 1500),
         knobs=replace(inspector.knobs, phase=-0.5, clock_offset=-120.5, model="circle"), image=ImageKind.TIME_SURFACE,
         colour=Colour.RESIDUAL, axis=Axis.TIME, view=View.XY, overlaid=True, against=replace(inspector.knobs, apex=0.0),
         sources=tuple(inspector.sources.items()),
@@ -755,7 +766,7 @@ def test_a_state_comes_back_from_its_address(inspector: Inspector, recording: Re
         "region=1,2,3", "region=5,5,5,9", "region=0,0,999,9", "region=-1,0,9,9", "region=1.5,0,9,9", "start_ms=-1",
         "start_ms=1e99", "length_ms=0", "polarity=2", "hide_hot=yes", "noise_us=-5", "noise_us=\u0663", "sources=apex",
         "sources=x:hand", "sources=apex:god", "unknown=1", "b_=1", "b_model=", "%ff=%ff", "<script>=1",
-        "focal_length=0",
+        "focal_length=0", "region=0,0,161,9", "region=0,0,9,121",
     ],
 )  # fmt: skip
 def test_a_wrong_address_is_explained_and_the_rest_is_taken(inspector: Inspector, query: str) -> None:
@@ -1093,6 +1104,7 @@ def test_intervals_between_two_runs_are_not_counted(monkeypatch: pytest.MonkeyPa
     made.open(0, 100_000)
     found = made.statistics()
     assert found["rows"][0] == ["rate", "64,000 events/s"]  # 3,200 in 50 ms
+    assert ["pixels with events", "100.0 %"] in found["rows"]
     counts = np.array(found["y"]) / 100.0 * (3200 - 2 * spans.RUNS)
     np.testing.assert_allclose(counts, np.rint(counts), rtol=0, atol=1e-6)
 

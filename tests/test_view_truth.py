@@ -116,6 +116,16 @@ def test_each_drawn_event_has_its_own_truth(
         check(thinned)
 
 
+def test_points_that_are_left_out_take_their_truth_with_them(inspector: Inspector) -> None:
+    shown = inspector.show()
+    for read_before in (False, True):  # the second time, the values of all points are known already
+        few = shown.every(7)
+        assert np.array_equal(few.truth.values(Colour.CAUSE), few.events.t % 4)
+        assert np.array_equal(few.truth.values(Colour.INSTANCE), few.events.t % 3)
+        if not read_before:
+            assert np.array_equal(shown.truth.values(Colour.CAUSE), shown.events.t % 4)
+
+
 def test_legends_name_what_the_colours_show(inspector: Inspector) -> None:
     shown, share = inspector.show(), 100.0 / COUNT
     t = shown.events.t
