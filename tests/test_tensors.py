@@ -521,6 +521,18 @@ def test_windows_of_turns_at_varying_speed() -> None:
     np.testing.assert_allclose(turned, np.pi, rtol=0, atol=4e-3)  # a whole microsecond
 
 
+@pytest.mark.parametrize("offset", [30_000.0, -20_000.25])
+def test_windows_of_turns_between_few_samples_with_a_clock_offset(offset: float) -> None:
+    """The speed changes at each sample, whose time is on the encoder's clock."""
+    encoder = Encoder.from_angles([0, 90_000, 210_000, 400_000], [0.0, 11.0, 15.0, 40.0]).with_clock_offset(offset)
+    t = np.arange(25_000, 350_000, 1000)
+    events = Events.from_arrays(t * 0, t * 0, t, t * 0)
+    cut = amiwarp.windows(events, encoder=encoder, turns=0.5)
+    turned = (encoder.angle_at(np.append(cut.t_start, cut.t_end[-1])) - encoder.angle_at([25_000])) / np.pi
+    assert len(cut) > 8
+    np.testing.assert_allclose(turned, np.arange(len(cut) + 1), rtol=0, atol=1e-4)  # half turns; times are whole
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_windows_of_turns_to_and_fro(sign: float) -> None:
     """A window ends a quarter turn from its start on either side; less to and fro does not count."""

@@ -1109,6 +1109,18 @@ def test_intervals_between_two_runs_are_not_counted(monkeypatch: pytest.MonkeyPa
     np.testing.assert_allclose(counts, np.rint(counts), rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("offset", [0.0, 4000.0])
+def test_a_recording_beside_has_the_angles_of_the_same_time(recording: Recording, offset: float) -> None:
+    assert recording.encoder is not None
+    inspector = Inspector(replace(recording, encoder=recording.encoder.with_clock_offset(offset)))
+    events = random_events(1000, 160, 120)
+    later = Events(events.x, events.y, events.t + 7_000_000, events.p)
+    inspector.put_beside(Recording(MemoryEvents(later, 160, 120)))
+    assert inspector.beside is not None
+    own = inspector.encoder.angle_at(recording.events.t_first + events.t - events.t[0])
+    np.testing.assert_allclose(inspector.beside.encoder.angle_at(later.t), own, rtol=0, atol=1e-9)
+
+
 def test_another_recording_is_shown_beside(recording: Recording, inspector: Inspector, tmp_path: Path) -> None:
     """A compensated one, on another clock, and without an encoder: its events lie where the inspector puts its own."""
     assert recording.encoder is not None

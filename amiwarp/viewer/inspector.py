@@ -662,7 +662,7 @@ class Inspector:
         own = self.recording.encoder
         if recording.encoder is None and own is not None and len(source):
             shift = source.t_first - self.recording.events.t_first
-            recording = replace(recording, encoder=Encoder(own.t + shift, own.angle))
+            recording = replace(recording, encoder=Encoder(own.t + shift, own.angle, own.clock_offset_us))
         self.beside = Inspector(recording, device=self.device, most_points=self.most_points)
         self.beside._is_beside = True
 
