@@ -4,8 +4,8 @@
 
 ``benchmarks/planted.toml`` lists defects by hand: a sign, a swapped pair, a lost case, a cache that is not renewed.
 Each is planted alone in a copy of the repository, and the module's own test files run until a test fails, which kills
-it. Without a defect they must pass. A defect whose text is not in the code exactly once is stale. The exit status is 1
-if a defect survives or is stale. ``--again`` judges only those of an earlier ``--out`` that were not killed.
+it. Without a defect they must pass. A defect is stale if its text is not in the code exactly once, or if no test can
+run with it. The exit status is 1 unless all are killed. ``--again`` judges only what an earlier ``--out`` did not kill.
 """
 
 from __future__ import annotations
@@ -65,11 +65,10 @@ def is_stale(defect: Defect) -> bool:
 
 def run_tests(copy: Path, tests: Sequence[str], limit_s: float | None, kernels: Path) -> tuple[int, str]:
     """Run test files until a test fails. Return the exit status and the reason."""
-    files = [f"tests/test_{name}.py" for name in tests]
-    command = ["-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *files]
+    command = ["-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *(f"tests/test_{name}.py" for name in tests)]
     status, output = run_python(copy, command, limit_s, {"WARP_CACHE_PATH": str(kernels)})
-    reasons = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR", "timeout"))]
-    reason = reasons[-1] if reasons else output.strip()[-200:]
+    lines = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR", "timeout"))]
+    reason = (lines or [output.strip()[-200:]])[-1]
     return status, re.sub(r"(?<![\w.])(/[\w.-]+){2,}/", "", reason)[:300]  # without folders of this machine
 
 
@@ -84,7 +83,8 @@ def judge(defect: Defect, copy: Path, seconds: float, kernels: Path) -> tuple[st
         status, reason = run_tests(copy, defect.tests, PATIENCE * seconds + START_S, kernels)
     finally:
         write_code(path, code)
-    return ("killed", reason) if status else ("survived", "")
+    outcome = {0: "survived", 2: "stale"}.get(status, "killed")  # 2: the tests cannot be collected
+    return outcome, "" if status == 0 else reason
 
 
 def score(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:

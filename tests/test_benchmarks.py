@@ -1,5 +1,6 @@
 """The benchmark runner on small scenes: right results pass, wrong ones are named, and the page shows the files."""
 
+import ast
 import dataclasses
 import gc
 import importlib.util
@@ -19,7 +20,7 @@ from PIL import Image
 from amiwarp import Events, Vote
 from amiwarp.compensation.recordings import PIECE
 from benchmarks import __main__ as runner
-from benchmarks import cases, compensate, dataset, mutants_plugin, ours, report, scenes, truth
+from benchmarks import cases, compensate, dataset, mutants_plugin, ours, planted, report, scenes, truth
 from benchmarks.job import Job
 from benchmarks.libraries import Missing
 from benchmarks.scenes import SECONDS, TURNS_PER_S, EventScene, RecordingScene, event_scene
@@ -317,6 +318,35 @@ def test_explained_mutants_and_their_modules_are_in_the_code() -> None:
         for one in config["equivalent"]
     }
     assert [one["before"] for one in config["equivalent"] if one["before"] not in lines[one["module"]]] == []
+
+
+def test_planted_defects_are_in_the_code_once() -> None:
+    defects = planted.load()
+    assert [f"{one.file}: {one.before}" for one in defects if planted.is_stale(one)] == []
+    assert len({one.name for one in defects}) == len(defects)
+    assert all((report.ROOT / "tests" / f"test_{name}.py").exists() for one in defects for name in one.tests)
+    for one in defects:
+        code = (report.ROOT / one.file).read_text()
+        changed = code.replace(one.before, one.after)
+        ast.parse(changed, one.file)
+        assert changed != code
+
+
+def test_a_planted_defect_is_killed_or_survives_or_is_stale(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code, path = "ONE, TWO, THREE = 1, 2, 3\n", tmp_path / "amiwarp" / "one.py"
+    for name in ("amiwarp", "tests"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "amiwarp" / "__init__.py").touch()
+    path.write_text(code)
+    (tmp_path / "tests" / "test_one.py").write_text(
+        "from amiwarp.one import ONE\n\ndef test_one():\n    assert ONE == 1\n"
+    )
+    monkeypatch.setattr(planted, "ROOT", tmp_path)
+    trials = (("= 1", "= 4", "killed"), (" 3", " 4", "survived"), (", ", ",", "stale"), ("ONE", "NONE", "stale"))
+    for before, after, outcome in trials:
+        defect = planted.Defect(2, "area", "amiwarp/one.py", before, after, "", ("one",))
+        assert planted.judge(defect, tmp_path, 1.0, tmp_path / "kernels")[0] == outcome
+        assert path.read_text() == code
 
 
 def test_mutants_replace_functions_that_are_hidden_from_the_collector(
