@@ -60,6 +60,7 @@ repository_pages = {
     "reference/files/*": "examples/*.py",
     "reference/files/auto": "benchmarks/auto.py",
     "reference/files/mutants": "benchmarks/mutants.toml",
+    "reference/files/planted": "benchmarks/planted.toml",
     "reference/files/packets": "amiwarp/live/stream/packets.py",
     "reference/files/refraction": "amiwarp/kernels/refraction.py",
 }
