@@ -228,7 +228,8 @@ def test_windows_of_a_recording_raw_and_compensated(recurrent: Network, device: 
 
 
 @pytest.mark.parametrize(("multiple", "height", "width", "top", "left"), [
-    (1, 22, 37, 0, 0), (2, 22, 38, 0, 1), (5, 25, 40, 2, 2), (8, 24, 40, 1, 2), (16, 32, 48, 5, 6), (64, 64, 64, 21, 14),
+    (1, 22, 37, 0, 0), (2, 22, 38, 0, 1), (5, 25, 40, 2, 2), (8, 24, 40, 1, 2), (16, 32, 48, 5, 6),
+    (64, 64, 64, 21, 14),
 ])  # fmt: skip
 def test_padding_and_cropping(tmp_path: Path, multiple: int, height: int, width: int, top: int, left: int) -> None:
     network = Network(torch_file(tmp_path / "n.pt", "Positions"), GRID, multiple=multiple)
