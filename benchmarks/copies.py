@@ -18,9 +18,14 @@ CLOCK = itertools.count(10**9)
 """Times of change of the changed files [s]."""
 
 
-def make_copy(to: Path) -> Path:
-    """Copy the repository, without what tests do not need."""
-    return Path(shutil.copytree(ROOT, to, ignore=shutil.ignore_patterns(".*", "_build", "results")))
+def make_copies(folder: Path, count: int) -> list[Path]:
+    """Copy the repository ``count`` times, without what tests do not need.
+
+    Programs that run in the background ignore interrupts, and so would the tests, which interrupt themselves.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    unneeded = shutil.ignore_patterns(".*", "_build", "results")
+    return [Path(shutil.copytree(ROOT, folder / str(k), ignore=unneeded)) for k in range(count)]
 
 
 def write_code(path: Path, code: str) -> None:

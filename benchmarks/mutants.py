@@ -43,7 +43,7 @@ from cosmic_ray.mutating import MutationVisitor
 from cosmic_ray.operators.operator import Operator
 from parso.python.tree import Name, PythonNode
 
-from benchmarks.copies import PATIENCE, ROOT, START_S, make_copy, run_python, write_code
+from benchmarks.copies import PATIENCE, ROOT, START_S, make_copies, run_python, write_code
 
 CONFIG = ROOT / "benchmarks" / "mutants.toml"
 
@@ -391,7 +391,7 @@ def main() -> None:
     names = list(dict.fromkeys(name for area in areas for name in area["tests"]))
     files_of = {area["name"]: area["tests"] for area in areas}
     with tempfile.TemporaryDirectory() as scratch, contextlib.ExitStack() as opened:
-        copies = [make_copy(Path(scratch) / str(k)) for k in range(given.jobs)]
+        copies = make_copies(Path(scratch), given.jobs)
         folder = given.map or Path(scratch) / "map"
         if not (folder / "tests.json").exists():
             record(folder, copies[0], names)

@@ -28,7 +28,7 @@ from typing import Any
 
 import warp as wp
 
-from benchmarks.copies import PATIENCE, ROOT, START_S, make_copy, run_python, write_code
+from benchmarks.copies import PATIENCE, ROOT, START_S, make_copies, run_python, write_code
 
 DEFECTS = ROOT / "benchmarks" / "planted.toml"
 
@@ -116,8 +116,8 @@ def main() -> None:
         known, unfinished = Path(wp.config.kernel_cache_dir), shutil.ignore_patterns("*_p[0-9]*_t[0-9]*")
         shutil.copytree(known, kernels / known.name, ignore=unfinished)
         copies: SimpleQueue[Path] = SimpleQueue()
-        for k in range(given.jobs):
-            copies.put(make_copy(Path(scratch) / str(k)))
+        for copy in make_copies(Path(scratch), given.jobs):
+            copies.put(copy)
 
         def measure(tests: tuple[str, ...]) -> float:
             copy, began = copies.get(), time.perf_counter()
