@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -35,7 +35,7 @@ def write_code(path: Path, code: str) -> None:
 
 
 def run_python(
-    copy: Path, command: Sequence[str], limit_s: float | None, environment: Mapping[str, str]
+    copy: Path, command: Sequence[str], limit_s: float | None, environment: dict[str, str]
 ) -> tuple[int, str]:
     """Run Python in a copy of the repository. Return its exit status and its output."""
     environment = os.environ | {"PYTHONPATH": str(copy)} | environment
