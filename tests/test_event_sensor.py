@@ -231,6 +231,14 @@ def test_still_images_give_no_events(device: str) -> None:
     assert host(event_count(events, 4, 3, windows=found)).sum(axis=(1, 2)).tolist() == [0, 24]
 
 
+def test_the_image_of_one_camera_can_be_given_with_an_axis_in_front(device: str) -> None:
+    sensor = EventSensor(1, 3, 4, SensorModel.ideal(), device=device)
+    still = np.full((3, 4), -0.5, np.float32)
+    sensor.step(still[None], 0)  # NumPy gives the new axis a stride of 0
+    events, _ = sensor.step((still + np.float32(0.6))[None], 1000)
+    assert len(events) == 24
+
+
 def test_images_of_warp_stay_as_they_are_and_events_on_their_device(device: str) -> None:
     images = textures(2)
     sensor, other = (EventSensor(3, 8, 10, device=device) for _ in range(2))

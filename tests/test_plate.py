@@ -1,6 +1,7 @@
 """The rotating tilted plate: model, simulator, files, calibration of its phase, and depth at rest."""
 
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -234,8 +235,21 @@ def test_depth_is_found(seen: amiwarp.Recording, calibration: amiwarp.Calibratio
     again = amiwarp.DepthMap.load(tmp_path / "d.npz")
     np.testing.assert_array_equal(again.inverse_depth, found.inverse_depth)
     assert np.isfinite(again.filled()).all()
-    found.save_points(tmp_path / "d.ply")
-    assert f"element vertex {int(found.known.sum())}".encode() in (tmp_path / "d.ply").read_bytes()[:200]
+
+
+def test_points_of_a_map_are_read_by_another_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    inverse = np.array([[2.0, 1.0, np.nan], [0.5, 1.0, np.nan]], np.float32)
+    points = np.stack([np.arange(6.0).reshape(2, 3), -np.arange(6.0).reshape(2, 3), 1.0 / inverse], axis=2)
+    map_of_four = amiwarp.DepthMap(inverse, 0.01 * inverse, points.astype(np.float32))
+    trimesh = pytest.importorskip("trimesh")
+    monkeypatch.setitem(sys.modules, "trimesh", None)  # a plain installation does not have it
+    map_of_four.save_points(tmp_path / "four.ply")
+    cloud = trimesh.load(tmp_path / "four.ply")
+    np.testing.assert_array_equal(cloud.vertices, points.reshape(-1, 3)[[0, 1, 3, 4]].astype(np.float32))
+    near, far = cloud.colors[0], cloud.colors[2]
+    assert near[:2].min() > 200  # yellow
+    assert far[2] > far[1]  # violet
+    assert (cloud.colors[:, 3] == 255).all()
 
 
 def test_events_are_compensated_at_their_depths(

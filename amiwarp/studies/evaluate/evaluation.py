@@ -669,7 +669,7 @@ def evaluate(
         if scheduler is None:
             jobs = [replace(job, threads=max(1, cpu_threads() // count)) for job in jobs]
         store = Store(folder / "cells")
-        with start_workers("amiwarp evaluate", "cluster", scheduler, count, device) as there:
+        with start_workers("amiwarp evaluate", "evaluate", scheduler, count, device) as there:
             results, new, processor_s = _run(jobs, store, there, progress or silent)
         names = [name for name in EVALUATIONS if any(r.evaluation == name for r in results)]
         sections = [section(name, [r for r in results if r.evaluation == name]) for name in names]
