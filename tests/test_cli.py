@@ -25,6 +25,7 @@ from amiwarp.calib.parameters import LINEAR_UNKNOWNS, units
 from amiwarp.cli.app import COMMANDS, app, function_of
 from amiwarp.cli.common import number
 from amiwarp.cli.simulation import RigOptions
+from amiwarp.kernels import launch
 
 
 def test_help_and_info_load_only_what_they_need(made: tuple[Path, str]) -> None:
@@ -115,6 +116,21 @@ def test_the_help_names_every_parameter() -> None:
     text = run("calibrate", "--help").stdout
     named = set(re.findall(r"\w+", re.sub(r"[│\n]", " ", text)))
     assert set(units()) | {"motion", *LINEAR_UNKNOWNS} <= named
+
+
+def test_the_warning_of_a_missing_driver_is_hidden_on_machines_without_a_gpu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def init() -> None:
+        os.write(2, b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. No GPU.\nanother line\n")
+
+    monkeypatch.setattr(launch.wp, "init", init)
+    monkeypatch.setattr(launch, "GPU_FILES", (tmp_path / "nvidiactl",))
+    assert "cpu" in launch.start_quietly()
+    assert capfd.readouterr().err == "another line\n"
+    (tmp_path / "nvidiactl").touch()
+    launch.start_quietly()
+    assert "NVIDIA CUDA driver" in capfd.readouterr().err
 
 
 def test_version() -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from itertools import pairwise
+from pathlib import Path
 from queue import SimpleQueue
 from threading import Lock, Thread, get_ident, main_thread
 from typing import Any
@@ -452,9 +453,15 @@ NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 """Warning of Warp on machines without a GPU, which is no news there."""
 
 
+GPU_FILES = (Path("/dev/nvidiactl"), Path("/dev/nvidia0"), Path("/dev/dxg"))
+"""Files of Linux that exist if there is a GPU, the last one in Windows' subsystem for Linux. A driver without its
+library is worth the warning there."""
+
+
 def start_quietly() -> list[str]:
     """Initialise Warp and return the names of its devices."""
-    with _without(NO_DRIVER):
+    has_gpu = any(file.exists() for file in GPU_FILES)
+    with contextlib.nullcontext() if has_gpu else _without(NO_DRIVER):
         wp.init()
     return [device.alias for device in wp.get_devices()]
 
