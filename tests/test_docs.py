@@ -1,5 +1,6 @@
 """The documentation's links have a target, headings included; its index names every page; files and names exist."""
 
+import importlib
 import pkgutil
 import re
 from pathlib import Path
@@ -187,6 +188,49 @@ def test_commands_that_do_not_exist_are_seen() -> None:
     assert unknown_commands(text) == [
         "amiwarp.events.solve", "--loud", "--deaf", "dance", "--bad", "benchmarks.no",
     ]  # fmt: skip
+
+
+@pytest.fixture
+def page_commands(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+    return importlib.import_module("page_commands")
+
+
+def untested(page_commands: Any, text: str) -> list[str]:
+    """Return what is wrong with the twins of a page's blocks that are marked as not tested."""
+    out = []
+    for block, twin in page_commands.with_twins(page_commands.blocks(text)):
+        marked = block.text.startswith(page_commands.NOT_RUN)
+        if marked and twin is None:
+            out.append(f"line {block.line}: no twin")
+        elif marked:
+            out += [f"line {block.line}: {name}" for name in page_commands.lacking(block, twin)]
+        elif twin is not None:
+            out.append(f"line {twin.line}: the twin of a block that runs")
+    return out
+
+
+def test_each_block_that_is_not_tested_has_a_twin_with_its_commands_and_options(page_commands: Any) -> None:
+    found = {page: untested(page_commands, page.read_text()) for page in page_commands.pages_of()}
+    assert {page: problems for page, problems in found.items() if problems} == {}
+
+
+def test_a_missing_twin_and_a_missing_option_are_seen(page_commands: Any) -> None:
+    block = (
+        "```sh\n# not tested: long\namiwarp view a.h5 --web  # or --live\npython -m benchmarks.fuzz --files 9\n```\n"
+    )
+    code = "```python\n# not tested: long\namiwarp.view(recording)\n```\n"
+    assert untested(page_commands, block) == ["line 1: no twin"]
+    assert untested(page_commands, block + "```sh\ntrue\n```\n") == ["line 1: no twin"]
+    assert untested(page_commands, "```sh\ntrue\n```\n<!-- twin: true -->\n") == [
+        "line 4: the twin of a block that runs"
+    ]
+    whole = "<!-- twin:\namiwarp view b.h5 --web\npython -m benchmarks.fuzz --files 1 --frames 2\n-->\n"
+    assert untested(page_commands, block + whole) == []
+    assert untested(page_commands, block + whole.replace("--web", "--webs")) == ["line 1: --web"]
+    part = "<!-- twin without --web, benchmarks.fuzz --files: amiwarp info b.h5 -->\n"
+    assert untested(page_commands, block + part) == ["line 1: amiwarp view"]
+    assert untested(page_commands, code + "<!-- twin: amiwarp.views(1) -->\n") == ["line 1: amiwarp.view"]
 
 
 def test_tables_of_speed_are_those_of_the_measured_files() -> None:

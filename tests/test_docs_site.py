@@ -241,6 +241,91 @@ def test_what_fails_on_a_page_or_is_in_the_way_is_seen(
     }
 
 
+NEEDS_MORE = """```sh
+python -c "import pytest; print(pytest.__name__)"
+python -c "from importlib.util import find_spec; print(find_spec('pytest'))" | tee found.txt
+```
+
+```output
+pytest
+None
+```
+
+```python
+import pytest
+
+print(pytest.__name__)
+```
+
+```output
+pytest
+```
+
+```python
+from importlib.util import find_spec
+from subprocess import run
+from sys import executable
+
+print(find_spec("numpy").name, find_spec("pytest"), run([executable, "-c", "import pytest"], stderr=-3).returncode)
+```
+
+```output
+numpy None 1
+```
+"""
+
+
+def test_pages_are_run_as_in_a_plain_installation(
+    extension: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages = extension("page_commands")
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text(NEEDS_MORE)
+    text = "needs pytest, which a plain installation lacks and the page does not name"
+    assert pages.run_pages([page]) == {page: [(1, text), (11, text)]}
+    page.write_text(NEEDS_MORE + "\nInstall it with `pip install '.[test]'`.\n")
+    assert pages.run_pages([page]) == {page: []}
+
+
+def test_a_plain_installation_is_what_pyproject_requires_and_what_that_requires(extension: Any) -> None:
+    plain = extension("plain_installation")
+    assert {"amiwarp", "numpy", "vtk", "aiosignal"} <= plain.installed_by()  # some only in turn
+    hidden = plain.hidden_names()
+    extra = {"distributed", "opencv-python-headless", "pyarrow", "rosbags", "trimesh", "dask", "av"}
+    assert extra <= {*hidden["distributions"]}
+    assert not extra & plain.installed_by()
+    assert not plain.installed_by() & {*hidden["distributions"]}
+    assert {"cv2": "opencv-python-headless", "dask": "dask"}.items() <= hidden["modules"].items()
+    assert not {"numpy", "amiwarp", "benchmarks", "tests", "json"} & {*hidden["modules"]}
+    assert "dask" in hidden["extras"]["cluster"]
+    assert "dask" not in hidden["extras"]["ros"]
+
+
+def test_what_a_command_needs_is_what_its_last_line_says(extension: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = extension("plain_installation")
+    monkeypatch.setattr(
+        plain, "names", lambda: {"modules": {"cv2": "opencv"}, "extras": {"lens": ["opencv"], "ros": []}}
+    )
+    line = "boards need OpenCV; run: pip install 'amiwarp[lens]'"
+    trace = 'Traceback (most recent call last):\n  File "{}", line 1\n'
+    missing = "ModuleNotFoundError: No module named 'cv2'"
+    own, user = trace.format(plain.ROOT / "amiwarp" / "lens" / "board.py"), trace.format("<string>")
+    assert plain.need_of(f"note: x\namiwarp: {line}\n", command=True) == "[lens]"
+    assert plain.need_of(f"{own}amiwarp.errors.AmiwarpError: {line}\n", command=True) is None
+    assert plain.need_of(f"{own}amiwarp.errors.AmiwarpError: {line}\n", command=False) == "[lens]"
+    assert plain.need_of(own + missing, command=True) is None
+    assert plain.need_of(own + missing, command=False) is None  # amiwarp should have said it
+    assert plain.need_of(user + missing, command=False) == "opencv"
+    assert plain.need_of(user + missing.replace("cv2", "cv3"), command=False) is None
+    assert plain.need_of(f"{line}\namiwarp: no such file\n", command=True) is None
+    assert plain.named("run `pip install '.[video,lens]'`", "[lens]")
+    assert plain.named("run `pip install '.[lens]'`", "opencv")
+    assert plain.named("run `pip install opencv`", "opencv")
+    assert not plain.named("run `pip install '.[ros]'`", "opencv")
+    assert not plain.named("OpenCV, lens", "[lens]")
+
+
 def test_spreads_of_numbers_on_pages(extension: Any) -> None:
     difference = extension("page_commands").difference
     assert difference("a 10 px b", "x a 11 px b y", "px±10%") is None

@@ -6,9 +6,17 @@ for any words. Numbers must be equal, except those whose spread the info string 
 
     ```output px±10% deg±0.001 s±any
 
-A block whose first line is ``# not tested: REASON`` is skipped, and so are installations with pip. The comment
-``<!-- given: COMMAND -->`` makes files that a page takes for granted, before its first block; pages whose first such
-comment is the same share its files. What a guide writes must not be in the way of another guide in the same folder.
+A block whose first line is ``# not tested: REASON`` is not run, and neither are installations with pip. The comment
+``<!-- twin: COMMANDS -->`` directly after such a block is run instead: the same work with smaller settings, or without
+hardware. Each such block has one, with every command and option of the block (:func:`lacking`), unless the comment
+states which it does without: ``<!-- twin without --full --device: COMMANDS -->``.
+The comment ``<!-- given: COMMAND -->`` makes files that a page takes for granted, before its first block; pages whose
+first such comment is the same share its files. What a guide writes must not be in the way of another guide in the same
+folder. In these comments, ``$REPOSITORY`` is the folder of the repository, ``$PAGE`` the file of the page, and
+``HELPERS`` has functions for programs that run until Ctrl-C.
+
+Every block runs as in a plain installation. If it needs an extra, amiwarp must say so in one line, and the page must
+name the extra; then it runs again with it (``plain_installation.py``).
 
 The build of the site runs the pages that have changed. ``python docs/_ext/page_commands.py PAGE ...`` runs single ones.
 """
@@ -35,11 +43,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[2]
+import plain_installation
+
+ROOT = REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = ("README.md", "docs/getting-started/*.md", "docs/how-to/*.md", "docs/explanation/*.md", "docs/reference/*.md")
 GUIDES = ("docs/getting-started/", "docs/how-to/")
 """Folders of pages that one reader follows in one folder."""
-BLOCK = re.compile(r"^( *)```(sh|python|output)([^\n]*)\n(.*?)^\1```$|<!-- given: (.*?) -->", re.M | re.S)
+BLOCK = re.compile(
+    r"^( *)```(sh|python|output)([^\n]*)\n(.*?)^\1```$|^ *<!-- (given|twin)( [^:\n]*)?:(.*?)-->", re.M | re.S
+)
 NUMBER = re.compile(r"(?<![\w.])[-+−]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?", re.I)
 NOT_RUN = "# not tested: "
 INSTALLATION = re.compile(r"\bpip install\b|\.venv/bin/activate")
@@ -49,7 +61,10 @@ LIMIT_S = 300.0
 
 @dataclass(frozen=True)
 class Block:
-    """One block of a page: its kind (``given``, ``sh``, ``python`` or ``output``), info string, text and line."""
+    """One block of a page: its kind, info string (of a twin: what it does without), text and line.
+
+    Kinds are ``sh``, ``python`` and ``output``, and ``given`` and ``twin`` of comments.
+    """
 
     kind: str
     info: str
@@ -63,7 +78,7 @@ def blocks(page: str) -> list[Block]:
     for match in BLOCK.finditer(page):
         line = page.count("\n", 0, match.start()) + 1
         if match[5]:
-            out.append(Block("given", "", match[5], line))
+            out.append(Block(match[5], (match[6] or "").strip(), textwrap.dedent(match[7]).strip(), line))
         else:
             out.append(Block(match[2], match[3].strip(), textwrap.dedent(match[4]), line))
     return out
@@ -72,6 +87,24 @@ def blocks(page: str) -> list[Block]:
 def given_commands(page: Path) -> list[str]:
     """Return the commands that make what a page takes for granted."""
     return [block.text for block in blocks(page.read_text()) if block.kind == "given"]
+
+
+NAMED = re.compile(r"(?:\bamiwarp|python -m) [a-z][\w.-]*|(?<![\w-])--[a-z][\w-]*|\bamiwarp\.\w+")
+"""What a block tests: commands, options, and names of the Python package."""
+
+
+def lacking(block: Block, twin: Block) -> list[str]:
+    """Return the commands, options and names of a block that its twin neither has nor says to do without."""
+    text = re.sub(r"(?<!\S)# .*", "", block.text)
+    have = {*NAMED.findall(twin.text), *twin.info.removeprefix("without").replace(",", " ").split()}
+    return [name for name in dict.fromkeys(NAMED.findall(text)) if name not in have and name.split()[-1] not in have]
+
+
+def with_twins(found: list[Block]) -> Iterator[tuple[Block, Block | None]]:
+    """Yield the blocks of a page that are not twins, each with its twin: the comment that follows it directly."""
+    for block, following in zip(found, [*found, None][1:], strict=True):
+        if block.kind != "twin":
+            yield block, following if following is not None and following.kind == "twin" else None
 
 
 def spreads(info: str) -> dict[str, str]:
@@ -119,11 +152,21 @@ def difference(shown: str, printed: str, info: str = "") -> str | None:
     return None
 
 
-def shell(command: str, folder: Path) -> str:
+HELPERS = """
+trap 'kill $(jobs -p) 2>/dev/null || true; wait || true' EXIT
+ready() {
+    for file; do for _ in $(seq 1200); do [ -e "$file" ] && continue 2; sleep 0.1; done; return 1; done
+}
+ctrl_c_after() { timeout --preserve-status --signal INT "$@" || [ $? = 130 ]; }
+"""
+"""Start of each shell command. Programs in the background end with it. ``ready FILE ...`` waits until they have made
+files or sockets, ``ctrl_c_after SECONDS COMMAND`` interrupts a command that runs on."""
+
+
+def shell(command: str, folder: Path, variables: dict[str, str] | None = None) -> str:
     """Run a shell command in ``folder`` and return what it prints on stdout and stderr."""
-    here = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     done = subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", command], cwd=folder, env={**os.environ, "PATH": here, "MPLBACKEND": "agg"},
+        ["bash", "-euo", "pipefail", "-c", HELPERS + command], cwd=folder, env=variables,
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=LIMIT_S,
         check=False,
     )  # fmt: skip
@@ -137,9 +180,20 @@ def python(code: str, names: dict[str, Any]) -> str:
     printed = io.StringIO()
     name = f"<page {len(linecache.cache)}>"
     linecache.cache[name] = len(code), None, code.splitlines(keepends=True), name  # PyTorch reads it
+    program = compile(code, name, "exec")
     try:
         with contextlib.redirect_stdout(printed):
-            exec(compile(code, name, "exec"), names)
+            try:
+                exec(program, names)
+            except Exception:
+                need = plain_installation.need_of(traceback.format_exc(), command=False)
+                if need is None:
+                    raise
+                plain_installation.note(need)
+                printed.seek(0)
+                printed.truncate()
+                with plain_installation.everything_shown():
+                    exec(program, names)
     except Exception as error:
         raise RuntimeError("".join(traceback.format_exception_only(error)).strip()) from error
     return printed.getvalue()
@@ -149,7 +203,7 @@ def problems(text: str, folder: Path) -> Iterator[tuple[int, str]]:
     """Run the blocks of a page's text in ``folder``, the current one, and yield line and text of each problem."""
     names: dict[str, Any] = {"__name__": "__main__"}
     printed = None
-    for block in blocks(text):
+    for block, twin in with_twins(blocks(text)):
         if block.kind == "given":
             continue
         if block.kind == "output":
@@ -158,12 +212,16 @@ def problems(text: str, folder: Path) -> Iterator[tuple[int, str]]:
                 yield block.line, found
             continue
         printed = None
-        if block.text.startswith(NOT_RUN) or (block.kind == "sh" and INSTALLATION.search(block.text)):
+        run = block if twin is None else twin
+        if run.text.startswith(NOT_RUN) or (run is block and block.kind == "sh" and INSTALLATION.search(block.text)):
             continue
         try:
-            printed = python(block.text, names) if block.kind == "python" else shell(block.text, folder)
+            printed = python(run.text, names) if block.kind == "python" else shell(run.text, folder)
         except (RuntimeError, subprocess.TimeoutExpired) as error:
-            yield block.line, str(error)
+            yield run.line, str(error)
+        for need in plain_installation.noted():
+            if not plain_installation.named(text, need):
+                yield run.line, f"needs {need}, which a plain installation lacks and the page does not name"
 
 
 def written(folder: Path) -> set[str]:
@@ -171,20 +229,32 @@ def written(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
-def run_page(page: Path, given: Path) -> dict[str, Any]:
-    """Run one page in a new folder, in a process of its own; ``given`` is what its first given command has made."""
+def environment(page: Path | None = None) -> dict[str, str]:
+    """Return the variables for the commands of a page."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    return {**os.environ, "PATH": path, "MPLBACKEND": "agg", "REPOSITORY": str(REPOSITORY), "PAGE": str(page)}
+
+
+def run_page(page: Path, given: Path, plain: Path) -> dict[str, Any]:
+    """Run one page in a new folder, in a process of its own.
+
+    ``given`` is what its first given command has made, ``plain`` the folder of programs in which packages are hidden.
+    """
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as name:
         shutil.copytree(given, name, dirs_exist_ok=True)
         for command in given_commands(page)[1:]:
             try:
-                shell(command, Path(name))
+                shell(command, Path(name), environment(page))
             except RuntimeError as error:
                 return {"problems": [(1, f"given: {error}")], "files": []}
         before = written(Path(name))
-        done = subprocess.run(
-            [sys.executable, __file__, "--page", str(page)], cwd=name, capture_output=True, text=True, check=False
-        )
+        with tempfile.NamedTemporaryFile() as needs:
+            variables = plain_installation.environment(environment(page), plain, Path(needs.name))
+            done = subprocess.run(
+                [sys.executable, __file__, "--page", str(page)], cwd=name, env=variables,
+                capture_output=True, text=True, check=False,
+            )  # fmt: skip
         found = [] if done.returncode == 0 else [(1, done.stderr[-500:])]
         found += json.loads(done.stdout.splitlines()[-1]) if done.returncode == 0 else []
         print(f"{page.relative_to(ROOT)}: {time.perf_counter() - began:.0f} s", file=sys.stderr)
@@ -198,8 +268,12 @@ def run_pages(pages: list[Path]) -> dict[Path, list[tuple[int, str]]]:
         folders = {command: Path(name) / str(k) for k, command in enumerate(dict.fromkeys(givens.values()))}
         for folder in folders.values():
             folder.mkdir()
-        list(pool.map(lambda item: shell(*item), folders.items()))
-        results = list(pool.map(lambda page: run_page(page, folders[givens[page]]), pages))
+        plain = Path(name) / "plain"
+        plain_installation.prepare(plain)
+        first_pages = {command: page for page, command in reversed(givens.items())}
+        made = pool.map(lambda command: shell(command, folders[command], environment(first_pages[command])), folders)
+        list(made)
+        results = list(pool.map(lambda page: run_page(page, folders[givens[page]], plain), pages))
     out = {page: [tuple(found) for found in result["problems"]] for page, result in zip(pages, results, strict=True)}
     owner: dict[str, Path] = {}
     for page, result in zip(pages, results, strict=True):
