@@ -280,6 +280,19 @@ def test_rerun_gets_a_live_stream(recording, tmp_path, monkeypatch):
         viewers.rerun_viewer("nowhere", (64, 48), "camera")
 
 
+def test_a_missing_library_leaves_no_file_of_a_stream(recording, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    save_recording(tmp_path / "in.h5", recording)
+    KNOWN.save(tmp_path / "known.json")
+    result = run(
+        "live", tmp_path / "in.h5", "--calibration", tmp_path / "known.json", "--out", tmp_path / "out.h5",
+        "--foxglove", "127.0.0.1:0",
+    )  # fmt: skip
+    assert result.exit_code == 1
+    assert "pip install 'amiwarp[foxglove]'" in result.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.h5", "known.json"]
+
+
 def test_foxglove_gets_a_live_stream(recording):
     """A client by Foxglove's WebSocket protocol subscribes to all topics, and gets images and angles."""
     pytest.importorskip("foxglove")

@@ -442,6 +442,8 @@ class _Receivers:
                 say(f"{what} packets are served at {opened.address}")
             return opened
 
+        # first, because a recording that has begun is kept although a viewer's library is missing
+        self.viewers = [resources.enter_context(one) for one in _open_viewers(options, source)]
         self.raw: list[RawConsumer] = []
         if options.record is not None:
             writer = _writer(options.record, source, found, compensated=False, encoders=encoders, offset_us=offset_us)
@@ -454,7 +456,6 @@ class _Receivers:
             writer = _writer(options.out, source, found, compensated=True, encoders=encoders)
             self.out = resources.enter_context(writer)
         self.sink = sink("compensated", options.to)
-        self.viewers = [resources.enter_context(one) for one in _open_viewers(options, source)]
         self.raw += self.viewers
 
     @property
