@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -397,6 +398,16 @@ def test_a_quick_run_holds_every_evaluation() -> None:
         math.radians(0.5),
         math.radians(1.0),
     ]  # seeds, scenes and lenses share them
+
+
+def test_a_missing_scheduler_library_names_the_extra_of_the_evaluation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(
+        amiwarp.AmiwarpError, match=r"'amiwarp evaluate' needs Dask; run: pip install 'amiwarp\[evaluate\]'"
+    ):
+        amiwarp.evaluate(tmp_path / "evaluation", only=["texture"], seeds=1, workers=2)
 
 
 def test_the_number_of_workers_is_limited_by_cores_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
