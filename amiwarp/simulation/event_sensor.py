@@ -232,8 +232,8 @@ class EventSensor:
         if where != self._device:
             raise AmiwarpError(f"images are on {where}, the sensor is on {self._device}; move the images")
         if isinstance(levels, np.ndarray):
-            row = levels.reshape(-1)  # an axis of one camera, added by [None], has a stride that Warp cannot reshape
-            levels = wp.array(row, dtype=float, device=self._device, copy=not self._device.is_cpu)
+            flat = levels.reshape(-1)  # an axis of one camera, added by [None], has a stride that Warp cannot reshape
+            levels = wp.array(flat, dtype=float, device=self._device, copy=not self._device.is_cpu)
         levels = levels.reshape((1, -1))
         place = first_beyond(levels[0], LARGEST_LEVEL)
         if place < levels.size:

@@ -31,6 +31,7 @@ import math
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -165,14 +166,19 @@ files or sockets, ``ctrl_c_after SECONDS COMMAND`` interrupts a command that run
 
 def shell(command: str, folder: Path, variables: dict[str, str] | None = None) -> str:
     """Run a shell command in ``folder`` and return what it prints on stdout and stderr."""
-    done = subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", HELPERS + command], cwd=folder, env=variables,
-        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=LIMIT_S,
-        check=False,
+    running = subprocess.Popen(
+        ["bash", "-euo", "pipefail", "-c", HELPERS + command], cwd=folder, env=variables, text=True,
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
     )  # fmt: skip
-    if done.returncode:
-        raise RuntimeError(f"exit code {done.returncode}: {' '.join(done.stdout.split()[-60:])}")
-    return done.stdout
+    try:
+        printed, _ = running.communicate(timeout=LIMIT_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(running.pid, signal.SIGTERM)
+        running.communicate()
+        raise
+    if running.returncode:
+        raise RuntimeError(f"exit code {running.returncode}: {' '.join(printed.split()[-60:])}")
+    return printed
 
 
 def python(code: str, names: dict[str, Any]) -> str:
@@ -217,8 +223,10 @@ def problems(text: str, folder: Path) -> Iterator[tuple[int, str]]:
             continue
         try:
             printed = python(run.text, names) if block.kind == "python" else shell(run.text, folder)
-        except (RuntimeError, subprocess.TimeoutExpired) as error:
+        except RuntimeError as error:
             yield run.line, str(error)
+        except subprocess.TimeoutExpired:
+            yield run.line, f"takes longer than {LIMIT_S:g} s"
         for need in plain_installation.noted():
             if not plain_installation.named(text, need):
                 yield run.line, f"needs {need}, which a plain installation lacks and the page does not name"
