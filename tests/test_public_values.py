@@ -363,7 +363,7 @@ def test_names_of_unions_serve_in_checks_and_annotations() -> None:
     assert (named | None, None | named, named | int) == (union | None, None | union, union | int)
     assert named is amiwarp.NominalPrism
 
-    def use(one: amiwarp.NominalPrism, other: "amiwarp.Progress | None") -> None: ...
+    def use(one: amiwarp.NominalPrism, other: amiwarp.Progress | None) -> None: ...
 
     assert get_type_hints(use)["one"] is named
     assert repr(named) == "amiwarp.NominalPrism"

@@ -12,7 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.choices import Option
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import INT64, array, as_times, check_ascending, finite, guarded, instance, not_called, shown, whole
+from amiwarp.validation import (
+    INT64,
+    array,
+    as_times,
+    check_ascending,
+    finite,
+    guarded,
+    instance,
+    not_called,
+    shown,
+    whole,
+)
 
 Item = TypeVar("Item", covariant=True)
 """What a store returns: an array, or a record."""
