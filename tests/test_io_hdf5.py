@@ -455,7 +455,7 @@ def requests(monkeypatch) -> list[str]:
     monkeypatch.setattr(
         reading_process.ReadingProcess,
         "send",
-        lambda self, function, *arguments: sent.append(str(function)) or send(self, function, *arguments),
+        lambda self, function, *arguments, **how: sent.append(str(function)) or send(self, function, *arguments, **how),
     )
     return sent
 
