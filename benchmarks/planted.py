@@ -131,7 +131,7 @@ def main() -> None:
             copy = copies.get()
             outcome, reason = judge(defect, copy, seconds[defect.tests], kernels)
             copies.put(copy)
-            rows.append(asdict(defect) | {"outcome": outcome, "reason": reason})
+            rows.append(asdict(defect) | {"outcome": outcome, "reason": reason, "again": bool(given.again)})
             print(f"{outcome:8} {defect.area}: {defect.wrong}  [{reason}]", flush=True)
 
         files = sorted({defect.tests for defect in chosen})
