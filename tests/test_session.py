@@ -436,7 +436,7 @@ def test_a_stopped_session_drops_what_takes_too_long(monkeypatch: pytest.MonkeyP
         session = Session(Ahead([]), raw=[raw], say=said.append)
     else:
         session = Session(Ahead([]), KNOWN, sinks=(take,), say=said.append)
-        session._compensator.batch = 1  # type: ignore[union-attr]
+        session._compensator.batch = 500  # type: ignore[union-attr]
     status = session.run(stop, lambda _: None)
     (message,) = said
     processed, written = (int(n.replace(",", "")) for n in re.findall(r"([\d,]+) (?:events )?that waited", message))
