@@ -36,7 +36,7 @@ def large(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("prophesee", "aedat", "plain_files"):
         name, value = ("READ_BYTES", 4000) if module == "plain_files" else ("DEFAULT_BLOCK", 500)
         monkeypatch.setattr(f"amiwarp.io.{module}.{name}", value)
-    monkeypatch.setattr("amiwarp.io.prophesee.EVT_BLOCK", 500)
+    monkeypatch.setattr("amiwarp.io.prophesee.EVT_BYTES", 4000)
 
 
 def write_later_start(path: Path, events: Events) -> None:

@@ -33,6 +33,7 @@ from amiwarp import (
 )
 from amiwarp.io import file_scan as scan
 from amiwarp.io import read_encoder_triggers
+from amiwarp.io.evt_decoder import EvtDecoder
 from amiwarp.io.export import left_out
 from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, _halves_are_swapped, words_of
 from amiwarp.io.ros import _types_of, read_packets
@@ -110,8 +111,8 @@ def test_evt_words_as_faery_decodes_them(data_dir):
         data = path.read_bytes()
         start = data.rindex(b"\n% ", 0, 1000)
         words = words_of(data[data.index(b"\n", start + 1) + 1 :], version)
-        decoder = Evt3Decoder() if version == "3" else Evt2Decoder(vectors=False)
-        # Pieces of odd length, as in the messages of ROS.
+        decoder = EvtDecoder(f"{version}.0")
+        # Pieces of odd length.
         found = [decoder.decode(words[at : at + 10_007])[0] for at in range(0, len(words), 10_007)]
         x, y, t, p = (np.concatenate(parts) for parts in zip(*found, strict=True))
         with evt.Decoder(path, (2048, 2048), f"evt{version}") as packets_:

@@ -52,18 +52,6 @@ def test_raw_files_without_faery(tmp_path, version):
     test_io_formats.test_triggers_of_raw_files(tmp_path, version)
 
 
-@pytest.mark.parametrize("name", ["evt3_driving_1280x720.raw", "evt2_balls_640x480.raw"])
-def test_raw_files_of_cameras_without_faery(data_dir, request, name):
-    with_faery = open_recording(data_dir / "evt" / name).events
-    request.getfixturevalue("no_faery")
-    without = open_recording(data_dir / "evt" / name).events
-    assert len(without) == len(with_faery)
-    expected, found = (events.slice(0, len(with_faery)) for events in (with_faery, without))
-    assert all(np.array_equal(getattr(found, column), getattr(expected, column)) for column in "xyp")
-    # faery raises a time to the largest in any word before it: by up to 11 us in the file of EVT 3.
-    assert 0 <= (expected.t - found.t).max() <= 11
-
-
 @pytest.mark.usefixtures("no_faery")
 @pytest.mark.parametrize("name", ["aedat4", "es"])
 def test_files_that_need_faery_name_it(tmp_path, name):

@@ -224,7 +224,6 @@ OPENED_OTHERWISE = {
     # Functions of the reading process. ReadingProcess.send has checked and noted the path.
     "amiwarp.io.aedat: aedat.Decoder(path)": "reading process",
     "amiwarp.io.prophesee: es.Decoder(path, 0)": "reading process",
-    "amiwarp.io.prophesee: evt.Decoder(path, WIDEST, 'evt3')": "reading process",
     "amiwarp.io.hdf5_server: h5py.File(path, 'r')": "reading process",
     "amiwarp.io.hdf5_server: h5py.h5f.open(name, how, fapl=access)": "reading process",
     "amiwarp.io.hdf5_server: h5py.h5f.open(name, how | h5py.h5f.ACC_SWMR_READ, fapl=access)": "reading process",

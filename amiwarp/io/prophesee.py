@@ -1,7 +1,7 @@
 """Prophesee's files and words: RAW (EVT 2.0, 2.1, 3.0) is read and written; DAT and Event Stream files are read."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording
+from amiwarp.io.evt_decoder import WORD_TYPES, EventColumns, EvtDecoder, Triggers
 from amiwarp.io.file_scan import FileEvents, Packet, last_word, nearest, read_pieces, read_words, unwrapped
 from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.formats import LONGEST_US, Outline
-from amiwarp.io.reading_process import Reply, faery_module, has_faery, noting_progress, packets, run
+from amiwarp.io.reading_process import Reply, faery_module, noting_progress, packets, run
 from amiwarp.validation import TIME_LIMIT
 
 # Decoders of Prophesee's EVT words with NumPy: EVT 2.0, 2.1 and 3.0, for streams that arrive in pieces.
 #
-# The words are those of Prophesee's documentation of the formats. The faster decoder of RAW files (faery) reads whole
-# files only, not EVT 2.1, and is not available for every platform. Messages of ROS hold pieces of a stream.
+# The words are those of Prophesee's documentation of the formats. Messages of ROS are decoded with these, in the
+# process that reads the bag; files with :class:`EvtDecoder`.
 
 Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
@@ -146,17 +147,13 @@ class Evt3Decoder:
         return base, polarity
 
 
-# Readers of Prophesee's files: RAW with faery (EVT 2.0, 3.0) or NumPy (EVT 2.1, or without faery), DAT with NumPy.
+# Readers of Prophesee's files: RAW with the decoder in Warp, DAT with NumPy.
 
-EVT_BLOCK = 1 << 16
-"""Number of EVT words that NumPy decodes at once, with up to 32 events each."""
+EVT_BYTES = 1 << 21
+"""Number of bytes of EVT words that are decoded at once. They hold at most 13 million events."""
 
-VERSION_OF = {2: "3", 4: "2", 8: "2.1"}
+VERSION_OF = {2: "3.0", 4: "2.0", 8: "2.1"}
 """Version of EVT by the size of its words [bytes]."""
-
-WIDEST = (2048, 2048)
-"""Largest width and height that EVT coordinates can represent [px]. The decoder is given this size, so that it accepts
-all events."""
 
 GENERATIONS = {
     "gen3": (640, 480),
@@ -202,16 +199,19 @@ class EvtFile:
     """Time that is added to those of the words [us]: ``t0`` of the header, which amiwarp and faery write."""
 
     def words(self, data: bytes) -> NDArray[Any]:
-        """Return the whole words of some bytes of the file."""
-        words = words_of(data, VERSION_OF[self.word])
-        return swap_halves(words) if self.swapped else words
+        """Return the whole words of some bytes of the file, with halves as they are stored."""
+        return np.frombuffer(data, WORD_TYPES[VERSION_OF[self.word]], len(data) // self.word)
+
+    def decoder(self) -> EvtDecoder:
+        """Return a new decoder of the file's words."""
+        return EvtDecoder(VERSION_OF[self.word], swapped=self.swapped)
 
 
 def open_evt(path: Path) -> Recording:
-    """Open a RAW file. The decoder raises each time to the largest so far, without reporting how often."""
+    """Open a RAW file."""
     about = _read_evt_header(path)
     last = None if about.word == 2 else partial(_last_evt_time, about)
-    events = FileEvents(path, _evt_source(about, False), size=_evt_size(about.fields), last_time=last)
+    events = FileEvents(path, partial(_evt_events, about), size=_evt_size(about.fields), last_time=last)
     truncated = (path.stat().st_size - about.offset) % about.word
     noted = {"truncated_bytes": truncated} if truncated else {}
     return Recording(
@@ -232,13 +232,6 @@ def _read_evt_header(path: Path) -> EvtFile:
     return EvtFile(path, fields, "2.1" if word == 8 else version, offset, word, swapped, int(origin))
 
 
-def _evt_source(about: EvtFile, triggers: bool) -> Callable[[dict[str, int]], Iterator[Packet]]:
-    """Return the function that yields the events, or the triggers, of a RAW file: with faery if it can read them."""
-    if about.word == 8 or not has_faery():
-        return partial(_numpy_packets, about, triggers)
-    return partial(packets, read_evt_packets, about.path.absolute(), triggers)
-
-
 def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
     """Return the sensor size in a header [px]; None if the header has no size."""
     if match := re.fullmatch(r"(\d+)x(\d+)", fields.get("geometry", "")):
@@ -252,43 +245,38 @@ def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
     return GENERATIONS[match[0]] if match else None
 
 
-def read_evt_packets(notes: dict[str, int], path: str, triggers: bool) -> Iterator[Packet]:
-    """Yield packets of events, or of triggers, of a RAW file. Runs in the reading process."""
-    evt = faery_module("evt")
-    notes["triggers"] = 0
-    with evt.Decoder(path, WIDEST, "evt3") as decoder:
-        for packet in noting_progress(decoder, path, notes):
-            edges = packet.get("triggers")
-            notes["triggers"] += 0 if edges is None else len(edges)
-            if triggers and edges is not None:
-                yield edges["source"], edges["source"] * 0, edges["t"], edges["rising"]
-            elif "events" in packet and not triggers:
-                events = packet["events"]
-                yield events["x"], events["y"], events["t"], events["p"]
-
-
 def trigger_packets(path: Path) -> Iterator[Packet]:
     """Yield the edges of the external triggers of a RAW file."""
-    return _evt_source(_read_evt_header(path), True)({})
+    about = _read_evt_header(path)
+    for _, edges in _decoded(about, {}):
+        yield edges.channel, np.zeros_like(edges.channel), edges.t + about.origin, edges.rising
 
 
-def _numpy_packets(about: EvtFile, triggers: bool, notes: dict[str, int]) -> Iterator[Packet]:
-    """Yield the events, or the triggers, of a RAW file."""
-    decoder = Evt3Decoder() if about.word == 2 else Evt2Decoder(vectors=about.word == 8)
-    for data in read_pieces(about.path, about.offset, about.word * EVT_BLOCK, notes):
+def _decoded(about: EvtFile, notes: dict[str, int]) -> Iterator[tuple[EventColumns, Triggers]]:
+    """Yield the events and the triggers of a RAW file, and note what was counted."""
+    decoder = about.decoder()
+    for data in read_pieces(about.path, about.offset, EVT_BYTES, notes):
         events, edges = decoder.decode(about.words(data))
-        notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
-        x, y, t, p = edges if triggers else events
-        yield x, y, t + about.origin, p
+        notes["triggers"] = notes.get("triggers", 0) + len(edges.t)
+        notes["dropped_untimed_events"] = decoder.untimed
+        yield events, edges
+
+
+def _evt_events(about: EvtFile, notes: dict[str, int]) -> Iterator[Packet]:
+    """Yield the events of a RAW file."""
+    for events, _ in _decoded(about, notes):
+        if about.origin:
+            np.add(events.t, about.origin, out=events.t)
+        yield Events(*events)
 
 
 def _last_evt_time(about: EvtFile, estimate: int) -> int | None:
     """Return the time of the last event of a file of EVT 2.0 or 2.1 [us]. Times of EVT 3.0 wrap after 17 s."""
     count = (about.path.stat().st_size - about.offset) // about.word
     with open_input(about.path) as file:
-        file.seek(about.offset + max(count - EVT_BLOCK, 0) * about.word)
-        words = about.words(file.read(about.word * EVT_BLOCK))
-    t = Evt2Decoder(vectors=about.word == 8).decode(words)[0][2]
+        file.seek(about.offset + max(count - EVT_BYTES // about.word, 0) * about.word)
+        words = about.words(file.read(EVT_BYTES))
+    t = about.decoder().decode(words)[0].t
     return nearest(int(t[-1]) + about.origin, 34, estimate) if t.size else None
 
 
@@ -298,7 +286,7 @@ def _is_swapped(path: Path, offset: int, layout: str) -> bool:
         return "endianness=legacy" in layout
     with open_input(path) as file:
         file.seek(offset)
-        return _halves_are_swapped(words_of(file.read(8 * EVT_BLOCK), "2.1"))
+        return _halves_are_swapped(words_of(file.read(EVT_BYTES), "2.1"))
 
 
 def _halves_are_swapped(words: NDArray[np.uint64]) -> bool:

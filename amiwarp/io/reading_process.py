@@ -8,7 +8,6 @@ this file runs in the process.
 
 import contextlib
 import importlib
-import importlib.util
 import json
 import os
 import signal
@@ -488,11 +487,6 @@ def _next_packets(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[
         yield packet
         if count >= PACKET or time.process_time() - began > PACKET_S:
             return
-
-
-def has_faery() -> bool:
-    """Return whether the compiled decoders of faery are installed, without importing them."""
-    return importlib.util.find_spec("faery") is not None
 
 
 def faery_module(name: str) -> Any:

@@ -1,0 +1,453 @@
+"""Decoders of Prophesee's EVT 2.0, 2.1 and 3.0: a first pass finds the state at the start of each block of words.
+
+An EVT word changes the decoder's state (time, row, column of the next vector) or is an event. So that all blocks can be
+decoded at the same time, :func:`survey_evt2` and :func:`survey_evt3` note what each block changes, whatever the state
+before it; :func:`link_blocks` follows the changes from block to block; :func:`decode_evt2` and :func:`decode_evt3` then
+decode each block from the state at its start. One thread reads one block.
+
+The words are described at https://docs.prophesee.ai/stable/data/encoding_formats/index.html.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from amiwarp.kernels.native_code import load_uint16
+
+wp.set_module_options({"enable_backward": False})
+
+NONE = wp.constant(-1)
+"""Stands for what no word of a block has set."""
+LARGEST = wp.constant(65535)
+"""Largest coordinate that can be stored [px]."""
+
+# Types of EVT 2.0 and 2.1 words, in their upper four bits.
+ON = wp.constant(0x1)
+"""Change detection ON. OFF is 0."""
+TIME_HIGH = wp.constant(0x8)
+"""Upper bits of the time, in all versions."""
+TRIGGER = wp.constant(0xA)
+"""Edge of an external trigger, in all versions."""
+
+# Types of EVT 3.0 words, in their upper four bits.
+ROW = wp.constant(0x0)
+SINGLE = wp.constant(0x2)
+VECTOR_BASE = wp.constant(0x3)
+VECTOR_12 = wp.constant(0x4)
+VECTOR_8 = wp.constant(0x5)
+TIME_LOW = wp.constant(0x6)
+
+
+@wp.struct
+class State:
+    """What the words so far determine for those that follow."""
+
+    timed: int
+    """Whether a TIME_HIGH word has come. Events before it have no time and are dropped."""
+    high: wp.int64
+    """Last TIME_HIGH, without its wraps [64 us, or 4096 us in EVT 3.0]."""
+    low: int
+    """Time after TIME_HIGH, of EVT 3.0 [us]."""
+    row: int
+    """Row of the next events, of EVT 3.0 [px]."""
+    base: int
+    """Column of the next vector, of EVT 3.0 [px]."""
+    polarity: int
+    """Polarity of the next vectors, of EVT 3.0."""
+
+
+@wp.struct
+class Change:
+    """What a block of words changes, and what it holds. What no word sets is :data:`NONE`."""
+
+    first_high: int
+    """First TIME_HIGH of the block, as stored."""
+    rise: wp.int64
+    """Last TIME_HIGH of the block after its first one, without wraps."""
+    low_before: int
+    """Last TIME_LOW before the first TIME_HIGH."""
+    low_after: int
+    """Last TIME_LOW after the first TIME_HIGH; 0 if a TIME_HIGH with another value followed."""
+    row: int
+    base: int
+    """Last VECTOR_BASE, without the vectors behind it."""
+    moved: int
+    """Width of the vectors after VECTOR_BASE, or of all vectors of the block without it [px]."""
+    polarity: int
+    events: int
+    """Number of events."""
+    triggers: int
+    """Number of edges of triggers."""
+    early_events: int
+    """Number of events before the first TIME_HIGH."""
+    early_triggers: int
+    """Number of edges before the first TIME_HIGH."""
+
+
+@wp.struct
+class EventArrays:
+    """Decoded events."""
+
+    x: wp.array(dtype=wp.uint16)
+    """Columns [px]."""
+    y: wp.array(dtype=wp.uint16)
+    """Rows [px]."""
+    t: wp.array(dtype=wp.int64)
+    """Times [us]."""
+    p: wp.array(dtype=wp.uint8)
+    """Polarities: 1 is ON."""
+
+
+@wp.struct
+class TriggerArrays:
+    """Decoded edges of external triggers."""
+
+    channel: wp.array(dtype=wp.uint8)
+    """Numbers of the inputs."""
+    t: wp.array(dtype=wp.int64)
+    """Times [us]."""
+    rising: wp.array(dtype=wp.uint8)
+    """1 for a rising edge."""
+
+
+@wp.func
+def unchanged() -> Change:
+    """Return the change by a block without words."""
+    change = Change()
+    change.first_high = NONE
+    change.low_before = NONE
+    change.low_after = NONE
+    change.row = NONE
+    change.base = NONE
+    change.polarity = NONE
+    return change
+
+
+@wp.func
+def set_bits(mask: wp.uint32) -> int:
+    """Return the number of set bits."""
+    pairs = mask - ((mask >> wp.uint32(1)) & wp.uint32(0x55555555))
+    fours = (pairs & wp.uint32(0x33333333)) + ((pairs >> wp.uint32(2)) & wp.uint32(0x33333333))
+    bytes_ = (fours + (fours >> wp.uint32(4))) & wp.uint32(0x0F0F0F0F)
+    return int((bytes_ * wp.uint32(0x01010101)) >> wp.uint32(24))
+
+
+@wp.func_native("""
+#ifdef __CUDA_ARCH__
+    return __ffs(mask) - 1;
+#else
+    return __builtin_ctz(mask);
+#endif
+""")
+def lowest_bit(mask: wp.uint32) -> int:
+    """Return the position of the lowest set bit of a mask that is not 0."""
+
+
+@wp.func_native("""
+    ((uint16_t*)events.x.data)[i] = column;
+    ((uint16_t*)events.y.data)[i] = row;
+    ((int64_t*)events.t.data)[i] = now;
+    ((uint8_t*)events.p.data)[i] = polarity;
+""")
+def store_event(events: EventArrays, i: int, column: wp.uint16, row: wp.uint16, now: wp.int64, polarity: wp.uint8):
+    """Store event ``i`` in contiguous arrays."""
+
+
+@wp.func
+def step_of(value: int, last: int, bits: int) -> int:
+    """Return the step of a counter of ``bits`` bits. A step of more than half its range is a wrap, either way."""
+    half = 1 << (bits - 1)
+    step = value - last
+    if step < -half:
+        step += 2 * half
+    elif step > half:
+        step -= 2 * half
+    return step
+
+
+# EVT 2.0 and 2.1. A word of EVT 2.1 has the same upper half, and one bit for each of 32 pixels in its lower half.
+
+
+@wp.func
+def head_of(word: wp.uint32, swapped: int) -> wp.uint32:
+    """Return type, time and place of a word."""
+    return word
+
+
+@wp.func
+def head_of(word: wp.uint64, swapped: int) -> wp.uint32:
+    """Return type, time and place of a word."""
+    if swapped != 0:
+        return wp.uint32(word)
+    return wp.uint32(word >> wp.uint64(32))
+
+
+@wp.func
+def pixels_of(word: wp.uint32, swapped: int) -> wp.uint32:
+    """Return which pixels from the word's place on have an event."""
+    return wp.uint32(1)
+
+
+@wp.func
+def pixels_of(word: wp.uint64, swapped: int) -> wp.uint32:
+    """Return which pixels from the word's place on have an event."""
+    if swapped != 0:
+        return wp.uint32(word >> wp.uint64(32))
+    return wp.uint32(word)
+
+
+@wp.kernel
+def survey_evt2(words: wp.array(dtype=Any), length: int, swapped: int, start: int, changes: wp.array(dtype=Change)):
+    """Note what each block of ``length`` words changes."""
+    block = wp.tid() + start
+    change = unchanged()
+    last = int(NONE)
+    for i in range(block * length, wp.min((block + 1) * length, words.shape[0])):
+        head = head_of(words[i], swapped)
+        kind = int(head >> wp.uint32(28))
+        if kind <= ON:
+            change.events += set_bits(pixels_of(words[i], swapped))
+        elif kind == TIME_HIGH:
+            high = int(head & wp.uint32(0xFFFFFFF))
+            if last == NONE:
+                change.first_high = high
+                change.early_events = change.events
+                change.early_triggers = change.triggers
+            else:
+                change.rise += wp.int64(step_of(high, last, 28))
+            last = high
+        elif kind == TRIGGER:
+            change.triggers += 1
+    changes[block] = change
+
+
+@wp.kernel
+def decode_evt2(
+    words: wp.array(dtype=Any),
+    length: int,
+    swapped: int,
+    states: wp.array(dtype=State),
+    first_event: wp.array(dtype=int),
+    first_trigger: wp.array(dtype=int),
+    start: int,
+    events: EventArrays,
+    triggers: TriggerArrays,
+):
+    """Write the events and the edges of each block, from the state at its start."""
+    block = wp.tid() + start
+    timed = states[block].timed
+    high = states[block].high
+    event = first_event[block]
+    trigger = first_trigger[block]
+    for i in range(block * length, wp.min((block + 1) * length, words.shape[0])):
+        head = head_of(words[i], swapped)
+        kind = int(head >> wp.uint32(28))
+        if kind == TIME_HIGH:
+            value = int(head & wp.uint32(0xFFFFFFF))
+            if timed == 0:
+                high = wp.int64(value)
+                timed = int(1)
+            else:
+                high += wp.int64(step_of(value, int(high & wp.int64(0xFFFFFFF)), 28))
+        elif timed != 0:
+            now = (high << wp.int64(6)) | wp.int64((head >> wp.uint32(22)) & wp.uint32(0x3F))
+            if kind <= ON:
+                pixels = pixels_of(words[i], swapped)
+                column = int((head >> wp.uint32(11)) & wp.uint32(0x7FF))
+                row = wp.uint16(head & wp.uint32(0x7FF))
+                while pixels != wp.uint32(0):
+                    at = wp.uint16(column + lowest_bit(pixels))
+                    store_event(events, event, at, row, now, wp.uint8(kind))
+                    event += 1
+                    pixels = pixels & (pixels - wp.uint32(1))
+            elif kind == TRIGGER:
+                triggers.channel[trigger] = wp.uint8((head >> wp.uint32(8)) & wp.uint32(0x1F))
+                triggers.t[trigger] = now
+                triggers.rising[trigger] = wp.uint8(head & wp.uint32(1))
+                trigger += 1
+
+
+for _word in (wp.uint32, wp.uint64):
+    wp.overload(survey_evt2, {"words": wp.array(dtype=_word)})
+    wp.overload(decode_evt2, {"words": wp.array(dtype=_word)})
+
+
+# EVT 3.0. A vector has one bit for each of 12 or 8 pixels, and moves the base behind them.
+
+
+@wp.kernel
+def survey_evt3(words: wp.array(dtype=wp.uint16), length: int, start: int, changes: wp.array(dtype=Change)):
+    """Note what each block of ``length`` words changes."""
+    block = wp.tid() + start
+    change = unchanged()
+    last = int(NONE)
+    low = int(NONE)
+    for i in range(block * length, wp.min((block + 1) * length, words.shape[0])):
+        word = int(load_uint16(words, i))
+        kind = word >> 12
+        load = word & 0xFFF
+        # Selections instead of branches: which type of word follows cannot be predicted.
+        pixels = wp.where(kind == VECTOR_12, load, wp.where(kind == VECTOR_8, load & 0xFF, 0))
+        change.events += set_bits(wp.uint32(pixels)) + wp.where(kind == SINGLE, 1, 0)
+        width = wp.where(kind == VECTOR_12, 12, wp.where(kind == VECTOR_8, 8, 0))
+        change.moved = wp.where(kind == VECTOR_BASE, 0, change.moved + width)
+        change.base = wp.where(kind == VECTOR_BASE, load & 0x7FF, change.base)
+        change.polarity = wp.where(kind == VECTOR_BASE, load >> 11, change.polarity)
+        change.row = wp.where(kind == ROW, load & 0x7FF, change.row)
+        low = wp.where(kind == TIME_LOW, load, low)
+        if kind == TIME_HIGH:
+            if last == NONE:
+                change.first_high = load
+                change.early_events = change.events
+                change.early_triggers = change.triggers
+                change.low_before = low
+                low = int(NONE)
+            elif load != last:
+                change.rise += wp.int64(step_of(load, last, 12))
+                low = int(0)
+            last = load
+        elif kind == TRIGGER:
+            change.triggers += 1
+    if last == NONE:
+        change.low_before = low
+    else:
+        change.low_after = low
+    changes[block] = change
+
+
+@wp.kernel
+def decode_evt3(
+    words: wp.array(dtype=wp.uint16),
+    length: int,
+    states: wp.array(dtype=State),
+    first_event: wp.array(dtype=int),
+    first_trigger: wp.array(dtype=int),
+    start: int,
+    events: EventArrays,
+    triggers: TriggerArrays,
+):
+    """Write the events and the edges of each block, from the state at its start."""
+    block = wp.tid() + start
+    timed = states[block].timed
+    high = states[block].high
+    now = (high << wp.int64(12)) | wp.int64(states[block].low)
+    row = wp.uint16(states[block].row)
+    base = states[block].base
+    polarity = wp.uint8(states[block].polarity)
+    event = first_event[block]
+    trigger = first_trigger[block]
+    for i in range(block * length, wp.min((block + 1) * length, words.shape[0])):
+        word = int(load_uint16(words, i))
+        kind = word >> 12
+        load = word & 0xFFF
+        if kind == SINGLE:
+            if timed != 0:
+                store_event(events, event, wp.uint16(load & 0x7FF), row, now, wp.uint8(load >> 11))
+                event += 1
+        elif kind == ROW:
+            row = wp.uint16(load & 0x7FF)
+        elif kind == VECTOR_12 or kind == VECTOR_8:
+            pixels = wp.uint32(load)
+            width = int(12)
+            if kind == VECTOR_8:
+                pixels = wp.uint32(load & 0xFF)
+                width = int(8)
+            if timed != 0:
+                while pixels != wp.uint32(0):
+                    at = wp.uint16(wp.min(base + lowest_bit(pixels), LARGEST))
+                    store_event(events, event, at, row, now, polarity)
+                    event += 1
+                    pixels = pixels & (pixels - wp.uint32(1))
+            base += width
+        elif kind == VECTOR_BASE:
+            base = load & 0x7FF
+            polarity = wp.uint8(load >> 11)
+        elif kind == TIME_LOW:
+            now = (high << wp.int64(12)) | wp.int64(load)
+        elif kind == TIME_HIGH:
+            if timed == 0:
+                high = wp.int64(load)
+                now = (high << wp.int64(12)) | (now & wp.int64(0xFFF))
+                timed = int(1)
+            else:
+                step = step_of(load, int(high & wp.int64(0xFFF)), 12)
+                if step != 0:  # a new TIME_HIGH starts at its beginning, until the next TIME_LOW
+                    high += wp.int64(step)
+                    now = high << wp.int64(12)
+        elif kind == TRIGGER:
+            if timed != 0:
+                triggers.channel[trigger] = wp.uint8(load >> 8)
+                triggers.t[trigger] = now
+                triggers.rising[trigger] = wp.uint8(load & 1)
+                trigger += 1
+
+
+# All versions.
+
+
+@wp.func
+def followed(state: State, change: Change, bits: int) -> State:
+    """Return the state after a block. ``bits``: number of bits of TIME_HIGH."""
+    after = State()
+    after.timed = state.timed
+    after.high = state.high
+    after.low = state.low
+    if change.low_before != NONE:
+        after.low = change.low_before
+    if change.first_high != NONE:
+        if state.timed == 0:
+            after.high = wp.int64(change.first_high)
+        else:
+            size = wp.int64(1) << wp.int64(bits)
+            step = step_of(change.first_high, int(state.high & (size - wp.int64(1))), bits)
+            after.high += wp.int64(step)
+            if step != 0:
+                after.low = 0
+        after.timed = 1
+        after.high += change.rise
+        if change.low_after != NONE:
+            after.low = change.low_after
+    after.row = state.row
+    if change.row != NONE:
+        after.row = change.row
+    after.base = state.base + change.moved
+    after.polarity = state.polarity
+    if change.base != NONE:
+        after.base = change.base + change.moved
+        after.polarity = change.polarity
+    after.base = wp.min(after.base, LARGEST)
+    return after
+
+
+@wp.kernel
+def link_blocks(
+    changes: wp.array(dtype=Change),
+    bits: int,
+    states: wp.array(dtype=State),
+    first_event: wp.array(dtype=int),
+    first_trigger: wp.array(dtype=int),
+    untimed: wp.array(dtype=int),
+):
+    """Find the state at the start of each block, and the index of its first event and edge. One thread.
+
+    ``states[0]`` is given. ``untimed``: number of events and edges before the first TIME_HIGH. The other outputs have
+    one element more than there are blocks.
+    """
+    untimed[0] = 0
+    first_event[0] = 0
+    first_trigger[0] = 0
+    for block in range(changes.shape[0]):
+        change = changes[block]
+        events = change.events
+        triggers = change.triggers
+        if states[block].timed == 0:
+            if change.first_high == NONE:
+                events = int(0)
+                triggers = int(0)
+            else:
+                events -= change.early_events
+                triggers -= change.early_triggers
+            untimed[0] += change.events - events + change.triggers - triggers
+        first_event[block + 1] = first_event[block] + events
+        first_trigger[block + 1] = first_trigger[block] + triggers
+        states[block + 1] = followed(states[block], change, bits)
