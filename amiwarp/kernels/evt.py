@@ -433,21 +433,30 @@ def link_blocks(
     ``states[0]`` is given. ``untimed``: number of events and edges before the first TIME_HIGH. The other outputs have
     one element more than there are blocks.
     """
-    untimed[0] = 0
-    first_event[0] = 0
-    first_trigger[0] = 0
+    # Local variables: one thread would wait for each value that it reads back from a GPU's memory.
+    state = states[0]
+    event = int(0)
+    trigger = int(0)
+    left_out = int(0)
     for block in range(changes.shape[0]):
         change = changes[block]
+        states[block] = state
+        first_event[block] = event
+        first_trigger[block] = trigger
         events = change.events
         triggers = change.triggers
-        if states[block].timed == 0:
+        if state.timed == 0:
             if change.first_high == NONE:
                 events = int(0)
                 triggers = int(0)
             else:
                 events -= change.early_events
                 triggers -= change.early_triggers
-            untimed[0] += change.events - events + change.triggers - triggers
-        first_event[block + 1] = first_event[block] + events
-        first_trigger[block + 1] = first_trigger[block] + triggers
-        states[block + 1] = followed(states[block], change, bits)
+            left_out += change.events - events + change.triggers - triggers
+        event += events
+        trigger += triggers
+        state = followed(state, change, bits)
+    states[changes.shape[0]] = state
+    first_event[changes.shape[0]] = event
+    first_trigger[changes.shape[0]] = trigger
+    untimed[0] = left_out
