@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 WORD_TYPES = {"2.0": "<u4", "2.1": "<u8", "3.0": "<u2"}
 """Type of a word by the version of EVT."""
-BLOCK_WORDS = {True: 1 << 14, False: 1 << 10}
+BLOCK_WORDS = {True: 1 << 14, False: 1 << 12}
 """Number of words that one thread decodes, on a CPU (True) and on CUDA (False)."""
 
 
