@@ -53,6 +53,10 @@ from .events.truth import WorldLabels as WorldLabels
 from .imaging.corners import CornerDetector as CornerDetector
 from .imaging.corners import detect_corners as detect_corners
 from .imaging.corners import find_background_activity as find_background_activity
+from .imaging.filters import EventFilter as EventFilter
+from .imaging.filters import FilterSummary as FilterSummary
+from .imaging.filters import filter_recording as filter_recording
+from .imaging.filters import find_hot_pixels as find_hot_pixels
 from .imaging.iwe import iwe as iwe
 from .imaging.metrics import edge_blur as edge_blur
 from .imaging.metrics import model_error as model_error

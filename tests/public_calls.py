@@ -274,6 +274,17 @@ OWN: dict[str, dict[str, Any]] = {
         "left_out": (),
     },
     "convert": {"source_path": "in.h5"},
+    "EventFilter.apply": {"size": (4, 3)},
+    "filter_recording": {"source_path": "in.h5", "chosen": aw.EventFilter(every=2)},
+    "FilterSummary": {
+        "events": 2,
+        "kept": 1,
+        "removed": {"every": 1},
+        "hot_pixels": (),
+        "duration_us": 5,
+        "kept_us": 0,
+        "left_out": (),
+    },
     "Board": {"columns": 3, "rows": 4, "square_m": 0.03},
     "Board.save": {"path": _new(".svg")},
     "Board.world": {"rotation": (0, 0, 0, 1), "position": (0, 0, 1)},
@@ -483,6 +494,7 @@ OBJECTS: dict[str, Any] = {
     "TruthRenderer": aw.TruthRenderer(IN_WORLD),
     "Trajectory": STILL,
     "MemoryImages": IMAGES,
+    "EventFilter": aw.EventFilter(every=2),
 }
 """Objects whose methods are called."""
 

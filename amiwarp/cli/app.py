@@ -60,6 +60,11 @@ COMMANDS = {
         "Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.",
         "amiwarp convert events.raw recording.h5 --encoder encoder.csv --counts-per-turn 4096 --fov-deg 60",
     ),
+    "filter": Command(
+        "filtering",
+        "Keep part of a recording: time, region, polarity; remove hot pixels, noise, and events beyond a rate.",
+        "amiwarp filter events.raw calm.h5 --window 1:3 --background-ms 10 --hot-pixels",
+    ),
     "simulate": Command(
         "simulation",
         "Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth.",

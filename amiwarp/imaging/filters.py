@@ -1,0 +1,464 @@
+"""Filters of events: part of the time and the image, polarity, hot pixels, noise, refractory period, and rate."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import check_sensor
+from amiwarp.events.recording import Events, EventSource, Recording, check_events
+from amiwarp.events.truth import EventTruth
+from amiwarp.io import formats
+from amiwarp.io.export import convert
+from amiwarp.io.files import check_output, scratch_folder
+from amiwarp.io.formats import OutputFormat, open_recording
+from amiwarp.io.native_format import RecordingWriter, copy_records
+from amiwarp.kernels import events as event_kernels
+from amiwarp.kernels.launch import launch, load
+from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.tasks import Progress
+from amiwarp.validation import TIME_LIMIT, guarded, real, vector, whole
+
+CREDIT_S = 1e-3
+"""Time without events that allows a burst, with a limited rate [s]."""
+
+
+@guarded
+@dataclass(frozen=True)
+class EventFilter:
+    """Choice of events. Its parts are applied in the order of the fields; each that is not given keeps all events.
+
+    Raises
+    ------
+    AmiwarpError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[3, 4, 9], y=[3, 3, 9], t=[0, 500, 900], p=[1, 1, 0])
+    >>> kept = amiwarp.EventFilter(polarity=1).apply(events, (16, 16))
+    >>> kept.x.tolist()
+    [3, 4]
+    """
+
+    window: tuple[int, int] | None = None
+    """Start and end of the kept time, on the events' clock [us]. The end is exclusive."""
+    region: tuple[int, int, int, int] | None = None
+    """Left, top, right and bottom of the kept part of the image [px]. Right and bottom are exclusive."""
+    polarity: int | None = None
+    """The kept polarity: 1 for ON, 0 for OFF."""
+    hot_pixels: NDArray[np.bool_] | None = None
+    """Pixels whose events are removed, shape ``(height, width)``, as :func:`find_hot_pixels` returns them."""
+    refractory_us: int = 0
+    """Time after a kept event in which further events of its pixel are removed [us]."""
+    background_us: int = 0
+    """Events are removed as noise if none of the eight neighbours of their pixel fired within this time before [us].
+    0 keeps all. See :func:`find_background_activity`."""
+    most_per_s: float = 0.0
+    """Largest rate [events/s]: each kept event costs a credit that grows with time, up to a millisecond's. 0 keeps
+    all."""
+    every: int = 1
+    """Of the events that are left, every n-th is kept, from the first one on."""
+
+    def __post_init__(self) -> None:
+        if self.window is not None:
+            window = vector(self.window, 2, "window", _time)
+            if not window[0] < window[1]:
+                raise AmiwarpError(f"window is {self.window}; give start and end [us], the end after the start")
+            object.__setattr__(self, "window", window)
+        if self.region is not None:
+            left, top, right, bottom = region = vector(self.region, 4, "region", _pixel)
+            if not (left < right and top < bottom):
+                raise AmiwarpError(f"region is {self.region}; give left, top, right and bottom [px] of a part")
+            object.__setattr__(self, "region", region)
+        if self.polarity is not None:
+            object.__setattr__(self, "polarity", whole(self.polarity, "polarity", 0, 1))
+        for name in ("refractory_us", "background_us"):
+            object.__setattr__(self, name, whole(getattr(self, name), name, 0, TIME_LIMIT, " us"))
+        object.__setattr__(self, "most_per_s", real(self.most_per_s, "most_per_s", 0.0, 1e12, " events/s"))
+        object.__setattr__(self, "every", whole(self.every, "every", 1, 1 << 31))
+
+    def apply(self, events: Events, size: tuple[int, int]) -> Events:
+        """Return the events that are kept.
+
+        Parameters
+        ----------
+        events : Events
+            Events from a sensor, sorted by time.
+        size : tuple of int
+            Sensor size (width, height) [px].
+
+        Returns
+        -------
+        Events
+            The kept events, in new arrays.
+
+        Raises
+        ------
+        AmiwarpError
+            If the events are compensated, out of order or outside the sensor, or the size does not fit the filter.
+        """
+        return events[RunningFilter(self, size).keep(events)]
+
+
+@dataclass
+class RunningFilter:
+    """A filter of one stream of events, which arrive in blocks. Blocks of any length give the same events."""
+
+    chosen: EventFilter
+    """What is kept."""
+    size: tuple[int, int]
+    """Sensor size (width, height) [px]."""
+    removed: dict[str, int] = field(default_factory=dict)
+    """Number of events that each part of the filter has removed so far, by its name."""
+    _latest: dict[str, wp.array] = field(default_factory=dict)
+    """Time of the last event of each pixel, by the name of the part that needs it [us]."""
+    _credit: wp.array | None = None
+    """Number of events that a limited rate allows at once."""
+    _last_t: int | None = None
+    """Time of the last event [us]."""
+    _hot_counts: NDArray[np.int64] = field(init=False)
+    """Number of events of hot pixels that were removed, shape ``(height, width)``."""
+    _seen: int = 0
+    """Number of events so far that reached the last part, ``every``."""
+
+    def __post_init__(self) -> None:
+        width, height = vector(self.size, 2, "size of the sensor", _side)
+        self.size = width, height
+        self._hot_counts = np.zeros((height, width), np.int64)
+        hot = self.chosen.hot_pixels
+        if hot is not None and (np.shape(hot) != (height, width) or np.asarray(hot).dtype != np.bool_):
+            raise AmiwarpError(
+                f"hot_pixels has shape {np.shape(hot)} and type {np.asarray(hot).dtype}; expected booleans of shape "
+                f"({height}, {width}), as find_hot_pixels returns them"
+            )
+        region = self.chosen.region
+        if region is not None and (region[2] > width or region[3] > height):
+            raise AmiwarpError(f"region is {region}; expected a part of the image of {width}x{height} px")
+
+    def keep(self, events: Events) -> NDArray[np.bool_]:
+        """Return which of the events that follow those of the last call are kept, bool, shape ``(n,)``."""
+        check_sensor(events)
+        check_events(events, *self.size, where="events", after_t=self._last_t)
+        if len(events):
+            self._last_t = int(events.t[-1])
+        kept = np.ones(len(events), np.bool_)
+        for name, part in PARTS.items():
+            if not _is_given(self.chosen, name):
+                continue
+            candidates = np.flatnonzero(kept)
+            wanted = part(self, events[candidates])
+            kept[candidates[~wanted]] = False
+            self.removed[name] = self.removed.get(name, 0) + int(np.count_nonzero(~wanted))
+        return kept
+
+    def _window(self, events: Events) -> NDArray[np.bool_]:
+        assert self.chosen.window is not None
+        start, end = self.chosen.window
+        return (events.t >= start) & (events.t < end)
+
+    def _region(self, events: Events) -> NDArray[np.bool_]:
+        assert self.chosen.region is not None
+        left, top, right, bottom = self.chosen.region
+        in_columns = (events.x >= left) & (events.x < right)
+        in_rows = (events.y >= top) & (events.y < bottom)
+        return in_columns & in_rows
+
+    def _polarity(self, events: Events) -> NDArray[np.bool_]:
+        return np.asarray(events.p == self.chosen.polarity, np.bool_)
+
+    def _hot_pixels(self, events: Events) -> NDArray[np.bool_]:
+        assert self.chosen.hot_pixels is not None
+        hot = self.chosen.hot_pixels[events.y, events.x]
+        np.add.at(self._hot_counts, (events.y[hot], events.x[hot]), 1)
+        return ~hot
+
+    def hot_counts(self) -> tuple[tuple[int, int, int], ...]:
+        """Return column, row [px] and number of removed events of each hot pixel, the busiest first."""
+        rows, columns = np.nonzero(self._hot_counts)
+        counts = self._hot_counts[rows, columns]
+        found = zip(columns.tolist(), rows.tolist(), counts.tolist(), strict=True)
+        return tuple(sorted(found, key=lambda each: -each[2]))
+
+    def _refractory(self, events: Events) -> NDArray[np.bool_]:
+        width, height = self.size
+        kernel = event_kernels.mark_refractory
+        return ~self._marked("refractory_us", kernel, events, self.chosen.refractory_us, width, width * height)
+
+    def _background(self, events: Events) -> NDArray[np.bool_]:
+        width, height = self.size
+        pixels = (width + 2) * (height + 2)  # with a border
+        kernel = event_kernels.mark_background
+        return ~self._marked("background_us", kernel, events, self.chosen.background_us, width + 2, pixels)
+
+    def _marked(
+        self, name: str, kernel: Any, events: Events, time_us: int, stride: int, pixels: int
+    ) -> NDArray[np.bool_]:
+        """Return which events a kernel marks that passes over them in order, and keeps a time of each pixel."""
+        if name not in self._latest:
+            self._latest[name] = wp.full(pixels, wp.int64(event_kernels.NEVER), dtype=wp.int64, device="cpu")
+        columns = [wp.array(each, device="cpu", copy=False) for each in (events.x, events.y, events.t)]
+        marks = wp.empty(len(events), dtype=wp.bool, device="cpu")
+        load(kernel, wp.get_device("cpu"))
+        inputs = [*columns, time_us, stride, self._latest[name]]
+        wp.launch(kernel, 1, inputs, [marks], device="cpu")
+        return np.asarray(marks.numpy(), np.bool_)
+
+    def _rate(self, events: Events) -> NDArray[np.bool_]:
+        if "most_per_s" not in self._latest:
+            self._latest["most_per_s"] = wp.full(1, wp.int64(event_kernels.NEVER), dtype=wp.int64, device="cpu")
+            self._credit = wp.full(1, self._most_credit, dtype=wp.float64, device="cpu")
+        over = wp.empty(len(events), dtype=wp.bool, device="cpu")
+        load(event_kernels.mark_over_rate, wp.get_device("cpu"))
+        inputs = [wp.array(events.t, device="cpu", copy=False), 1e-6 * self.chosen.most_per_s, self._most_credit]
+        outputs = [self._credit, self._latest["most_per_s"], over]
+        wp.launch(event_kernels.mark_over_rate, 1, inputs, outputs, device="cpu")
+        return ~np.asarray(over.numpy(), np.bool_)
+
+    @property
+    def _most_credit(self) -> float:
+        """Number of events that may follow at once after a pause, with a limited rate."""
+        return max(1.0, self.chosen.most_per_s * CREDIT_S)
+
+    def _every(self, events: Events) -> NDArray[np.bool_]:
+        numbers = self._seen + np.arange(len(events))
+        self._seen += len(events)
+        return np.asarray(numbers % self.chosen.every == 0, np.bool_)
+
+
+PARTS = {
+    "window": RunningFilter._window,
+    "region": RunningFilter._region,
+    "polarity": RunningFilter._polarity,
+    "hot_pixels": RunningFilter._hot_pixels,
+    "refractory_us": RunningFilter._refractory,
+    "background_us": RunningFilter._background,
+    "most_per_s": RunningFilter._rate,
+    "every": RunningFilter._every,
+}
+"""Parts of a filter by the names of the fields of :class:`EventFilter`, in the order in which they are applied."""
+
+
+def described(chosen: EventFilter) -> str:
+    """Return the parts of a filter as text, for the metadata of a recording."""
+    texts = []
+    for name in PARTS:
+        value = getattr(chosen, name)
+        if name == "hot_pixels" and value is not None:
+            texts.append(f"hot_pixels {np.count_nonzero(value)}")
+        elif _is_given(chosen, name):
+            texts.append(f"{name} {value}")
+    return "; ".join(texts)
+
+
+def _is_given(chosen: EventFilter, name: str) -> bool:
+    """Return whether a part of a filter may remove events."""
+    value = getattr(chosen, name)
+    return value is not None and not (isinstance(value, int | float) and name != "polarity" and value == NOTHING[name])
+
+
+NOTHING = {each.name: each.default for each in fields(EventFilter)}
+"""Values with which the parts of a filter keep all events."""
+
+
+def _time(value: object, what: str) -> int:
+    return whole(value, what, -TIME_LIMIT, TIME_LIMIT, " us")
+
+
+def _pixel(value: object, what: str) -> int:
+    return whole(value, what, 0, LARGEST_SIZE, " px")
+
+
+def _side(value: object, what: str) -> int:
+    return whole(value, what, 1, LARGEST_SIZE, " px")
+
+
+@guarded
+def find_hot_pixels(events: Events | EventSource, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Find pixels that fire far more often than the pixels around them.
+
+    Parameters
+    ----------
+    events : Events or EventSource
+        Events from a sensor, some seconds or more.
+    size : tuple of int
+        Sensor size (width, height) [px].
+
+    Returns
+    -------
+    ndarray
+        Whether each pixel is hot, bool, shape ``(height, width)``.
+
+    Raises
+    ------
+    AmiwarpError
+        If the events are compensated or outside the sensor.
+
+    Notes
+    -----
+    A pixel with n events is hot if n > 3 m + 5 √m + 8, with m events of the second busiest of the other pixels of the
+    5 x 5 around it. So a thin edge that stays at one place for long is not hot. A lamp of one or two pixels is.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> events = amiwarp.Events.from_arrays(x=[5] * 50, y=[4] * 50, t=np.arange(50) * 1000, p=[1] * 50)
+    >>> np.argwhere(amiwarp.find_hot_pixels(events, (16, 12))).tolist()
+    [[4, 5]]
+    """
+    width, height = vector(size, 2, "size of the sensor", _side)
+    count = np.zeros(height * width, np.int32)
+    for block in [events] if isinstance(events, Events) else events.blocks():
+        check_sensor(block)
+        check_events(block, width, height, where="events")
+        count += np.bincount(block.y.astype(np.int64) * width + block.x, minlength=height * width).astype(np.int32)
+    hot = wp.empty(height * width, dtype=wp.bool, device="cpu")
+    counts = wp.array(count.reshape(height, width), device="cpu")
+    launch(event_kernels.mark_hot_pixels, height * width, [counts], [hot], device="cpu")
+    return np.asarray(hot.numpy().reshape(height, width), np.bool_)
+
+
+@dataclass(frozen=True)
+class FilterSummary:
+    """What :func:`filter_recording` did."""
+
+    events: int
+    """Number of events of the input."""
+    kept: int
+    """Number of events of the output."""
+    removed: dict[str, int]
+    """Number of events that each part of the filter removed, in the order in which the parts were applied."""
+    hot_pixels: tuple[tuple[int, int, int], ...]
+    """Column, row [px] and number of events of each removed hot pixel, the busiest first."""
+    duration_us: int
+    """Time from the first to the last event of the input [us]."""
+    kept_us: int
+    """Time from the first to the last event of the output [us]."""
+    left_out: tuple[str, ...]
+    """What the format of the output cannot hold."""
+
+
+@guarded
+def filter_recording(
+    source_path: str | os.PathLike[str],
+    out_path: str | os.PathLike[str],
+    chosen: EventFilter,
+    *,
+    topic: str | None = None,
+    format: OutputFormat | str | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+) -> FilterSummary:
+    """Write the events of a recording that a filter keeps, in constant memory.
+
+    In amiwarp's format, encoder, camera, prism, ground truth, IMU samples and frames are kept.
+
+    Parameters
+    ----------
+    source_path : str or path-like
+        The recording to read, in any supported format.
+    out_path : str or path-like
+        The file to write. Its extension gives the format, see :class:`OutputFormat`.
+    chosen : EventFilter
+        Which events are kept.
+    topic : str, optional
+        The topic or camera to read, if the input holds several, see :func:`open_recording`.
+    format : OutputFormat or str, optional
+        The format to write, if not that of the extension.
+    progress : callable, optional
+        Called with the name of the step and the finished fraction of the task, 0 to 1.
+    overwrite : bool, default False
+        Whether an existing output may be replaced.
+
+    Returns
+    -------
+    FilterSummary
+        Numbers of events before and after.
+
+    Raises
+    ------
+    AmiwarpError
+        If the input cannot be read, no event is kept, or the output cannot be written. Then no output remains.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[1, 2, 2], y=[0, 0, 0], t=[0, 10, 20], p=[1, 0, 1])
+    >>> amiwarp.save_recording("noisy.h5", amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4)))
+    >>> amiwarp.filter_recording("noisy.h5", "calm.h5", amiwarp.EventFilter(refractory_us=15)).removed
+    {'refractory_us': 1}
+    """
+    out_path = Path(out_path)
+    check_output(out_path, overwrite=overwrite)
+    output = formats.output_format(out_path, format)
+    recording = open_recording(source_path, topic=topic)
+    if output is OutputFormat.NATIVE:
+        return _write_kept(recording, out_path, chosen, progress, overwrite)
+    # Other formats are converted from amiwarp's.
+    with scratch_folder(out_path.parent) as folder:
+        summary = _write_kept(recording, folder / "kept.h5", chosen, progress, False)
+        left_out = convert(folder / "kept.h5", out_path, format=output, progress=progress, overwrite=overwrite).left_out
+    return replace(summary, left_out=left_out)
+
+
+def _write_kept(
+    recording: Recording, path: Path, chosen: EventFilter, progress: Progress | None, overwrite: bool
+) -> FilterSummary:
+    """Write the kept events in amiwarp's format, with everything else that the recording holds."""
+    source = recording.events
+    running = RunningFilter(chosen, source.size)
+    truth = recording.truth
+    about = {name: value for name, value in recording.metadata.items() if name != "format"}
+    start = 0
+    kept_times: list[int] = []
+    with RecordingWriter(
+        path,
+        width=source.size[0],
+        height=source.size[1],
+        camera=recording.camera,
+        prism=recording.prism,
+        encoder=recording.encoder,
+        metadata={**about, "filter": described(chosen)},
+        overwrite=overwrite,
+        truth_parameters=None if truth is None else truth.parameters,
+        truth_labels=None if truth is None else truth.labels,
+    ) as writer:
+        for block in source.blocks():
+            stop = start + len(block)
+            kept = running.keep(block)
+            known = None if truth is None else _part(truth.of_events(start, stop), kept)
+            part = block[kept]
+            if len(part):
+                writer.append(part, truth=known)
+                kept_times = [*kept_times[:1], int(part.t[0]), int(part.t[-1])]
+            start = stop
+            if progress is not None:
+                progress("filtering events", start / len(source))
+        if not len(writer):
+            raise AmiwarpError(f"{path}: the filter keeps none of {len(source):,} events; choose less strict values")
+        copy_records(recording, writer)
+        if recording.frames is not None:
+            for index, t in enumerate(recording.frames.t.tolist()):
+                writer.append_image(t, recording.frames[index])
+        count = len(writer)
+    return FilterSummary(
+        events=len(source),
+        kept=count,
+        removed=dict(running.removed),
+        hot_pixels=running.hot_counts(),
+        duration_us=source.t_last - source.t_first,
+        kept_us=kept_times[-1] - kept_times[0],
+        left_out=(),
+    )
+
+
+def _part(truth: EventTruth, kept: NDArray[np.bool_]) -> EventTruth:
+    """Return the ground truth of the kept events."""
+    values = {each.name: getattr(truth, each.name) for each in fields(truth)}
+    return EventTruth(**{name: None if value is None else value[kept] for name, value in values.items()})
