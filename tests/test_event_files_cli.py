@@ -33,8 +33,8 @@ def large(monkeypatch: pytest.MonkeyPatch) -> None:
     """Treat files from 1 kB on as large, and their first 600 events as the part that is read, in blocks of 500."""
     monkeypatch.setattr("amiwarp.cli.recordings.LARGE_BYTES", 1000)
     monkeypatch.setattr("amiwarp.cli.recordings.HEAD_EVENTS", 600)
-    for module in ("prophesee", "aedat", "plain_files"):
-        name, value = ("READ_BYTES", 4000) if module == "plain_files" else ("DEFAULT_BLOCK", 500)
+    for module in ("prophesee", "aedat", "text_files"):
+        name, value = ("READ_BYTES", 4000) if module == "text_files" else ("DEFAULT_BLOCK", 500)
         monkeypatch.setattr(f"amiwarp.io.{module}.{name}", value)
     monkeypatch.setattr("amiwarp.io.prophesee.EVT_BYTES", 4000)
 

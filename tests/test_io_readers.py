@@ -76,6 +76,9 @@ def test_real_files_to_the_exact_count(data_dir, tmp_path, file):
     assert (len(source), source.size) == (count, size)
     assert (source.t_last - source.t_first) / 1000 == pytest.approx(span_ms, abs=0.6 if span_ms > 99 else 0.06)
     expected = {"format": recording.metadata["format"], **records}
+    if file.endswith((".txt", ".dat", ".bin")):  # which do not state the size
+        expected["assumed_size"] = recording.metadata["assumed_size"]
+        assert str(expected["assumed_size"]).startswith(f"{size[0]}x{size[1]}: ")
     assert {name: value for name, value in recording.metadata.items() if name != "topic"} == expected
     summary = convert(data_dir / file, tmp_path / "out.h5")
     assert (summary.events, summary.t_first, summary.t_last, summary.repairs) == (
@@ -111,7 +114,7 @@ def test_every_format_reads_back(tmp_path, monkeypatch, name, keep):
 def test_a_file_is_named_also_if_its_name_is_a_word_of_the_error(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     with open(name, "wb") as file:
-        np.savez(file, x=[1], y=[0], t=[0.5], p=[1])
+        np.savez(file, x=[1], y=[0], t=[np.nan], p=[1])
     assert str(refusal(open_recording, Path(name))).startswith(
         (f"{name}: before the first event: ", f"{name[:100]}...")
     )
@@ -189,12 +192,19 @@ def test_compensated_events_far_outside_do_not_count_for_the_size(tmp_path):
 
 
 def test_a_file_without_a_size_gets_that_of_the_smallest_sensor_that_holds_it():
-    sensors = [(128, 128), (240, 180), (304, 240), (320, 240), (346, 260), (640, 480), (1280, 720)]
-    for smaller, (width, height) in zip([(0, 0), *sensors], sensors, strict=False):
+    sensors = [
+        (128, 128), (132, 104), (240, 180), (304, 240), (320, 240), (346, 260), (320, 320), (640, 480), (640, 512),
+        (1280, 720), (1280, 800), (1280, 960),
+    ]  # fmt: skip
+    for width, height in sensors:
         assert scan.smallest_sensor(width - 1, height - 1) == (width, height)
-        assert scan.smallest_sensor(smaller[0], 0) == (width, height)
-    assert scan.smallest_sensor(0, 479) == (640, 480)
-    assert scan.smallest_sensor(1279, 720) == (1280, 721)
+    for x_max, size in [(0, (128, 128)), (128, (132, 104)), (132, (240, 180)), (240, (304, 240)), (304, (320, 240)),
+                        (320, (346, 260)), (346, (640, 480)), (640, (1280, 720))]:  # fmt: skip
+        assert scan.smallest_sensor(x_max, 0) == size
+    for y_max, size in [(128, (240, 180)), (260, (320, 320)), (320, (640, 480)), (480, (640, 512)), (512, (1280, 720)),
+                        (720, (1280, 800)), (800, (1280, 960))]:  # fmt: skip
+        assert scan.smallest_sensor(0, y_max) == size
+    assert scan.smallest_sensor(1279, 960) == (1280, 961)
     assert scan.smallest_sensor(1280, 719) == (1281, 720)
 
 
@@ -223,7 +233,7 @@ LINES = [f"{i * 1e-4:.6f} {i % 240} {i % 180} {i % 2}" for i in range(1000)]
     ],
 )
 def test_text_names_the_bad_line(tmp_path, monkeypatch, line, message):
-    monkeypatch.setattr("amiwarp.io.plain_files.READ_BYTES", 1000)
+    monkeypatch.setattr("amiwarp.io.text_files.READ_BYTES", 1000)
     path = write_lines(tmp_path / "events.txt", [*LINES[:300], line, *LINES[300:]])
     with pytest.raises(AmiwarpError, match=f"events.txt: .*{message}"):
         open_recording(path)
@@ -325,7 +335,8 @@ def test_dat_times_run_on_past_32_bits(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"t": np.arange(5.0)}, "array t is float64; expected integers"),
+        ({"t": np.array([0, 1, 2, 3, np.inf])}, "times span .* inf us: not finite"),
+        ({"t": np.array(list("abcde"))}, "array t is <U1; expected integers"),
         ({"x": np.full(5, np.nan)}, "array x is float64"),
         (
             {"y": np.arange(5.0)},
@@ -375,7 +386,7 @@ def test_one_fraction_in_text_is_damage(tmp_path):
 
 def test_fractions_in_text_are_read_block_by_block(tmp_path, monkeypatch):
     """What the first block shows holds for the whole file, also for a block of whole numbers."""
-    monkeypatch.setattr("amiwarp.io.plain_files.READ_BYTES", 200)
+    monkeypatch.setattr("amiwarp.io.text_files.READ_BYTES", 200)
     lines = [f"{k * 1e-4:.6f} {k / (8 if k < 90 else 1)} -0.25 1" for k in range(100)]
     write_lines(tmp_path / "a.txt", lines)
     events = open_recording(tmp_path / "a.txt").events.slice(0, 100)

@@ -248,7 +248,7 @@ OPENED_OTHERWISE = {
     "amiwarp.io.hdf5_server: h5py.h5a.open(group, attribute.encode())": "attribute",
     "amiwarp.io.hdf5_server: h5py.h5g.open(file, b'/')": "group",
     "amiwarp.io.hdf5_server: h5py.h5o.open(parent, key)": "group or dataset",
-    "amiwarp.io.plain_files: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
+    "amiwarp.io.text_files: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
     "amiwarp.plotting.figures: Image.open(buffer)": "bytes",
     "amiwarp.simulation.worlds.world_files: Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)": "bytes",
     "amiwarp.simulation.worlds.world_files: trimesh.load(file, file_type=kind, resolver=files, force='scene', "

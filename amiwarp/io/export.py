@@ -22,7 +22,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import SENSOR_DTYPE, Events, EventSource, Recording, check_coordinates
 from amiwarp.events.truth import FrameStore, Poses, PoseStore
 from amiwarp.io import formats
-from amiwarp.io.file_scan import RECORDS, FileEvents
+from amiwarp.io.file_scan import ASSUMED, ASSUMED_SIZE, RECORDS, FileEvents
 from amiwarp.io.files import NewFile, check_output, errors_name
 from amiwarp.io.formats import LIMITS, Bag, Codec, Outline, OutputFormat, Rounding, open_recording
 from amiwarp.io.native_format import write_recording
@@ -310,6 +310,8 @@ def convert(
     size = recording.events.size
     if recording.camera is not None and not getattr(recording.events, "size_is_known", True):
         size = recording.camera.width, recording.camera.height
+        known = {name: value for name, value in recording.metadata.items() if name != ASSUMED_SIZE}
+        recording = replace(recording, metadata=known)
     dropped = 0
     if chosen is OutputFormat.NATIVE:
         source = dict(zip(SOURCE_NAMES, (recording.name, recording.metadata["format"]), strict=True))
@@ -360,7 +362,8 @@ def left_out(recording: Recording, chosen: OutputFormat) -> tuple[str, ...]:
     """Return what a recording has in addition to its events and a format does not hold."""
     if chosen is OutputFormat.NATIVE:
         return ("triggers",) if recording.metadata.get("triggers") and recording.encoder is None else ()
-    known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {}), "other_topics"}
+    known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {}), "other_topics", "columns", "time_unit"}
+    known |= {name for name in recording.metadata if name.startswith(ASSUMED)}
     from_bag = str(recording.metadata.get("format")).startswith("rosbag")
     copied = chosen is OutputFormat.ROS2 and bag_of(recording) is not None
     if copied:

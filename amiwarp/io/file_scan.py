@@ -9,7 +9,7 @@ but steps back of at most a millisecond are always repaired.
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import partial
@@ -49,8 +49,25 @@ CHECKED_EVENTS = 1 << 15
 KEEP_EVENTS = 1 << 22
 """Largest recording that stays in memory after the first pass [events], 55 MB."""
 
-SENSORS = ((128, 128), (240, 180), (304, 240), (320, 240), (346, 260), (640, 480), (1280, 720))
-"""Sizes of known sensors (width, height) [px], for files that do not state a size."""
+SORT_EVENTS = 1 << 25
+"""Largest recording that is sorted by time [events], for which 1.2 GB of memory are needed."""
+
+SENSORS = (
+    (128, 128),  # DVS128; it also holds the events of the SciDVS (126x112)
+    (132, 104),  # DVS132S
+    (240, 180),  # DAVIS240
+    (304, 240),  # ATIS
+    (320, 240),  # DVXplorer Lite
+    (346, 260),  # DAVIS346
+    (320, 320),  # Prophesee GenX320
+    (640, 480),  # Prophesee Gen3.1, DVXplorer, DAVIS640
+    (640, 512),
+    (1280, 720),  # Prophesee Gen4.1, IMX636, IMX646
+    (1280, 800),  # CeleX-V
+    (1280, 960),  # Samsung DVS-Gen4
+)
+"""Sizes of known sensors (width, height) [px], for files that do not state a size: the first that holds all
+events is taken."""
 
 
 def smallest_sensor(x_max: int, y_max: int, sensors: tuple[tuple[int, int], ...] = SENSORS) -> tuple[int, int]:
@@ -59,6 +76,79 @@ def smallest_sensor(x_max: int, y_max: int, sensors: tuple[tuple[int, int], ...]
         if x_max < width and y_max < height:
             return width, height
     return x_max + 1, y_max + 1
+
+
+ASSUMED = "assumed_"
+"""Prefix of the names of assumptions in the metadata of a recording."""
+
+ASSUMED_SIZE = ASSUMED + "size"
+"""Name of the assumption of a sensor size."""
+
+
+@dataclass(frozen=True, slots=True)
+class Assumption:
+    """Property of a file that the file does not state."""
+
+    what: str
+    """Name of the property, such as "time unit"."""
+    value: str
+    """Value that is assumed."""
+    why: str
+    """Reason for it."""
+    option: str
+    """Option of the command line that overrides it."""
+
+    @property
+    def entry(self) -> tuple[str, str]:
+        """Name and text of the assumption in the metadata of a recording."""
+        return ASSUMED + self.what.replace(" ", "_"), f"{self.value}: {self.why}; {self.option}"
+
+
+def assumptions_of(metadata: Mapping[str, MetadataValue]) -> list[Assumption]:
+    """Return the assumptions in the metadata of a recording."""
+    found = []
+    for name, text in metadata.items():
+        if name.startswith(ASSUMED):
+            value, _, rest = str(text).partition(": ")
+            why, _, option = rest.rpartition("; ")
+            found.append(Assumption(name.removeprefix(ASSUMED).replace("_", " "), value, why, option))
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class GivenSource:
+    """What the user says of an event source."""
+
+    size: tuple[int, int] | None = None
+    """Sensor size (width, height) [px], which replaces the size in the file; or None."""
+    sort: bool = False
+    """Whether the events are sorted by time."""
+
+
+_given: ContextVar[GivenSource | None] = ContextVar("given", default=None)
+"""What the user says of the sources that are opened, or None."""
+
+
+@contextlib.contextmanager
+def given_source(given: GivenSource) -> Iterator[None]:
+    """Apply what the user says to the sources that are opened in the block."""
+    token = _given.set(given)
+    try:
+        yield
+    finally:
+        _given.reset(token)
+
+
+def given_size() -> tuple[int, int] | None:
+    """Return the size of :func:`given_source`, or None."""
+    given = _given.get()
+    return None if given is None else given.size
+
+
+def assumed_size(size: tuple[int, int], sensors: Iterable[tuple[int, int]] = SENSORS) -> Assumption:
+    """Return the assumption of a sensor size."""
+    holds = "the smallest known sensor" if size in sensors else "the smallest frame"
+    return Assumption("size", f"{size[0]}x{size[1]}", f"the file does not state it; {holds} with all events", "--size")
 
 
 _head: ContextVar[int | None] = ContextVar("head", default=None)
@@ -163,10 +253,13 @@ class FileEvents(EventSource):
         Without a ``size``, that of the smallest of ``sensors`` with all events is taken. ``last_time`` returns the time
         of the last event [us] from the end of the file, given an estimate; it is used if only the head is read.
         """
+        size = given_size() or size
         if size is not None:
             check_size(*size, path)
         self.path = path
-        self._packets = packets
+        self._sensors = sensors
+        given = _given.get()
+        self._packets = _sorted_packets(path, packets) if given is not None and given.sort else packets
         self._size = size
         self.size_is_known = size is not None
         """Whether the file stores the sensor size. Otherwise the smallest known sensor that contains all events is
@@ -213,9 +306,15 @@ class FileEvents(EventSource):
         total = counts.count + counts.outside
         late = counts.late if counts.late_us > SMALL_STEP_US else 0
         frame = "the {}x{} frame".format(*self._size) if self._size else f"pixels 0 .. {LARGEST_SIZE - 1}"
-        for bad, what in ((counts.outside, f"lie outside {frame}"), (late, "are out of order")):
+        damaged = "the file is damaged or mislabelled"
+        unsorted = f"{damaged}; if its events are in the order of pixels, sort them by time with --sort"
+        faults = (
+            (counts.outside, f"lie outside {frame}", damaged),
+            (late, "are out of order", unsorted),
+        )
+        for bad, what, remedy in faults:
             if bad * 100 > total:
-                raise AmiwarpError(f"{self.path}: {bad} of {total} events {what}; the file is damaged or mislabelled")
+                raise AmiwarpError(f"{self.path}: {bad} of {total} events {what}; {remedy}")
         if not counts.count:
             raise AmiwarpError(f"{self.path}: holds no events; give another recording")
 
@@ -236,9 +335,10 @@ class FileEvents(EventSource):
         return {name: self._counts.notes[name] for name in RECORDS if self._counts.notes.get(name)}
 
     @property
-    def metadata(self) -> dict[str, int]:
-        """Counts for the metadata of a recording: other records and repairs."""
-        return {**self.records, **self.repairs}
+    def metadata(self) -> dict[str, MetadataValue]:
+        """Counts for the metadata of a recording: other records and repairs; and the size, if it is assumed."""
+        assumed = () if self.size_is_known else (assumed_size(self.size, self._sensors).entry,)
+        return {**self.records, **self.repairs, **dict(assumed)}
 
     def __len__(self) -> int:
         return self._counts.count
@@ -378,6 +478,39 @@ class FileEvents(EventSource):
             for name, values in (("x", x), ("y", y))
         )
         return Events(x, y, ordered, np.array(as_polarity(p)))
+
+
+def _sorted_packets(
+    path: Path, packets: Callable[[dict[str, int]], Iterator[Packet]]
+) -> Callable[[dict[str, int]], Iterator[Packet]]:
+    """Return a function that starts a pass over the events in the order of time. They are all kept in memory.
+
+    Events of equal times keep their order. Raises :class:`AmiwarpError` for more than :data:`SORT_EVENTS` events.
+    """
+    counts: dict[str, int] = {}
+    parts: list[tuple[NDArray[Any], ...]] = []
+    count = 0
+    with errors_name(path, lambda: f"after {count} events"):
+        for packet in packets(counts):
+            columns = (packet.x, packet.y, packet.t, packet.p) if isinstance(packet, Events) else packet
+            parts.append(columns)
+            count += len(columns[2])
+            if count > SORT_EVENTS:
+                raise AmiwarpError(f"holds over {SORT_EVENTS:,} events, too many to sort; sort the file by time")
+        if not parts:
+            return lambda notes: iter(())
+        x, y, t, p = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        parts.clear()
+        times = rounded_times(t)
+        order = np.argsort(times, kind="stable")
+        counts["sorted_events"] = int(np.count_nonzero(order != np.arange(order.size)))
+        in_order = x[order], y[order], times[order], p[order]
+
+    def start(notes: dict[str, int]) -> Iterator[Packet]:
+        notes.update(counts)
+        yield in_order
+
+    return start
 
 
 def _copied(blocks: list[Events]) -> Events:

@@ -248,8 +248,6 @@ UNPACK = "unpack it first"
 
 MISTAKEN_FILES: tuple[tuple[int, bytes, str, str], ...] = (
     # position, bytes, what the file is, what to do
-    (0, b"MATLAB 5.0 MAT-file", "a MATLAB 5 file", MATLAB),
-    (0, b"MATLAB 7.3 MAT-file", "a MATLAB 7.3 file", MATLAB),
     (0, b"\x89PNG\r\n\x1a\n", "a PNG picture", PICTURE),
     (0, b"\xff\xd8\xff", "a JPEG picture", PICTURE),
     (0, b"GIF8", "a GIF picture", PICTURE),
@@ -260,7 +258,6 @@ MISTAKEN_FILES: tuple[tuple[int, bytes, str, str], ...] = (
     (4, b"ftyp", "an MP4 video", VIDEO),
     (8, b"AVI ", "an AVI video", VIDEO),
     (0, b"\x1aE\xdf\xa3", "a Matroska or WebM video", VIDEO),
-    (0, b"\x93NUMPY", "a NumPy array (.npy)", "save x, y, t [us] and p together with numpy.savez"),
     (0, b"\x1f\x8b", "a gzip archive", UNPACK),
     (0, b"BZh", "a bzip2 archive", UNPACK),
     (0, b"\xfd7zXZ\0", "an xz archive", UNPACK),
@@ -273,7 +270,6 @@ MISTAKEN_FILES: tuple[tuple[int, bytes, str, str], ...] = (
     (0, b"\xa1\xb2\xc3\xd4", "a pcap capture of network packets", CAPTURE),
     (0, b"\x4d\x3c\xb2\xa1", "a pcap capture of network packets", CAPTURE),
     (0, b"\n\r\r\n", "a pcapng capture of network packets", CAPTURE),
-    (0, b"PAR1", "a Parquet table", TABLE),
     (0, b"ARROW1", "an Arrow table", TABLE),
     (0, b"\x80\x04\x95", "a Python pickle", "save x, y, t [us] and p from it as .npz; pickles are never loaded"),
     (0, b"#ROSBAG V1", "a ROS 1 bag of version 1", "run rosbag migrate and rosbag reindex"),

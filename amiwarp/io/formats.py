@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from amiwarp.choices import Option
 from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.recording import Recording
+from amiwarp.io.columns import GivenLayout
+from amiwarp.io.file_scan import GivenSource, given_source
 from amiwarp.io.files import check_regular, errors_name, name_kind, note_folders, open_input
 from amiwarp.io.json_files import read_json
 from amiwarp.optics.camera import LARGEST_SIZE
@@ -32,7 +34,8 @@ class Format(Option):
     """File formats of recordings that amiwarp reads."""
 
     HDF5 = "hdf5"
-    """HDF5 file: native recording of amiwarp, or event file of DSEC, TUM-VIE, M3ED, MVSEC or Prophesee."""
+    """HDF5 file: native recording of amiwarp; event file of DSEC, TUM-VIE, M3ED, MVSEC or Prophesee; or any layout of
+    columns."""
     EVT = "evt"
     """Prophesee RAW file with the encoding EVT 2.0, 2.1 or 3.0."""
     DAT = "dat"
@@ -48,9 +51,15 @@ class Format(Option):
     ES = "es"
     """Event Stream (.es) file."""
     TEXT = "text"
-    """Text file in the format of the Event Camera Dataset: lines of ``t x y p``, with t in seconds."""
+    """Text file: lines of ``t x y p`` with t in seconds, as in the Event Camera Dataset; or a table such as CSV."""
     NPZ = "npz"
-    """NumPy archive with the arrays x, y, t and p, or with those of N-ImageNet or EV-IMO."""
+    """NumPy archive: arrays x, y, t and p, those of N-ImageNet or EV-IMO, or of any layout."""
+    NPY = "npy"
+    """NumPy array: records with the fields x, y, t and p, or four columns."""
+    MAT = "mat"
+    """MATLAB file with the columns of events."""
+    PARQUET = "parquet"
+    """Parquet table of events."""
     EVIMO = "evimo"
     """Folder of NumPy files of the EV-IMO2 data set."""
     BIN = "bin"
@@ -67,6 +76,10 @@ SIGNATURES = (
     (b"\x89MCAP0\r\n", Format.ROSBAG),
     (b"Event Stream", Format.ES),
     (b"PK\x03\x04", Format.NPZ),
+    (b"\x93NUMPY", Format.NPY),
+    (b"MATLAB 5.0 MAT-file", Format.MAT),
+    (b"MATLAB 7.3 MAT-file", Format.HDF5),
+    (b"PAR1", Format.PARQUET),
 )
 """Pairs of a file's first bytes and the format that they identify."""
 
@@ -83,8 +96,11 @@ OPENERS = {
     Format.AEDAT2: "aedat:open_aedat2",
     Format.ROSBAG: "ros:open_rosbag",
     Format.ES: "prophesee:open_es",
-    Format.TEXT: "plain_files:open_text",
-    Format.NPZ: "plain_files:open_npz",
+    Format.TEXT: "text_files:open_text",
+    Format.NPZ: "column_files:open_npz",
+    Format.NPY: "column_files:open_npy",
+    Format.MAT: "column_files:open_mat",
+    Format.PARQUET: "column_files:open_parquet",
     Format.EVIMO: "plain_files:open_evimo",
     Format.BIN: "plain_files:open_bin",
 }
@@ -102,6 +118,12 @@ TRIGGERS = {
 
 TOPICS = (Format.HDF5, Format.ROSBAG)
 """Formats whose files may hold several streams of events."""
+
+LAYOUTS = (Format.HDF5, Format.TEXT, Format.NPZ, Format.NPY, Format.MAT, Format.PARQUET)
+"""Formats whose columns may have any layout. Their openers take a :class:`~amiwarp.io.columns.GivenLayout`."""
+
+CHIPS = (Format.AEDAT2,)
+"""Formats whose openers take the name of the camera's chip, if it is given."""
 
 
 def io_function(place: str) -> Callable[..., Any]:
@@ -138,10 +160,12 @@ def detect_format(path: Path) -> Format:
     # Before the others: such files have no header, so any of them can begin like text or a picture.
     if looks_like_bin(head, file_bytes):
         return Format.BIN
-    if head.startswith(b"%") and not head.startswith(b"%PDF"):
-        return Format.EVT if _is_evt(head) else Format.DAT
-    if _looks_like_text(head):
+    if head.startswith(b"%") and _is_evt(head):
+        return Format.EVT
+    if looks_like_text(head):
         return Format.TEXT
+    if head.startswith(b"%") and not head.startswith(b"%PDF"):
+        return Format.DAT
     if kind := name_kind(head):
         raise AmiwarpError(f"{path}: {kind}")
     known = ", ".join(member.value for member in Format)
@@ -182,26 +206,105 @@ def _is_evt(head: bytes) -> bool:
 
 def holds_values(line: bytes) -> bool:
     """Return whether a line of a text file is neither empty nor a comment."""
-    return line.lstrip()[:1] not in (b"", b"#")
+    return line.lstrip()[:1] not in (b"", b"#", b"%")
 
 
-def _looks_like_text(head: bytes) -> bool:
-    """Return whether the first line without a comment consists of two or four numbers."""
-    line = next(filter(holds_values, head.split(b"\n")), b"")
-    try:
-        return len([float(word) for word in line.split()]) in (2, 4)
-    except ValueError:
+WORDS = {b"true": b"1", b"on": b"1", b"positive": b"1", b"false": b"0", b"off": b"0", b"negative": b"0"}
+"""Words for polarities in text, in lower case."""
+
+WORD_PATTERN = re.compile(rb"\b(?:" + b"|".join(WORDS) + rb")\b", re.I)
+"""Pattern of these words."""
+
+
+@dataclass(frozen=True, slots=True)
+class TextRow:
+    """Form of the lines of a text file."""
+
+    separator: bytes
+    """Character between two columns; a space stands for any number of spaces and tabs."""
+    decimal_comma: bool = False
+    """Whether numbers have commas in place of decimal points."""
+    has_words: bool = False
+    """Whether the polarity is a word."""
+    quoted: bool = False
+    """Whether values are in quotation marks."""
+
+    @classmethod
+    def of(cls, line: bytes) -> TextRow:
+        """Return the form of a line."""
+        separator = next((mark for mark in (b";", b",", b"\t") if mark in line), b" ")
+        separator = b" " if separator == b"\t" else separator
+        comma = separator == b";" and b"," in line
+        return cls(separator, comma, WORD_PATTERN.search(line) is not None, b'"' in line or b"'" in line)
+
+    def plain(self, text: bytes) -> bytes:
+        """Return text with numbers between spaces."""
+        if self.quoted:
+            text = text.replace(b'"', b"").replace(b"'", b"")
+        if self.separator != b" ":
+            text = text.replace(self.separator, b" ")
+        if self.decimal_comma:
+            text = text.replace(b",", b".")
+        if self.has_words:
+            text = WORD_PATTERN.sub(lambda match: WORDS[match[0].lower()], text)
+        return text
+
+    def words(self, line: bytes) -> list[bytes]:
+        """Return the values of a line."""
+        return self.plain(line.removeprefix(BOM)).split()
+
+    def names(self, line: bytes) -> tuple[str, ...]:
+        """Return the names of columns in a line; empty ones are those without a name."""
+        text = line.removeprefix(BOM).decode("utf-8", "replace").strip("\r\n")
+        if self.separator == b" ":
+            found = text.split("\t") if "\t" in text else text.split()
+        else:
+            found = text.split(self.separator.decode())
+        return tuple(name.strip().strip("\"'") for name in found)
+
+    def is_row(self, line: bytes) -> bool:
+        """Return whether a line consists of numbers."""
+        try:
+            return len([float(word) for word in self.words(line)]) > 0
+        except ValueError:
+            return False
+
+
+BOM = b"\xef\xbb\xbf"
+"""Mark at the beginning of some files in UTF-8."""
+
+
+def looks_like_text(head: bytes) -> bool:
+    """Return whether a file begins with rows of at least three numbers, or a line of names or a size before them."""
+    lines = list(filter(holds_values, head.splitlines()))[:3]
+    if not lines:
         return False
+    first = TextRow.of(lines[0])
+    count = len(first.words(lines[0]))
+    if first.is_row(lines[0]):
+        return count >= 2
+    following = [line for line in lines[1:] if TextRow.of(line).is_row(line)]
+    return bool(following) and b"\0" not in head and all(len(TextRow.of(line).words(line)) >= 3 for line in following)
 
 
 @guarded
 def open_recording(
-    path: str | os.PathLike[str], *, format: Format | str | None = None, topic: str | None = None
+    path: str | os.PathLike[str],
+    *,
+    format: Format | str | None = None,
+    topic: str | None = None,
+    columns: str | None = None,
+    time_unit: str | None = None,
+    polarity: str | None = None,
+    scale_xy: int | None = None,
+    size: tuple[int, int] | None = None,
+    chip: str | None = None,
+    sort: bool = False,
 ) -> Recording:
     """Open a recording of any supported format.
 
     Formats without an index are read once to count, check and repair their events. The recording's ``metadata`` lists
-    the repairs.
+    the repairs, and what is assumed because the file does not state it, in entries whose names begin with ``assumed_``.
 
     Parameters
     ----------
@@ -212,6 +315,21 @@ def open_recording(
     topic : str, optional
         Topic of a ROS bag, or camera of an HDF5 file, if the file holds several: for example ``/dvs/events`` or
         ``davis/left``. The error for a missing topic lists all topics of the file.
+    columns : str, optional
+        Columns of a text, NumPy, HDF5, MATLAB or Parquet file, by name or number: ``"t=ts,x=xs,y=ys,p=ps"``. For
+        columns without names, their order: ``"x,y,p,t"``, with ``-`` for a column without use.
+    time_unit : str, optional
+        Unit of time in such a file: ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``.
+    polarity : str, optional
+        Meaning of the values of the polarity in such a file: ``"1=on,2=off"``.
+    scale_xy : int, optional
+        Number by which x and y in such a file are divided, if they are multiples of a fraction of a pixel.
+    size : tuple of int, optional
+        Sensor size (width, height) [px]. It replaces the size in the file.
+    chip : str, optional
+        Name of the camera's chip, if an AEDAT 2.0 file does not state it: for example ``"DVS128"``.
+    sort : bool, default False
+        Whether to sort the events by time, up to 33 million. They are then kept in memory.
 
     Returns
     -------
@@ -236,7 +354,19 @@ def open_recording(
     if format is not None and _folder_format(path) is not chosen:
         check_regular(path)
     check_topic(path, topic, chosen)
-    recording: Recording = io_function(OPENERS[chosen])(path, *((topic,) if chosen in TOPICS else ()))
+    layout = GivenLayout(columns, time_unit, polarity, scale_xy)
+    layout.check()
+    if layout != GivenLayout() and chosen not in LAYOUTS:
+        raise AmiwarpError(
+            f"{path}: is of the format {chosen.value}, whose layout is fixed; leave out {layout.options}"
+        )
+    if chip is not None and chosen not in CHIPS:
+        raise AmiwarpError(f"{path}: is of the format {chosen.value}, which needs no chip; leave out --chip")
+    arguments = [topic] if chosen in TOPICS else []
+    arguments += [layout] if chosen in LAYOUTS else []
+    named = {} if chip is None else {"chip": chip}
+    with given_source(GivenSource(None if size is None else (int(size[0]), int(size[1])), sort)):
+        recording: Recording = io_function(OPENERS[chosen])(path, *arguments, **named)
     return recording
 
 

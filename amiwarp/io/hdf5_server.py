@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS
+from amiwarp.io.columns import ROLES, names_roles
 from amiwarp.io.file_scan import microseconds, whole_pixels
 from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32
 from amiwarp.io.native_format import FORMAT
@@ -39,11 +40,8 @@ def find_layout(file: Any, topic: str | None, find: "Finder") -> tuple[str, str]
     found |= {f"davis/{side}": "mvsec" for side in SIDES if find(f"davis/{side}/events") is not None}
     found |= {"CD": "ecf"} if find("CD/events") is not None else {}
     listed = ", ".join(found)
-    if isinstance(find("events"), h5py.h5g.GroupID) and not found:
-        found, listed = {"": "native"}, "none, as it holds one stream of events"
     if not found:
-        names = ", ".join(list(h5py.Group(file))[:20]) or "none"
-        raise AmiwarpError(f"HDF5 without a group 'events'; expected events/x, y, t, p; its groups are {names}")
+        found, listed = {"": _own_or_columns(file, find)}, "none, as it holds one stream of events"
     if topic is not None and topic not in found:
         raise AmiwarpError(f"has no events in '{topic}'; the choices for --topic are {listed}")
     if topic is None and len(found) > 1:
@@ -51,6 +49,20 @@ def find_layout(file: Any, topic: str | None, find: "Finder") -> tuple[str, str]
         raise AmiwarpError(f"holds the events of several cameras: {listed}; {remedy}")
     chosen = next(iter(found)) if topic is None else topic
     return found[chosen], chosen
+
+
+def _own_or_columns(file: Any, find: "Finder") -> str:
+    """Return "native" for the layout of amiwarp and DSEC, or "columns" for any other."""
+    events = find("events")
+    if not isinstance(events, h5py.h5g.GroupID):
+        return "columns"
+    names = list(h5py.Group(events))
+    own = set(ROLES) & set(names)
+    if h5py.h5a.exists(find(""), b"format") or not own:
+        return "native" if own else "columns"
+    times = find("events/t")
+    seconds = isinstance(times, h5py.h5d.DatasetID) and times.dtype.kind == "f"
+    return "columns" if seconds or (len(own) < len(ROLES) and names_roles(names)) else "native"
 
 
 M3ED_COLUMNS = {**{f"events/{name}": name for name in "xytp"}, "ms_to_idx": "ms_map_idx"}
@@ -332,13 +344,13 @@ def _value(group: Any, name: str, attribute: str) -> Any:
         raise AmiwarpError(f"{name} attribute '{attribute}' is neither a number nor a string; remove it")
     if stored.get_storage_size() > ATTRIBUTE_BYTES:
         raise AmiwarpError(f"{name} attribute '{attribute}' has over {ATTRIBUTE_BYTES} bytes; the file is damaged")
-    return _plain(_whole(stored)[()])
+    return plain_value(_whole(stored)[()])
 
 
-def _plain(value: Any) -> Any:
+def plain_value(value: Any) -> Any:
     """Return a value of NumPy or HDF5 as a plain Python value."""
     if isinstance(value, np.ndarray):
-        return [_plain(item) for item in value.ravel()]
+        return [plain_value(item) for item in value.ravel()]
     if isinstance(value, (bytes, str)):
         return _text(value)
     if isinstance(value, np.floating):

@@ -36,8 +36,9 @@ from amiwarp.events.truth import (
     WorldLabels,
     check_truth,
 )
-from amiwarp.io import hdf5_files
-from amiwarp.io.file_scan import head_limit, smallest_sensor
+from amiwarp.io import column_files, hdf5_files
+from amiwarp.io.columns import GivenLayout, is_plain_polarity
+from amiwarp.io.file_scan import ASSUMED_SIZE, assumed_size, given_size, head_limit, smallest_sensor
 from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place, register_reader
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
 from amiwarp.io.hdf5_files import CHUNK, ChunkFile, Column, EncodedChunk, Hdf5File
@@ -168,7 +169,7 @@ def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
 # Opening of a recording.
 
 
-def open_hdf5(path: Path, topic: str | None = None) -> Recording:
+def open_hdf5(path: Path, topic: str | None, given: GivenLayout) -> Recording:
     """Open a native recording, or a file of another layout. ``topic`` chooses among several cameras.
 
     Raises :class:`AmiwarpError` for other files.
@@ -176,6 +177,12 @@ def open_hdf5(path: Path, topic: str | None = None) -> Recording:
     with errors_name(path, lambda: "opening HDF5"):
         file = Hdf5File(path, topic)
         try:
+            ours = file.attributes.get("/", {}).get("format") == FORMAT
+            if ours and given != GivenLayout():
+                raise AmiwarpError(f"{path}: is amiwarp's own format, whose layout is fixed; leave out {given.options}")
+            if file.layout == "columns" or given != GivenLayout() or _has_other_polarity(file):
+                file.close()
+                return column_files.open_hdf5_columns(path, given)
             if file.layout in ("mvsec", "ecf"):
                 file.close()
                 return hdf5_files.open_rows(path, file.layout, file.group)
@@ -185,6 +192,14 @@ def open_hdf5(path: Path, topic: str | None = None) -> Recording:
         except BaseException:
             file.close()
             raise
+
+
+def _has_other_polarity(file: Hdf5File) -> bool:
+    """Return whether the first polarities of a file of another program are not 1 for ON, 0 or -1 for OFF."""
+    column = file.columns.get("events/p")
+    if column is None or file.attributes.get("/", {}).get("format") == FORMAT or file.unfinished:
+        return False
+    return not is_plain_polarity(column.read(0, min(len(column), CHUNK)))
 
 
 def _read_recording(path: Path, file: Hdf5File) -> Recording:
@@ -200,6 +215,11 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
     metadata["format"] = "native" if attribute(root, f"{path}: /", "format", str, "") == FORMAT else "dsec"
     if file.layout == "m3ed":
         metadata |= {"format": "m3ed", "topic": file.group}
+    if given_size() is not None:
+        metadata.pop(ASSUMED_SIZE, None)
+    elif not events.size_is_stored:
+        metadata |= [assumed_size(events.size).entry]
+    events.size_is_known = ASSUMED_SIZE not in metadata
     camera, prism = file.attributes.get("camera"), file.attributes.get("prism")
     found = None if camera is None else read_camera(camera, f"{path}: /camera")
     if found is not None and (found.width, found.height) != events.size:
@@ -287,17 +307,26 @@ class NativeEvents(EventSource):
         self._offset = 0 if offset is None else rounded_times(offset.read(0, 1)).item()
         # The index of an unfinished file may be incomplete. Bisection is used instead.
         self._ms_to_idx = None if file.unfinished else file.columns.get("ms_to_idx")
-        self._size = self._find_size()
+        stored = given_size() or self._stored_size()
+        self.size_is_stored = stored is not None
+        """Whether the file or the user states the sensor size."""
+        self.size_is_known = self.size_is_stored
+        """Whether the size is neither taken from the events, nor was in the file that the recording was made from."""
+        self._size = stored or self._smallest_size()
         self._ends = [self.slice(at, at + 1).t for at in (0, self._count - 1)] if self._count else []
         register_reader(self, self.path)
 
-    def _find_size(self) -> tuple[int, int]:
-        """Return the stored sensor size, or else the smallest known sensor that holds all events [px]."""
+    def _stored_size(self) -> tuple[int, int] | None:
+        """Return the stored sensor size [px], or None."""
         attributes = self._file.attributes.get("/", {})
-        if "width" in attributes and "height" in attributes:
-            width, height = (attribute(attributes, f"{self.path}: /", name, int) for name in ("width", "height"))
-            check_size(width, height, self.path)
-            return width, height
+        if "width" not in attributes or "height" not in attributes:
+            return None
+        width, height = (attribute(attributes, f"{self.path}: /", name, int) for name in ("width", "height"))
+        check_size(width, height, self.path)
+        return width, height
+
+    def _smallest_size(self) -> tuple[int, int]:
+        """Return the smallest known sensor size that holds all events, but at least that of DSEC [px]."""
         largest = [0, 0]
         for start in range(0, min(self._count, head_limit() or self._count), DEFAULT_BLOCK):
             for axis, name in enumerate(("x", "y")):
@@ -1720,7 +1749,7 @@ class LiveWriter:
                 file.truncate(int.from_bytes(file.read(8), "little"))
             if tidy and os.path.getsize(self.part) > 2 * stored + MAX_WASTE_BYTES:
                 with contextlib.suppress(AmiwarpError):  # if the disk is full, the part itself is renamed
-                    tidied = dataclasses.replace(open_hdf5(self.part), metadata=self._metadata)
+                    tidied = dataclasses.replace(open_hdf5(self.part, None, GivenLayout()), metadata=self._metadata)
                     save_recording(self.path, tidied, overwrite=self._overwrite)
                     self.part.unlink()
                     return

@@ -1,4 +1,4 @@
-"""Plain formats of events: text and NumPy arrays, which are read and written, and the .bin files of N-MNIST."""
+"""Plain formats of events: writers of text and NumPy arrays, arrays of EV-IMO2, and the .bin files of N-MNIST."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, BinaryIO, ClassVar, Self, TypeAlias
+from typing import IO, Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 from numpy.lib import format as npy
@@ -17,39 +17,18 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording, regroup
-from amiwarp.io.file_scan import FileEvents, Packet, microseconds, read_pieces, whole_pixels
-from amiwarp.io.files import LONGEST_LINE, NewFile, errors_name, input_path, open_input, scratch_folder
+from amiwarp.io.file_scan import FileEvents, Packet, microseconds, read_pieces
+from amiwarp.io.files import NewFile, errors_name, input_path, open_input, scratch_folder
 from amiwarp.io.formats import (
     BIN_EVENT_BYTES,
     BIN_MARK_ROW,
     Outline,
     bin_columns,
     check_ending,
-    holds_values,
     looks_like_bin,
 )
 from amiwarp.optics.camera import LARGEST_SIZE, Camera, RadialTangential
 from amiwarp.tasks import in_order
-
-# Reader of text in the format of the Event Camera Dataset: one event ``t x y p`` per line, t in seconds, p 1 or 0.
-#
-# A first line ``width height``, which some exporters write, gives the sensor size. Otherwise it is that of the smallest
-# known sensor that holds all events (240x180 for that dataset). A ``calib.txt`` in the same folder gives the camera as
-# ``fx fy cx cy k1 k2 p1 p2 k3``. Empty lines and lines that start with ``#`` are ignored. If most of the first events
-# have fractional x or y, all are compensated, and ``nan`` marks events without coordinates.
-
-READ_BYTES = 1 << 22
-"""Amount of text that is parsed at once [bytes]: about 200,000 events."""
-
-
-def open_text(path: Path) -> Recording:
-    """Open a text recording, with the camera of ``calib.txt`` in the same folder if that file exists."""
-    with errors_name(path, lambda: "line 1"), open_input(path) as file:
-        size, _ = _read_size(path, file)
-    events = FileEvents(path, partial(_text_packets, path), size=size, last_time=partial(_last_time, path))
-    calib = path.with_name("calib.txt")
-    camera = read_calib(calib, *events.size) if calib.exists() and calib != path else None
-    return Recording(events=events, camera=camera, metadata={"format": "text", **events.metadata}, name=path.stem)
 
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
@@ -63,104 +42,6 @@ def read_calib(path: Path, width: int, height: int) -> Camera:
             raise AmiwarpError(f"{path}: has {len(numbers)} numbers; expected finite fx fy cx cy k1 k2 p1 p2 k3")
         fx, fy, cx, cy = numbers[:4]
         return Camera(width, height, fx, fy, cx, cy, RadialTangential(*numbers[4:]))
-
-
-def _read_size(path: Path, file: BinaryIO) -> tuple[tuple[int, int] | None, int]:
-    """Return the sensor size from a first line of two numbers, and the number of lines read.
-
-    Empty lines and comments may come before it. If the first line is an event, return None and 0.
-    """
-    number, words = 0, list[bytes]()
-    while not words and (line := file.readline(LONGEST_LINE)).endswith(b"\n"):
-        number, words = number + 1, line.split() if holds_values(line) else []
-    if len(words) != 2:
-        file.seek(0)
-        return None, 0
-    if not (words[0].isdigit() and words[1].isdigit()):
-        given = b" ".join(words)[:80].decode("ascii", "replace")
-        raise AmiwarpError(
-            f"{path}: line {number} '{given}' is not a size in pixels; expected 'width height' or 't x y p'"
-        )
-    return (int(words[0]), int(words[1])), number
-
-
-def _last_time(path: Path, estimate: int) -> int | None:
-    """Return the time of the last line [us], or None if it holds none."""
-    with open_input(path) as file:
-        file.seek(max(path.stat().st_size - 2 * LONGEST_LINE, 0))
-        lines = list(filter(holds_values, file.read().split(b"\n")[1:]))
-    with contextlib.suppress(ValueError, IndexError, OverflowError):
-        return round(float(lines[-1].split()[0]) * 1e6)
-    return None
-
-
-def _text_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
-    fractional: bool | None = None
-    with open_input(path) as file:
-        _, line_number = _read_size(path, file)
-        rest = b""
-        notes["total"] = path.stat().st_size
-        while data := file.read(READ_BYTES):
-            notes["read"] = file.tell()
-            whole, newline, rest = (rest + data).rpartition(b"\n")
-            if len(rest) > LONGEST_LINE:
-                raise AmiwarpError(f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters")
-            if newline:
-                lines = whole.split(b"\n")
-                fractional, events = _parse(path, lines, line_number, fractional)
-                yield events
-                line_number += len(lines)
-        if rest.strip():
-            yield _parse(path, [rest], line_number, fractional)[1]
-
-
-def _parse(path: Path, lines: list[bytes], line_number: int, fractional: bool | None) -> tuple[bool | None, Packet]:
-    """Return whether the events of a file are compensated, and those in lines of text.
-
-    ``line_number`` is the number of the line before them, ``fractional`` what the lines before have shown.
-    """
-    kept = list(filter(holds_values, lines))
-    if not kept:
-        nothing = np.zeros(0, np.int64)
-        return fractional, (nothing, nothing, nothing, nothing)
-    try:
-        table = np.loadtxt(kept, ndmin=2, comments=None, encoding="ascii")
-    except ValueError:
-        table = np.zeros((0, 0))
-    if fractional is None and table.shape[1] == 4:
-        fractional = bool((table[:, 1:3] != np.floor(table[:, 1:3])).any(axis=1).mean() > 0.5)
-    if table.shape != (len(kept), 4) or not _plausible(table, fractional).all():
-        bad = _first_bad_line(lines, line_number, fractional)
-        raise AmiwarpError(f"{path}: {bad}; expected 't x y p' with t in seconds, p 0 or 1")
-    t, x, y, p = table.T
-    t, p = np.rint(t * 1e6).astype(np.int64), p.astype(np.int64)
-    return fractional, (x, y, t, p) if fractional else (x.astype(np.int64), y.astype(np.int64), t, p)
-
-
-def _plausible(table: NDArray[np.float64], fractional: bool | None) -> NDArray[np.bool_]:
-    """Return for each row ``t x y p`` whether its numbers are usable."""
-    t, x, y, p = table.T
-    # Pixels must fit 32 bits. Pixels outside the frame are dropped later. NaN fails every comparison.
-    places: Any = (np.abs(x) < 2**31) & (np.abs(y) < 2**31)
-    if fractional:
-        places |= np.isnan(x) | np.isnan(y)
-    else:
-        places &= (np.floor(x) == x) & (np.floor(y) == y)
-    return np.asarray((np.abs(t) < 2**62 / 1e6) & places & ((p == 0) | (p == 1) | (p == -1)))
-
-
-def _first_bad_line(lines: list[bytes], line_number: int, fractional: bool | None) -> str:
-    """Return a description of the first line that does not hold an event, for error messages."""
-    for number, line in enumerate(lines, line_number + 1):
-        if not holds_values(line):
-            continue
-        try:
-            row = np.array([[float(word) for word in line.split()]])
-        except ValueError:
-            row = np.zeros((1, 0))
-        if row.shape != (1, 4) or not _plausible(row, fractional).all():
-            return f"line {number} is '{line[:80].decode('ascii', 'replace').strip()}'"
-    return f"line {line_number + 1} or after it is malformed"
 
 
 # Writer of text in the format of the Event Camera Dataset: one event ``t x y p`` per line, t in seconds, p 1 or 0.
@@ -233,30 +114,13 @@ def _digits(values: NDArray[np.integer], places: int = 0) -> Digits:
     return characters, kept
 
 
-# Reader of NumPy arrays of events: archives (.npz) and the folders of EV-IMO2.
+# NumPy arrays, and the reader of the folders of EV-IMO2. :mod:`amiwarp.io.column_files` reads other arrays.
 #
-# An archive holds the integer arrays x, y [px], t [us] and p (1 is ON, 0 or -1 is OFF), with floating x and y for
-# compensated events, or one structured array ``event_data`` with these fields (N-ImageNet), or one array ``events``
-# with the columns t [s], x, y, p (EV-IMO). The optional numbers ``width`` and ``height`` give the sensor size.
-# Otherwise it is the smallest known sensor that holds all events. A folder of EV-IMO2 holds ``dataset_events_t.npy``
-# [s], ``dataset_events_xy.npy`` and ``dataset_events_p.npy``. Arrays are read in pieces, so that memory does not depend
-# on the size that a file declares.
+# A folder of EV-IMO2 holds ``dataset_events_t.npy`` [s], ``dataset_events_xy.npy`` and ``dataset_events_p.npy``. Arrays
+# are read in pieces, so that memory does not depend on the size that a file declares.
 
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods that NumPy writes. Others are refused, because they may take any amount of memory."""
-
-
-def open_npz(path: Path) -> Recording:
-    """Open an archive of events.
-
-    Arrays are read in pieces, and read again for each use if they are too large to keep in memory.
-    """
-    with errors_name(path, lambda: "reading width and height"), zipfile.ZipFile(input_path(path)) as archive:
-        size = None
-        if {"width.npy", "height.npy"} <= set(archive.namelist()):
-            size = (_number(archive, "width"), _number(archive, "height"))
-    events = FileEvents(path, partial(_npz_packets, path), size=size)
-    return Recording(events=events, metadata={"format": "npz", **events.metadata}, name=path.stem)
 
 
 Array: TypeAlias = tuple[IO[bytes], tuple[int, ...], np.dtype[Any]]
@@ -266,30 +130,45 @@ Array: TypeAlias = tuple[IO[bytes], tuple[int, ...], np.dtype[Any]]
 @contextlib.contextmanager
 def open_array(archive: zipfile.ZipFile, name: str, kinds: str = "iub") -> Iterator[Array]:
     """Open an array of the archive: its bytes, shape and type. Its header must agree with the archive's directory."""
+    with open_any_array(archive, name, kinds) as (array, by_columns):
+        if by_columns:
+            raise AmiwarpError(f"array {name} is stored by columns; save numpy.ascontiguousarray of it")
+        yield array
+
+
+@contextlib.contextmanager
+def open_any_array(archive: zipfile.ZipFile, name: str, kinds: str) -> Iterator[tuple[Array, bool]]:
+    """Open an array of the archive as :func:`open_array`, also one that is stored by columns. Yield whether it is."""
     about = archive.getinfo(f"{name}.npy")
     if about.compress_type not in PACKED:
         raise AmiwarpError(
             f"array {name} is compressed by method {about.compress_type}; save the array with numpy.savez"
         )
     with archive.open(about) as stream:
-        yield _header(stream, name, about.file_size, kinds)
+        yield array_header(stream, f"array {name}", about.file_size, kinds)
 
 
-def _header(stream: IO[bytes], name: str, file_bytes: int, kinds: str) -> Array:
-    """Read the header of an array of ``file_bytes`` bytes, and check it."""
+def array_header(stream: IO[bytes], name: str, file_bytes: int, kinds: str) -> tuple[Array, bool]:
+    """Read the header of an array of ``file_bytes`` bytes, and check it. Return whether it is stored by columns."""
     version = npy.read_magic(stream)
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
     if read is None:
-        raise AmiwarpError(f"array {name} has a header of version {version}; expected 1.0 or 2.0")
+        raise AmiwarpError(f"{name} has a header of version {version}; expected 1.0 or 2.0")
     shape, by_columns, dtype = read(stream)
-    # Floating times could be in seconds or in microseconds. Object arrays would be unpickled, which is unsafe.
+    # Object arrays would be unpickled, which is unsafe.
     if dtype.hasobject or dtype.kind not in kinds:
-        raise AmiwarpError(f"array {name} is {dtype}; expected integers (t in microseconds), no pickled objects")
+        raise AmiwarpError(f"{name} is {dtype}; expected integers (t in microseconds), no pickled objects")
     if math.prod(shape) * dtype.itemsize != file_bytes - stream.tell():
-        raise AmiwarpError(f"array {name} declares shape {shape}, which the archive does not hold; copy the file again")
-    if by_columns and len(shape) > 1:
+        raise AmiwarpError(f"{name} declares shape {shape}, which the archive does not hold; copy the file again")
+    return (stream, shape, dtype), by_columns and len(shape) > 1
+
+
+def _header(stream: IO[bytes], name: str, file_bytes: int, kinds: str) -> Array:
+    """Read the header of an array of ``file_bytes`` bytes, and check it. Refuse an array that is stored by columns."""
+    array, by_columns = array_header(stream, f"array {name}", file_bytes, kinds)
+    if by_columns:
         raise AmiwarpError(f"array {name} is stored by columns; save numpy.ascontiguousarray of it")
-    return stream, shape, dtype
+    return array
 
 
 # Maps of a sensor's pixels: arrays with one value or vector per pixel.
@@ -393,74 +272,7 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
     return found
 
 
-def _number(archive: zipfile.ZipFile, name: str) -> int:
-    """Return the single number in an array of the archive."""
-    with open_array(archive, name) as (stream, shape, dtype):
-        if math.prod(shape) != 1:
-            raise AmiwarpError(f"{name} has shape {shape}; expected one number")
-        return int(np.frombuffer(stream.read(dtype.itemsize), dtype)[0])
-
-
-def _npz_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
-    with contextlib.ExitStack() as opened:
-        archive = opened.enter_context(zipfile.ZipFile(input_path(path)))
-        names = {name.removesuffix(".npy") for name in archive.namelist()}
-        missing = [name for name in "xytp" if name not in names]
-        if not missing:
-            kinds = {"x": "iubf", "y": "iubf", "t": "iub", "p": "iub"}
-            arrays = {name: opened.enter_context(open_array(archive, name, kinds[name])) for name in "xytp"}
-            yield from _npz_columns(path, arrays, notes)
-        elif "event_data" in names:
-            array = opened.enter_context(open_array(archive, "event_data", "V"))
-            yield from _records(path, array, notes)
-        elif "events" in names:
-            array = opened.enter_context(open_array(archive, "events", "iuf"))
-            yield from _rows(path, array, notes)
-        else:
-            raise AmiwarpError(f"{path}: is a ZIP archive without x, y, t and p: no array {', '.join(missing)}; {USED}")
-
-
-USED = "expected x, y, t, p; or event_data (N-ImageNet); or events (EV-IMO)"
-"""Arrays that are read, for messages."""
-
-
-def _npz_columns(path: Path, arrays: Mapping[str, Array], notes: dict[str, int]) -> Iterator[Packet]:
-    """Yield the events of the arrays x, y, t, p."""
-    count = arrays["t"][1]
-    for name, (_, shape, _) in arrays.items():
-        if len(shape) != 1 or shape != count:
-            raise AmiwarpError(f"{path}: array {name} has shape {shape}, t {count}; expected one length (n,)")
-    x_type, y_type = (arrays[name][2] for name in "xy")
-    if (x_type.kind == "f") != (y_type.kind == "f"):
-        given = f"array x is {x_type}, y is {y_type}"
-        raise AmiwarpError(f"{path}: {given}; expected integers, or floating numbers for compensated events")
-    for length in _lengths(count[0], notes):
-        x, y, t, p = (_next(array, length) for array in arrays.values())
-        yield x, y, t, p
-
-
-def _records(path: Path, array: Array, notes: dict[str, int]) -> Iterator[Packet]:
-    """Yield the events of a structured array with the fields x, y, t [us], p."""
-    _, shape, dtype = array
-    fields: Mapping[str, Any] = dtype.fields or {}
-    if len(shape) != 1 or any(name not in fields or fields[name][0].kind not in "iub" for name in "xytp"):
-        raise AmiwarpError(f"{path}: array event_data is {dtype} of shape {shape}; expected integer fields x, y, t, p")
-    for length in _lengths(shape[0], notes):
-        rows = _next(array, length)
-        yield rows["x"], rows["y"], rows["t"], rows["p"]
-
-
-def _rows(path: Path, array: Array, notes: dict[str, int]) -> Iterator[Packet]:
-    """Yield the events of an array with the columns t [s], x, y, p."""
-    _, shape, dtype = array
-    if len(shape) != 2 or shape[1] != 4 or dtype.kind != "f":
-        raise AmiwarpError(f"{path}: array events is {dtype} of shape {shape}; expected float (n, 4): t [s], x, y, p")
-    for length in _lengths(shape[0], notes):
-        t, x, y, p = _next(array, length).T
-        yield whole_pixels(x), whole_pixels(y), microseconds(t), p > 0
-
-
-def _lengths(count: int, notes: dict[str, int]) -> Iterator[int]:
+def lengths(count: int, notes: dict[str, int]) -> Iterator[int]:
     """Yield the lengths of the pieces of ``count`` events, and note the progress."""
     notes["total"] = max(count, 1)
     for start in range(0, count, DEFAULT_BLOCK):
@@ -468,7 +280,7 @@ def _lengths(count: int, notes: dict[str, int]) -> Iterator[int]:
         yield min(DEFAULT_BLOCK, count - start)
 
 
-def _next(array: Array, length: int) -> NDArray[Any]:
+def next_rows(array: Array, length: int) -> NDArray[Any]:
     """Return the next ``length`` rows of an array."""
     stream, shape, dtype = array
     row = math.prod(shape[1:])
@@ -498,8 +310,8 @@ def _evimo_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
         if len(set(counts.values())) != 1 or sizes != {"t": 1, "xy": 2, "p": 1}:
             shapes = ", ".join(f"{name} {shape}" for name, (_, shape, _) in arrays.items())
             raise AmiwarpError(f"{path}: the arrays have the shapes {shapes}; expected (n,), (n, 2), (n,)")
-        for length in _lengths(counts["t"], notes):
-            t, xy, p = (_next(array, length) for array in arrays.values())
+        for length in lengths(counts["t"], notes):
+            t, xy, p = (next_rows(array, length) for array in arrays.values())
             yield xy[:, 0], xy[:, 1], microseconds(t.reshape(-1)), p.reshape(-1)
 
 

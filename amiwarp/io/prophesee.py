@@ -161,6 +161,8 @@ GENERATIONS = {
     "gen4": (1280, 720),
     "gen41": (1280, 720),
     "imx636": (1280, 720),
+    "imx646": (1280, 720),
+    "genx320": (320, 320),
 }
 """Sensor sizes (width, height) [px] by name of the sensor generation, for headers without a geometry."""
 
@@ -239,9 +241,8 @@ def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
     parts = dict(part.partition("=")[::2] for part in fields.get("format", "").split(";") if "=" in part)
     if parts.get("width", "").isdecimal() and parts.get("height", "").isdecimal():
         return int(parts["width"]), int(parts["height"])
-    match = re.search(
-        r"gen31|gen41|gen3|gen4|imx636", f"{fields.get('plugin_name')} {fields.get('sensor_name')}".lower()
-    )
+    names = f"{fields.get('plugin_name')} {fields.get('sensor_name')} {fields.get('generation')}".lower()
+    match = re.search("|".join(sorted(GENERATIONS, key=len, reverse=True)), names.replace(".", ""))
     return GENERATIONS[match[0]] if match else None
 
 

@@ -291,9 +291,14 @@ def _keep_idle(process: ReadingProcess) -> None:
 
 def run(function: Function, *arguments: Any) -> Any:
     """Run one function in a reading process, and return its JSON value."""
+    return run_with_arrays(function, *arguments)[0]
+
+
+def run_with_arrays(function: Function, *arguments: Any) -> tuple[Any, list[NDArray[Any]]]:
+    """Run one function in a reading process, and return its JSON value and its arrays."""
     process = borrow()
     try:
-        return process.call(function, *arguments)[0]
+        return process.call(function, *arguments)
     finally:
         give_back(process)
 

@@ -1,0 +1,272 @@
+"""Reader of text: the format of the Event Camera Dataset, and tables of any layout, such as CSV.
+
+The Event Camera Dataset has one event ``t x y p`` per line, t in seconds, p 1 or 0. A first line ``width height``,
+which some exporters write, gives the sensor size. A ``calib.txt`` in the same folder gives the camera as
+``fx fy cx cy k1 k2 p1 p2 k3``. If most of the first events have fractional x or y, all are compensated, and ``nan``
+marks events without coordinates.
+
+Other tables have columns between commas, semicolons, tabs or spaces, and may begin with a line of names. Empty lines
+and lines that start with ``#`` or ``%`` are comments. A comment may give the names, or the size as ``geometry``.
+:mod:`amiwarp.io.columns` decides what the columns are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
+from amiwarp.io.column_files import check_table
+from amiwarp.io.columns import ROLES, TIME_UNITS, Column, GivenLayout, Hints, Layout, find_layout, names_roles
+from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.files import LONGEST_LINE, errors_name, open_input
+from amiwarp.io.formats import TextRow, holds_values
+from amiwarp.io.plain_files import read_calib
+
+READ_BYTES = 1 << 22
+"""Amount of text that is parsed at once [bytes]: about 200,000 events."""
+
+HEAD_BYTES = 1 << 17
+"""Amount of text from which the layout is found [bytes]: about 6,000 events."""
+
+SECONDS = re.compile(rb"-?\d+\.\d{6,}")
+"""Pattern of times in seconds, as the Event Camera Dataset and amiwarp write them."""
+
+SIZE = re.compile(r"geometry\W{1,3}(\d+)\s*[,x ]\s*(\d+)|width\W{1,3}(\d+).*?height\W{1,3}(\d+)", re.I | re.S)
+"""Pattern of the sensor size in comments."""
+
+
+@dataclass(frozen=True, slots=True)
+class TextForm:
+    """Form of a text file."""
+
+    start: int
+    """Position of the first line of values [bytes]."""
+    lines: int
+    """Number of lines before it."""
+    row: TextRow
+    """Form of its lines."""
+    width: int
+    """Number of columns."""
+    names: tuple[str, ...] | None
+    """Names of the columns, or None."""
+    size: tuple[int, int] | None
+    """Sensor size that the file states [px], or None."""
+
+
+def open_text(path: Path, given: GivenLayout) -> Recording:
+    """Open a text recording, with the camera of ``calib.txt`` in the same folder if that file exists."""
+    with errors_name(path, lambda: "line 1"), open_input(path) as file:
+        head = file.read(max(HEAD_BYTES, 2 * LONGEST_LINE))
+        form = _find_form(path, head)
+    with errors_name(path, lambda: "finding the columns"):
+        layout = _find_text_layout(head, form, given)
+    events = FileEvents(
+        path,
+        partial(_text_packets, path, form, layout),
+        size=form.size,
+        last_time=partial(_last_time, path, form, layout),
+    )
+    check_table(path, events, layout)
+    calib = path.with_name("calib.txt")
+    camera = read_calib(calib, *events.size) if calib.exists() and calib != path else None
+    metadata = {"format": "text", **layout.metadata, **events.metadata}
+    return Recording(events=events, camera=camera, metadata=metadata, name=path.stem)
+
+
+# The form of a file, from its first lines.
+
+
+def _find_form(path: Path, head: bytes) -> TextForm:
+    """Return the form of a file that begins with ``head``."""
+    comments: list[str] = []
+    names: tuple[str, ...] | None = None
+    size: tuple[int, int] | None = None
+    position = number = 0
+    for line in head.splitlines(keepends=True):
+        words = TextRow.of(line).words(line) if holds_values(line) else []
+        if not words:
+            comments.append(line.decode("utf-8", "replace").strip().lstrip("#%\ufeff").strip())
+        elif len(words) == 2 and size is None and names is None and words[0].isdigit() and words[1].isdigit():
+            size = int(words[0]), int(words[1])
+        elif TextRow.of(line).is_row(line):
+            if len(words) == 2:
+                shown = b" ".join(words)[:80].decode("ascii", "replace")
+                raise AmiwarpError(
+                    f"{path}: line {number + 1} '{shown}' is not a size in pixels; expected 'width height' or 't x y p'"
+                )
+            row = TextRow.of(line)
+            return TextForm(position, number, row, len(words), names or _commented(comments, row, len(words)),
+                            size or _commented_size(comments))  # fmt: skip
+        elif names is None:
+            names = TextRow.of(line).names(line)
+        else:
+            break
+        position, number = position + len(line), number + 1
+    raise AmiwarpError(
+        f"{path}: line {number + 1} holds no numbers; expected 't x y p', or names of columns before them"
+    )
+
+
+def _commented(comments: Sequence[str], row: TextRow, width: int) -> tuple[str, ...] | None:
+    """Return the names of columns in the last comment before the values, or None."""
+    last = next((comment for comment in reversed(comments) if comment), "")
+    for names in (row.names(last.encode()), tuple(last.split())):
+        if len(names) == width and names_roles(names):
+            return names
+    return None
+
+
+def _commented_size(comments: Sequence[str]) -> tuple[int, int] | None:
+    """Return the sensor size in comments, or None."""
+    match = SIZE.search("\n".join(comments))
+    if match is None:
+        return None
+    return int(match[1] or match[3]), int(match[2] or match[4])
+
+
+def _find_text_layout(head: bytes, form: TextForm, given: GivenLayout) -> Layout:
+    """Return the layout of the columns of a file that begins with ``head``."""
+    if form.names is not None and len(form.names) != form.width and given.columns is None:
+        raise AmiwarpError(
+            f"names {len(form.names)} columns ({', '.join(form.names)[:200]}), and its rows have {form.width}; give "
+            "the order with --columns, such as t,x,y,p"
+        )
+    rows = []
+    lines = head[form.start :].splitlines()
+    is_cut = len(head) >= HEAD_BYTES  # the last line may go on
+    for line in lines[:-1] if is_cut else lines:
+        words = form.row.words(line) if holds_values(line) else []
+        if len(words) == form.width and form.row.is_row(line):
+            rows.append(words)
+    numbers = np.array([[float(word) for word in words] for words in rows]).reshape(-1, form.width)
+    names = form.names if form.names is not None and len(form.names) == form.width else None
+    columns = [Column(names[at] if names else None, _whole_if_possible(values)) for at, values in enumerate(numbers.T)]
+    if names is not None and not any(names):
+        columns = [replace(column, name=None) for column in columns]
+    hints = Hints(order=ROLES, fractions="s") if names is None else Hints()
+    layout = find_layout(columns, given, hints)
+    t_words = [words[layout.columns["t"]] for words in rows]
+    if given.time_unit is None and names is None and all(SECONDS.fullmatch(word) for word in t_words):
+        layout = replace(
+            layout,
+            unit="s",
+            unit_is_assumed=False,
+            assumptions=tuple(each for each in layout.assumptions if each.what != "time unit"),
+        )
+        layout = replace(layout, is_promised=given == GivenLayout() and not layout.assumptions)
+    places = numbers[:, [layout.columns["x"], layout.columns["y"]]]
+    fractional = bool((places != np.floor(places)).any(axis=1).mean() > 0.5)
+    return replace(layout, compensated=fractional)
+
+
+def _whole_if_possible(values: NDArray[np.float64]) -> NDArray[Any]:
+    """Return values as integers if all are whole."""
+    inside = np.abs(values) < 2**63
+    return values.astype(np.int64) if inside.all() and (values == np.floor(values)).all() else values
+
+
+# The events.
+
+
+def _last_time(path: Path, form: TextForm, layout: Layout, estimate: int) -> int | None:
+    """Return the time of the last line [us], or None if it holds none."""
+    with open_input(path) as file:
+        file.seek(max(path.stat().st_size - 2 * LONGEST_LINE, 0))
+        lines = list(filter(holds_values, file.read().split(b"\n")[1:]))
+    with contextlib.suppress(ValueError, IndexError, OverflowError):
+        word = form.row.words(lines[-1])[layout.columns["t"]]
+        return round(float(word) * TIME_UNITS[layout.unit])
+    return None
+
+
+def _text_packets(path: Path, form: TextForm, layout: Layout, notes: dict[str, int]) -> Iterator[Packet]:
+    parse = partial(_parse, path, form, layout, notes)
+    with open_input(path) as file:
+        file.seek(form.start)
+        line_number = form.lines
+        rest = b""
+        notes["total"] = path.stat().st_size
+        while data := file.read(READ_BYTES):
+            notes["read"] = file.tell()
+            whole, newline, rest = (rest + data).rpartition(b"\n")
+            if len(rest) > LONGEST_LINE:
+                raise AmiwarpError(f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters")
+            if newline:
+                yield parse(whole, line_number)
+                line_number += whole.count(b"\n") + 1
+        if rest.strip():
+            yield parse(rest, line_number)
+
+
+def _parse(path: Path, form: TextForm, layout: Layout, notes: dict[str, int], text: bytes, line_number: int) -> Packet:
+    """Return the events in lines of text. ``line_number`` is the number of the line before them."""
+    lines = text.split(b"\n")
+    kept = list(filter(holds_values, form.row.plain(text).split(b"\n")))
+    if not kept:
+        nothing = np.zeros(0, np.int64)
+        return nothing, nothing, nothing, nothing
+    try:
+        table = np.loadtxt(kept, ndmin=2, comments=None, encoding="ascii")
+    except ValueError:
+        table = np.zeros((0, 0))
+    if table.shape != (len(kept), form.width) or not _plausible(table[:, layout.chosen], layout).all():
+        bad = _first_bad_line(lines, line_number, form, layout)
+        raise AmiwarpError(f"{path}: {bad}; expected {_expected(form, layout)}")
+    t, x, y, p = table[:, layout.chosen].T
+    if layout.unit == "ns":  # whole nanoseconds since 1970 have more digits than float64
+        with contextlib.suppress(ValueError):
+            at = layout.columns["t"]
+            t = np.loadtxt(kept, np.int64, ndmin=1, comments=None, encoding="ascii", usecols=at)
+    if not layout.compensated:
+        x, y = x.astype(np.int64), y.astype(np.int64)
+    return layout.events(t, x, y, p, notes=notes)
+
+
+def _expected(form: TextForm, layout: Layout) -> str:
+    """Return what a line holds, for messages."""
+    values = sorted(value for value in layout.coding if abs(value) < 2**31)
+    polarity = "0 or 1" if values == [-1, 0, 1] else " or ".join(map(str, values))
+    unit = {"s": "seconds"}.get(layout.unit, layout.unit)
+    order = sorted(layout.columns, key=lambda role: layout.columns[role])
+    return f"'{' '.join(order)}' with t in {unit}, p {polarity}" + (
+        "" if form.width == len(ROLES) else f", in {form.width} columns"
+    )
+
+
+def _plausible(table: NDArray[np.float64], layout: Layout) -> NDArray[np.bool_]:
+    """Return for each row t, x, y, p whether its numbers are usable."""
+    t, x, y, p = table.T
+    # Pixels must fit 32 bits. Pixels outside the frame are dropped later. NaN fails every comparison.
+    places: Any = (np.abs(x) < 2**31) & (np.abs(y) < 2**31)
+    if layout.compensated:
+        places |= np.isnan(x) | np.isnan(y)
+    else:
+        places &= (np.floor(x) == x) & (np.floor(y) == y)
+    known: Any = np.zeros(len(p), np.bool_)
+    for value in layout.coding:
+        known |= p == value
+    return np.asarray((np.abs(t) < 2**62 / TIME_UNITS[layout.unit]) & places & known)
+
+
+def _first_bad_line(lines: list[bytes], line_number: int, form: TextForm, layout: Layout) -> str:
+    """Return a description of the first line that does not hold an event, for error messages."""
+    for number, line in enumerate(lines, line_number + 1):
+        if not holds_values(line):
+            continue
+        try:
+            row = np.array([[float(word) for word in form.row.words(line)]])
+        except ValueError:
+            row = np.zeros((1, 0))
+        if row.shape != (1, form.width) or not _plausible(row[:, layout.chosen], layout).all():
+            return f"line {number} is '{line[:80].decode('ascii', 'replace').strip()}'"
+    return f"line {line_number + 1} or after it is malformed"
