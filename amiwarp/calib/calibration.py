@@ -386,7 +386,8 @@ class Calibrator:
         return replace(again, calibration=calibration)
 
     def _told(self, found: Calibration) -> Calibration:
-        """Return the calibration, with a warning if it found that the prism's speed is not constant."""
+        """Return the calibration, with warnings of an assumed sensor size and of a speed that is not constant."""
+        found = _warning(found, *checks.size_warnings(self.recording))
         if found.path is None or self.path is not None:
             return found
         said = f"the prism's speed is not constant: it {speed_in_words(found.path)}"

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from amiwarp.calib.bad_pixels import BadPixelSummary
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.iwe import Image
 from amiwarp.imaging.sharpness import edge_coherence
+from amiwarp.io.file_scan import ASSUMED_SIZE
 from amiwarp.optics.models import MODELS, Model
 from amiwarp.optics.prism import Prism
 
@@ -166,6 +168,24 @@ def check_light(mask: NDArray[np.bool_], summary: BadPixelSummary, name: str) ->
         raise AmiwarpError(
             f"{name}: {100 * mask.mean():.0f} % of the pixels flicker at {at} Hz; use daylight or flicker-free lighting"
         )
+
+
+CENTRED_PX = 0.01
+"""Largest distance of a principal point from the centre of an image that it is placed at [px]."""
+
+
+def size_warnings(recording: Recording) -> tuple[str, ...]:
+    """Return a warning if the camera's centre follows from a sensor size that is assumed, and nothing otherwise."""
+    camera = recording.camera
+    if ASSUMED_SIZE not in recording.metadata or camera is None:
+        return ()
+    width, height = camera.width, camera.height
+    if max(abs(camera.cx - (width - 1) / 2), abs(camera.cy - (height - 1) / 2)) > CENTRED_PX:
+        return ()
+    return (
+        f"the file does not state the sensor size: {width}x{height} px is assumed, and the camera's centre with it; if "
+        "the sensor has another size, give it with --size",
+    )
 
 
 def check_nominal(model: str, parameters: Mapping[str, float], nominal: Prism, name: str) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.calib.calibration import path_of, prepare, zero_time
+from amiwarp.calib.checks import size_warnings
 from amiwarp.calib.nlopt_solver import SearchStage, best_of
 from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.settings import STAGES, Settings
@@ -80,7 +81,7 @@ def calibrate_as_paper(
         path=path_of(used, search),
         events=len(cut),
         seconds=time.perf_counter() - began,
-        warnings=warnings,
+        warnings=(*warnings, *size_warnings(recording)),
     )
 
 

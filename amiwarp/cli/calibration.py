@@ -253,6 +253,7 @@ def run_calibrate(
     parameters: ParameterOptions,
     camera: cli.CameraOptions,
     prism: cli.NominalPrismOptions,
+    layout: cli.FileOptions,
     common: cli.Common,
 ) -> None:
     """Find the prism's parameters by contrast maximisation: those that make the image of warped events sharpest.
@@ -267,7 +268,7 @@ def run_calibrate(
     device = cli.choose_device(common.device)
     base = Settings() if preset is None else Preset.load(preset, "calibration").calibration_settings()
     settings = replace(base, seed=common.seed, **search.changes(base.photometric), **parameters.changes())
-    opened = cli.complete(open_recording(recording), camera, prism)
+    opened = cli.complete(open_recording(recording, **layout.given()), camera, prism)
     opened = cut(opened, window) if window else opened
     out = out or recording.with_name(f"{recording.stem}.calibration.json")
     check_ending(out, "calibrations are written", [".json"])
@@ -479,6 +480,7 @@ def run_compensate(
     encoder: cli.EncoderOptions,
     topic: cli.Topic = None,
     iwe: IweOptions,
+    layout: cli.FileOptions,
     common: cli.Common,
 ) -> None:
     """Compensate the prism's motion: move every event to its position without the prism.
@@ -499,7 +501,7 @@ def run_compensate(
     if preset is not None:
         found = simplified(found, Preset.load(preset, "compensation").settings["model"])
     log = encoder.build(recording, topic)
-    opened = open_recording(recording, topic=topic)
+    opened = open_recording(recording, topic=topic, **layout.given())
     opened = opened if log is None else replace(opened, encoder=log)
     depths = None if depth is None else DepthMap.load(depth)
     files = iwe.build(opened, device)
@@ -659,6 +661,7 @@ def run_reconstruct(
     window: WindowOptions,
     picture: PictureOptions,
     by: NetworkOptions,
+    layout: cli.FileOptions,
     common: cli.Common,
 ) -> None:
     """Reconstruct a picture of the scene from the events of a window, or a video from a sliding window.
@@ -686,14 +689,18 @@ def run_reconstruct(
     given = None if calibration is None else Calibration.load(calibration)
     began = time.perf_counter()
     if by.network is not None:
-        data = _by_network(open_recording(recording), given, out, window, picture, by, device)
+        data = _by_network(open_recording(recording, **layout.given()), given, out, window, picture, by, device)
         data = {"file": str(out), **data, "seconds": time.perf_counter() - began, "device": device}
         cli.report(common, data, [_network_line(data)])
         return
     if given is None:
         raise AmiwarpError(f"{out}: --calibration is missing; give a calibration file, or a network by --network")
     work = Reconstruction(
-        open_recording(recording), given, camera_rotation=window.camera_rotation(), fill=picture.fill, device=device
+        open_recording(recording, **layout.given()),
+        given,
+        camera_rotation=window.camera_rotation(),
+        fill=picture.fill,
+        device=device,
     )
     start, length = window.span(work.recording, work.turn_us, video=video)
     began = time.perf_counter()
@@ -876,6 +883,7 @@ def run_pixels(
         float | None,
         typer.Option(min=0.0, help="Refractory period of the sensor (us). Default: that of the calibration."),
     ] = None,
+    layout: cli.FileOptions,
     common: cli.Common,
 ) -> None:
     """Measure the ON and OFF threshold of every pixel, and find hot and dead pixels, from a calibrated recording.
@@ -889,7 +897,7 @@ def run_pixels(
 
     check_ending(out, "pixel maps are written", [".npz"])
     device = cli.choose_device(common.device)
-    source = open_recording(recording)
+    source = open_recording(recording, **layout.given())
     first = source.events.t_first if len(source.events) else 0
     began = time.perf_counter()
     with cli.progress("measuring the pixels") as advance:
@@ -950,6 +958,7 @@ def run_depth(
         Path | None, typer.Option(help="Figure of the depths and their deviations to write (.png)."), cli.OUTPUT
     ] = None,
     nearest_m: Annotated[float, typer.Option(help="Smallest depth that is tried (m).")] = 0.25,
+    layout: cli.FileOptions,
     common: cli.Common,
 ) -> None:
     """Find the depth of every edge from a camera at rest behind a rotating tilted plate, with its uncertainty.
@@ -967,8 +976,8 @@ def run_depth(
     began = time.perf_counter()
     with cli.progress("finding depths") as advance:
         found = depth(
-            open_recording(recording), Calibration.load(calibration), nearest_m=nearest_m, device=device,
-            progress=advance,
+            open_recording(recording, **layout.given()), Calibration.load(calibration), nearest_m=nearest_m,
+            device=device, progress=advance,
         )  # fmt: skip
     found.save(out)
     if ply is not None:

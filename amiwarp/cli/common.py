@@ -51,10 +51,65 @@ Topic = Annotated[
 """Option that chooses among several streams of events."""
 
 # Options in a panel of the help.
+_in_layout = partial(typer.Option, rich_help_panel="Layout of the file")
 _in_common = partial(typer.Option, rich_help_panel="Common")
 in_camera = partial(typer.Option, rich_help_panel="Camera")
 in_prism = partial(typer.Option, rich_help_panel="Prism")
 in_encoder = partial(typer.Option, rich_help_panel="Encoder")
+
+
+@dataclass(frozen=True)
+class LayoutOptions:
+    """Options for what an event file does not state. They override what is assumed."""
+
+    columns: Annotated[
+        str | None,
+        _in_layout(
+            help="Columns of text, NumPy, HDF5, MATLAB and Parquet files: t=NAME,x=NAME,y=NAME,p=NAME, or their order, "
+            "such as x,y,p,t (-: a column without use).",
+            metavar="t=NAME,...",
+        ),
+    ] = None
+    time_unit: Annotated[
+        Literal["s", "ms", "us", "ns"] | None, _in_layout(help="Unit of time in such a file.", show_default=False)
+    ] = None
+    polarity: Annotated[
+        str | None,
+        _in_layout(help="Meaning of the polarities in such a file: 1=on,2=off.", metavar="VALUE=on|off,..."),
+    ] = None
+    scale_xy: Annotated[
+        int | None, _in_layout(min=1, help="Number by which x and y in such a file are divided: 32 for BS-ERGB.")
+    ] = None
+    chip: Annotated[
+        str | None, _in_layout(help="Chip of the camera, if an AEDAT 2.0 file does not state it: DVS128 ...")
+    ] = None
+    sort: Annotated[
+        bool, _in_layout("--sort", help="Sort the events by time, up to 33 million, which are kept in memory.")
+    ] = False
+
+    def given(self) -> dict[str, Any]:
+        """Return the arguments of :func:`amiwarp.open_recording` that the options give."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: value for name, value in values.items() if value not in (None, False)}
+
+
+@dataclass(frozen=True)
+class FileOptions(LayoutOptions):
+    """Options for what an event file does not state, with the size of the sensor."""
+
+    size: Annotated[
+        str | None,
+        _in_layout(
+            help="Sensor size (px), which replaces the size in the file. Default: that of the file, or the smallest "
+            "known sensor that holds all events.",
+            metavar="WIDTHxHEIGHT",
+        ),
+    ] = None
+
+    def given(self) -> dict[str, Any]:
+        """Return the arguments of :func:`amiwarp.open_recording` that the options give."""
+        found = super().given()
+        return found if self.size is None else {**found, "size": parse_size(self.size)}
 
 
 @dataclass(frozen=True)

@@ -107,6 +107,7 @@ def run_lens(
     ] = None,
     stream: SourceOptions,
     prism: cli.NominalPrismOptions,
+    layout: cli.FileOptions,
     common: cli.Common,
 ) -> None:
     """Calibrate the camera's lens, and the prism with it, from a printed board that stands still.
@@ -132,7 +133,7 @@ def run_lens(
     else:
         if stream != SourceOptions():
             raise AmiwarpError("--port, --counts-per-turn, --fast, --seconds and --wait-for-source belong to --live")
-        opened = [open_recording(path) for path in recordings]
+        opened = [open_recording(path, **layout.given()) for path in recordings]
         given = [replace(recording, prism=prism.build(recording.prism)) for recording in opened]
         with cli.progress("lens") as show:
             found = calibrate_lens(given, made, fov=fov, fisheye=fisheye, device=device, progress=show)

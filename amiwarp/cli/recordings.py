@@ -20,7 +20,7 @@ from amiwarp.events.recording import DEFAULT_BLOCK, EventSource, ImageStore, Imu
 from amiwarp.events.truth import Cause, Truth
 from amiwarp.io import convert, open_recording
 from amiwarp.io.export import GAP_INTERVALS, save_flow_dsec, save_flow_mvsec, save_poses_tum
-from amiwarp.io.file_scan import head_only
+from amiwarp.io.file_scan import ASSUMED, assumptions_of, head_only
 from amiwarp.io.formats import EXTENSION_HELP, Codec, make_folder
 from amiwarp.optics.camera import camera_to_json
 from amiwarp.optics.prism import NominalPrism, Plate, Prism
@@ -44,9 +44,10 @@ def run_info(
         bool, typer.Option("--count", help="Read all of a large file, to count its events instead of estimating them.")
     ] = False,
     topic: cli.Topic = None,
+    layout: cli.FileOptions,
     common: cli.Common,
 ) -> None:
-    """Show a recording's format, events, encoder, camera, prism, IMU, frames, ground truth and repairs.
+    """Show a recording's format, events, encoder, camera, prism, IMU, frames, ground truth, repairs and assumptions.
 
     Files of up to 256 MiB are read once, in blocks. Of larger files only the first 4 million events and the end are
     read, unless --count is given. Figures that are then estimates are marked as such.
@@ -56,7 +57,7 @@ def run_info(
         return
     large = not count and _file_bytes(file) > LARGE_BYTES
     with head_only(HEAD_EVENTS) if large else contextlib.nullcontext():
-        recording = open_recording(file, topic=topic)
+        recording = open_recording(file, topic=topic, **layout.given())
     data = describe(recording, str(file), head=large)
     cli.report(common, data, [cli.table(_rows(data))])
 
@@ -102,6 +103,7 @@ def describe(recording: Recording, file: str, *, head: bool = False) -> dict[str
         "world": None if recording.truth is None else _world(recording.truth, None if head else len(source)),
         "records": getattr(source, "records", {}),
         "repairs": getattr(source, "repairs", {}),
+        "assumptions": [asdict(each) for each in assumptions_of(recording.metadata)],
         "metadata": recording.metadata,
     }
     if recording.prism is not None:
@@ -320,8 +322,12 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     if d["world"] is not None:
         rows += _world_rows(d["world"])
     rows.append(("repairs", ", ".join(f"{name} {count:,}" for name, count in d["repairs"].items()) or "none"))
-    rest = {k: v for k, v in d["metadata"].items() if k != "format" and k not in d["repairs"] and k not in d["records"]}
-    return rows + [(name, str(value)) for name, value in rest.items()]
+    known = {"format", *d["repairs"], *d["records"]}
+    rest = {k: v for k, v in d["metadata"].items() if k not in known and not k.startswith(ASSUMED)}
+    rows += [(name, str(value)) for name, value in rest.items()]
+    for each in d["assumptions"]:
+        rows.append(("assumed", f"{each['what']} {each['value']}: {each['why']} ({each['option']})"))
+    return rows
 
 
 def _prism_text(p: dict[str, Any] | None) -> str:
@@ -401,6 +407,7 @@ def run_convert(
     prism: cli.NominalPrismOptions,
     viewers: ViewerOptions,
     topic: cli.Topic = None,
+    layout: cli.FileOptions,
     common: cli.Common,
 ) -> None:
     """Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.
@@ -421,19 +428,19 @@ def run_convert(
         )
     log = encoder.build(source, topic)
     if for_viewer:
-        opened = open_recording(source, topic=topic)
+        opened = open_recording(source, topic=topic, **layout.given())
         _write_for_viewer(opened if log is None else replace(opened, encoder=log), out, viewers, common, began)
         return
     lens = wedge = None
     if camera != cli.CameraOptions() or prism != cli.NominalPrismOptions():  # opening may read the whole file
-        recording = open_recording(source, topic=topic)
+        recording = open_recording(source, topic=topic, **layout.given())
         # If the file does not hold the sensor's size, the camera's size is used.
         lens = camera.build(*recording.events.size, fixed=getattr(recording.events, "size_is_known", True))
         wedge = prism.build(recording.prism)
     with cli.progress("converting") as advance:
         summary = convert(
             source, out, encoder=log, camera=lens, prism=wedge, topic=topic, format=format, codec=codec,
-            progress=advance, rounding=round, seed=common.seed,
+            progress=advance, rounding=round, seed=common.seed, **layout.given(),
         )  # fmt: skip
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {"file": str(out), **asdict(summary), "seconds": seconds}
@@ -477,6 +484,7 @@ def _convert_lines(d: dict[str, Any]) -> list[str]:
         f"{d['file']}: {d['events']:,} events, {d['width']} x {d['height']}, {d['seconds']:.2f} s, {rate:.3g} Mev/s"
     ]
     lines += [f"note: {name}: {count:,}" for name, count in d["repairs"].items()]
+    lines += [f"note: assumed {text}" for text in d["assumptions"]]
     if d["encoder_covers"] is False:
         lines.append("warning: the encoder samples do not cover all events")
     if d["encoder_gaps"]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.choices import Optic, Seeing
 from amiwarp.cli import common as cli
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
 from amiwarp.io.camera_files import load_camera
 from amiwarp.io.files import text_lines
@@ -693,6 +694,7 @@ def run_translate(
     rig: RigOptions,
     sensor: SensorOptions,
     encoder: EncoderModelOptions,
+    layout: cli.LayoutOptions,
     common: cli.Common,
 ) -> None:
     """Simulate the recording of an event camera behind the prism from a video, pictures, or a plain event recording.
@@ -707,9 +709,14 @@ def run_translate(
     device = cli.choose_device(common.device)
     name = None if dataset is None else choice(DataSet, dataset, "--dataset")
     way = choice(Interpolation, interpolation, "--interpolation")
+    plain: Path | Recording = source
+    between: Path | Recording | None = events
+    if layout.given():
+        opened = open_recording(source if events is None else events, **layout.given())
+        plain, between = (opened, None) if events is None else (source, opened)
     with cli.progress("reading") as advance:
         given = translator_input(
-            source, events=events, dataset=name, interpolation=way, fps=fps, device=device, progress=advance
+            plain, events=between, dataset=name, interpolation=way, fps=fps, device=device, progress=advance
         )
     if duration is None and not given.duration_us:
         raise AmiwarpError(f"{source}: does not state its duration; give --duration")

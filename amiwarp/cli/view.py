@@ -259,6 +259,7 @@ def run_view(
     look: LookOptions,
     camera: cli.CameraOptions,
     prism: cli.NominalPrismOptions,
+    layout: cli.LayoutOptions,
     common: cli.Common,
 ) -> None:
     """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
@@ -268,11 +269,13 @@ def run_view(
         raise AmiwarpError("--screenshot and --web are both given; give one of them")
     if not page.web and page != PageOptions():
         raise AmiwarpError("--host and --port apply to the page; give --web too")
+    if stream.live and layout.given():
+        raise AmiwarpError("--live shows a stream, to which the options for the layout of a file do not apply")
     device = cli.choose_device(common.device)
     with stream.follow(str(recording)) as latest:
 
         def new_inspector() -> Inspector:
-            opened = open_recording(recording) if latest is None else latest()
+            opened = open_recording(recording, **layout.given()) if latest is None else latest()
             return start.build(cli.complete(opened, camera, prism), device, latest, None if page.web else WINDOW_POINTS)
 
         waiting = [new_inspector()]  # created before the page opens, so that bad input is reported at once
@@ -288,7 +291,8 @@ def run_view(
             return
 
         def open_other(path: Path) -> Inspector:
-            return Inspector(cli.complete(open_recording(path), camera, prism), device=device)
+            opened = open_recording(path, **(layout.given() if path == recording else {}))
+            return Inspector(cli.complete(opened, camera, prism), device=device)
 
         library = None if stream.live else Library(recording.parent, open_other)
 

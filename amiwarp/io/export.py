@@ -22,7 +22,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import SENSOR_DTYPE, Events, EventSource, Recording, check_coordinates
 from amiwarp.events.truth import FrameStore, Poses, PoseStore
 from amiwarp.io import formats
-from amiwarp.io.file_scan import ASSUMED, ASSUMED_SIZE, RECORDS, FileEvents
+from amiwarp.io.file_scan import ASSUMED, ASSUMED_SIZE, RECORDS, FileEvents, assumptions_of
 from amiwarp.io.files import NewFile, check_output, errors_name
 from amiwarp.io.formats import LIMITS, Bag, Codec, Outline, OutputFormat, Rounding, open_recording
 from amiwarp.io.native_format import write_recording
@@ -217,6 +217,8 @@ class ConversionSummary:
     """How coordinates were rounded to whole pixels, or None if they were not."""
     dropped: int = 0
     """Number of events that were not written, because after rounding they are outside the image."""
+    assumptions: tuple[str, ...] = ()
+    """What was assumed, because the input does not state it, with the option that overrides it."""
 
 
 @guarded
@@ -228,6 +230,13 @@ def convert(
     camera: Camera | None = None,
     prism: NominalPrism | None = None,
     topic: str | None = None,
+    columns: str | None = None,
+    time_unit: str | None = None,
+    polarity: str | None = None,
+    scale_xy: int | None = None,
+    size: tuple[int, int] | None = None,
+    chip: str | None = None,
+    sort: bool = False,
     progress: Progress | None = None,
     overwrite: bool = False,
     format: OutputFormat | str | None = None,
@@ -257,6 +266,16 @@ def convert(
         Replaces the nominal prism of the file.
     topic : str, optional
         The topic or camera to read, if the input holds several, see :func:`open_recording`.
+    columns, time_unit, polarity : str, optional
+        Layout of the input, see :func:`open_recording`.
+    scale_xy : int, optional
+        Number by which x and y of the input are divided, see :func:`open_recording`.
+    size : tuple of int, optional
+        Sensor size (width, height) [px]. It replaces the size in the input.
+    chip : str, optional
+        Name of the camera's chip, see :func:`open_recording`.
+    sort : bool, default False
+        Whether to sort the events by time, see :func:`open_recording`.
     progress : callable, optional
         Called with the name of the step and the finished fraction of the task, 0 to 1.
     overwrite : bool, default False
@@ -303,13 +322,16 @@ def convert(
     chosen = formats.output_format(out_path, format)
     codec = formats.check_codec(out_path, codec, chosen)
     rounding = formats.check_rounding(out_path, rounding, chosen)
-    opened = open_recording(source_path, topic=topic)
+    opened = open_recording(
+        source_path, topic=topic, columns=columns, time_unit=time_unit, polarity=polarity, scale_xy=scale_xy, size=size,
+        chip=chip, sort=sort,
+    )  # fmt: skip
     recording = replace(
         opened, encoder=encoder or opened.encoder, camera=camera or opened.camera, prism=prism or opened.prism
     )
-    size = recording.events.size
+    frame = recording.events.size
     if recording.camera is not None and not getattr(recording.events, "size_is_known", True):
-        size = recording.camera.width, recording.camera.height
+        frame = recording.camera.width, recording.camera.height
         known = {name: value for name, value in recording.metadata.items() if name != ASSUMED_SIZE}
         recording = replace(recording, metadata=known)
     dropped = 0
@@ -317,14 +339,14 @@ def convert(
         source = dict(zip(SOURCE_NAMES, (recording.name, recording.metadata["format"]), strict=True))
         metadata = {**source, **{name: value for name, value in recording.metadata.items() if name != "format"}}
         write_recording(
-            out_path, replace(recording, metadata=metadata), size, codec=codec, progress=progress, overwrite=overwrite
+            out_path, replace(recording, metadata=metadata), frame, codec=codec, progress=progress, overwrite=overwrite
         )
     else:
         dropped = export(
-            recording.events, out_path, chosen, size, codec=codec, progress=progress, overwrite=overwrite,
+            recording.events, out_path, chosen, frame, codec=codec, progress=progress, overwrite=overwrite,
             rounding=rounding, seed=seed, bag=bag_of(recording),
         )  # fmt: skip
-    return _summary(recording, size, chosen, rounding, dropped)
+    return _summary(recording, frame, chosen, rounding, dropped)
 
 
 def _summary(
@@ -347,6 +369,7 @@ def _summary(
         left_out=left_out(recording, chosen),
         rounding=rounding,
         dropped=dropped,
+        assumptions=tuple(f"{each.what} {each.value} ({each.option})" for each in assumptions_of(recording.metadata)),
     )
 
 
