@@ -59,6 +59,12 @@ def write_evt21(path: Path, events: Events, *, legacy: bool = True, header: str 
     path.write_bytes(f"{text}% end\n".encode() + words.astype("<u8").tobytes())
 
 
+def write_raw_of_a_sensor(path: Path, line: str) -> None:
+    """Write one event at (5, 7) in EVT 2.0, below a header without a geometry and with a line about the camera."""
+    words = np.array([0x8 << 28 | 10, 1 << 28 | 5 << 11 | 7], "<u4")
+    path.write_bytes(f"% evt 2.0\n% {line}\n% end\n".encode() + words.tobytes())
+
+
 # AEDAT, by iniVation's specification and jAER's addresses.
 
 

@@ -134,6 +134,38 @@ def test_topics(tmp_path: Path) -> None:
     assert open_recording(tmp_path / "c.h5").camera is not None
 
 
+def test_layout_options(tmp_path: Path) -> None:
+    """What is assumed is shown, and each option reaches the reader."""
+    rows = [(7, 3, 2, 5000), (319, 319, 1, 1000)]  # x, y, polarity, t
+    path = tmp_path / "events.csv"
+    path.write_text("".join(f"{x},{y},{p},{t}\n" for x, y, p, t in rows))
+    assert "--polarity" in fails("info", path)
+    options = ("--polarity", "1=on,2=off", "--columns", "x,y,p,t", "--sort")
+    assert "--time-unit" not in fails("info", path, *options[:4])  # but --sort
+    shown = run("info", path, *options)
+    assert "assumed    time unit us: times are whole numbers" in shown
+    assert "assumed    size 320x320: the file does not state it;" in shown
+    assert "(--size)" in shown
+    found = json.loads(run("info", path, *options, "--time-unit", "ms", "--size", "640x480", "--json"))
+    assert (found["t_first_us"], found["width"], found["assumptions"]) == (1_000_000, 640, [])
+    out = tmp_path / "out.h5"
+    assert "note: assumed size 320x320 (--size)" in run("convert", path, out, *options)
+    events = open_recording(out).events.slice(0, 2)
+    assert [events.x.tolist(), events.y.tolist(), events.t.tolist(), events.p.tolist()] == [
+        [319, 7], [319, 3], [1000, 5000], [1, 0],
+    ]  # fmt: skip
+    assert json.loads(run("info", out, "--json"))["assumptions"][-1] == {
+        "what": "size",
+        "value": "320x320",
+        "why": "the file does not state it; the smallest known sensor with all events",
+        "option": "--size",
+    }
+    scaled = tmp_path / "scaled.npz"
+    np.savez(scaled, x=[64, 20448], y=[0, 32], t=[0, 9], p=[0, 1])
+    run("convert", scaled, tmp_path / "scaled.h5", "--scale-xy", "32")
+    assert open_recording(tmp_path / "scaled.h5").events.slice(0, 2).x.tolist() == [2, 639]
+
+
 def test_encoder_from_triggers(data_dir: Path, tmp_path: Path) -> None:
     path = data_dir / "rosbag/ros2_evt3_640x480_trig10Hz.db3"
     run("convert", path, tmp_path / "out.h5", "--encoder-from", "triggers:6")

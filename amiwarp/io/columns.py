@@ -358,7 +358,9 @@ def _given_columns(columns: Sequence[Column], text: str) -> dict[str, int]:
     """Return the columns that the option ``--columns`` gives."""
     names = [column.name for column in columns]
     roles = {}
-    for role, wanted in given_roles(text).items():
+    given = given_roles(text)
+    for role in ROLES:
+        wanted = given[role]
         same = [at for at, name in enumerate(names) if name == wanted]
         if not same:
             same = [at for at, name in enumerate(names) if name and name.rpartition("/")[2] == wanted]
@@ -426,7 +428,7 @@ class _Facts:
         fractions = known.dtype.kind == "f" and bool((known != np.floor(known)).any())
         low, high = float(known.min()), float(known.max())
         falls = np.count_nonzero(known[1:] < known[:-1])
-        few = not fractions and len(_common_values(known)) <= 3
+        few = not fractions and 1 <= len(_common_values(known)) <= 3
         outside = np.count_nonzero((known < 0) | (known >= LARGEST_SIZE))
         return cls(fractions, low, high, _is_rare(falls, known.size), few, fractions or _is_rare(outside, known.size))
 

@@ -1,0 +1,485 @@
+"""Files of plain columns: names, order, unit and polarity are found, and said; in doubt, an option is named.
+
+The layouts are those that users of other readers write or report. Each file is made here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from scipy.io import loadmat, savemat
+
+from amiwarp import AmiwarpError, Camera, Events, Recording, convert, open_recording
+from amiwarp.calib.checks import size_warnings
+from amiwarp.io.columns import role_of
+from amiwarp.io.file_scan import assumptions_of
+from reference.io_samples_extra import write_raw_of_a_sensor
+
+N = 1000
+RANDOM = np.random.default_rng(0)
+X, Y = RANDOM.integers(0, 640, N), RANDOM.integers(0, 480, N)
+X[0], Y[0] = 639, 479
+T = np.sort(RANDOM.integers(0, 100_000, N))
+P = RANDOM.integers(0, 2, N)
+SECONDS = T / 1e6
+EPOCH = 1_700_000_000_000_000
+"""A time in 2023 [us]."""
+
+Maker = Callable[[Path], None]
+
+
+def lines(rows: Any, *, separator: str = " ", head: str = "", end: str = "\n") -> Maker:
+    """Return a function that writes rows of text below a head."""
+
+    def write(path: Path) -> None:
+        path.write_bytes((head + "".join(separator.join(map(str, row)) + end for row in rows)).encode())
+
+    return write
+
+
+def archive(*arrays: Any, compressed: bool = False, **named: Any) -> Maker:
+    """Return a function that writes an archive of arrays."""
+
+    def write(path: Path) -> None:
+        with open(path, "wb") as file:
+            (np.savez_compressed if compressed else np.savez)(file, *arrays, **named)
+
+    return write
+
+
+def array(values: Any) -> Maker:
+    """Return a function that writes one array."""
+
+    def write(path: Path) -> None:
+        with open(path, "wb") as file:
+            np.save(file, values)
+
+    return write
+
+
+def hdf5(attributes: dict[str, Any] | None = None, units: dict[str, str] | None = None, **datasets: Any) -> Maker:
+    """Return a function that writes an HDF5 file. ``__`` in a name stands for ``/``."""
+
+    def write(path: Path) -> None:
+        with h5py.File(path, "w") as file:
+            for name, values in datasets.items():
+                file[name.replace("__", "/")] = values
+            for name, unit in (units or {}).items():
+                file[name].attrs["unit"] = unit
+            file.attrs.update(attributes or {})
+
+    return write
+
+
+def matlab(**variables: Any) -> Maker:
+    """Return a function that writes a MATLAB 5 file."""
+    return lambda path: savemat(path, variables, appendmat=False)
+
+
+def matlab_73(path: Path) -> None:
+    """Write a structure as MATLAB 7.3 does: HDF5 behind a block of text, with columns as rows."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in (("x", X), ("y", Y), ("ts", T), ("p", P)):
+            file[f"TD/{name}"] = values.reshape(1, -1).astype(float)
+        file["#refs#/a"] = np.zeros(3)
+    with open(path, "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(128))
+
+
+def parquet(**columns: Any) -> Maker:
+    """Return a function that writes a Parquet table in groups of 300 rows."""
+    return lambda path: pq.write_table(pa.table(columns), path, row_group_size=300)
+
+
+def records(*fields: tuple[str, str], values: tuple[Any, ...]) -> Any:
+    """Return an array of records."""
+    rows = np.zeros(N, list(fields))
+    for (name, _), column in zip(fields, values, strict=True):
+        rows[name] = column
+    return rows
+
+
+def openmv(kinds: Any) -> Any:
+    """Return the array of OpenMV's GenX320: type, s, ms, us, x, y."""
+    t = T + 2_345_000
+    return np.c_[kinds, t // 1_000_000, t // 1000 % 1000, t % 1000, X // 2, Y * 2 // 3].astype("<u2")
+
+
+RECORDS = records(("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "?"), values=(T, X, Y, P))
+ROWS = np.c_[T, X, Y, P]
+SECOND_ROWS = [(f"{t:.6f}", x, y, p) for t, x, y, p in zip(SECONDS, X, Y, P, strict=True)]
+WORDS = np.array(["False", "True"])[P]
+SIGNED = 2 * P - 1
+
+LAYOUTS: dict[str, tuple[Maker, dict[str, Any]]] = {
+    # name: (maker, options)
+    "text: whole microseconds": (lines(ROWS), {}),
+    "text: np.savetxt of microseconds": (lines([[f"{v:.18e}" for v in row] for row in ROWS]), {}),
+    "text: x y t p": (lines(np.c_[X, Y, T, P]), {}),
+    "text: x y t p in seconds": (lines(zip(X, Y, SECONDS, P, strict=True)), {}),
+    "text: x y p t": (lines(np.c_[X, Y, P, T], separator="\t", end="\r\n"), {}),
+    "text: polarity first": (lines(np.c_[P, X, Y, T]), {}),
+    "text: -1 and 1": (lines(np.c_[T, X, Y, SIGNED]), {}),
+    "text: names in a comment": (lines(np.c_[Y, X, T, P], head="# recorded\n# y x t_us p\n"), {}),
+    "csv of Metavision": (lines(np.c_[X, Y, P, T], separator=",", head="%geometry:640,480\n"), {}),
+    "csv with names": (lines(np.c_[T, X, Y, P], separator=",", head="t,x,y,p\n"), {}),
+    "csv of pandas": (
+        lines(
+            zip(range(N), SECONDS, X, Y, WORDS, strict=True), separator=",", head=",timestamp [s],x,y,polarity\n"
+        ),
+        {},
+    ),
+    "csv with a decimal comma": (
+        lines([(t.replace(".", ","), x, y, p) for t, x, y, p in SECOND_ROWS], separator=";", head="Time (s);x;y;pol\n"),
+        {},
+    ),
+    "csv with a mark and quotes": (
+        lines([[f'"{v}"' for v in row] for row in ROWS], separator=",", head='\ufeff"Timestamp(us)","X","Y","P"\n'),
+        {},
+    ),
+    "csv with further columns": (
+        lines(np.c_[X, Y, P, T, T * 0 + 7, T * 0], separator=",", head="col,row,on,time_us,label,track\n"),
+        {},
+    ),
+    "csv in nanoseconds": (lines(np.c_[T * 1000, X, Y, P], separator=",", head="time_ns,x,y,p\n"), {}),
+    "csv in milliseconds": (lines(zip(T / 1e3, X, Y, P, strict=True), separator=",", head="t_ms,x,y,p\n"), {}),
+    "csv, ms by option": (
+        lines(zip(T / 1e3, X, Y, P, strict=True), separator=",", head="t,x,y,p\n"),
+        {"time_unit": "ms"},
+    ),
+    "text, order by option": (lines(np.c_[T * 0 + 5, Y, X, T, P]), {"columns": "-,y,x,t,p"}),
+    "npz: xs ys ts ps": (archive(xs=X, ys=Y, ts=SECONDS, ps=P.astype(bool)), {}),
+    "npz: 255 is OFF": (archive(x=X, y=Y, t=T, p=np.where(P, 1, 255).astype("u1")), {}),
+    "npz: -1 in 32 bits": (archive(x=X, y=Y, t=T, p=np.where(P, 1, 2**32 - 1).astype("u4")), {}),
+    "npz: -1 in 16 bits": (archive(x=X, y=Y, t=T, p=np.where(P, 1, -1).astype("u2")), {}),
+    "npz: 1 and 2 by option": (archive(x=X, y=Y, t=T, p=2 - P), {"polarity": "1=on,2=off"}),
+    "npz: x times 32": (archive(x=(X * 32).astype("u2"), y=(Y * 32).astype("u2"), t=T, p=P), {"scale_xy": 32}),
+    "npz: events in floating microseconds": (archive(events=ROWS.astype(float)), {}),
+    "npz: events of integers": (archive(events=ROWS), {}),
+    "npz: events of records": (archive(events=RECORDS, K=np.eye(3)), {}),
+    "npz: arr_0 by columns": (archive(np.stack([T, X, Y, P]).T, compressed=True), {}),
+    "npz: arr_0 of seconds": (archive(np.c_[X, Y, SECONDS, SIGNED]), {}),
+    "npz: one array of any name": (archive(dvs=np.c_[X, Y, T, P]), {}),
+    "npz: names by option": (archive(a=X, b=Y, c=T, d=P, e=np.eye(2)), {"columns": "t=c,x=a,y=b,p=d"}),
+    "npz: floating t": (archive(x=X, y=Y, t=SECONDS, p=P), {}),
+    "npy by columns": (array(np.asfortranarray(ROWS)), {}),
+    "npy by rows": (array(np.c_[X, Y, P, T].astype("<u4")), {}),
+    "npy of rows per property": (array(np.stack([SECONDS, X, Y, SIGNED])), {}),
+    "npy of records": (array(RECORDS), {}),
+    "npy of records of tonic": (
+        array(records(("x", "<i2"), ("y", "<i2"), ("timestamp", "<i4"), ("polarity", "i1"), values=(X, Y, T, SIGNED))),
+        {},
+    ),
+    "HDF5: matrix of v2e": (hdf5(events=ROWS.astype("u4")), {}),
+    "HDF5: matrix of v2e with -1": (hdf5(events=np.c_[T, X, Y, SIGNED].astype("i8").astype("u4")), {}),
+    "HDF5: events/xs of event_utils": (
+        hdf5({"sensor_resolution": (480, 640)}, events__xs=X.astype("i2"), events__ys=Y, events__ts=SECONDS,
+             events__ps=P.astype(bool), images__image000=np.zeros((4, 4))),
+        {},
+    ),
+    "HDF5: root": (hdf5(x=X, y=Y, t=T, p=P), {}),
+    "HDF5: events/t in seconds": (hdf5(events__x=X, events__y=Y, events__t=SECONDS, events__p=P), {}),
+    "HDF5: events/p of 1 and 255": (
+        hdf5(events__x=X, events__y=Y, events__t=T, events__p=np.where(P, 1, 255).astype("u1")),
+        {},
+    ),
+    "HDF5: other names in events": (hdf5(events__x=X, events__y=Y, events__timestamp=T, events__polarity=P), {}),
+    "HDF5: records": (hdf5(dvs=RECORDS), {}),
+    "HDF5: unit of a dataset": (hdf5(units={"t": "ms"}, x=X, y=Y, t=T / 1e3, p=P), {}),
+    "HDF5: deep groups": (
+        hdf5(davis__left__dvs__x=X, davis__left__dvs__y=Y, davis__left__dvs__ts=T, davis__left__dvs__pol=P), {},
+    ),
+    "HDF5: names by option": (
+        hdf5(a__x=X, a__y=Y, a__t=T, a__p=P, b__x=Y, b__y=Y, b__t=T, b__p=P),
+        {"columns": "t=a/t,x=a/x,y=a/y,p=a/p"},
+    ),
+    "HDF5: unit by option": (
+        hdf5(events__x=X, events__y=Y, events__t=T * 1000, events__p=P),
+        {"time_unit": "ns"},
+    ),
+    "MATLAB: structure of ATIS": (
+        matlab(TD={"x": X, "y": Y, "ts": T, "p": P + 1}), {"polarity": "1=off,2=on"},
+    ),
+    "MATLAB: columns": (matlab(x=X.reshape(-1, 1), y=Y.reshape(-1, 1), t=SECONDS.reshape(-1, 1), pol=SIGNED), {}),
+    "MATLAB: matrix in a structure": (matlab(events={"name": "a", "e_data": np.stack([SECONDS, X, Y, P])}), {}),
+    "MATLAB 7.3": (matlab_73, {}),
+    "Parquet": (parquet(t=T, x=X.astype("u2"), y=Y.astype("u2"), polarity=P.astype(bool)), {}),
+    "Parquet with durations": (
+        parquet(timestamp=pa.array(T.astype("m8[us]")), x=X, y=Y, p=P, label=["a"] * N), {},
+    ),
+}  # fmt: skip
+
+
+def made(folder: Path, maker: Maker) -> Path:
+    """Write a file without an extension, as the content decides."""
+    maker(folder / "events")
+    return folder / "events"
+
+
+def of(recording: Recording) -> Events:
+    return recording.events.slice(0, len(recording.events))
+
+
+def assert_same(recording: Recording, shift: int = 0) -> None:
+    """Check that a recording holds the events of this page, ``shift`` [us] later."""
+    events = of(recording)
+    for name, expected in (("x", X), ("y", Y), ("t", T + shift), ("p", P)):
+        np.testing.assert_array_equal(getattr(events, name), expected, err_msg=name)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_layouts_are_found(tmp_path: Path, name: str) -> None:
+    maker, options = LAYOUTS[name]
+    recording = open_recording(made(tmp_path, maker), **options)
+    assert_same(recording)
+    assert recording.events.size == (640, 480)
+
+
+@pytest.mark.parametrize("name", ["csv with names", "npy by columns", "HDF5: root", "npz: arr_0 by columns"])
+def test_large_files_are_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr("amiwarp.io.file_scan.KEEP_EVENTS", 0)
+    monkeypatch.setattr("amiwarp.io.plain_files.DEFAULT_BLOCK", 300)
+    monkeypatch.setattr("amiwarp.io.text_files.READ_BYTES", 500)
+    recording = open_recording(made(tmp_path, LAYOUTS[name][0]))
+    assert_same(recording)
+    assert_same(recording)
+
+
+COUNT = np.arange(60_000)
+
+REFUSED: dict[str, tuple[Maker, str]] = {
+    "polarity 1 and 2": (archive(x=X, y=Y, t=T, p=2 - P), r"values 1, 2, of which .* --polarity, such as 1=on,2=off"),
+    "polarity 0 and -1": (archive(x=X, y=Y, t=T, p=-P), r"values -1, 0, of which .* --polarity"),
+    "polarity -1, 0, 1": (array(np.c_[T, X, Y, RANDOM.integers(-1, 2, N)]), r"values -1, 0, 1, of which"),
+    "polarity 0 and 255": (archive(x=X, y=Y, t=T, p=P * 255), r"values 0, 255, of which"),
+    "a brightness": (archive(x=X, y=Y, t=T, p=X % 90), r"polarity has many different values, 0 to 89; .* --polarity"),
+    "x times 32": (
+        archive(x=(X * 32).astype("u2"), y=(Y * 32).astype("u2"), t=T, p=P),
+        r"x and y reach 20448 and are multiples of 32, .* --scale-xy 32",
+    ),
+    "fractions of 1/32": (
+        archive(x=(X * 32 + 1).astype("u2"), y=(Y * 32 + 1).astype("u2"), t=T, p=P),
+        r"x and y reach 20449 and 15329, more than any sensor has; .*--scale-xy",
+    ),
+    "sorted by pixel": (
+        lines(sorted(zip(SECONDS, X, Y, P, strict=True), key=lambda row: row[1])),
+        r"of 1000 events are out of order; .* --sort",
+    ),
+    "milliseconds or seconds": (
+        lines(zip(T / 7, X, Y, P, strict=True), separator=",", head="t,x,y,p\n"),
+        r"unit of time is in doubt: times have fractions, .* --time-unit",
+    ),
+    "nanoseconds since the start": (
+        array(np.c_[T * 100_000, X, Y, P]), r"unit of time is in doubt: times are whole numbers, .* --time-unit",
+    ),
+    "more events than a sensor sends": (
+        archive(ts=COUNT // 59_999, xs=COUNT % 640, ys=COUNT % 7, ps=COUNT % 2),
+        r"unit of time is in doubt: times are whole numbers, and the first 60,000 events span 1; ",
+    ),
+    "three columns": (lines(np.c_[T, X, Y]), r"has 3 columns without names; .* --columns"),
+    "five columns": (array(np.c_[T, X, Y, P, P]), r"has 5 columns without names; .* --columns"),
+    "no y": (
+        lines(np.c_[T, X, P, Y], separator=",", head="t,x,p,z\n"),
+        r"no column is named as y; .* t, x, p, z; .*--columns",
+    ),
+    "two times": (
+        lines(np.c_[T, T, X, Y, P], separator=",", head="t,ts,x,y,p\n"), r"columns t and ts can both be t; .*--columns",
+    ),
+    "two small columns": (array(np.c_[T % 2, P, T % 2, P]), r"order of t, x, y and p is in doubt .* --columns"),
+    "names that do not fit": (lines(ROWS, separator=",", head="t,x,y,p,label\n"), r"names 5 columns .* rows have 4"),
+    "columns of other lengths": (hdf5(x=X, y=Y[:5], t=T, p=P), r"columns of events differ in length"),
+    "two sets of columns": (
+        hdf5(a__x=X, a__y=Y, a__t=T, a__p=P, b__x=X, b__y=Y, b__t=T, b__p=P),
+        r"several sets of columns with events: a, b; .* --columns, such as t=a/t,x=a/x,y=a/y,p=a/p",
+    ),
+    "fractions of pixels": (array(np.c_[SECONDS, X + 0.5, Y + 0.5, P]), r"is 639\.5; expected whole pixels"),
+    "no numbers": (hdf5(names=np.array([b"a", b"b"])), r"no arrays are named as t, x, y and p"),
+    "texts as columns": (parquet(t=["a"], x=["b"], y=["c"], p=["d"]), r"no arrays are named as t, x, y and p"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_doubt_names_the_option(tmp_path: Path, name: str) -> None:
+    maker, message = REFUSED[name]
+    with pytest.raises(AmiwarpError, match=rf"(?s)events: .*{message}"):
+        open_recording(made(tmp_path, maker))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"columns": "t=ts,x=xs"}, "does not name t, x, y and p once each"),
+        ({"columns": "x,y,t"}, "does not name t, x, y and p once each"),
+        ({"columns": "t=a,x=b,y=c,p=d"}, "has no column 'a', which --columns gives for t; it has t, x, y, p"),
+        ({"time_unit": "h"}, "--time-unit 'h' is unknown; choose among s, ms, us, ns"),
+        ({"polarity": "1=yes"}, "--polarity '1=yes' is not a list of values"),
+        ({"polarity": "3=on,4=off"}, "line 2 is '191,639,479,0'; expected 't x y p' with t in us, p 3 or 4"),
+        ({"scale_xy": 0}, "--scale-xy is 0"),
+        ({"scale_xy": 32}, "no multiple of 32; give another --scale-xy"),
+        ({"chip": "DVS128"}, "needs no chip; leave out --chip"),
+        ({"size": (320, 240)}, r"lie outside the frame \(320, 240\)"),
+    ],
+)
+def test_options_that_do_not_fit(tmp_path: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(AmiwarpError, match=message):
+        open_recording(made(tmp_path, LAYOUTS["csv with names"][0]), **options)
+
+
+def test_options_for_other_formats(tmp_path: Path) -> None:
+    write_raw_of_a_sensor(tmp_path / "a.raw", "plugin_name hal_plugin_genx320")
+    with pytest.raises(AmiwarpError, match=r"evt, whose layout is fixed; leave out --time-unit, --polarity"):
+        open_recording(tmp_path / "a.raw", time_unit="s", polarity="1=on,0=off")
+    convert(tmp_path / "a.raw", tmp_path / "a.h5")
+    with pytest.raises(AmiwarpError, match=r"amiwarp's own format, whose layout is fixed; leave out --columns"):
+        open_recording(tmp_path / "a.h5", columns="t,x,y,p")
+
+
+@pytest.mark.parametrize(
+    ("line", "size"),
+    [
+        ("plugin_name hal_plugin_genx320", (320, 320)),
+        ("sensor_name IMX636", (1280, 720)),
+        ("sensor_name Gen3.1", (640, 480)),
+        ("plugin_name hal_plugin_imx646_evk4", (1280, 720)),
+        ("generation 4.1", (128, 128)),  # without the name of a sensor, the smallest one that holds the event
+    ],
+)
+def test_sizes_of_raw_files_without_a_geometry(tmp_path: Path, line: str, size: tuple[int, int]) -> None:
+    write_raw_of_a_sensor(tmp_path / "a.raw", line)
+    recording = open_recording(tmp_path / "a.raw")
+    assert recording.events.size == size
+    assert ("assumed_size" in recording.metadata) == (size == (128, 128))
+
+
+def test_what_is_assumed_is_said(tmp_path: Path) -> None:
+    recording = open_recording(made(tmp_path, array(np.c_[X, Y, P * 0 + 1, T])))
+    assert recording.metadata["columns"] == "t = column 4, x = column 1, y = column 2, p = column 3"
+    assert recording.metadata["time_unit"] == "us"
+    found = [(each.what, each.value, each.option) for each in assumptions_of(recording.metadata)]
+    assert found == [
+        ("columns", "x y p t", "--columns"),
+        ("time unit", "us", "--time-unit"),
+        ("polarity", "1 is ON", "--polarity"),
+        ("size", "640x480", "--size"),
+    ]
+    stated = open_recording(
+        tmp_path / "events", columns="x,y,p,t", time_unit="us", polarity="1=on,0=off", size=(640, 480)
+    )
+    assert assumptions_of(stated.metadata) == []
+    assert stated.metadata["columns"] == recording.metadata["columns"]
+
+
+def test_a_documented_layout_is_not_assumed(tmp_path: Path) -> None:
+    for maker in (archive(x=X, y=Y, t=T, p=P, width=640, height=480), lines(SECOND_ROWS, head="640 480\n")):
+        recording = open_recording(made(tmp_path, maker))
+        assert set(recording.metadata) == {"format"}
+
+
+def test_times_since_1970(tmp_path: Path) -> None:
+    t = (T + EPOCH) * 1000 + 499  # rounded down, although float64 has steps of 256 ns here
+    for maker in (archive(xs=X, ys=Y, ts=t, ps=P), lines(np.c_[t, X, Y, P]), array(np.c_[t, X, Y, P])):
+        recording = open_recording(made(tmp_path, maker))
+        assert recording.metadata["time_unit"] == "ns"
+        assert_same(recording, EPOCH)
+    recording = open_recording(made(tmp_path, lines(np.c_[T + EPOCH, X, Y, P])))
+    assert recording.metadata["time_unit"] == "us"
+    assert_same(recording, EPOCH)
+
+
+def test_long_recordings_need_their_unit(tmp_path: Path) -> None:
+    """The first events may look plausible."""
+    t = np.concatenate([np.arange(70_000), [3600 * 10**6 + 1]])
+    rows = np.c_[t, t % 600, t % 400, t % 2]
+    path = made(tmp_path, archive(rows))
+    with pytest.raises(AmiwarpError, match=r"in us, the recording would last 3,600 s; give it with --time-unit"):
+        open_recording(path)
+    assert open_recording(path, time_unit="us").events.t_last == t[-1]
+
+
+def test_openmv(tmp_path: Path) -> None:
+    kinds = P.copy()
+    kinds[[3, 700]] = 4  # an edge of the trigger
+    recording = open_recording(made(tmp_path, archive(data=openmv(kinds))))
+    events, kept = of(recording), kinds <= 1
+    for name, expected in (("x", X // 2), ("y", Y * 2 // 3), ("t", T + 2_345_000), ("p", P)):
+        np.testing.assert_array_equal(getattr(events, name), expected[kept], err_msg=name)
+    assert (recording.events.size, recording.metadata["other_records"]) == ((320, 320), 2)
+    assert assumptions_of(recording.metadata)[0].value == "type s ms us x y"
+
+
+def test_events_in_the_order_of_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    order = np.lexsort((T, X))
+    path = made(tmp_path, lines(np.c_[T, X, Y, P][order], separator=",", head="t,x,y,p\n"))
+    recording = open_recording(path, sort=True)
+    expected = np.argsort(T[order], kind="stable")
+    events = of(recording)
+    np.testing.assert_array_equal(events.t, T)
+    np.testing.assert_array_equal(events.x, X[order][expected])
+    np.testing.assert_array_equal(events.y, Y[order][expected])
+    assert recording.metadata["sorted_events"] == np.count_nonzero(expected != np.arange(N))
+    assert "repaired_time_events" not in recording.metadata
+    monkeypatch.setattr("amiwarp.io.file_scan.SORT_EVENTS", N - 1)
+    with pytest.raises(AmiwarpError, match=r"events: after 1000 events: holds over 999 events, too many to sort"):
+        open_recording(path, sort=True)
+
+
+def test_the_assumed_size_survives_conversion(tmp_path: Path) -> None:
+    path = made(tmp_path, lines(SECOND_ROWS))
+    summary = convert(path, tmp_path / "a.h5")
+    assert summary.assumptions == ("size 640x480 (--size)",)
+    copied = open_recording(tmp_path / "a.h5")
+    assert not copied.events.size_is_known  # type: ignore[attr-defined]
+    assert [each.value for each in assumptions_of(copied.metadata)] == ["640x480"]
+    centred = Camera.from_fov(640, 480, 1.0)
+    (said,) = size_warnings(Recording(copied.events, camera=centred, metadata=copied.metadata))
+    assert "640x480 px is assumed, and the camera's centre with it" in said
+    measured = Camera(640, 480, 500.0, 500.0, 310.0, 239.5)
+    assert size_warnings(Recording(copied.events, camera=measured, metadata=copied.metadata)) == ()
+    stated = open_recording(tmp_path / "a.h5", size=(720, 576))
+    assert (stated.events.size, assumptions_of(stated.metadata)) == ((720, 576), [])
+    convert(path, tmp_path / "b.h5", size=(640, 512))
+    assert assumptions_of(open_recording(tmp_path / "b.h5").metadata) == []
+    convert(path, tmp_path / "c.h5", camera=Camera.from_fov(640, 512, 1.0))
+    assert assumptions_of(open_recording(tmp_path / "c.h5").metadata) == []
+
+
+def test_rare_polarities_are_damage(tmp_path: Path) -> None:
+    p = P.copy()
+    p[500] = 7
+    with pytest.raises(AmiwarpError, match=r"before the first event: a polarity is 7; expected -1, 0, 1; .*--polarity"):
+        open_recording(made(tmp_path, archive(x=X, y=Y, t=T, p=p)))
+    with pytest.raises(
+        AmiwarpError, match=rf"line 501 is '{T[500]} {X[500]} {Y[500]} 7'; expected 't x y p' with t in us"
+    ):
+        open_recording(made(tmp_path, lines(np.c_[T, X, Y, p])))
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "unit"),
+    [
+        ("t", "t", None), ("ts", "t", None), ("times", "t", None), ("Timestamp", "t", None), ("t_us", "t", "us"),
+        ("time [ms]", "t", "ms"), ("timestamp(ns)", "t", "ns"), ("timestampUs", "t", "us"), ("TD/ts", "t", None),
+        ("event_t_us", "t", "us"), ("x", "x", None), ("xs", "x", None), ("col", "x", None), ("x_px", "x", None),
+        ("row", "y", None), ("polarities", "p", None), ("'Pol'", "p", None), ("on", "p", None),
+        ("t0", None, None), ("x2", None, None), ("time_offset", None, None), ("exposure_us", None, None),
+    ],
+)  # fmt: skip
+def test_names_of_columns(name: str, role: str | None, unit: str | None) -> None:
+    assert role_of(name) == (role, unit)
+
+
+def test_real_matlab_file(data_dir: Path) -> None:
+    path = data_dir / "text/shapes_rotation/shapes_rotation_first_1.43s.mat"
+    recording = open_recording(path)
+    t, x, y, p = loadmat(path, simplify_cells=True)["events"]["e_data"]
+    events = of(recording)
+    assert (recording.events.size, len(events)) == ((240, 180), 120_000)
+    for name, expected in (("t", np.rint(t * 1e6)), ("x", x), ("y", y), ("p", p)):
+        np.testing.assert_array_equal(getattr(events, name), expected, err_msg=name)
