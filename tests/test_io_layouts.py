@@ -18,6 +18,7 @@ from scipy.io import loadmat, savemat
 
 from amiwarp import AmiwarpError, Camera, Events, Recording, convert, open_recording
 from amiwarp.calib.checks import size_warnings
+from amiwarp.io import text_files
 from amiwarp.io.columns import role_of
 from amiwarp.io.file_scan import assumptions_of
 from reference.io_samples_extra import write_raw_of_a_sensor
@@ -253,6 +254,61 @@ def test_large_files_are_read_in_pieces(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 COUNT = np.arange(60_000)
+
+
+@pytest.mark.parametrize(
+    ("separator", "head"), [(" ", ""), (",", "t,x,y,p\n"), ("\t", "")], ids=["spaces", "commas", "tabs"]
+)
+def test_the_kernel_reads_as_numpy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, separator: str, head: str) -> None:
+    """Decimal numbers of any length are rounded alike."""
+    count = 9000  # for three threads
+    rng = np.random.default_rng(1)
+    t = np.sort(rng.random(count)) * 1000 - 3
+    texts = [f"{value:.{digits}f}" for value, digits in zip(t, rng.integers(6, 13, count), strict=True)]
+    rows = list(zip(texts, rng.integers(0, 640, count), rng.integers(0, 480, count), rng.integers(0, 2, count),
+                    strict=True))  # fmt: skip
+    path = made(tmp_path, lines(rows, separator=separator, head=head, end="\r\n" if head else "\n"))
+    slow = of(open_recording(path, time_unit="s"))
+    monkeypatch.setattr("amiwarp.io.text_files.KERNEL_LINES", 100)
+    calls: list[int] = []
+    monkeypatch.setattr("amiwarp.io.text_files.THREAD_LINES", 4000)
+    table = text_files._plain_table
+
+    def counted(*arguments: Any) -> Any:
+        found = table(*arguments)
+        calls.append(0 if found is None else len(found))
+        return found
+
+    monkeypatch.setattr("amiwarp.io.text_files._plain_table", counted)
+    fast = of(open_recording(path, time_unit="s"))
+    assert calls == [count]
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(getattr(fast, name), getattr(slow, name), err_msg=name, strict=True)
+    np.testing.assert_array_equal(slow.t, np.rint([float(text) * 1e6 for text in texts]))
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("1e-1 5 6 1", True), ("0.1  5 6 1 ", True), ("# a comment", True), ("", True), ("0.1 05 006 1", True),
+        ("0.1 5 6 1.000000000000000000000", True), ("0.1 5 6", False), ("0.1 5 6 1 1", False), ("0.1 5 6 -", False),
+        ("0.1 5 6 .", False), ("0.1.2 5 6 1", False), ("0.1 5 6 1-", False), ("0.1 5 6 --1", False),
+        ("0.1 5 6 99999999999999999999", False), ("0.1 5 6 x", False),
+    ],
+)  # fmt: skip
+def test_the_kernel_leaves_other_lines_to_numpy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, told: bool
+) -> None:
+    monkeypatch.setattr("amiwarp.io.text_files.KERNEL_LINES", 100)
+    rows = [f"{0.001 * k:.6f} {k} {k} 1" for k in range(200)]
+    path = tmp_path / "a.txt"
+    path.write_text("\n".join([*rows[:100], line, *rows[100:]]))
+    if told:
+        assert len(open_recording(path).events) == 201 - line.startswith("#") - (not line)
+    else:
+        with pytest.raises(AmiwarpError, match=r"line 101 is"):
+            open_recording(path)
+
 
 REFUSED: dict[str, tuple[Maker, str]] = {
     "polarity 1 and 2": (archive(x=X, y=Y, t=T, p=2 - P), r"values 1, 2, of which .* --polarity, such as 1=on,2=off"),

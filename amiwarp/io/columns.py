@@ -219,7 +219,12 @@ class Layout:
         """Return the events of the columns in the order of :attr:`chosen`. Counts go to ``notes``."""
         if self.openmv:
             return self._openmv_events(columns, notes)
-        t, x, y, p = columns
+        return self.columns_of_events(*columns)
+
+    def columns_of_events(
+        self, t: NDArray[Any], x: NDArray[Any], y: NDArray[Any], p: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.int64], NDArray[np.uint8]]:
+        """Return x, y [px], t [us] and p of the columns t, x, y and p."""
         return self.pixels(x), self.pixels(y), self.times(t), self.polarities(p)
 
     def times(self, t: NDArray[Any]) -> NDArray[np.int64]:

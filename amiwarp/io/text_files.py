@@ -24,13 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.io.column_files import check_table
 from amiwarp.io.columns import ROLES, TIME_UNITS, Column, GivenLayout, Hints, Layout, find_layout, names_roles
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.files import LONGEST_LINE, errors_name, open_input
 from amiwarp.io.formats import TextRow, holds_values
 from amiwarp.io.plain_files import read_calib
+from amiwarp.optics.camera import LARGEST_SIZE
 
 READ_BYTES = 1 << 22
 """Amount of text that is parsed at once [bytes]: about 200,000 events."""
@@ -210,7 +211,9 @@ def _text_packets(path: Path, form: TextForm, layout: Layout, notes: dict[str, i
 
 def _parse(path: Path, form: TextForm, layout: Layout, notes: dict[str, int], text: bytes, line_number: int) -> Packet:
     """Return the events in lines of text. ``line_number`` is the number of the line before them."""
-    lines = text.split(b"\n")
+    table = _plain_table(text, form)
+    if table is not None and _plausible(_chosen(table, layout), layout).all():
+        return _events(table, layout, notes)
     kept = list(filter(holds_values, form.row.plain(text).split(b"\n")))
     if not kept:
         nothing = np.zeros(0, np.int64)
@@ -219,17 +222,64 @@ def _parse(path: Path, form: TextForm, layout: Layout, notes: dict[str, int], te
         table = np.loadtxt(kept, ndmin=2, comments=None, encoding="ascii")
     except ValueError:
         table = np.zeros((0, 0))
-    if table.shape != (len(kept), form.width) or not _plausible(table[:, layout.chosen], layout).all():
-        bad = _first_bad_line(lines, line_number, form, layout)
+    if table.shape != (len(kept), form.width) or not _plausible(_chosen(table, layout), layout).all():
+        bad = _first_bad_line(text.split(b"\n"), line_number, form, layout)
         raise AmiwarpError(f"{path}: {bad}; expected {_expected(form, layout)}")
-    t, x, y, p = table[:, layout.chosen].T
+    t = None
     if layout.unit == "ns":  # whole nanoseconds since 1970 have more digits than float64
         with contextlib.suppress(ValueError):
             at = layout.columns["t"]
             t = np.loadtxt(kept, np.int64, ndmin=1, comments=None, encoding="ascii", usecols=at)
-    if not layout.compensated:
-        x, y = x.astype(np.int64), y.astype(np.int64)
-    return layout.events(t, x, y, p, notes=notes)
+    return _events(table, layout, notes, t)
+
+
+def _events(
+    table: NDArray[np.float64], layout: Layout, notes: dict[str, int], whole_t: NDArray[np.int64] | None = None
+) -> Packet:
+    """Return the events in rows of numbers. ``whole_t`` replaces their times."""
+    t: NDArray[Any]
+    x: NDArray[Any]
+    y: NDArray[Any]
+    t, x, y, p = _chosen(table, layout)
+    t = t if whole_t is None else whole_t
+    if layout.compensated:
+        return layout.events(t, x, y, p, notes=notes)
+    x, y, t, p = layout.columns_of_events(t, x.astype(np.int64), y.astype(np.int64), p)
+    inside = min(int(x.min()), int(y.min())) >= 0 and max(int(x.max()), int(y.max())) < LARGEST_SIZE
+    if inside and len(t) >= KERNEL_LINES:
+        return Events(x.astype(np.uint16), y.astype(np.uint16), t, p)  # which a kernel checks, too
+    return x, y, t, p
+
+
+KERNEL_LINES = 20_000
+"""Number of lines from which on a kernel reads them. To load it takes as long as to read many lines without it."""
+THREAD_LINES = 1 << 12
+"""Number of lines that a thread of the kernel reads."""
+
+
+def _plain_table(text: bytes, form: TextForm) -> NDArray[np.float64] | None:
+    """Return the numbers in lines of plain decimal numbers by a kernel; None for few lines, and for any others."""
+    row = form.row
+    if len(text) < KERNEL_LINES * 2 * form.width or row.decimal_comma or row.has_words or row.quoted:
+        return None
+    characters = np.frombuffer(text, np.uint8)
+    ends = np.append(np.flatnonzero(characters == ord("\n")), len(text)).astype(np.int32)
+    if len(ends) < KERNEL_LINES:
+        return None
+    import warp as wp
+
+    from amiwarp.kernels.launch import launch
+    from amiwarp.kernels.text_numbers import MOST_DIGITS, read_numbers
+
+    blocks = -(-len(ends) // THREAD_LINES)
+    values = wp.empty((form.width, len(ends)), dtype=wp.float64, device="cpu")
+    faults = wp.empty(blocks, dtype=int, device="cpu")
+    powers = wp.array(10.0 ** np.arange(MOST_DIGITS + 1), dtype=wp.float64, device="cpu")
+    given = [wp.array(each, device="cpu", copy=False) for each in (characters, ends)]
+    inputs = [*given, ord(row.separator), powers, THREAD_LINES]
+    launch(read_numbers, blocks, inputs, [values, faults], device="cpu", smallest=1)
+    table: NDArray[np.float64] = values.numpy().T
+    return None if faults.numpy().any() else table
 
 
 def _expected(form: TextForm, layout: Layout) -> str:
@@ -243,9 +293,14 @@ def _expected(form: TextForm, layout: Layout) -> str:
     )
 
 
-def _plausible(table: NDArray[np.float64], layout: Layout) -> NDArray[np.bool_]:
+def _chosen(table: NDArray[np.float64], layout: Layout) -> list[NDArray[np.float64]]:
+    """Return the columns t, x, y, p."""
+    return [table[:, at] for at in layout.chosen]
+
+
+def _plausible(columns: Sequence[NDArray[np.float64]], layout: Layout) -> NDArray[np.bool_]:
     """Return for each row t, x, y, p whether its numbers are usable."""
-    t, x, y, p = table.T
+    t, x, y, p = columns
     # Pixels must fit 32 bits. Pixels outside the frame are dropped later. NaN fails every comparison.
     places: Any = (np.abs(x) < 2**31) & (np.abs(y) < 2**31)
     if layout.compensated:
@@ -267,6 +322,6 @@ def _first_bad_line(lines: list[bytes], line_number: int, form: TextForm, layout
             row = np.array([[float(word) for word in form.row.words(line)]])
         except ValueError:
             row = np.zeros((1, 0))
-        if row.shape != (1, form.width) or not _plausible(row[:, layout.chosen], layout).all():
+        if row.shape != (1, form.width) or not _plausible(_chosen(row, layout), layout).all():
             return f"line {number} is '{line[:80].decode('ascii', 'replace').strip()}'"
     return f"line {line_number + 1} or after it is malformed"
