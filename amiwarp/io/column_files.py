@@ -169,7 +169,7 @@ OpenedByName: TypeAlias = Callable[[str, contextlib.ExitStack], tuple[Array, boo
 
 def _own_table(opened: OpenedByName) -> Table:
     """Return the arrays x, y, t, p, as amiwarp writes them: integer times are in us."""
-    table = _arrays_table(ROLES, opened)
+    table = _arrays_table("xytp", opened)
     types = {str(column.name): column.values.dtype for column in table.columns}
     if (types["x"].kind == "f") != (types["y"].kind == "f"):
         given = f"array x is {types['x']}, y is {types['y']}"

@@ -70,9 +70,11 @@ def given_roles(text: str) -> dict[str, str]:
     words = [word.strip() for word in text.split(",")]
     if not any("=" in word for word in words):
         words = [f"{word}={number}" for number, word in enumerate(words, 1) if word != "-"]
-    pairs = [tuple(part.strip() for part in word.partition("=")[::2]) for word in words]
-    roles = dict(pairs)
-    if sorted(roles) != sorted(ROLES) or len(pairs) != len(ROLES) or not all(roles.values()):
+    roles: dict[str, str] = {}
+    for word in words:
+        role, _, name = word.partition("=")
+        roles[role.strip()] = name.strip()
+    if sorted(roles) != sorted(ROLES) or len(words) < len(ROLES) or not all(roles.values()):
         raise AmiwarpError(
             f"--columns {text!r} does not name t, x, y and p once each; write t=NAME,x=NAME,y=NAME,p=NAME, or their "
             "order in the file, such as x,y,p,t (- for a column without use)"
@@ -126,11 +128,11 @@ def role_of(name: str) -> tuple[str | None, str | None]:
     if match is None:
         return None, None
     stem, suffix = match[1] or match[3] or match[5], match[2] or match[4] or match[6] or ""
-    role = next((role for role, names in NAMES.items() if stem in names), None)
+    found = next((role for role, names in NAMES.items() if stem in names), None)
     unit = unit_of(suffix)
-    if role == "t":
-        return (role, unit) if unit else (None, None)
-    return (role, None) if role in ("x", "y") and suffix in ("px", "pixel", "pixels") else (None, None)
+    if found == "t":
+        return (found, unit) if unit else (None, None)
+    return (found, None) if found in ("x", "y") and suffix in ("px", "pixel", "pixels") else (None, None)
 
 
 def names_roles(names: Iterable[str]) -> bool:
@@ -336,7 +338,7 @@ def _shown(columns: Sequence[Column], at: int) -> str:
 
 # Which column is which.
 
-KNOWN_ORDERS = (("t", "x", "y", "p"), ("x", "y", "t", "p"), ("x", "y", "p", "t"))
+KNOWN_ORDERS: tuple[tuple[str, ...], ...] = (("t", "x", "y", "p"), ("x", "y", "t", "p"), ("x", "y", "p", "t"))
 """Orders of columns without names that other programs write."""
 
 
@@ -387,9 +389,9 @@ def _named_columns(columns: Sequence[Column]) -> dict[str, int]:
         if role is not None:
             found[role].append(at)
     listed = ", ".join(name for name in names if name)[:300]
-    for role, at in found.items():
-        if len(at) > 1:
-            several = " and ".join(names[k] for k in at)
+    for role, places in found.items():
+        if len(places) > 1:
+            several = " and ".join(names[place] for place in places)
             raise AmiwarpError(
                 f"columns {several} can both be {role}; choose with --columns, such as {_example(names)}"
             )
@@ -432,9 +434,9 @@ class _Facts:
             return cls(True, 0.0, 0.0, False, False, True)
         fractions = known.dtype.kind == "f" and bool((known != np.floor(known)).any())
         low, high = float(known.min()), float(known.max())
-        falls = np.count_nonzero(known[1:] < known[:-1])
+        falls = int(np.count_nonzero(known[1:] < known[:-1]))
         few = not fractions and 1 <= len(_common_values(known)) <= 3
-        outside = np.count_nonzero((known < 0) | (known >= LARGEST_SIZE))
+        outside = int(np.count_nonzero((known < 0) | (known >= LARGEST_SIZE)))
         return cls(fractions, low, high, _is_rare(falls, known.size), few, fractions or _is_rare(outside, known.size))
 
 
@@ -446,9 +448,7 @@ def _is_rare(count: int, total: int) -> bool:
 def _common_values(values: NDArray[Any]) -> list[Any]:
     """Return the different values, without those that at most 1 % of all have."""
     found, counts = np.unique(values, return_counts=True)
-    return [
-        value for value, count in zip(found.tolist(), counts.tolist(), strict=True) if not _is_rare(count, len(values))
-    ]
+    return [found[at].item() for at in np.flatnonzero(counts * 100 > len(values))]
 
 
 def _order_by_values(values: Sequence[NDArray[Any]], hints: Hints) -> tuple[str, ...]:
@@ -466,9 +466,9 @@ def _order_by_values(values: Sequence[NDArray[Any]], hints: Hints) -> tuple[str,
         best = max(times, key=lambda at: (facts[at].fractions, facts[at].high - facts[at].low))
         if all(_is_clearer(facts[best], facts[at]) for at in times - {best}):
             fitting = [order for order in fitting if order.index("t") == best]
-    if len(fitting) > 1:
-        known = [order for order in fitting if order in KNOWN_ORDERS]
-        fitting = known if len(known) == 1 else fitting
+    usual = [order for order in fitting if order in KNOWN_ORDERS]
+    if len(usual) == 1:
+        fitting = usual
     if len(fitting) == 1:
         return fitting[0]
     orders = " or ".join(" ".join(order) for order in fitting[:3])
@@ -584,7 +584,7 @@ def _find_coding(p: NDArray[Any], given: GivenLayout) -> tuple[Coding, list[Assu
         return ZERO_OR_ONE, []
     if not p.size:
         return SIGNED, []
-    values = [int(value) if float(value).is_integer() else float(value) for value in _common_values(p)]
+    values: list[Any] = [int(value) if float(value).is_integer() else value for value in _common_values(p)]
     if len(values) > 8 or not values:
         raise AmiwarpError(
             f"the polarity has many different values, {p.min()} to {p.max()}; choose its column with --columns, or "

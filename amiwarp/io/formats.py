@@ -362,7 +362,7 @@ def open_recording(
         )
     if chip is not None and chosen not in CHIPS:
         raise AmiwarpError(f"{path}: is of the format {chosen.value}, which needs no chip; leave out --chip")
-    arguments = [topic] if chosen in TOPICS else []
+    arguments: list[Any] = [topic] if chosen in TOPICS else []
     arguments += [layout] if chosen in LAYOUTS else []
     named = {} if chip is None else {"chip": chip}
     with given_source(GivenSource(None if size is None else (int(size[0]), int(size[1])), sort)):

@@ -191,7 +191,7 @@ def _last_time(path: Path, form: TextForm, layout: Layout, estimate: int) -> int
 
 
 def _text_packets(path: Path, form: TextForm, layout: Layout, notes: dict[str, int]) -> Iterator[Packet]:
-    parse = partial(_parse, path, form, layout, notes)
+    parse = partial(_parse, path, form, layout)
     with open_input(path) as file:
         file.seek(form.start)
         line_number = form.lines
@@ -209,11 +209,11 @@ def _text_packets(path: Path, form: TextForm, layout: Layout, notes: dict[str, i
             yield parse(rest, line_number)
 
 
-def _parse(path: Path, form: TextForm, layout: Layout, notes: dict[str, int], text: bytes, line_number: int) -> Packet:
+def _parse(path: Path, form: TextForm, layout: Layout, text: bytes, line_number: int) -> Packet:
     """Return the events in lines of text. ``line_number`` is the number of the line before them."""
     table = _plain_table(text, form)
     if table is not None and _plausible(_chosen(table, layout), layout).all():
-        return _events(table, layout, notes)
+        return _events(table, layout)
     kept = list(filter(holds_values, form.row.plain(text).split(b"\n")))
     if not kept:
         nothing = np.zeros(0, np.int64)
@@ -230,21 +230,19 @@ def _parse(path: Path, form: TextForm, layout: Layout, notes: dict[str, int], te
         with contextlib.suppress(ValueError):
             at = layout.columns["t"]
             t = np.loadtxt(kept, np.int64, ndmin=1, comments=None, encoding="ascii", usecols=at)
-    return _events(table, layout, notes, t)
+    return _events(table, layout, t)
 
 
-def _events(
-    table: NDArray[np.float64], layout: Layout, notes: dict[str, int], whole_t: NDArray[np.int64] | None = None
-) -> Packet:
+def _events(table: NDArray[np.float64], layout: Layout, whole_t: NDArray[np.int64] | None = None) -> Packet:
     """Return the events in rows of numbers. ``whole_t`` replaces their times."""
-    t: NDArray[Any]
-    x: NDArray[Any]
-    y: NDArray[Any]
-    t, x, y, p = _chosen(table, layout)
-    t = t if whole_t is None else whole_t
+    columns: list[NDArray[Any]] = [*_chosen(table, layout)]
+    if whole_t is not None:
+        columns[0] = whole_t
+    if not layout.compensated:
+        columns[1:3] = (values.astype(np.int64) for values in columns[1:3])
+    x, y, t, p = layout.columns_of_events(*columns)
     if layout.compensated:
-        return layout.events(t, x, y, p, notes=notes)
-    x, y, t, p = layout.columns_of_events(t, x.astype(np.int64), y.astype(np.int64), p)
+        return x, y, t, p
     inside = min(int(x.min()), int(y.min())) >= 0 and max(int(x.max()), int(y.max())) < LARGEST_SIZE
     if inside and len(t) >= KERNEL_LINES:
         return Events(x.astype(np.uint16), y.astype(np.uint16), t, p)  # which a kernel checks, too
