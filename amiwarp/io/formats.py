@@ -148,7 +148,7 @@ def detect_format(path: Path) -> Format:
     if folder is not None:
         return folder
     with errors_name(path, lambda: "opening"), open_input(path) as file:
-        head = file.read(4096)
+        head = file.read(HEAD_BYTES)
         file_bytes = os.fstat(file.fileno()).st_size
     if not head:
         raise AmiwarpError(f"{path}: is empty; give a recording")
@@ -171,6 +171,9 @@ def detect_format(path: Path) -> Format:
     known = ", ".join(member.value for member in Format)
     raise AmiwarpError(f"{path}: content is of no known format; expected one of {known}")
 
+
+HEAD_BYTES = 4096
+"""Number of bytes from which a format is detected."""
 
 BIN_EVENT_BYTES = 5
 """Size of an event in the ``.bin`` files of N-MNIST [bytes]."""
@@ -234,8 +237,8 @@ class TextRow:
         """Return the form of a line."""
         separator = next((mark for mark in (b";", b",", b"\t") if mark in line), b" ")
         separator = b" " if separator == b"\t" else separator
-        comma = separator == b";" and b"," in line
-        return cls(separator, comma, WORD_PATTERN.search(line) is not None, b'"' in line or b"'" in line)
+        # With semicolons, commas can only be decimal ones, also if the first numbers have none.
+        return cls(separator, separator == b";", WORD_PATTERN.search(line) is not None, b'"' in line or b"'" in line)
 
     def plain(self, text: bytes) -> bytes:
         """Return text with numbers between spaces."""
@@ -276,9 +279,9 @@ BOM = b"\xef\xbb\xbf"
 
 def looks_like_text(head: bytes) -> bool:
     """Return whether a file begins with rows of at least three numbers, or a line of names or a size before them."""
-    lines = list(filter(holds_values, head.splitlines()))[:3]
-    if not lines:
-        return False
+    lines = list(filter(holds_values, head.removeprefix(BOM).splitlines()))[:3]
+    if not lines:  # a long comment
+        return len(head) >= HEAD_BYTES and head.startswith(b"#") and b"\0" not in head
     first = TextRow.of(lines[0])
     count = len(first.words(lines[0]))
     if first.is_row(lines[0]):

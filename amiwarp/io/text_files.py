@@ -29,7 +29,7 @@ from amiwarp.io.column_files import check_table
 from amiwarp.io.columns import ROLES, TIME_UNITS, Column, GivenLayout, Hints, Layout, find_layout, names_roles
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.files import LONGEST_LINE, errors_name, open_input
-from amiwarp.io.formats import TextRow, holds_values
+from amiwarp.io.formats import BOM, TextRow, holds_values
 from amiwarp.io.plain_files import read_calib
 from amiwarp.optics.camera import LARGEST_SIZE
 
@@ -92,8 +92,8 @@ def _find_form(path: Path, head: bytes) -> TextForm:
     comments: list[str] = []
     names: tuple[str, ...] | None = None
     size: tuple[int, int] | None = None
-    position = number = 0
-    for line in head.splitlines(keepends=True):
+    position, number = len(BOM) * head.startswith(BOM), 0
+    for line in head[position:].splitlines(keepends=True):
         words = TextRow.of(line).words(line) if holds_values(line) else []
         if not words:
             comments.append(line.decode("utf-8", "replace").strip().lstrip("#%\ufeff").strip())
@@ -258,7 +258,9 @@ THREAD_LINES = 1 << 12
 def _plain_table(text: bytes, form: TextForm) -> NDArray[np.float64] | None:
     """Return the numbers in lines of plain decimal numbers by a kernel; None for few lines, and for any others."""
     row = form.row
-    if len(text) < KERNEL_LINES * 2 * form.width or row.decimal_comma or row.has_words or row.quoted:
+    if len(text) < KERNEL_LINES * 2 * form.width or row.has_words or row.quoted:
+        return None
+    if row.decimal_comma and b"," in text:
         return None
     characters = np.frombuffer(text, np.uint8)
     ends = np.append(np.flatnonzero(characters == ord("\n")), len(text)).astype(np.int32)
