@@ -20,7 +20,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.file_scan import Assumption, Packet, whole_pixels
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import TIME_LIMIT, rounded_times
+from amiwarp.validation import TIME_LIMIT, instance, rounded_times, whole
 
 # What is found, and what the user says of it.
 
@@ -55,10 +55,13 @@ class GivenLayout:
 
     def check(self) -> None:
         """Raise :class:`AmiwarpError` for a value that is none."""
+        for name in ("columns", "time_unit", "polarity"):
+            if getattr(self, name) is not None:
+                instance(getattr(self, name), str, name)
+        if self.scale_xy is not None:
+            whole(self.scale_xy, "--scale-xy", 1, LARGEST_SIZE)
         if self.time_unit is not None and self.time_unit not in TIME_UNITS:
             raise AmiwarpError(f"--time-unit {self.time_unit!r} is unknown; choose among {', '.join(TIME_UNITS)}")
-        if self.scale_xy is not None and self.scale_xy < 1:
-            raise AmiwarpError(f"--scale-xy is {self.scale_xy}; give a whole number from 1 on")
         if self.columns is not None:
             given_roles(self.columns)
         if self.polarity is not None:

@@ -363,14 +363,26 @@ def open_recording(
         raise AmiwarpError(
             f"{path}: is of the format {chosen.value}, whose layout is fixed; leave out {layout.options}"
         )
-    if chip is not None and chosen not in CHIPS:
+    if chip is not None and instance(chip, str, "chip") and chosen not in CHIPS:
         raise AmiwarpError(f"{path}: is of the format {chosen.value}, which needs no chip; leave out --chip")
     arguments: list[Any] = [topic] if chosen in TOPICS else []
     arguments += [layout] if chosen in LAYOUTS else []
     named = {} if chip is None else {"chip": chip}
-    with given_source(GivenSource(None if size is None else (int(size[0]), int(size[1])), sort)):
+    with given_source(GivenSource(None if size is None else _checked_size(size), sort)):
         recording: Recording = io_function(OPENERS[chosen])(path, *arguments, **named)
     return recording
+
+
+def _checked_size(size: Any) -> tuple[int, int]:
+    """Return a sensor size that the user gives [px]. Raises :class:`AmiwarpError` for any other value."""
+    if not isinstance(size, tuple | list) or len(size) != 2:
+        raise AmiwarpError(f"size is {shown(size)}; give the width and the height [px], such as (640, 480)")
+    width, height = (whole(side, f"{name} of size", 1, LARGEST_SIZE) for name, side in zip(SIDES, size, strict=True))
+    return width, height
+
+
+SIDES = ("width", "height")
+"""Names of the sides of a size, for messages."""
 
 
 def check_topic(path: Path, topic: str | None, found: Format) -> None:
