@@ -167,6 +167,32 @@ def test_layout_options(tmp_path: Path) -> None:
     assert open_recording(tmp_path / "scaled.h5").events.slice(0, 2).x.tolist() == [2, 639]
 
 
+@pytest.mark.parametrize(
+    ("command", "has_size"),
+    [
+        ("info", True), ("convert", True), ("calibrate", True), ("compensate", True), ("reconstruct", True),
+        ("pixels", True), ("depth", True), ("lens", True),
+        ("view", False), ("translate", False),  # whose --size means another one
+    ],
+)  # fmt: skip
+def test_commands_that_open_event_files_have_the_options(command: str, has_size: bool) -> None:
+    shown = " ".join(run(command, "--help").replace("│", " ").split())
+    for option in ("--columns", "--time-unit", "--polarity", "--scale-xy", "--chip", "--sort"):
+        assert option in shown
+    assert ("which replaces the size in the file" in shown) == has_size
+
+
+def test_translate_takes_the_layout_of_its_source(tmp_path: Path) -> None:
+    path = tmp_path / "events.csv"
+    path.write_text("".join(f"{k % 60},{k % 40},{k % 2 + 1},{100 * k}\n" for k in range(3000)))
+    given = ("--columns", "x,y,p,t", "--time-unit", "us")
+    assert "--polarity" in fails("translate", path, tmp_path / "a.h5", "--apex-deg", "1", "--rpm", "600", *given)
+    options = (*given, "--polarity", "1=on,2=off", "--fps", "30")  # pictures have a rate, a recording has none
+    assert "does not apply to a recording" in fails(
+        "translate", path, tmp_path / "a.h5", "--apex-deg", "1", "--rpm", "600", *options
+    )
+
+
 def test_encoder_from_triggers(data_dir: Path, tmp_path: Path) -> None:
     path = data_dir / "rosbag/ros2_evt3_640x480_trig10Hz.db3"
     run("convert", path, tmp_path / "out.h5", "--encoder-from", "triggers:6")

@@ -47,7 +47,7 @@ COMMANDS = {
     ),
     "info": Command(
         "recordings",
-        "Show a recording's format, events, encoder, camera, prism, IMU, frames, ground truth, repairs and assumptions.",
+        "Show a recording's format, events, encoder, camera, prism, IMU, frames, truth, repairs and assumptions.",
         "amiwarp info recording.h5",
     ),
     "view": Command(

@@ -47,7 +47,7 @@ def run_info(
     layout: cli.FileOptions,
     common: cli.Common,
 ) -> None:
-    """Show a recording's format, events, encoder, camera, prism, IMU, frames, ground truth, repairs and assumptions.
+    """Show a recording's format, events, encoder, camera, prism, IMU, frames, truth, repairs and assumptions.
 
     Files of up to 256 MiB are read once, in blocks. Of larger files only the first 4 million events and the end are
     read, unless --count is given. Figures that are then estimates are marked as such.

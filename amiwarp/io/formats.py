@@ -363,8 +363,10 @@ def open_recording(
         raise AmiwarpError(
             f"{path}: is of the format {chosen.value}, whose layout is fixed; leave out {layout.options}"
         )
-    if chip is not None and instance(chip, str, "chip") and chosen not in CHIPS:
-        raise AmiwarpError(f"{path}: is of the format {chosen.value}, which needs no chip; leave out --chip")
+    if chip is not None:
+        instance(chip, str, "chip")
+        if chosen not in CHIPS:
+            raise AmiwarpError(f"{path}: is of the format {chosen.value}, which needs no chip; leave out --chip")
     arguments: list[Any] = [topic] if chosen in TOPICS else []
     arguments += [layout] if chosen in LAYOUTS else []
     named = {} if chip is None else {"chip": chip}
