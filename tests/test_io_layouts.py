@@ -181,6 +181,7 @@ LAYOUTS: dict[str, tuple[Maker, dict[str, Any]]] = {
     "npy by rows": (array(np.c_[X, Y, P, T].astype("<u4")), {}),
     "npy of rows per property": (array(np.stack([SECONDS, X, Y, SIGNED])), {}),
     "npy of records": (array(RECORDS), {}),
+    "npy of big-endian integers": (array(np.c_[T, X, Y, P].astype(">i4")), {}),
     "npy of records of tonic": (
         array(records(("x", "<i2"), ("y", "<i2"), ("timestamp", "<i4"), ("polarity", "i1"), values=(X, Y, T, SIGNED))),
         {},
@@ -366,6 +367,10 @@ REFUSED: dict[str, tuple[Maker, str]] = {
         r"several sets of columns with events: a, b; .* --columns, such as t=a/t,x=a/x,y=a/y,p=a/p",
     ),
     "fractions of pixels": (array(np.c_[SECONDS, X + 0.5, Y + 0.5, P]), r"is 639\.5; expected whole pixels"),
+    "no events": (array(np.zeros((0, 4))), r"holds no events; give another recording"),
+    "numbers of 16 bits": (
+        array(np.c_[T % 2000, X, Y, P].astype("f2")), r"order of t, x, y and p is in doubt .* --columns",
+    ),
     "no numbers": (hdf5(names=np.array([b"a", b"b"])), r"no arrays are named as t, x, y and p"),
     "texts as columns": (parquet(t=["a"], x=["b"], y=["c"], p=["d"]), r"no arrays are named as t, x, y and p"),
 }  # fmt: skip

@@ -303,6 +303,8 @@ def _listed(values: Iterable[int]) -> str:
 def find_layout(columns: Sequence[Column], given: GivenLayout, hints: Hints) -> Layout:
     """Return the layout of a file's columns. Raises :class:`AmiwarpError` in doubt, with the option that decides."""
     given.check()
+    if columns and not any(column.values.size for column in columns):
+        raise AmiwarpError("holds no events; give another recording")
     if _is_openmv(columns) and given.columns is None:
         return _openmv_layout()
     roles, assumptions = _find_roles(columns, given, hints)
@@ -360,7 +362,7 @@ def _find_roles(columns: Sequence[Column], given: GivenLayout, hints: Hints) -> 
     roles = {role: order.index(role) for role in ROLES}
     if order == hints.order:
         return roles, []
-    why = "the columns have no names, and their values fit no other order"
+    why = "the columns have no names, and their values fit this order best"
     return roles, [Assumption("columns", " ".join(order), why, "--columns")]
 
 
@@ -432,7 +434,10 @@ class _Facts:
     @classmethod
     def of(cls, values: NDArray[Any]) -> _Facts:
         """Return what values show; values that are not finite are left out."""
-        known = values[np.abs(values) < 2.0**63] if values.dtype.kind == "f" else values  # also without NaN
+        known = values
+        if values.dtype.kind == "f":
+            wide = values.astype(np.float64)  # float16 holds no larger coordinates
+            known = wide[np.abs(wide) < 2.0**63]  # without NaN, too
         if not known.size:
             return cls(True, 0.0, 0.0, False, False, True)
         fractions = known.dtype.kind == "f" and bool((known != np.floor(known)).any())
