@@ -123,6 +123,7 @@ LAYOUTS: dict[str, tuple[Maker, dict[str, Any]]] = {
     # name: (maker, options)
     "text: whole microseconds": (lines(ROWS), {}),
     "text: np.savetxt of microseconds": (lines([[f"{v:.18e}" for v in row] for row in ROWS]), {}),
+    "text: %f of microseconds": (lines([[f"{t:.6f}", *row] for t, *row in ROWS.tolist()]), {}),
     "text: x y t p": (lines(np.c_[X, Y, T, P]), {}),
     "text: x y t p in seconds": (lines(zip(X, Y, SECONDS, P, strict=True)), {}),
     "text: x y p t": (lines(np.c_[X, Y, P, T], separator="\t", end="\r\n"), {}),

@@ -26,7 +26,17 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, Recording
 from amiwarp.io.column_files import check_table
-from amiwarp.io.columns import ROLES, TIME_UNITS, Column, GivenLayout, Hints, Layout, find_layout, names_roles
+from amiwarp.io.columns import (
+    LONGEST_S,
+    ROLES,
+    TIME_UNITS,
+    Column,
+    GivenLayout,
+    Hints,
+    Layout,
+    find_layout,
+    names_roles,
+)
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.files import LONGEST_LINE, errors_name, open_input
 from amiwarp.io.formats import BOM, TextRow, holds_values
@@ -36,8 +46,8 @@ from amiwarp.optics.camera import LARGEST_SIZE
 READ_BYTES = 1 << 22
 """Amount of text that is parsed at once [bytes]: about 200,000 events."""
 
-HEAD_BYTES = 1 << 17
-"""Amount of text from which the layout is found [bytes]: about 6,000 events."""
+HEAD_BYTES = 1 << 16
+"""Amount of text from which the layout is found [bytes]: about 3,000 events."""
 
 SECONDS = re.compile(rb"-?\d+\.\d{6,}")
 """Pattern of times in seconds, as the Event Camera Dataset and amiwarp write them."""
@@ -142,14 +152,17 @@ def _find_text_layout(head: bytes, form: TextForm, given: GivenLayout) -> Layout
             f"names {len(form.names)} columns ({', '.join(form.names)[:200]}), and its rows have {form.width}; give "
             "the order with --columns, such as t,x,y,p"
         )
-    rows = []
+    rows: list[list[bytes]] = []
+    values: list[list[float]] = []
     lines = head[form.start :].splitlines()
     is_cut = len(head) >= HEAD_BYTES  # the last line may go on
     for line in lines[:-1] if is_cut else lines:
         words = form.row.words(line) if holds_values(line) else []
-        if len(words) == form.width and form.row.is_row(line):
-            rows.append(words)
-    numbers = np.array([[float(word) for word in words] for words in rows]).reshape(-1, form.width)
+        if len(words) == form.width:
+            with contextlib.suppress(ValueError):  # the reader names such a line
+                values.append([float(word) for word in words])
+                rows.append(words)
+    numbers = np.array(values).reshape(-1, form.width)
     names = form.names if form.names is not None and len(form.names) == form.width else None
     columns = [Column(names[at] if names else None, _whole_if_possible(values)) for at, values in enumerate(numbers.T)]
     if names is not None and not any(names):
@@ -157,7 +170,8 @@ def _find_text_layout(head: bytes, form: TextForm, given: GivenLayout) -> Layout
     hints = Hints(order=ROLES, fractions="s") if names is None else Hints()
     layout = find_layout(columns, given, hints)
     t_words = [words[layout.columns["t"]] for words in rows]
-    if given.time_unit is None and names is None and all(SECONDS.fullmatch(word) for word in t_words):
+    in_decimals = all(SECONDS.fullmatch(word) for word in t_words) and _can_be_seconds(numbers[:, layout.columns["t"]])
+    if given.time_unit is None and names is None and in_decimals:
         layout = replace(
             layout,
             unit="s",
@@ -168,6 +182,15 @@ def _find_text_layout(head: bytes, form: TextForm, given: GivenLayout) -> Layout
     places = numbers[:, [layout.columns["x"], layout.columns["y"]]]
     fractional = bool((places != np.floor(places)).any(axis=1).mean() > 0.5)
     return replace(layout, compensated=fractional)
+
+
+def _can_be_seconds(t: NDArray[np.float64]) -> bool:
+    """Return whether times with six decimals can be in seconds: not if they are whole and far apart.
+
+    So are microseconds that a program has written with decimals.
+    """
+    span = float(np.ptp(t)) if t.size else 0.0
+    return bool((t != np.floor(t)).any()) or span < LONGEST_S or t.size > span
 
 
 def _whole_if_possible(values: NDArray[np.float64]) -> NDArray[Any]:
