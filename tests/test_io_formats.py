@@ -561,19 +561,6 @@ def test_a_damaged_header_of_aedat4_is_named(tmp_path, old, new):
         open_recording(path)
 
 
-def test_a_packet_of_aedat4_that_ends_beyond_the_table_is_named(tmp_path):
-    write_aedat4(tmp_path / "a.aedat4", EVENTS)
-    data = bytearray((tmp_path / "a.aedat4").read_bytes())
-    start = len(b"#!AER-DAT4.0\r\n")
-    at = start + 4 + struct.unpack_from("<I", data, start)[0]
-    (size,) = struct.unpack_from("<i", data, at + 4)
-    struct.pack_into("<i", data, at + 4, len(data))
-    (tmp_path / "b.aedat4").write_bytes(data)
-    with pytest.raises(AmiwarpError, match=rf"b\.aedat4: byte {at}: a packet ends beyond"):
-        open_recording(tmp_path / "b.aedat4")
-    assert 0 < size < len(data)
-
-
 AEDAT2_CHIPS = {"DVS128": (128, 128), "Davis128": (128, 128), "Davis208Mono": (208, 192), "Davis240C": (240, 180),
                 "Davis346blue": (346, 260), "Davis640": (640, 480), "Tmpdiff128": (128, 128)}  # fmt: skip
 

@@ -1,18 +1,15 @@
 """Every format that is written is read back exactly, by amiwarp and by programs that are not amiwarp."""
 
-import contextlib
 import itertools
 import math
 import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import hdf5plugin  # noqa: F401 - its import registers the compression
 import numpy as np
 import pytest
-from faery.extension import aedat
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -432,26 +429,6 @@ def test_an_interrupted_conversion_leaves_what_was_there(tmp_path, name):
         convert(source, source, format=name.split()[0], overwrite=True)
     assert sorted(os.listdir(tmp_path)) == sorted([path.name, "source.h5"])
     assert path.read_bytes() == b"mine"
-
-
-def test_a_disk_that_is_full_at_the_end_is_noticed(tmp_path, monkeypatch):
-    """faery does not report that its last bytes could not be written."""
-    source, encoder = save(tmp_path / "source.h5", make_events(50_000)), aedat.Encoder
-
-    @contextlib.contextmanager
-    def cut(path, *arguments):
-        with encoder(path, *arguments) as found:
-            yield found
-        os.truncate(path, os.path.getsize(path) - 5000)
-
-    with monkeypatch.context() as patched:
-        patched.setattr("shutil.disk_usage", lambda _folder: SimpleNamespace(free=5000))
-        with pytest.raises(AmiwarpError, match=r"out\.aedat4: .*disk is full: 50000 of 50000 events"):
-            convert(source, tmp_path / "out.aedat4")
-    monkeypatch.setattr(aedat, "Encoder", cut)
-    with pytest.raises(AmiwarpError, match=r"out\.aedat4: .*disk is full: 0 of 50000 events"):
-        convert(source, tmp_path / "out.aedat4")
-    assert os.listdir(tmp_path) == ["source.h5"]
 
 
 def test_a_missing_rosbags_is_named(tmp_path, monkeypatch):

@@ -15,7 +15,6 @@ import pytest
 from amiwarp import (
     AmiwarpError,
     compensate,
-    convert,
     open_recording,
     save_recording,
 )
@@ -24,7 +23,7 @@ from amiwarp.io.native_format import LiveWriter
 from amiwarp.live.stream.sockets import PipeSink
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.simulation.pictures import open_pictures
-from reference.io_samples import make_events, write_native, write_sample
+from reference.io_samples import make_events, write_sample
 from tests import test_io_formats
 from tests.test_io_readers import assert_equal
 
@@ -53,18 +52,10 @@ def test_raw_files_without_faery(tmp_path, version):
 
 
 @pytest.mark.usefixtures("no_faery")
-@pytest.mark.parametrize("name", ["aedat4", "es"])
+@pytest.mark.parametrize("name", ["es"])
 def test_files_that_need_faery_name_it(tmp_path, name):
     with pytest.raises(AmiwarpError, match=rf"sample\.{name}: .* need faery, .*'pip install faery', or convert"):
         open_recording(write_sample(tmp_path, name, EVENTS))
-
-
-@pytest.mark.usefixtures("no_faery")
-def test_writing_aedat4_names_faery(tmp_path):
-    write_native(tmp_path / "in.h5", EVENTS)
-    with pytest.raises(AmiwarpError, match=r"out\.aedat4: .* need faery, "):
-        convert(tmp_path / "in.h5", tmp_path / "out.aedat4")
-    assert not list(tmp_path.glob("*.aedat4"))
 
 
 def test_videos_name_the_package_that_they_need(tmp_path, monkeypatch):

@@ -222,7 +222,6 @@ OPEN_NO_FILE = {
 OPENED_OTHERWISE = {
     "amiwarp.io.files: _Input(path)": "the way that all take",
     # Functions of the reading process. ReadingProcess.send has checked and noted the path.
-    "amiwarp.io.aedat: aedat.Decoder(path)": "reading process",
     "amiwarp.io.prophesee: es.Decoder(path, 0)": "reading process",
     "amiwarp.io.hdf5_server: h5py.File(path, 'r')": "reading process",
     "amiwarp.io.hdf5_server: h5py.h5f.open(name, how, fapl=access)": "reading process",

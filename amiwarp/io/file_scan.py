@@ -666,21 +666,17 @@ class StreamedImages(Instants[NDArray[Any]]):
                     yield packet[start : start + count].view(self._dtype).reshape(height, width)
 
 
-def read_sensors(
-    path: Path, counts: Mapping[str, MetadataValue], module: str, *arguments: Any
+def sensors_of(
+    path: Path, counts: Mapping[str, MetadataValue], start: Callable[[str], Packets]
 ) -> tuple[ImuSamples | None, StreamedImages | None, dict[str, MetadataValue]]:
     """Return the IMU samples and frames that were counted, and for those that cannot be read a note that says why.
 
-    ``module`` is the name of the module with ``read_imu``, ``read_heads`` and ``read_images``, which run in the reading
-    process and get the absolute path and ``arguments``.
+    ``start`` starts a pass over the file, with the name of what it yields: ``read_imu``, ``read_heads`` or
+    ``read_images``.
     """
     notes: dict[str, MetadataValue] = {}
     if head_limit() is not None:
         return None, None, notes
-
-    def start(function: str) -> Packets:
-        return packets(f"{module}:{function}", path.absolute(), *arguments, {})
-
     imu = frames = None
     if counts.get("imu_samples"):
         imu = _if_readable(path, "imu", lambda: imu_of(path, start("read_imu")), notes)
@@ -688,6 +684,17 @@ def read_sensors(
         images = partial(start, "read_images")
         frames = _if_readable(path, "frames", lambda: StreamedImages(path, start("read_heads"), images), notes)
     return imu, frames, notes
+
+
+def read_sensors(
+    path: Path, counts: Mapping[str, MetadataValue], module: str, *arguments: Any
+) -> tuple[ImuSamples | None, StreamedImages | None, dict[str, MetadataValue]]:
+    """Return what :func:`sensors_of` returns, read in the reading process.
+
+    ``module`` is the name of the module with the functions that are started. They get the absolute path and
+    ``arguments``.
+    """
+    return sensors_of(path, counts, lambda name: packets(f"{module}:{name}", path.absolute(), *arguments, {}))
 
 
 def only_counted(counts: Mapping[str, MetadataValue], *names: str) -> dict[str, MetadataValue]:

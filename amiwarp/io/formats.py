@@ -91,7 +91,7 @@ OPENERS = {
     Format.HDF5: "native_format:open_hdf5",
     Format.EVT: "prophesee:open_evt",
     Format.DAT: "prophesee:open_dat",
-    Format.AEDAT4: "aedat:open_aedat4",
+    Format.AEDAT4: "aedat4:open_aedat4",
     Format.AEDAT3: "aedat:open_aedat3",
     Format.AEDAT2: "aedat:open_aedat2",
     Format.ROSBAG: "ros:open_rosbag",
@@ -108,7 +108,7 @@ OPENERS = {
 
 TRIGGERS = {
     Format.EVT: "prophesee:trigger_packets",
-    Format.AEDAT4: "aedat:aedat4_triggers",
+    Format.AEDAT4: "aedat4:aedat4_triggers",
     Format.AEDAT3: "aedat:aedat3_triggers",
     Format.AEDAT2: "aedat:aedat2_triggers",
     Format.ROSBAG: "ros:trigger_packets",
@@ -549,7 +549,7 @@ LIMITS = {
 WRITERS = {
     OutputFormat.DSEC: "native_format:write_dsec",
     OutputFormat.EVT3: "prophesee:write_evt3",
-    OutputFormat.AEDAT4: "aedat:write_aedat4",
+    OutputFormat.AEDAT4: "aedat4:write_aedat4",
     OutputFormat.NPZ: "plain_files:write_npz",
     OutputFormat.TEXT: "plain_files:write_text",
     OutputFormat.ROS2: "ros:write_ros2",

@@ -1,0 +1,432 @@
+"""AEDAT 4: what cameras and recorders really write, damage that leaves the rest readable, and files for others."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from faery.extension import aedat
+
+from amiwarp import AmiwarpError, Events, MemoryEvents, Recording, convert, open_recording, save_recording
+from amiwarp.io import aedat4, read_encoder_triggers
+from reference.io_samples import SIZE, make_events
+from tests.test_io_readers import assert_equal
+
+EVENTS = make_events()
+DOUBLE = struct.Struct("<q")
+G = 9.80665
+
+# Files by the schema of iniVation: https://docs.inivation.com/software/software-advanced-usage/file-formats/
+
+
+def table(fields: dict[int, bytes], vectors: dict[int, bytes]) -> tuple[bytes, int]:
+    """A FlatBuffer table with its layout before it and its vectors behind it, and the table's position in it."""
+    count = 1 + max([*fields, *vectors], default=-1)
+    places, body = [0] * count, b""
+    for number, data in fields.items():
+        body += bytes(-(4 + len(body)) % len(data))
+        places[number] = 4 + len(body)
+        body += data
+    for number in vectors:
+        body += bytes(-len(body) % 4)
+        places[number] = 4 + len(body)
+        body += b"slot"
+    layout = struct.pack(f"<{2 + count}H", 4 + 2 * count, 4 + len(body), *places)
+    layout = bytes(-len(layout) % 8 + 4) + layout if len(layout) % 4 == 0 else bytes(2) + layout
+    start = len(layout)
+    out = bytearray(layout + struct.pack("<i", 4 + 2 * count) + body)
+    for number, data in vectors.items():
+        out += bytes(-len(out) % 4)
+        struct.pack_into("<I", out, start + places[number], len(out) - start - places[number])
+        out += data
+    return bytes(out), start
+
+
+def flat(kind: str, fields: dict[int, bytes], vectors: dict[int, bytes]) -> bytes:
+    """A packet: size, position of its table, type, and table."""
+    data, start = table(fields, vectors)
+    body = struct.pack("<I", 8 + start) + kind.encode() + data
+    return struct.pack("<I", len(body)) + body
+
+
+def lists(kind: str, rows: list[dict[int, bytes]]) -> bytes:
+    """A packet with a list of tables."""
+    parts = [table(row, {}) for row in rows]
+    at = 4 * len(parts)
+    slots, body = b"", b""
+    for k, (data, start) in enumerate(parts):
+        slots += struct.pack("<I", at + len(body) + start - 4 * k)
+        body += data + bytes(-len(data) % 4)
+    return flat(kind, {}, {0: struct.pack("<I", len(parts)) + slots + body})
+
+
+def events_packet(events: Events, **wrong: Any) -> bytes:
+    rows = np.zeros(len(events), [("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("rest", "V3")])
+    for name in "xytp":
+        rows[name] = wrong.get(name, getattr(events, name))
+    return flat("EVTS", {}, {0: struct.pack("<I", len(rows)) + rows.tobytes()})
+
+
+def frame_packet(t: int, pixels: np.ndarray, kind: int) -> bytes:
+    sides = {6: struct.pack("<h", pixels.shape[1]), 7: struct.pack("<h", pixels.shape[0])}
+    data = pixels.tobytes()
+    return flat("FRME", {0: DOUBLE.pack(t), 5: bytes([kind]), **sides}, {10: struct.pack("<I", len(data)) + data})
+
+
+def imu_row(t: int, *values: float) -> dict[int, bytes]:
+    """A sample with acceleration x, y, z and angular velocity x, y, z; fields of the value 0 are left out."""
+    return {0: DOUBLE.pack(t), **{2 + k: struct.pack("<f", value) for k, value in enumerate(values) if value}}
+
+
+COMPRESSIONS: dict[str, tuple[int, Callable[[bytes], bytes]]] = {
+    "none": (0, bytes),
+    "lz4": (1, lz4.frame.compress),
+    "lz4_high": (2, lambda data: lz4.frame.compress(data, compression_level=9, store_size=False)),
+    "zstd": (3, zstandard.ZstdCompressor().compress),
+    "zstd_high": (4, zstandard.ZstdCompressor(level=12, write_content_size=False).compress),
+}
+
+
+def file_of(
+    packets: list[tuple[int, bytes]], *, kinds: str = "EVTS FRME IMUS TRIG", compression: str = "lz4"
+) -> tuple[bytes, list[int]]:
+    """A file without a table, and the positions of its packets. Stream k is of the kind k."""
+    sizes = f'<attr key="sizeX" type="int">{SIZE[0]}</attr><attr key="sizeY" type="int">{SIZE[1]}</attr>'
+    nodes = "".join(
+        f'<node name="{k}"><attr key="typeIdentifier" type="string">{kind}</attr>'
+        f'<node name="info">{sizes}</node></node>'
+        for k, kind in enumerate(kinds.split())
+    )
+    text = f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'.encode()
+    number, compress = COMPRESSIONS[compression]
+    data, start = table(
+        {0: struct.pack("<i", number), 1: DOUBLE.pack(-1)}, {2: struct.pack("<I", len(text)) + text + b"\0"}
+    )
+    header = struct.pack("<I", 8 + start) + b"IOHE" + data
+    out = b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header)) + header
+    places = []
+    for stream, content in packets:
+        places.append(len(out))
+        packed = compress(content)
+        out += struct.pack("<ii", stream, len(packed)) + packed
+    return out, places
+
+
+def opened(folder: Path, data: bytes) -> Recording:
+    path = folder / "a.aedat4"
+    path.write_bytes(data)
+    return open_recording(path)
+
+
+def parts_of(events: Events, size: int = 100) -> list[Events]:
+    return [events[at : at + size] for at in range(0, len(events), size)]
+
+
+def all_of(recording: Recording) -> Events:
+    return recording.events.slice(0, len(recording.events))
+
+
+def write_own(path: Path, events: Events) -> None:
+    save_recording(path.with_suffix(".h5"), Recording(MemoryEvents(events, *SIZE)))
+    convert(path.with_suffix(".h5"), path)
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_every_compression_is_read(tmp_path, compression):
+    packets = [(0, events_packet(part)) for part in parts_of(EVENTS)]
+    recording = opened(tmp_path, file_of(packets, compression=compression)[0])
+    assert (recording.metadata, recording.events.size) == ({"format": "aedat4"}, SIZE)
+    assert_equal(all_of(recording), EVENTS)
+
+
+def test_frames_of_16_bits(tmp_path):
+    """Of jAER 3."""
+    pixels = np.random.default_rng(0).integers(0, 1024, (2, 5, 7)).astype("<u2")
+    packets = [(1, frame_packet(1_000_000 + 40_000 * k, image, 2)) for k, image in enumerate(pixels)]
+    recording = opened(tmp_path, file_of([(0, events_packet(EVENTS)), *packets])[0])
+    assert recording.metadata == {"format": "aedat4", "frames": 2}
+    assert recording.frames is not None
+    assert (recording.frames.t.tolist(), recording.frames.size) == ([1_000_000, 1_040_000], (7, 5))
+    for index in (1, 0):
+        np.testing.assert_array_equal(recording.frames[index], pixels[index], strict=True)
+    assert_equal(all_of(recording), EVENTS)
+
+
+def test_frames_in_colour_are_counted(tmp_path):
+    colour = np.zeros((4, 5, 3), np.uint8)
+    recording = opened(tmp_path, file_of([(0, events_packet(EVENTS)), (1, frame_packet(9, colour, 16))])[0])
+    assert (recording.metadata["frames"], recording.frames) == (1, None)
+    assert recording.metadata["frames_note"] == "only counted: the frames are in colour (format 16 of OpenCV), not grey"
+    assert_equal(all_of(recording), EVENTS)
+
+
+def test_other_streams_are_counted(tmp_path):
+    """Unknown ones in the header and without it, and a second one of events."""
+    packets = [(0, events_packet(EVENTS[:300])), (1, flat("POSE", {}, {})), (9, flat("BBOX", {}, {})),
+               (2, events_packet(EVENTS[:7])), (0, events_packet(EVENTS[300:]))]  # fmt: skip
+    recording = opened(tmp_path, file_of(packets, kinds="EVTS POSE EVTS")[0])
+    assert recording.metadata == {"format": "aedat4", "packets_of_unknown_streams": 2, "events_of_other_sources": 7}
+    assert_equal(all_of(recording), EVENTS)
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_a_file_cut_in_its_last_packet(tmp_path, compression):
+    data, places = file_of([(0, events_packet(part)) for part in parts_of(EVENTS)], compression=compression)
+    for end in (places[-1] + 3, places[-1] + 30, len(data) - 1):
+        recording = opened(tmp_path, data[:end])
+        lost = "truncated_bytes" if end > places[-1] + 8 else "dropped_damaged_bytes"
+        assert recording.metadata == {"format": "aedat4", lost: end - places[-1]}
+        assert_equal(all_of(recording), EVENTS[:500])
+
+
+def test_a_written_file_cut_before_its_table(tmp_path):
+    write_own(tmp_path / "whole.aedat4", make_events(20_000))
+    data = (tmp_path / "whole.aedat4").read_bytes()
+    assert_equal(all_of(opened(tmp_path, data[: len(data) * 9 // 10])), make_events(20_000)[:16384])
+
+
+def test_samples_and_triggers_follow_the_schema(tmp_path):
+    rows = [imu_row(1_000_000, 1.0, 0.0, -2.0, 90.0, 0.0, 45.0), imu_row(1_000_500), imu_row(1_001_000, 0.0, 3.0)]
+    # A type of 0, which a FlatBuffer leaves out, is a reset of the time; 4 and 8 are no edges at the input either.
+    edges = [{0: DOUBLE.pack(1_000_000 + 500 * k), **({1: bytes([kind])} if kind else {})} for k, kind in
+             enumerate([1, 2, 3, 0, 4, 8, 1])]  # fmt: skip
+    packets = [(0, events_packet(EVENTS)), (2, lists("IMUS", rows[:2])), (3, lists("TRIG", edges)),
+               (2, lists("IMUS", rows[2:])), (2, lists("IMUS", []))]  # fmt: skip
+    recording = opened(tmp_path, file_of(packets)[0])
+    assert recording.metadata == {"format": "aedat4", "imu_samples": 3, "triggers": 4}
+    assert recording.imu is not None
+    assert recording.imu.t.tolist() == [1_000_000, 1_000_500, 1_001_000]
+    np.testing.assert_allclose(recording.imu.acceleration, np.array([[1, 0, -2], [0, 0, 0], [0, 3, 0]]) * G)
+    np.testing.assert_allclose(recording.imu.angular_velocity, np.radians([[90, 0, 45], [0, 0, 0], [0, 0, 0]]))
+    encoder = read_encoder_triggers(tmp_path / "a.aedat4")
+    assert encoder.t.tolist() == [1_000_000, 1_001_000, 1_003_000]
+
+
+# The clock of the camera starts again.
+
+
+def again(t: np.ndarray, parts: list[tuple[int, int]]) -> np.ndarray:
+    """Times whose clock shows ``start`` at index ``at``, for each pair."""
+    stored = t.copy()
+    for at, start in parts:
+        stored[at:] += start - stored[at]
+    return stored
+
+
+@pytest.mark.parametrize("size", [100, 90, 600])
+def test_a_clock_that_starts_again(tmp_path, size):
+    """At the start of a packet, within one, and in a file of one packet (libcaer's issue 69)."""
+    t = EVENTS.t + 500_000 * (np.arange(len(EVENTS)) >= 150)
+    events = Events(EVENTS.x, EVENTS.y, again(t, [(300, 0)]), EVENTS.p)
+    recording = opened(tmp_path, file_of([(0, events_packet(part)) for part in parts_of(events, size)])[0])
+    right = t.copy()
+    right[300:] -= right[300] - right[299]
+    assert all_of(recording).t.tolist() == right.tolist()
+    added = "1 time: the times behind it follow the earlier ones, for which"
+    assert recording.metadata == {
+        "format": "aedat4", "clock_restarts": 1, "clock_note": f"started again {added} {t[299]} us were added",
+    }  # fmt: skip
+
+
+def test_every_restart_is_found(tmp_path):
+    t = EVENTS.t * 1000
+    stored = again(t, [(200, 0), (470, 1000)])
+    events = Events(EVENTS.x, EVENTS.y, stored, EVENTS.p)
+    recording = opened(tmp_path, file_of([(0, events_packet(part)) for part in parts_of(events)])[0])
+    right = t.copy()
+    for at in (200, 470):
+        right[at:] -= right[at] - right[at - 1]
+    assert all_of(recording).t.tolist() == right.tolist()
+    assert (recording.metadata["clock_restarts"], "repaired_time_events" in recording.metadata) == (2, False)
+
+
+def test_other_records_follow_the_clock(tmp_path):
+    """Packets of samples and edges stand on either side of the restart."""
+    events = Events(EVENTS.x, EVENTS.y, again(EVENTS.t * 1000, [(300, 0)]), EVENTS.p)
+    last = int(events.t[299])
+    samples = [(2, lists("IMUS", [imu_row(t)])) for t in (last - 2000, last - 1000, last - 10, 990, 1990)]
+    edges = [(3, lists("TRIG", [{0: DOUBLE.pack(t), 1: b"\1"}])) for t in (last - 5000, 0, 5000)]
+    early, late = ((0, events_packet(part)) for part in (events[:300], events[300:]))
+    for behind, first_edge in ((2, 1), (3, 2), (4, 1)):
+        packets = [*samples[:behind], *edges[:first_edge], early, late, *samples[behind:], *edges[first_edge:]]
+        recording = opened(tmp_path, file_of(packets)[0])
+        assert recording.imu is not None
+        assert (recording.imu.t - last).tolist() == [-2000, -1000, -10, 990, 1990]
+        assert (read_encoder_triggers(tmp_path / "a.aedat4").t - last).tolist() == [-5000, 0, 5000]
+
+
+@pytest.mark.parametrize("at", [1, 250, 299])
+def test_a_single_wrong_time_is_no_restart(tmp_path, at):
+    t = EVENTS.t.copy()
+    t[at] += 3_000_000
+    events = Events(EVENTS.x, EVENTS.y, t, EVENTS.p)
+    with pytest.raises(AmiwarpError, match=r"a\.aedat4: .* of 600 events are out of order"):
+        opened(tmp_path, file_of([(0, events_packet(part)) for part in parts_of(events)])[0])
+
+
+def test_times_that_jump_all_the_time_are_refused(tmp_path):
+    t = EVENTS.t + 10_000_000 * (np.arange(len(EVENTS)) % 2)
+    with pytest.raises(AmiwarpError, match="are out of order"):
+        opened(tmp_path, file_of([(0, events_packet(Events(EVENTS.x, EVENTS.y, t, EVENTS.p)))])[0])
+
+
+# Damage.
+
+
+@pytest.mark.parametrize("window", [64, 1 << 22])
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+@pytest.mark.parametrize("part", ["stream", "size", "small", "huge", "negative", "mark", "rest"])
+def test_damage_leaves_the_packets_around_it(tmp_path, monkeypatch, compression, part, window):
+    monkeypatch.setattr(aedat4, "WINDOW_BYTES", window)
+    data, places = file_of([(0, events_packet(part_)) for part_ in parts_of(EVENTS)], compression=compression)
+    damaged = bytearray(data)
+    at = places[2]
+    size = places[3] - at - 8
+    sizes = {"size": size + 150, "small": size - 150, "huge": 2**31 - 1, "negative": -5}
+    if part == "stream":
+        struct.pack_into("<i", damaged, at, 77)
+    elif part in sizes:
+        struct.pack_into("<i", damaged, at + 4, sizes[part])
+    elif part == "mark":
+        damaged[at + 8 : at + 28] = b"\xff" * 20
+    else:
+        damaged[at : places[4]] = b"\xff" * (places[4] - at)
+    recording = opened(tmp_path, bytes(damaged))
+    found = all_of(recording)
+    assert_equal(found[:200], EVENTS[:200])
+    if part in sizes and part != "negative":
+        assert recording.metadata == {"format": "aedat4", "repaired_packet_sizes": 1}
+        assert_equal(found, EVENTS)
+    elif part == "rest":
+        assert recording.metadata == {"format": "aedat4", "dropped_damaged_bytes": places[4] - at}
+        assert_equal(found[200:], EVENTS[400:])
+    else:
+        lost = recording.metadata.get("dropped_damaged_bytes", 0)
+        unknown = recording.metadata.get("packets_of_unknown_streams", 0)
+        assert (lost, unknown) in ((places[3] - at, 0), (0, 1)) or part == "negative"
+        assert_equal(found[-300:], EVENTS[300:])
+
+
+def test_a_damaged_list_leaves_the_other_tables(tmp_path):
+    rows = [imu_row(1_000_000 + k, k) for k in range(9)]
+    packet = bytearray(lists("IMUS", rows))
+    slots = packet.index(struct.pack("<I", 9)) + 4
+    struct.pack_into("<I", packet, slots + 4 * 3, 2**31)  # beyond the packet
+    beyond = bytearray(lists("IMUS", rows))
+    struct.pack_into("<I", beyond, slots - 4, 10**6)  # more tables than the packet can hold
+    packets = [(0, events_packet(EVENTS)), (2, bytes(packet)), (2, bytes(beyond))]
+    recording = opened(tmp_path, file_of(packets)[0])
+    assert (recording.metadata["imu_samples"], recording.metadata["dropped_damaged_records"]) == (8, 2)
+    assert recording.imu is not None
+    assert (recording.imu.t - 1_000_000).tolist() == [0, 1, 2, 4, 5, 6, 7, 8]
+
+
+def test_events_outside_a_packet_and_impossible_ones(tmp_path):
+    beyond = bytearray(events_packet(EVENTS[200:300]))
+    struct.pack_into("<I", beyond, beyond.index(struct.pack("<I", 100)), 10**8)
+    t = EVENTS.t[100:200].copy()
+    t[5], t[6] = -(2**63), 2**63 - 1
+    x = EVENTS.x[300:400].astype(np.int16)
+    x[9] = -3
+    packets = [events_packet(EVENTS[:100]), events_packet(EVENTS[100:200], t=t), bytes(beyond),
+               events_packet(EVENTS[300:400], x=x), events_packet(EVENTS[400:])]  # fmt: skip
+    data, places = file_of([(0, packet) for packet in packets])
+    recording = opened(tmp_path, data)
+    assert recording.metadata == {
+        "format": "aedat4", "dropped_outside_events": 1, "dropped_damaged_events": 2,
+        "dropped_damaged_bytes": places[3] - places[2],
+    }  # fmt: skip
+    keep = np.ones(len(EVENTS), np.bool_)
+    keep[[105, 106, 309]] = False
+    keep[200:300] = False
+    assert_equal(all_of(recording), Events(*(getattr(EVENTS, name)[keep] for name in "xytp")))
+
+
+@pytest.mark.parametrize("compression", ["lz4", "lz4_high", "zstd", "zstd_high"])
+def test_packets_that_grow_without_measure_are_dropped(tmp_path, monkeypatch, compression):
+    monkeypatch.setattr(aedat4, "LARGEST_PACKET", 1 << 16)
+    packets = [events_packet(EVENTS[:300]), bytes(1 << 20), events_packet(EVENTS[300:])]
+    data, places = file_of([(0, packet) for packet in packets], compression=compression)
+    recording = opened(tmp_path, data)
+    assert recording.metadata == {"format": "aedat4", "dropped_damaged_bytes": places[2] - places[1]}
+    assert_equal(all_of(recording), EVENTS)
+
+
+def test_a_size_that_a_packet_only_states_takes_no_memory(tmp_path):
+    """The heads of LZ4 and Zstandard may state any size."""
+    stated = {
+        "lz4": lz4.frame.compress(b"x", store_size=True)[:6] + DOUBLE.pack(2**62),
+        "zstd": b"\x28\xb5\x2f\xfd\xe0",
+    }
+    for compression, head in stated.items():
+        data, _ = file_of([(0, events_packet(EVENTS))], compression=compression)
+        bad = head + b"\x7f" * 40
+        recording = opened(tmp_path, data + struct.pack("<ii", 0, len(bad)) + bad)
+        assert recording.metadata == {"format": "aedat4", "dropped_damaged_bytes": 8 + len(bad)}
+        assert_equal(all_of(recording), EVENTS)
+
+
+def test_a_table_at_a_wrong_place_is_none(tmp_path):
+    write_own(tmp_path / "whole.aedat4", make_events(20_000))
+    data = bytearray((tmp_path / "whole.aedat4").read_bytes())
+    (place,) = DOUBLE.unpack_from(data, aedat4.TABLE_POSITION)
+    for wrong in (place - 1000, len(data) + 1, 0, -7):
+        DOUBLE.pack_into(data, aedat4.TABLE_POSITION, wrong)
+        recording = opened(tmp_path, bytes(data))
+        assert_equal(all_of(recording), make_events(20_000))
+        assert recording.metadata == {"format": "aedat4", "dropped_damaged_bytes": len(data) - place}
+
+
+def test_a_file_without_a_stream_of_events_is_named(tmp_path):
+    with pytest.raises(AmiwarpError, match=r"a\.aedat4: has no stream of events; give a file with events"):
+        opened(tmp_path, file_of([], kinds="IMUS")[0])
+
+
+# Files for other programs.
+
+
+def test_faery_reads_what_is_written(tmp_path):
+    events = make_events(20_000)
+    write_own(tmp_path / "a.aedat4", events)
+    with aedat.Decoder(tmp_path / "a.aedat4") as decoder:
+        assert [(track.id, track.data_type, track.dimensions) for track in decoder.tracks()] == [(0, "events", SIZE)]
+        found = np.concatenate([packet for _, packet in decoder])
+    for name in "xytp":
+        np.testing.assert_array_equal(found[name], getattr(events, name))
+
+
+def test_the_table_of_a_written_file_lists_its_packets(tmp_path):
+    """dv-processing finds the packets of a part by it."""
+    dv = pytest.importorskip("dv_processing")
+    events = make_events(20_000)
+    write_own(tmp_path / "a.aedat4", events)
+    reader = dv.io.MonoCameraRecording(str(tmp_path / "a.aedat4"))
+    assert reader.getTimeRange() == (events.t[0], events.t[-1])
+    for start, stop in ((0, 5), (9_000, 12_000), (16_384, 19_999)):
+        t = events.t[start], events.t[stop]
+        found = reader.getEventsTimeRange(int(t[0]), int(t[1]))
+        assert found.timestamps().tolist() == events.t[(events.t >= t[0]) & (events.t < t[1])].tolist()
+
+
+def test_real_files_as_faery_reads_them(data_dir):
+    for name in ("aedat4_dvxplorerlite_320x240", "aedat4_davis346_cars"):
+        path = data_dir / f"aedat/{name}.aedat4"
+        recording = open_recording(path)
+        with aedat.Decoder(path) as decoder:
+            packets = [(track.data_type, packet) for track, packet in decoder]
+        expected = np.concatenate([packet for kind, packet in packets if kind == "events"])
+        found = all_of(recording)
+        for field in "xytp":
+            np.testing.assert_array_equal(getattr(found, field), expected[field])
+        samples = np.concatenate([packet for kind, packet in packets if kind == "imus"])
+        assert recording.imu is not None
+        np.testing.assert_array_equal(recording.imu.t, samples["t"])
+        for k, axis in enumerate("xyz"):
+            turning = np.radians(samples[f"gyroscope_{axis}"].astype(np.float64))
+            np.testing.assert_array_equal(recording.imu.angular_velocity[:, k], turning)
+            pulling = samples[f"accelerometer_{axis}"].astype(np.float64) * G
+            np.testing.assert_array_equal(recording.imu.acceleration[:, k], pulling)
