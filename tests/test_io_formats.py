@@ -17,7 +17,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from faery.extension import aedat, evt
+from faery.extension import aedat, es, evt
 
 from amiwarp import (
     AmiwarpError,
@@ -192,8 +192,64 @@ def test_aedat2_of_a_dvs128_and_wrapping_times(tmp_path):
     assert_equal(recording.events.slice(0, 999), events)
     assert events.t[-1] > 2**32
     (tmp_path / "a.aedat").write_bytes((tmp_path / "a.aedat").read_bytes().replace(b"DVS128", b"Cochlea"))
-    with pytest.raises(AmiwarpError, match=r"a\.aedat: .*names camera 'eu.seebetter.*Cochlea'; expected one of dvs128"):
+    with pytest.raises(
+        AmiwarpError, match=r"a\.aedat: .*names camera 'eu.seebetter.*Cochlea'; expected one of .*--chip"
+    ):
         open_recording(tmp_path / "a.aedat")
+
+
+def aedat2_file(path: Path, lines: list[str], newline: str, records: np.ndarray) -> Recording:
+    path.write_bytes("".join(line + newline for line in lines).encode() + records.astype(">u4").tobytes())
+    return open_recording(path)
+
+
+@pytest.mark.parametrize("newline", ["\r\n", "\n", "\r"])
+@pytest.mark.parametrize("last", [["#End Of ASCII Header"], []])
+@pytest.mark.parametrize("first", [0x23500800, 0x230A0800, 0x0A0D0800])
+def test_aedat2_records_may_begin_like_a_line_of_the_header(tmp_path, newline, last, first):
+    """The first bytes are ``#P``, ``#`` with a newline, or newlines."""
+    lines = ["#!AER-DAT2.0", "# This is a raw AE data file", "#\tAEChip: eu.seebetter.ini.chips.davis.Davis346red"]
+    records = np.array([[first, 1000], [0x23000800, 1000], [0, 2000]])
+    events = aedat2_file(tmp_path / "a.aedat", lines + last, newline, records).events
+    assert (len(events), events.size, events.t_first, events.t_last) == (3, (346, 260), 1000, 2000)
+    found = events.slice(0, 3)
+    assert found.x.tolist() == [345 - (int(word) >> 12 & 0x3FF) for word, _ in records]
+    assert found.y.tolist() == [259 - (int(word) >> 22 & 0x1FF) for word, _ in records]
+    # A file without records ends with its header.
+    assert "holds no events" in str(refusal(aedat2_file, tmp_path / "a.aedat", lines + last, newline, records[:0]))
+
+
+def davis_record(x: int, y: int, t: int) -> tuple[int, int]:
+    """Record of an event at a column and a row from the lower right."""
+    return y << 22 | x << 12 | 1 << 11, t
+
+
+@pytest.mark.parametrize(
+    ("records", "name", "size"),
+    [
+        ([(127 << 8 | 127 << 1, 10), (1 << 15, 20)], "dvs128", (128, 128)),
+        ([davis_record(127, 5, 10)], "davis128", (128, 128)),
+        ([davis_record(5, 191, 10)], "davis208", (208, 192)),
+        ([davis_record(239, 5, 10), davis_record(5, 179, 20)], "davis240", (240, 180)),
+        ([davis_record(5, 192, 10)], "davis346", (346, 260)),
+        ([davis_record(345, 5, 10), (1 << 31 | 1000 << 12, 20), (1 << 10 | 1000 << 12, 30)], "davis346", (346, 260)),
+        ([davis_record(346, 5, 10)], "davis640", (640, 480)),
+    ],
+)
+def test_aedat2_without_a_camera_takes_the_smallest_and_says_so(tmp_path, records, name, size):
+    """Samples of frames and edges have other bits than events."""
+    recording = aedat2_file(tmp_path / "a.aedat", ["#!AER-DAT2.0"], "\r\n", np.array(records))
+    assert recording.events.size == size
+    assert recording.metadata["chip"] == (
+        f"assumed: {name}, the smallest camera that has the largest address; choose another with --chip"
+    )
+    recording = open_recording(tmp_path / "a.aedat", chip="Davis640")
+    assert (recording.events.size, "chip" in recording.metadata) == ((640, 480), False)
+    with pytest.raises(AmiwarpError, match=r"a\.aedat: .*chip is 'gen4'; expected one of dvs128, davis128, "):
+        open_recording(tmp_path / "a.aedat", chip="gen4")
+    np.savez(tmp_path / "a.npz", x=[1], y=[1], t=[1], p=[1])
+    with pytest.raises(AmiwarpError, match=r"a\.npz: is no AEDAT 2\.0 file but npz, which needs no chip; leave"):
+        open_recording(tmp_path / "a.npz", chip="dvs128")
 
 
 def test_triggers_of_a_dvs128(tmp_path):
@@ -282,6 +338,78 @@ def test_bin_with_and_without_marks(tmp_path):
     recording = open_recording(tmp_path / "b.bin")
     assert (recording.events.size, recording.metadata["overflow_marks"]) == ((240, 180), 1)
     assert_equal(recording.events.slice(0, 999), wide)
+
+
+# Event Stream.
+
+ES_SIZE = 300, 260
+
+
+def es_bytes(events: Events, kind: str, *, exposure: np.ndarray | None = None) -> bytes:
+    """A file by the specification of Event Stream, with a reset between any two events."""
+    shift, longest = (1, 127) if kind == "dvs" else (2, 63)
+    out = b"Event Stream\2\0\0" + bytes([1 if kind == "dvs" else 2]) + struct.pack("<HH", *ES_SIZE)
+    before = 0
+    for k in range(len(events)):
+        left = int(events.t[k]) - before
+        before = int(events.t[k])
+        while left >= longest:
+            times = 1 if kind == "dvs" else min(3, left // longest)
+            out += bytes([longest << shift | times])
+            left -= longest * times
+        on = int(events.p[k])
+        bits = on if kind == "dvs" else on << 1 | int(exposure is not None and exposure[k])
+        out += bytes([left << shift | bits])
+        out += struct.pack("<HH", events.x[k], ES_SIZE[1] - 1 - int(events.y[k])) + bytes([longest << shift])
+    return out
+
+
+@pytest.mark.parametrize("piece", [1, 4, 7, 1 << 20])
+@pytest.mark.parametrize("kind", ["dvs", "atis"])
+def test_event_stream_files(tmp_path, monkeypatch, kind, piece):
+    """Gaps of more than a byte of time, columns of more than a byte, and exposures of an ATIS, which are left out."""
+    monkeypatch.setattr("amiwarp.io.event_stream.PIECE_BYTES", piece)
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.choice([0, 1, 62, 63, 64, 126, 127, 128, 400, 70_000], 200))
+    events = Events.from_arrays(rng.integers(0, 300, 200), rng.integers(0, 260, 200), t, rng.integers(0, 2, 200))
+    exposure = rng.random(200) < 0.3 if kind == "atis" else np.zeros(200, np.bool_)
+    path = tmp_path / "a.es"
+    path.write_bytes(es_bytes(events, kind, exposure=exposure))
+    recording = open_recording(path)
+    kept = Events(*(getattr(events, name)[~exposure] for name in "xytp"))
+    assert (recording.metadata, recording.events.size) == ({"format": "es"}, ES_SIZE)
+    assert_equal(recording.events.slice(0, 999), kept)
+    with es.Decoder(path, 0) as decoder:
+        expected = np.concatenate(list(decoder))
+    if kind == "atis":
+        expected = expected[~expected["exposure"].astype(bool)]
+    np.testing.assert_array_equal(expected["t"], kept.t)
+    np.testing.assert_array_equal(expected["x"], kept.x)
+    np.testing.assert_array_equal(ES_SIZE[1] - 1 - expected["y"], kept.y)
+
+
+def test_event_stream_files_that_are_cut_or_damaged(tmp_path):
+    path = tmp_path / "a.es"
+    whole = es_bytes(small(EVENTS, 300, 240, t_first=0), "dvs")
+    path.write_bytes(whole[:-2])  # the last event lacks a byte, and its reset
+    recording = open_recording(path)
+    assert (len(recording.events), recording.metadata["truncated_bytes"]) == (len(EVENTS) - 1, 4)
+    outside = bytearray(whole)
+    outside[-2] = 1  # row 256 + from the bottom
+    path.write_bytes(outside)
+    assert open_recording(path).metadata.get("dropped_outside_events", 0) == int(whole[-3] > 3)
+    for at, value, message in (
+        (12, 1, r"has the version 1\.0\.0; expected 2"), (15, 0, "holds generic events; expected dvs or atis"),
+        (15, 9, r"holds unknown \(type 9\) events"),
+    ):  # fmt: skip
+        other = bytearray(whole)
+        other[at] = value
+        path.write_bytes(other)
+        with pytest.raises(AmiwarpError, match=rf"a\.es: .*{message}"):
+            open_recording(path)
+    path.write_bytes(whole[:14])
+    with pytest.raises(AmiwarpError, match=r"a\.es: .*the header ends beyond the file"):
+        open_recording(path)
 
 
 def test_evimo2_folders(tmp_path):

@@ -18,44 +18,15 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.io import files, reading_process
+from amiwarp.io import files
 from amiwarp.io.native_format import LiveWriter
 from amiwarp.live.stream.sockets import PipeSink
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.simulation.pictures import open_pictures
-from reference.io_samples import make_events, write_sample
-from tests import test_io_formats
+from reference.io_samples import make_events
 from tests.test_io_readers import assert_equal
 
 EVENTS = make_events()
-
-
-@pytest.fixture
-def no_faery(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide faery from this process and from the reading process, wherever it is installed."""
-    monkeypatch.setitem(sys.modules, "faery", None)
-    hidden = reading_process.START.replace("import sys;", "import sys; sys.modules['faery'] = None;", 1)
-    assert hidden != reading_process.START
-    monkeypatch.setattr(reading_process, "START", hidden)
-    monkeypatch.setattr(reading_process, "_idle", [])
-    # A reader of an earlier test that is collected meanwhile would give back a process that has faery.
-    monkeypatch.setattr(reading_process, "borrow", reading_process.ReadingProcess)
-
-
-@pytest.mark.usefixtures("no_faery")
-@pytest.mark.parametrize("version", ["2", "3"])
-def test_raw_files_without_faery(tmp_path, version):
-    recording = open_recording(write_sample(tmp_path, f"evt{version}", EVENTS))
-    assert (recording.metadata["format"], len(recording.events)) == (f"evt{version}.0", len(EVENTS))
-    assert_equal(recording.events.slice(0, len(EVENTS)), EVENTS)
-    test_io_formats.test_triggers_of_raw_files(tmp_path, version)
-
-
-@pytest.mark.usefixtures("no_faery")
-@pytest.mark.parametrize("name", ["es"])
-def test_files_that_need_faery_name_it(tmp_path, name):
-    with pytest.raises(AmiwarpError, match=rf"sample\.{name}: .* need faery, .*'pip install faery', or convert"):
-        open_recording(write_sample(tmp_path, name, EVENTS))
 
 
 def test_videos_name_the_package_that_they_need(tmp_path, monkeypatch):

@@ -30,7 +30,6 @@ HEAVY = (
     "hdf5plugin",
     "pyvista",
     "serial",
-    "faery",
     "av",
     "matplotlib",
     "scipy",
@@ -222,7 +221,6 @@ OPEN_NO_FILE = {
 OPENED_OTHERWISE = {
     "amiwarp.io.files: _Input(path)": "the way that all take",
     # Functions of the reading process. ReadingProcess.send has checked and noted the path.
-    "amiwarp.io.prophesee: es.Decoder(path, 0)": "reading process",
     "amiwarp.io.hdf5_server: h5py.File(path, 'r')": "reading process",
     "amiwarp.io.hdf5_server: h5py.h5f.open(name, how, fapl=access)": "reading process",
     "amiwarp.io.hdf5_server: h5py.h5f.open(name, how | h5py.h5f.ACC_SWMR_READ, fapl=access)": "reading process",
@@ -232,7 +230,6 @@ OPENED_OTHERWISE = {
     # Files of the system and of the package.
     "amiwarp.io.files: Path('/proc/sys/kernel/random/boot_id').read_text(encoding='ascii')": "system",
     "amiwarp.io.reading_process: os.open('/proc/self/statm', os.O_RDONLY)": "system",
-    "amiwarp.io.reading_process: open(f'/proc/self/fdinfo/{number}', encoding='ascii')": "system",
     "amiwarp.studies.cluster: info.read_text(encoding='utf-8')": "system",
     "amiwarp.live.stream.sources: open(0, 'rb', buffering=0, closefd=False)": "standard input",
     "amiwarp.viewer.serve: path.read_text(encoding='utf-8')": "file of the package",

@@ -99,6 +99,18 @@ HEADER_BYTES = 1 << 24
 """Longest header that is read [bytes]. It can hold all settings of the camera."""
 
 
+HEADER_LAST = b"#end of ascii header"
+"""Last line of the header, in lower case; older versions of jAER do not write it."""
+LINE = re.compile(rb"(#[^\r\n]*)(\r\n|\n|\r)")
+"""Line of the header, and its end."""
+CONTROL = re.compile(rb"[\x00-\x08\x0b-\x1f]")
+"""Characters that are part of no line of text."""
+RECORD_LIKE = re.compile(rb"#.{0,5}|.*[\x7f-\xff].*", re.DOTALL)
+"""Lines that can be the start of a record, whose address begins with ``#``."""
+RECORD_BYTES = 8
+"""Size of a record."""
+
+
 @dataclass(frozen=True, slots=True)
 class Chip:
     """Layout of a camera's addresses."""
@@ -117,14 +129,19 @@ CHIPS = {
 """Layouts by the name of jAER's class in the header, in lower case and without a suffix."""
 
 
-def open_aedat2(path: Path) -> Recording:
-    """Open the events of an AEDAT 2.0 file."""
+def open_aedat2(path: Path, chip: str | None = None) -> Recording:
+    """Open the events of an AEDAT 2.0 file.
+
+    ``chip`` is the name of the camera, one of :data:`CHIPS`. By default, it is taken from the header.
+    """
     with errors_name(path, lambda: "reading the header"):
-        chip, offset = _read_aedat2_header(path)
-    read, last = partial(_aedat2_packets, path, chip, offset), partial(file_scan.last_word, path, offset, ">u4")
-    events = FileEvents(path, read, size=(chip.width, chip.height), last_time=last)
+        camera, offset, assumed = _read_aedat2_header(path, chip)
+    read, last = partial(_aedat2_packets, path, camera, offset), partial(file_scan.last_word, path, offset, ">u4")
+    events = FileEvents(path, read, size=(camera.width, camera.height), last_time=last)
     imu, notes = _imu(path, offset, events)
     notes |= file_scan.only_counted(events.records, "frames")
+    if assumed:
+        notes["chip"] = assumed
     metadata = {"format": "aedat2", **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu)
 
@@ -142,29 +159,78 @@ def _imu(path: Path, offset: int, events: FileEvents) -> tuple[ImuSamples | None
 
 def aedat2_triggers(path: Path) -> Iterator[Packet]:
     """Yield the edges at the external input, all as rising edges of channel 0."""
-    chip, offset = _read_aedat2_header(path)
+    chip, offset, _ = _read_aedat2_header(path)
     for words, t in _records(path, offset, {}):
         at = (words >> 31 == 0) & (words >> 10 & 1 == 1) if chip.davis else words >> 15 & 1 == 1
         nothing = np.zeros(np.count_nonzero(at), np.int64)
         yield nothing, nothing, t[at], nothing + 1
 
 
-def _read_aedat2_header(path: Path) -> tuple[Chip, int]:
-    """Return the camera, and the position of the first record."""
+def _read_aedat2_header(path: Path, given: str | None = None) -> tuple[Chip, int, str]:
+    """Return the camera, the position of the first record, and what was assumed about the camera."""
     with open_input(path) as file:
-        name, start = "", 0
-        while (line := file.readline(HEADER_BYTES)).startswith(b"#") and line.endswith(b"\n"):
-            start += len(line)
-            if found := re.match(rb"#\s*AEChip:\s*(\S+)", line):
-                name = found[1].decode("ascii", "replace")
-            if start > HEADER_BYTES:
-                raise AmiwarpError(f"the header is longer than {HEADER_BYTES >> 20} MiB; the file is damaged")
+        head = file.read(HEADER_BYTES + 1)
+    lines, start = _header_lines(head, path.stat().st_size)
+    if start > HEADER_BYTES:
+        raise AmiwarpError(f"the header is longer than {HEADER_BYTES >> 20} MiB; the file is damaged")
+    named = [found[1] for line in lines if (found := re.match(rb"#\s*AEChip:\s*(\S+)", line))]
+    name = named[-1].decode("ascii", "replace") if named else ""
+    if given is not None:
+        if given.lower() not in CHIPS:
+            raise AmiwarpError(f"chip is '{given[:60]}'; expected one of {', '.join(CHIPS)}")
+        return CHIPS[given.lower()], start, ""
+    if not name:
+        guessed = _guessed_chip(path, start)
+        what = f"assumed: {guessed}, the smallest camera that has the largest address; choose another with --chip"
+        return CHIPS[guessed], start, what
     short = name.rpartition(".")[2].lower()
     chip = next((chip for key, chip in CHIPS.items() if short.startswith(key)), None)
     if chip is None:
-        given = f"camera '{name[:60]}'" if name else "no camera (AEChip)"
-        raise AmiwarpError(f"the header names {given}; expected one of {', '.join(CHIPS)}")
-    return chip, start
+        known = ", ".join(CHIPS)
+        raise AmiwarpError(f"the header names camera '{name[:60]}'; expected one of {known}; choose one with --chip")
+    return chip, start, ""
+
+
+def _header_lines(head: bytes, file_bytes: int) -> tuple[list[bytes], int]:
+    """Return the lines of the header of a file of some size, and the position of the first record.
+
+    Records can begin with ``#``, too. The header ends at a line that says so; without it, at what is no line of text.
+    """
+    lines: list[bytes] = []
+    start = 0
+    first = newline = b""
+    while found := LINE.match(head, start):
+        line, newline = found.groups()
+        if CONTROL.search(line):
+            break
+        first = first or newline
+        if first == b"\r":
+            newline = first  # the first record begins with what looks like the rest of a newline
+        lines.append(line)
+        start += len(line) + len(newline)
+        if line.strip().lower() == HEADER_LAST:
+            return lines, start
+    doubtful = len(lines) > 1 and RECORD_LIKE.fullmatch(lines[-1]) is not None
+    if doubtful and (file_bytes - start) % RECORD_BYTES:
+        before = start - len(lines[-1]) - len(newline)
+        # The last line is the start of a record if whole records follow without it.
+        if (file_bytes - before) % RECORD_BYTES == 0:
+            return lines[:-1], before
+    return lines, start
+
+
+def _guessed_chip(path: Path, offset: int) -> str:
+    """Return the name of the smallest camera that has the largest address in a file without the camera's name."""
+    largest = right = top = 0
+    for words, _ in _records(path, offset, {}):
+        largest = max(largest, int(words.max(initial=0)))
+        events = words[(words >> 31 == 0) & (words >> 10 & 1 == 0)]
+        right = max(right, int((events >> 12 & 0x3FF).max(initial=0)))
+        top = max(top, int((events >> 22 & 0x1FF).max(initial=0)))
+    if largest < 1 << 16:
+        return "dvs128"
+    davis = [(name, chip) for name, chip in CHIPS.items() if chip.davis]
+    return next((name for name, chip in davis if right < chip.width and top < chip.height), davis[-1][0])
 
 
 def _records(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[NDArray[Any], NDArray[np.int64]]]:

@@ -95,7 +95,7 @@ OPENERS = {
     Format.AEDAT3: "aedat:open_aedat3",
     Format.AEDAT2: "aedat:open_aedat2",
     Format.ROSBAG: "ros:open_rosbag",
-    Format.ES: "prophesee:open_es",
+    Format.ES: "event_stream:open_es",
     Format.TEXT: "text_files:open_text",
     Format.NPZ: "column_files:open_npz",
     Format.NPY: "column_files:open_npy",
@@ -330,7 +330,8 @@ def open_recording(
     size : tuple of int, optional
         Sensor size (width, height) [px]. It replaces the size in the file.
     chip : str, optional
-        Name of the camera's chip, if an AEDAT 2.0 file does not state it: for example ``"DVS128"``.
+        Camera of an AEDAT 2.0 file, for example ``dvs128`` or ``davis346``. By default, it is taken from the header; if
+        it is not there, it is guessed from the largest address, and ``metadata["chip"]`` says so.
     sort : bool, default False
         Whether to sort the events by time, up to 33 million. They are then kept in memory.
 

@@ -1,4 +1,4 @@
-"""Prophesee's files and words: RAW (EVT 2.0, 2.1, 3.0) is read and written; DAT and Event Stream files are read."""
+"""Prophesee's files and words: RAW (EVT 2.0, 2.1, 3.0) is read and written; DAT files are read."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -16,7 +16,6 @@ from amiwarp.io.evt_decoder import WORD_TYPES, EventColumns, EvtDecoder, Trigger
 from amiwarp.io.file_scan import FileEvents, Packet, last_word, nearest, read_pieces, read_words, unwrapped
 from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.formats import LONGEST_US, Outline
-from amiwarp.io.reading_process import Reply, faery_module, noting_progress, packets, run
 from amiwarp.validation import TIME_LIMIT
 
 # Decoders of Prophesee's EVT words with NumPy: EVT 2.0, 2.1 and 3.0, for streams that arrive in pieces.
@@ -428,39 +427,3 @@ def write_evt3(part: Path, blocks: Iterable[Events], about: Outline) -> None:
         file.write("".join(f"% {line}\n" for line in header).encode())
         for events in blocks:
             file.write(encoder.encode(events).astype("<u2").data)
-
-
-# Reader of Event Stream files (.es), with faery: events of DVS files, and change detections of ATIS files.
-
-
-def open_es(path: Path) -> Recording:
-    """Open an Event Stream file. Its rows are counted from the bottom, so they are flipped."""
-    with errors_name(path, lambda: "reading the header"):
-        width, height = run(read_es_head, path.absolute())
-    source = partial(packets, read_es_packets, path.absolute(), height)
-    events = FileEvents(path, source, size=(width, height))
-    return Recording(events=events, metadata={"format": "es", **events.metadata}, name=path.stem)
-
-
-def _es_decoder(path: str) -> Any:
-    """Open a file with faery, which loads slowly. Called in the reading process."""
-    es = faery_module("es")
-    return es.Decoder(path, 0)
-
-
-def read_es_head(path: str) -> Reply:
-    """Return width and height of the sensor. Called in the reading process."""
-    with _es_decoder(path) as decoder:
-        kind, size = decoder.event_type, decoder.dimensions
-        if kind not in ("dvs", "atis") or size is None:
-            raise AmiwarpError(f"holds {kind} events; expected dvs or atis")
-        return (int(size[0]), int(size[1])), []
-
-
-def read_es_packets(notes: dict[str, int], path: str, height: int) -> Iterator[Packet]:
-    """Yield packets of events. Called in the reading process."""
-    with _es_decoder(path) as decoder:
-        atis = decoder.event_type == "atis"
-        for packet in noting_progress(decoder, path, notes):
-            events = packet[~packet["exposure"].astype(bool)] if atis else packet
-            yield events["x"], height - 1 - events["y"], events["t"], events["polarity" if atis else "p"]

@@ -1,9 +1,8 @@
 """Separate process that reads files, so that a damaged file which crashes or hangs a decoder causes only an error.
 
-HDF5 with its filters and the compiled decoders of other formats trust a file's content. The process that runs them is
-started by ``subprocess``, not ``multiprocessing``, so that a user's script is not imported again. It runs functions of
-amiwarp that return a JSON value and arrays, which are sent through pipes. The second part of
-this file runs in the process.
+HDF5 with its filters and the readers of ROS bags trust a file's content. The process that runs them is started by
+``subprocess``, not ``multiprocessing``, so that a user's script is not imported again. It runs functions of amiwarp
+that return a JSON value and arrays, which are sent through pipes. The second part of this file runs in the process.
 """
 
 import contextlib
@@ -492,39 +491,3 @@ def _next_packets(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[
         yield packet
         if count >= PACKET or time.process_time() - began > PACKET_S:
             return
-
-
-def faery_module(name: str) -> Any:
-    """Import the compiled decoder and encoder of a format, which load slowly: ``aedat``, ``es`` or ``evt``."""
-    try:
-        from faery import extension
-    except ImportError as error:
-        raise AmiwarpError(
-            "AEDAT 4 and Event Stream files need faery, for which Macs with an Apple chip have no package before "
-            "macOS 26: install Rust and run 'pip install faery', or convert the file to .h5 on another computer"
-        ) from error
-    return getattr(extension, name)
-
-
-def noting_progress(decoder: Iterator[Any], path: str, notes: dict[str, int]) -> Iterator[Any]:
-    """Yield the packets of a compiled decoder, and note how much of its file it has read, on Linux."""
-    number = _open_file(path)
-    for packet in decoder:
-        if number is not None:
-            with (
-                contextlib.suppress(OSError, ValueError),
-                open(f"/proc/self/fdinfo/{number}", encoding="ascii") as about,
-            ):
-                notes["read"] = int(about.readline().split()[1])
-                notes["total"] = os.path.getsize(path)
-        yield packet
-
-
-def _open_file(path: str) -> str | None:
-    """Return the number of the open file with this path, on Linux."""
-    with contextlib.suppress(OSError):
-        for number in os.listdir("/proc/self/fd"):
-            with contextlib.suppress(OSError):
-                if os.path.samefile(f"/proc/self/fd/{number}", path):
-                    return number
-    return None
