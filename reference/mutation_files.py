@@ -68,6 +68,7 @@ from amiwarp.studies.evaluate.evaluation import Store, section
 from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, encode_picture
 from amiwarp.studies.stability import cells as stability
 from amiwarp.studies.stability.report import aggregate
+from reference.aedat4_files import whole_file
 from reference.calibration_sample import exact_calibration
 from reference.io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
 from reference.io_samples_extra import MORE_WRITERS, packets, small, write_bin, write_ros2
@@ -540,6 +541,12 @@ KINDS: dict[str, Kind] = {
     **{
         name: (f".{ending}", partial(lambda write, path: write(path, EVENTS), write), read_recording)
         for name, (_, ending, _, write) in MORE_WRITERS.items()
+    },
+    **{
+        f"aedat4_{name}": (
+            ".aedat4", lambda path, name=name: path.write_bytes(whole_file(EVENTS, name)), read_recording
+        )
+        for name in ("none", "lz4", "zstd")
     },
     "ros2_mono": (".db3", write_mono, read_recording),
     "n_mnist": (".bin", lambda path: write_bin(path, small(EVENTS, 34, 34, t_first=0)), read_recording),

@@ -1,119 +1,31 @@
 """AEDAT 4: what cameras and recorders really write, damage that leaves the rest readable, and files for others."""
 
 import struct
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import lz4.frame
 import numpy as np
 import pytest
-import zstandard
 from faery.extension import aedat
 
 from amiwarp import AmiwarpError, Events, MemoryEvents, Recording, convert, open_recording, save_recording
 from amiwarp.io import aedat4, read_encoder_triggers
+from reference.aedat4_files import (
+    COMPRESSIONS,
+    DOUBLE,
+    events_packet,
+    file_of,
+    flat,
+    frame_packet,
+    imu_row,
+    lists,
+    whole_file,
+)
 from reference.io_samples import SIZE, make_events
 from tests.test_io_readers import assert_equal
 
 EVENTS = make_events()
-DOUBLE = struct.Struct("<q")
 G = 9.80665
-
-# Files by the schema of iniVation: https://docs.inivation.com/software/software-advanced-usage/file-formats/
-
-
-def table(fields: dict[int, bytes], vectors: dict[int, bytes]) -> tuple[bytes, int]:
-    """A FlatBuffer table with its layout before it and its vectors behind it, and the table's position in it."""
-    count = 1 + max([*fields, *vectors], default=-1)
-    places, body = [0] * count, b""
-    for number, data in fields.items():
-        body += bytes(-(4 + len(body)) % len(data))
-        places[number] = 4 + len(body)
-        body += data
-    for number in vectors:
-        body += bytes(-len(body) % 4)
-        places[number] = 4 + len(body)
-        body += b"slot"
-    layout = struct.pack(f"<{2 + count}H", 4 + 2 * count, 4 + len(body), *places)
-    layout = bytes(-len(layout) % 8 + 4) + layout if len(layout) % 4 == 0 else bytes(2) + layout
-    start = len(layout)
-    out = bytearray(layout + struct.pack("<i", 4 + 2 * count) + body)
-    for number, data in vectors.items():
-        out += bytes(-len(out) % 4)
-        struct.pack_into("<I", out, start + places[number], len(out) - start - places[number])
-        out += data
-    return bytes(out), start
-
-
-def flat(kind: str, fields: dict[int, bytes], vectors: dict[int, bytes]) -> bytes:
-    """A packet: size, position of its table, type, and table."""
-    data, start = table(fields, vectors)
-    body = struct.pack("<I", 8 + start) + kind.encode() + data
-    return struct.pack("<I", len(body)) + body
-
-
-def lists(kind: str, rows: list[dict[int, bytes]]) -> bytes:
-    """A packet with a list of tables."""
-    parts = [table(row, {}) for row in rows]
-    at = 4 * len(parts)
-    slots, body = b"", b""
-    for k, (data, start) in enumerate(parts):
-        slots += struct.pack("<I", at + len(body) + start - 4 * k)
-        body += data + bytes(-len(data) % 4)
-    return flat(kind, {}, {0: struct.pack("<I", len(parts)) + slots + body})
-
-
-def events_packet(events: Events, **wrong: Any) -> bytes:
-    rows = np.zeros(len(events), [("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("rest", "V3")])
-    for name in "xytp":
-        rows[name] = wrong.get(name, getattr(events, name))
-    return flat("EVTS", {}, {0: struct.pack("<I", len(rows)) + rows.tobytes()})
-
-
-def frame_packet(t: int, pixels: np.ndarray, kind: int) -> bytes:
-    sides = {6: struct.pack("<h", pixels.shape[1]), 7: struct.pack("<h", pixels.shape[0])}
-    data = pixels.tobytes()
-    return flat("FRME", {0: DOUBLE.pack(t), 5: bytes([kind]), **sides}, {10: struct.pack("<I", len(data)) + data})
-
-
-def imu_row(t: int, *values: float) -> dict[int, bytes]:
-    """A sample with acceleration x, y, z and angular velocity x, y, z; fields of the value 0 are left out."""
-    return {0: DOUBLE.pack(t), **{2 + k: struct.pack("<f", value) for k, value in enumerate(values) if value}}
-
-
-COMPRESSIONS: dict[str, tuple[int, Callable[[bytes], bytes]]] = {
-    "none": (0, bytes),
-    "lz4": (1, lz4.frame.compress),
-    "lz4_high": (2, lambda data: lz4.frame.compress(data, compression_level=9, store_size=False)),
-    "zstd": (3, zstandard.ZstdCompressor().compress),
-    "zstd_high": (4, zstandard.ZstdCompressor(level=12, write_content_size=False).compress),
-}
-
-
-def file_of(
-    packets: list[tuple[int, bytes]], *, kinds: str = "EVTS FRME IMUS TRIG", compression: str = "lz4"
-) -> tuple[bytes, list[int]]:
-    """A file without a table, and the positions of its packets. Stream k is of the kind k."""
-    sizes = f'<attr key="sizeX" type="int">{SIZE[0]}</attr><attr key="sizeY" type="int">{SIZE[1]}</attr>'
-    nodes = "".join(
-        f'<node name="{k}"><attr key="typeIdentifier" type="string">{kind}</attr>'
-        f'<node name="info">{sizes}</node></node>'
-        for k, kind in enumerate(kinds.split())
-    )
-    text = f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'.encode()
-    number, compress = COMPRESSIONS[compression]
-    data, start = table(
-        {0: struct.pack("<i", number), 1: DOUBLE.pack(-1)}, {2: struct.pack("<I", len(text)) + text + b"\0"}
-    )
-    header = struct.pack("<I", 8 + start) + b"IOHE" + data
-    out = b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header)) + header
-    places = []
-    for stream, content in packets:
-        places.append(len(out))
-        packed = compress(content)
-        out += struct.pack("<ii", stream, len(packed)) + packed
-    return out, places
 
 
 def opened(folder: Path, data: bytes) -> Recording:
@@ -141,6 +53,16 @@ def test_every_compression_is_read(tmp_path, compression):
     recording = opened(tmp_path, file_of(packets, compression=compression)[0])
     assert (recording.metadata, recording.events.size) == ({"format": "aedat4"}, SIZE)
     assert_equal(all_of(recording), EVENTS)
+
+
+def test_a_file_with_all_types_of_packets(tmp_path):
+    recording = opened(tmp_path, whole_file(EVENTS, "zstd"))
+    assert recording.metadata == {"format": "aedat4", "frames": 4, "imu_samples": 12, "triggers": 10}
+    assert_equal(all_of(recording), EVENTS)
+    assert recording.frames is not None
+    assert recording.frames[3].tolist() == np.arange(35).reshape(5, 7).tolist()
+    assert recording.imu is not None
+    assert recording.imu.t.tolist() == EVENTS.t[::50].tolist()
 
 
 def test_frames_of_16_bits(tmp_path):

@@ -95,6 +95,8 @@ def _starts(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.flatnonzero((windows == np.arange(RECORDS_OF_SAMPLE)).all(axis=1))
 
 
+AEDAT2_MAGIC = b"#!AER-DAT2.0"
+"""First bytes of a file."""
 HEADER_BYTES = 1 << 24
 """Longest header that is read [bytes]. It can hold all settings of the camera."""
 
@@ -170,6 +172,8 @@ def _read_aedat2_header(path: Path, given: str | None = None) -> tuple[Chip, int
     """Return the camera, the position of the first record, and what was assumed about the camera."""
     with open_input(path) as file:
         head = file.read(HEADER_BYTES + 1)
+    if not head.startswith(AEDAT2_MAGIC):
+        raise AmiwarpError("byte 0: is not the header of an AEDAT 2.0 file; give another file")
     lines, start = _header_lines(head, path.stat().st_size)
     if start > HEADER_BYTES:
         raise AmiwarpError(f"the header is longer than {HEADER_BYTES >> 20} MiB; the file is damaged")
