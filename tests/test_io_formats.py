@@ -3,10 +3,12 @@
 import contextlib
 import gzip
 import io
+import itertools
 import json
 import lzma
 import os
 import pickle
+import random
 import sqlite3
 import struct
 import tarfile
@@ -31,8 +33,8 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
+from amiwarp.io import ecf, read_encoder_triggers
 from amiwarp.io import file_scan as scan
-from amiwarp.io import read_encoder_triggers
 from amiwarp.io.evt_decoder import EvtDecoder
 from amiwarp.io.export import left_out
 from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, _halves_are_swapped, words_of
@@ -62,6 +64,7 @@ from reference.io_samples_extra import (
     write_ros1,
     write_ros2,
 )
+from reference.mutation_files import mutated
 from tests.test_io_readers import assert_equal, assert_same_source
 
 EVENTS = make_events()
@@ -446,21 +449,156 @@ def test_mvsec_counts_frames_and_needs_a_choice(tmp_path):
     assert convert(tmp_path / "a.hdf5", tmp_path / "out.h5", topic="davis/right").events == len(EVENTS)
 
 
-def test_prophesee_hdf5_without_its_codec(tmp_path):
+def test_triggers_in_prophesee_hdf5(tmp_path):
     write_prophesee_hdf5(tmp_path / "a.hdf5", EVENTS, compression="gzip")
     assert open_recording(tmp_path / "a.hdf5").metadata["triggers"] == 4
     assert read_encoder_triggers(tmp_path / "a.hdf5").rpm == pytest.approx(30_000)
-    rows = h5py.File(tmp_path / "a.hdf5")["CD/events"][()]
+
+
+def ecf_runs(values: list[int], bits: int, words: str) -> bytes:
+    """Runs of equal values, with their lengths in the lowest bits, or behind them if they are long."""
+    out = b""
+    for value, group in itertools.groupby(values):
+        count = len(list(group))
+        longest = (1 << bits) - 1
+        if count >= longest:
+            out += struct.pack(f"<{words}", value << bits | longest) + struct.pack("<H", count)
+        else:
+            out += struct.pack(f"<{words}", value << bits | count)
+    return out
+
+
+def ecf_packed(values: list[int], bits: int) -> bytes:
+    """Groups of four values: their bits in the order v0, low bits of v1, rest of v1, ... as three words."""
+    part = bits // 3
+    out = b""
+    for at in range(0, len(values), 4):
+        v0, v1, v2, v3 = [*values[at : at + 4], 1, 2, 3][:4]  # the codec does not clear the last ones
+        first = v0 << part | v1 % 2**part
+        second = v1 >> part << 2 * part | v2 % 2 ** (2 * part)
+        third = v2 >> 2 * part << 3 * part | v3
+        out += struct.pack("<3H" if bits == 12 else "<3I", first, second, third)
+    return out
+
+
+def ecf_chunk(events: Events, mode: str) -> bytes:
+    """A chunk by the description of Prophesee's codec."""
+    x, y, t, p = (column.tolist() for column in (events.x, events.y, events.t, events.p))
+    out = struct.pack("<Iq", len(t) << 2 | {"packed": 2, "rows": 1, "masks": 0}[mode], t[0])
+    now = t[0]
+    for time, group in itertools.groupby(t):
+        count = len(list(group))
+        step = time - now
+        now = time
+        gap = step if step >= 15 else 0
+        step -= gap
+        while gap:
+            out += bytes([0xF0 | gap & 15])
+            gap >>= 4
+        if count >= 15:
+            out += bytes([step << 4 | 15]) + struct.pack("<H", count)
+        else:
+            out += bytes([step << 4 | count])
+    if mode == "packed":
+        return out + ecf_packed([row << 12 | column << 1 | on for column, row, on in zip(x, y, p, strict=True)], 24)
+    out += ecf_runs(y, 5, "H")
+    if mode == "rows":
+        return out + ecf_packed([column << 1 | on for column, on in zip(x, p, strict=True)], 12)
+    at = 0
+    while at < len(x):
+        first, mask = x[at], 0
+        at += 1
+        for bit in range(5):
+            if at < len(x) and x[at] == first + bit + 1:
+                mask |= 16 >> bit
+                at += 1
+        # What lies behind the last event is not cleared.
+        out += struct.pack("<H", first << 5 | (mask | 1 if at == len(x) and mask < 2 else mask))
+    return out + ecf_runs(p, 7, "B")
+
+
+def write_ecf(path: Path, chunks: list[bytes], count: int, length: int, *filters: int, mask: int = 0) -> None:
+    """A file as Metavision writes it: chunks of ``length`` events in the ECF codec."""
+    rows = np.dtype({"names": ["x", "y", "p", "t"], "formats": ["<u2", "<u2", "<i2", "<i8"],
+                     "offsets": [0, 2, 4, 8], "itemsize": 16})  # fmt: skip
     creation = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    creation.set_chunk((256,))
-    creation.set_filter(0x8ECF, h5py.h5z.FLAG_OPTIONAL, ())
-    with h5py.File(tmp_path / "b.hdf5", "w") as file:
+    creation.set_chunk((length,))
+    for number in (*filters, 0x8ECF):
+        creation.set_filter(number, h5py.h5z.FLAG_OPTIONAL, ())
+    with h5py.File(path, "w") as file:
         group = file.create_group("CD")
-        kind, space = h5py.h5t.py_create(rows.dtype), h5py.h5s.create_simple(rows.shape)
-        h5py.h5d.create(group.id, b"events", kind, space, creation)
-        group["events"][...] = rows
-    with pytest.raises(AmiwarpError, match=r"b\.hdf5: .*ECF codec, which is not installed; .*HDF5_PLUGIN_PATH"):
-        open_recording(tmp_path / "b.hdf5")
+        kind, space = h5py.h5t.py_create(rows), h5py.h5s.create_simple((count,))
+        dataset = h5py.h5d.create(group.id, b"events", kind, space, creation)
+        for k, chunk in enumerate(chunks):
+            dataset.write_direct_chunk((k * length,), chunk, mask if k == 0 else 0)
+        file.attrs["geometry"] = "320x240"
+
+
+def ecf_events(count: int) -> Events:
+    """Rows of events next to each other, long runs, gaps of time, and the largest coordinates."""
+    rng = np.random.default_rng(3)
+    t = 10**15 + np.cumsum(rng.choice([0, 0, 0, 0, 1, 14, 15, 16, 255, 300_000], count))
+    t[50:400] = t[50]
+    t[400:] += t[50] - t[399] + 350_000_000 if t[399] > t[50] else 0
+    t = np.maximum.accumulate(t)
+    x = (np.arange(count) * rng.choice([1, 1, 1, 2, 7], count)) % 320
+    y = np.repeat(rng.integers(0, 240, count), rng.integers(1, 70, count))[:count]
+    p = np.repeat(rng.integers(0, 2, count), rng.integers(1, 300, count))[:count]
+    x[1], y[1] = 319, 239
+    return Events.from_arrays(x, y, t, p)
+
+
+@pytest.mark.parametrize("mode", ["packed", "rows", "masks"])
+def test_prophesee_hdf5_without_its_codec(tmp_path, mode):
+    """The last chunk is padded, and the first one may be stored without the codec."""
+    events = ecf_events(2003)
+    padded = Events.concatenate([events, *[events[-1:]] * 397])
+    chunks = [ecf_chunk(padded[at : at + 800], mode) for at in (0, 800, 1600)]
+    write_ecf(tmp_path / "a.hdf5", chunks, 2003, 800)
+    recording = open_recording(tmp_path / "a.hdf5")
+    assert (recording.metadata, recording.events.size) == ({"format": "ecf", "topic": "CD"}, SIZE)
+    assert_equal(recording.events.slice(0, 9999), events)
+    plain = np.zeros(800, [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("pad", "<i2"), ("t", "<i8")])
+    for name in "xytp":
+        plain[name] = getattr(events, name)[:800]
+    write_ecf(tmp_path / "b.hdf5", [plain.tobytes(), *chunks[1:]], 2003, 800, mask=1)
+    assert_equal(open_recording(tmp_path / "b.hdf5").events.slice(0, 9999), events)
+
+
+def test_prophesee_hdf5_that_is_damaged(tmp_path):
+    events = ecf_events(800)
+    path = tmp_path / "a.hdf5"
+    for mode in ("packed", "rows", "masks"):
+        whole = ecf_chunk(events, mode)
+        for chunk, message in (
+            (whole[:-3], "holds other .* than events"), (whole[:5], "lacks its head"),
+            (struct.pack("<I", 1 << 31) + whole[4:], r"has 536870912 events in \d+ bytes; expected at most 65535"),
+            (ecf_chunk(events[:700], mode), "a chunk has 700 events; expected 800"),
+            (whole[:12] + b"\xf1" * 20 + whole[12:], "holds other times than events"),
+        ):  # fmt: skip
+            write_ecf(path, [chunk], 800, 800)
+            with pytest.raises(AmiwarpError, match=rf"a\.hdf5: .*{message}"):
+                open_recording(path)
+    write_ecf(path, [b"\0" * (32 * 65535 + 1)], 800, 800)
+    with pytest.raises(AmiwarpError, match=r"a\.hdf5: .*a chunk has 2097121 bytes; expected at most 2097120"):
+        open_recording(path)
+    write_ecf(path, [ecf_chunk(events, "packed")], 800, 800, 32004)
+    with pytest.raises(AmiwarpError, match=r"a\.hdf5: .*ECF codec and another filter, .*HDF5_PLUGIN_PATH"):
+        open_recording(path)
+
+
+@pytest.mark.parametrize("mode", ["packed", "rows", "masks"])
+def test_damaged_chunks_of_ecf_are_decoded_or_refused(mode):
+    whole = ecf_chunk(ecf_events(800), mode)
+    refused = 0
+    for seed in range(200):
+        try:
+            columns = ecf.decode_chunk(mutated(whole, random.Random(seed)))
+        except AmiwarpError:
+            refused += 1
+        else:
+            assert len({len(column) for column in columns}) == 1
+    assert 0 < refused < 200
 
 
 def test_hdf5_without_known_events_is_named(tmp_path):

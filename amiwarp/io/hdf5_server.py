@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS
 from amiwarp.io.columns import ROLES, names_roles
+from amiwarp.io import ecf
+from amiwarp.io.evt_decoder import EventColumns
 from amiwarp.io.file_scan import microseconds, whole_pixels
 from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32
 from amiwarp.io.native_format import FORMAT
@@ -561,6 +563,9 @@ def read_rows(notes: dict[str, int], path: str, name: str) -> Iterator[Columns]:
         dataset = member(file, name)
         _check_rows(dataset, name, path)
         notes["total"] = max(int(dataset.shape[0]), 1)
+        if _filters(dataset) == [ECF]:
+            yield from _ecf_columns(dataset, notes)
+            return
         for start in range(0, dataset.shape[0], PIECE):
             rows = dataset[start : start + PIECE]
             notes["read"] = min(start + PIECE, dataset.shape[0])
@@ -571,6 +576,36 @@ def read_rows(notes: dict[str, int], path: str, name: str) -> Iterator[Columns]:
                 yield rows["id"], rows["id"] * 0, rows["t"], rows["p"]
             else:
                 yield rows["x"], rows["y"], rows["t"], rows["p"]
+
+
+def _filters(dataset: Any) -> list[int]:
+    """Return the numbers of the filters of a dataset."""
+    creation = dataset.id.get_create_plist()
+    return [creation.get_filter(at)[0] for at in range(creation.get_nfilters())]
+
+
+def _ecf_columns(dataset: Any, notes: dict[str, int]) -> Iterator[Columns]:
+    """Yield the events in the chunks of a dataset of Metavision, without Prophesee's plugin for HDF5."""
+    if not {"x", "y", "t", "p"} <= set(dataset.dtype.names or ()):
+        raise AmiwarpError(f"dataset '{dataset.name}' is {dataset.dtype}; the ECF codec holds rows of x, y, t, p")
+    count, length = dataset.shape[0], dataset.chunks[0]
+    for start in range(0, count, length):
+        size = dataset.id.get_chunk_info_by_coord((start,)).size
+        if size > ecf.MOST_BYTES:
+            raise AmiwarpError(f"dataset '{dataset.name}': a chunk has {size} bytes; expected at most {ecf.MOST_BYTES}")
+        mask, data = dataset.id.read_direct_chunk((start,))
+        rows = min(length, count - start)
+        if mask & 1:  # the codec was left out for this chunk
+            plain = np.frombuffer(data, dataset.dtype)
+            columns = EventColumns(*(plain[name] for name in EventColumns._fields))
+        else:
+            columns = ecf.decode_chunk(data)
+        if len(columns.t) < rows:
+            raise AmiwarpError(
+                f"dataset '{dataset.name}': a chunk has {len(columns.t)} events; expected {rows}; the file is damaged"
+            )
+        notes["read"] = start + rows
+        yield columns.x[:rows], columns.y[:rows], columns.t[:rows], columns.p[:rows]
 
 
 def is_dataset(found: Any) -> bool:
@@ -592,12 +627,11 @@ def _check_rows(dataset: Any, name: str, path: str) -> None:
         good = dataset.ndim == 2 and dataset.shape[1] == 4 and dataset.dtype.kind in "fiu"
     if not good:
         raise AmiwarpError(f"dataset '{name}' is {dataset.dtype} of shape {dataset.shape}; expected rows of x, y, t, p")
-    creation = dataset.id.get_create_plist()
-    codes = [creation.get_filter(at)[0] for at in range(creation.get_nfilters())]
-    if ECF in codes and not h5py.h5z.filter_avail(ECF):
+    codes = _filters(dataset)
+    if ECF in codes and codes != [ECF] and not h5py.h5z.filter_avail(ECF):
         raise AmiwarpError(
-            "is compressed with Prophesee's ECF codec, which is not installed; install the plugin hdf5_ecf, set "
-            "HDF5_PLUGIN_PATH to its folder, or convert the file to RAW with Metavision"
+            "is compressed with Prophesee's ECF codec and another filter, which is not read; install the plugin "
+            "hdf5_ecf, set HDF5_PLUGIN_PATH to its folder, or convert the file to RAW with Metavision"
         )
     check_stored(dataset, name, path)
 
