@@ -631,12 +631,13 @@ def _event_packets(about: Aedat4File, restarts: list[tuple[int, int]], notes: di
             buffer = buffer if size <= len(buffer) else bytearray(size)
             rows, starts, places, lost = _event_rows(found, buffer)
             damaged["dropped_damaged_bytes"] += lost
-            t = rows["t"].astype(np.int64)
+            t: NDArray[np.int64] = rows["t"].astype(np.int64)
             if t.size and not (t.min() > -TIME_LIMIT and t.max() < TIME_LIMIT):
                 sound = (t > -TIME_LIMIT) & (t < TIME_LIMIT)
                 damaged["dropped_damaged_events"] += int(t.size - np.count_nonzero(sound))
-                starts = (np.cumsum(sound) - sound)[np.minimum(starts, t.size - 1)].tolist()
-                rows, t = rows[sound], t[sound]
+                starts = (np.array(starts) - np.searchsorted(np.flatnonzero(~sound), starts)).tolist()
+                rows = rows[sound]
+                t = t[sound]
             for name in {*damaged, *batch.notes}:
                 notes[name] = damaged.get(name, 0) + batch.notes.get(name, 0)
             if t.size:
@@ -671,7 +672,10 @@ def _event_rows(contents: list[Content], buffer: bytearray) -> tuple[NDArray[Any
 
 def _count_records(contents: list[Content], number: int | None, notes: dict[str, int]) -> None:
     """Count frames, IMU samples, triggers, and the events of other streams than ``number``."""
-    others = [content for content in contents if content.kind == "EVTS" and content.stream != number]
+    contents = [content for content in contents if content.stream != number]
+    if not contents:
+        return
+    others = [content for content in contents if content.kind == "EVTS"]
     buffer = bytearray(sum(len(content.data) for content in others))
     samples = _tables([content.data for content in contents if content.kind == "IMUS"], {0: "<i8"})
     edges = _tables([content.data for content in contents if content.kind == "TRIG"], TRIGGER_FIELDS)
