@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS
-from amiwarp.io.columns import ROLES, names_roles
 from amiwarp.io import ecf
+from amiwarp.io.columns import ROLES, names_roles
 from amiwarp.io.evt_decoder import EventColumns
 from amiwarp.io.file_scan import microseconds, whole_pixels
 from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32
