@@ -174,7 +174,7 @@ def test_other_records_follow_the_clock(tmp_path):
     edges = [(3, lists("TRIG", [{0: DOUBLE.pack(t), 1: b"\1"}])) for t in (last - 5000, 0, 5000)]
     early, late = ((0, events_packet(part)) for part in (events[:300], events[300:]))
     for behind, first_edge in ((2, 1), (3, 2), (4, 1)):
-        packets = [*samples[:behind], *edges[:first_edge], early, late, *samples[behind:], *edges[first_edge:]]
+        packets = [*samples[:behind], early, *edges[:first_edge], late, *samples[behind:], *edges[first_edge:]]
         recording = opened(tmp_path, file_of(packets)[0])
         assert recording.imu is not None
         assert (recording.imu.t - last).tolist() == [-2000, -1000, -10, 990, 1990]
@@ -231,6 +231,17 @@ def test_damage_leaves_the_packets_around_it(tmp_path, monkeypatch, compression,
         unknown = recording.metadata.get("packets_of_unknown_streams", 0)
         assert (lost, unknown) in ((places[3] - at, 0), (0, 1)) or part == "negative"
         assert_equal(found[-300:], EVENTS[300:])
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4"])
+def test_a_packet_is_found_wherever_a_window_ends(tmp_path, monkeypatch, compression):
+    data, places = file_of([(0, events_packet(part)) for part in parts_of(EVENTS)], compression=compression)
+    damaged = bytearray(data)
+    damaged[places[2] : places[3]] = b"\xff" * (places[3] - places[2])
+    for window in range(30, 62):
+        monkeypatch.setattr(aedat4, "WINDOW_BYTES", window)
+        recording = opened(tmp_path, bytes(damaged))
+        assert recording.metadata == {"format": "aedat4", "dropped_damaged_bytes": places[3] - places[2]}
 
 
 def test_a_damaged_list_leaves_the_other_tables(tmp_path):
