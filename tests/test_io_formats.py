@@ -243,15 +243,15 @@ def test_aedat2_without_a_camera_takes_the_smallest_and_says_so(tmp_path, record
     """Samples of frames and edges have other bits than events."""
     recording = aedat2_file(tmp_path / "a.aedat", ["#!AER-DAT2.0"], "\r\n", np.array(records))
     assert recording.events.size == size
-    assert recording.metadata["chip"] == (
-        f"assumed: {name}, the smallest camera that has the largest address; choose another with --chip"
+    assert recording.metadata["assumed_chip"] == (
+        f"{name}: the header names no camera, and this is the smallest that has the largest address; --chip"
     )
     recording = open_recording(tmp_path / "a.aedat", chip="Davis640")
-    assert (recording.events.size, "chip" in recording.metadata) == ((640, 480), False)
+    assert (recording.events.size, "assumed_chip" in recording.metadata) == ((640, 480), False)
     with pytest.raises(AmiwarpError, match=r"a\.aedat: .*chip is 'gen4'; expected one of dvs128, davis128, "):
         open_recording(tmp_path / "a.aedat", chip="gen4")
     np.savez(tmp_path / "a.npz", x=[1], y=[1], t=[1], p=[1])
-    with pytest.raises(AmiwarpError, match=r"a\.npz: is no AEDAT 2\.0 file but npz, which needs no chip; leave"):
+    with pytest.raises(AmiwarpError, match=r"a\.npz: is of the format npz, which needs no chip; leave"):
         open_recording(tmp_path / "a.npz", chip="dvs128")
 
 

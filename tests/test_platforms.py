@@ -1,6 +1,7 @@
 """Other platforms, as far as Linux can imitate them: packages that are missing there, and systems without POSIX."""
 
 import contextlib
+import importlib
 import os
 import select
 import signal
@@ -42,6 +43,7 @@ def test_videos_name_the_package_that_they_need(tmp_path, monkeypatch):
 @pytest.fixture
 def no_posix(monkeypatch: pytest.MonkeyPatch) -> None:
     """Remove what Windows lacks, and let open files keep their names, as there."""
+    importlib.import_module("blosc")  # which imports psutil, if installed, whose module for Windows is not here
     for name in ("fcntl", "resource", "termios", "tty", "pty"):
         monkeypatch.setitem(sys.modules, name, None)
     for module, names in (

@@ -142,8 +142,9 @@ def open_aedat2(path: Path, chip: str | None = None) -> Recording:
     events = FileEvents(path, read, size=(camera.width, camera.height), last_time=last)
     imu, notes = _imu(path, offset, events)
     notes |= file_scan.only_counted(events.records, "frames")
-    if assumed:
-        notes["chip"] = assumed
+    if assumed is not None:
+        name, text = assumed.entry
+        notes[name] = text
     metadata = {"format": "aedat2", **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu)
 
@@ -168,8 +169,8 @@ def aedat2_triggers(path: Path) -> Iterator[Packet]:
         yield nothing, nothing, t[at], nothing + 1
 
 
-def _read_aedat2_header(path: Path, given: str | None = None) -> tuple[Chip, int, str]:
-    """Return the camera, the position of the first record, and what was assumed about the camera."""
+def _read_aedat2_header(path: Path, given: str | None = None) -> tuple[Chip, int, file_scan.Assumption | None]:
+    """Return the camera, the position of the first record, and what was assumed about the camera, if anything."""
     with open_input(path) as file:
         head = file.read(HEADER_BYTES + 1)
     if not head.startswith(AEDAT2_MAGIC):
@@ -182,17 +183,17 @@ def _read_aedat2_header(path: Path, given: str | None = None) -> tuple[Chip, int
     if given is not None:
         if given.lower() not in CHIPS:
             raise AmiwarpError(f"chip is '{given[:60]}'; expected one of {', '.join(CHIPS)}")
-        return CHIPS[given.lower()], start, ""
+        return CHIPS[given.lower()], start, None
     if not name:
         guessed = _guessed_chip(path, start)
-        what = f"assumed: {guessed}, the smallest camera that has the largest address; choose another with --chip"
-        return CHIPS[guessed], start, what
+        why = "the header names no camera, and this is the smallest that has the largest address"
+        return CHIPS[guessed], start, file_scan.Assumption("chip", guessed, why, "--chip")
     short = name.rpartition(".")[2].lower()
     chip = next((chip for key, chip in CHIPS.items() if short.startswith(key)), None)
     if chip is None:
         known = ", ".join(CHIPS)
         raise AmiwarpError(f"the header names camera '{name[:60]}'; expected one of {known}; choose one with --chip")
-    return chip, start, ""
+    return chip, start, None
 
 
 def _header_lines(head: bytes, file_bytes: int) -> tuple[list[bytes], int]:

@@ -331,7 +331,7 @@ def open_recording(
         Sensor size (width, height) [px]. It replaces the size in the file.
     chip : str, optional
         Camera of an AEDAT 2.0 file, for example ``dvs128`` or ``davis346``. By default, it is taken from the header; if
-        it is not there, it is guessed from the largest address, and ``metadata["chip"]`` says so.
+        it is not there, it is guessed from the largest address, and ``metadata["assumed_chip"]`` says so.
     sort : bool, default False
         Whether to sort the events by time, up to 33 million. They are then kept in memory.
 
