@@ -52,7 +52,7 @@ def no_posix(monkeypatch: pytest.MonkeyPatch) -> None:
             ("preadv", "pwritev", "posix_fallocate", "sched_getaffinity", "openpty", "fork", "getuid", "set_blocking"),
         ),
         (select, ("poll",)),
-        (signal, ("SIGHUP", "SIGKILL", "pthread_kill")),
+        (signal, ("SIGHUP", "SIGKILL", "pthread_kill", "pthread_sigmask")),
         (socket, ("AF_UNIX",)),
     ):
         for name in names:
