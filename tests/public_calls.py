@@ -275,7 +275,7 @@ OWN: dict[str, dict[str, Any]] = {
     },
     "convert": {"source_path": "in.h5"},
     "EventFilter.apply": {"size": (4, 3)},
-    "filter_recording": {"source_path": "in.h5", "chosen": aw.EventFilter(every=2)},
+    "filter_recording": {"chosen": aw.EventFilter(every=2)},
     "FilterSummary": {
         "events": 2,
         "kept": 1,

@@ -201,7 +201,7 @@ def test_a_file_is_filtered_with_all_that_it_holds(tmp_path: Path, texture: np.n
     first = recording.events.t_first
     result = run(
         "filter", tmp_path / "in.h5", tmp_path / "out.h5", "--window", "0.05:0.15", "--region", "10,20,100,80",
-        "--polarity", "off", "--refractory-us", "500", "--background-ms", "5", "--hot-pixels", "--json",
+        "--only", "off", "--refractory-us", "500", "--background-ms", "5", "--hot-pixels", "--json",
     )  # fmt: skip
     data = json.loads(result.stdout)
     found = open_recording(tmp_path / "out.h5")
@@ -233,6 +233,8 @@ def test_a_file_is_filtered_with_all_that_it_holds(tmp_path: Path, texture: np.n
         assert keys[x, y, t] == point
     assert "window (" in str(found.metadata["filter"])
     assert "background_us 5000" in str(found.metadata["filter"])
+    filter_recording(found, tmp_path / "again.h5", EventFilter(every=2))
+    assert str(open_recording(tmp_path / "again.h5").metadata["filter"]).endswith("background_us 5000; then every 2")
 
 
 def test_other_formats_and_lines_of_text(tmp_path: Path) -> None:
@@ -246,14 +248,30 @@ def test_other_formats_and_lines_of_text(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.h5", "out.raw"]
     (tmp_path / "mine.raw").write_text("mine")
     with pytest.raises(AmiwarpError, match="exists"):
-        filter_recording(tmp_path / "in.h5", tmp_path / "mine.raw", EventFilter(every=2))
+        filter_recording(open_recording(tmp_path / "in.h5"), tmp_path / "mine.raw", EventFilter(every=2))
+
+
+def test_a_table_is_filtered_with_the_options_for_its_layout(tmp_path: Path) -> None:
+    lines = "".join(f"{k},{k % 9},{k % 7},{k % 2}\n" for k in range(100))
+    (tmp_path / "a.csv").write_text("when,column,line,sign\n" + lines)
+    columns = ("--columns", "t=when,x=column,y=line,p=sign", "--time-unit", "ms", "--size", "9x7")
+    result = run("filter", tmp_path / "a.csv", tmp_path / "out.h5", "--window", "0.02:0.05", *columns)
+    assert result.exit_code == 0, result.output
+    found = open_recording(tmp_path / "out.h5")
+    assert found.events.slice(0, 99).t.tolist() == list(range(20_000, 50_000, 1000))
+    assert found.events.size == (9, 7)
+    same = EventFilter(hot_pixels=HOT)
+    assert same == EventFilter(hot_pixels=~HOT)  # compared without the arrays
+    assert hash(same) == hash(EventFilter())
 
 
 def test_a_filter_that_keeps_nothing_or_says_nothing_leaves_no_file(tmp_path: Path) -> None:
     save_recording(tmp_path / "in.h5", Recording(MemoryEvents(some_events(), WIDTH, HEIGHT)))
     result = run("filter", tmp_path / "in.h5", tmp_path / "out.h5", "--window", "5:6")
     assert result.exit_code == 1
-    assert "keeps none of 3,000 events" in " ".join(result.stderr.split())
+    assert "in: the filter keeps none of 3,000 events" in " ".join(result.stderr.split())
+    result = run("filter", tmp_path / "in.h5", tmp_path / "out.raw", "--window", "5:6")
+    assert "in: the filter keeps none of 3,000 events" in " ".join(result.stderr.split())
     result = run("filter", tmp_path / "in.h5", tmp_path / "out.h5")
     assert "no filter is chosen" in " ".join(result.stderr.split())
     result = run("filter", tmp_path / "in.h5", tmp_path / "out.h5", "--region", "0,0,2.5,4")

@@ -6,10 +6,12 @@ from pathlib import Path
 import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from faery.extension import aedat
 
 from amiwarp import AmiwarpError, Events, MemoryEvents, Recording, convert, open_recording, save_recording
 from amiwarp.io import aedat4, read_encoder_triggers
+from amiwarp.io.aedat4 import Clock, Compression, _Decompressor
 from reference.aedat4_files import (
     COMPRESSIONS,
     DOUBLE,
@@ -179,6 +181,33 @@ def test_other_records_follow_the_clock(tmp_path):
         assert recording.imu is not None
         assert (recording.imu.t - last).tolist() == [-2000, -1000, -10, 990, 1990]
         assert (read_encoder_triggers(tmp_path / "a.aedat4").t - last).tolist() == [-5000, 0, 5000]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_step_back_at_the_end_of_a_batch_is_decided_by_the_next_one(count):
+    """Of wrong times the next events know nothing; behind a restart they go on."""
+    earlier = 5_000_000 + np.arange(100)
+    wrong = np.concatenate([earlier, 1000 + np.arange(count)])
+    clock = Clock()
+    clock.shift_all(wrong.copy(), [0], [10])
+    later = 5_000_100 + np.arange(100)
+    clock.shift_all(later, [0], [20])
+    assert clock.restarts == []
+    assert later.tolist() == (5_000_100 + np.arange(100)).tolist()
+
+    clock = Clock()
+    clock.shift_all(wrong.copy(), [0], [10])
+    behind = 1000 + count + np.arange(100)
+    clock.shift_all(behind, [0], [20])
+    assert [place for place, _ in clock.restarts] == [20]
+    assert behind.tolist() == (5_000_099 + count + np.arange(100)).tolist()
+
+
+def test_a_black_frame_that_zstandard_has_compressed_is_whole():
+    black = bytes(640 * 480)
+    packed = zstandard.ZstdCompressor().compress(black)
+    assert len(packed) < 100
+    assert _Decompressor(Compression.ZSTD)(packed) == black
 
 
 @pytest.mark.parametrize("at", [1, 250, 299])

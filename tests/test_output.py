@@ -399,7 +399,9 @@ CALLS: dict[str, Callable[[Path, Any], object]] = {
     "Trajectory.save_tum": lambda path, _: amiwarp.Trajectory.still([0, 0, 0], look_at=[0, 1, 0]).save_tum(path),
     "compensate": lambda path, given: amiwarp.compensate(given.recording, given.calibration, path),
     "convert": lambda path, _: amiwarp.convert("a.h5", path),
-    "filter_recording": lambda path, _: amiwarp.filter_recording("a.h5", path, amiwarp.EventFilter(every=2)),
+    "filter_recording": lambda path, _: amiwarp.filter_recording(
+        open_recording("a.h5"), path, amiwarp.EventFilter(every=2)
+    ),
     "save_camera": lambda path, given: amiwarp.save_camera(path, given.simulation.camera),
     "save_flow_dsec": lambda path, given: amiwarp.save_flow_dsec(path, given.frames),
     "save_flow_mvsec": lambda path, given: amiwarp.save_flow_mvsec(path, given.frames),

@@ -432,7 +432,7 @@ def test_unknown_values_are_grey_and_counted(inspector: Inspector, recording: Re
     assert unknown_rows(shown, Colour.TIME) == ()
     # both clouds compensated
     both = inspector.show(against=replace(true_knobs(recording), apex=math.radians(2.5)))
-    assert "on the left" in unknown_rows(both, colour)[0][1]
+    assert "of the first cloud" in unknown_rows(both, colour)[0][1]
 
 
 @pytest.mark.parametrize(("width", "tolerance"), [(0.3, 0.3), (1.0, 0.05), (2.0, 0.05), (3.0, 0.1), (5.0, 0.2)])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -38,7 +39,8 @@ def without_start_burst(recording: Recording) -> tuple[Recording, tuple[str, ...
         f"{count:,} events carry the first time stamp ({source.t_first} us), far more than any later one, as cameras "
         "emit when they start: they were left out of the calibration"
     )
-    return replace(recording, events=later), (said,)
+    # The ground truth has a value for each event of the whole recording. Calibration does not use it.
+    return replace(recording, events=later, truth=None), (said,)
 
 
 def burst_size(source: EventSource) -> int:
@@ -78,8 +80,8 @@ class LaterEvents(EventSource):
     def __len__(self) -> int:
         return len(self.source) - self.first
 
-    @property
-    def t_first(self) -> int:
+    @cached_property
+    def t_first(self) -> int:  # type: ignore[override]  # reading it may take a pass over a file
         return int(self.source.slice(self.first, self.first + 1).t[0])
 
     @property

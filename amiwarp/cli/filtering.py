@@ -34,7 +34,7 @@ class FilterOptions:
         _in_filter(help="Keep the events of a part of the image (px). Right and bottom are exclusive.",
                    metavar="LEFT,TOP,RIGHT,BOTTOM"),
     ] = None  # fmt: skip
-    polarity: Annotated[Literal["on", "off"] | None, _in_filter(help="Keep the events of one polarity.")] = None
+    only: Annotated[Literal["on", "off"] | None, _in_filter(help="Keep the events of one polarity.")] = None
     hot_pixels: Annotated[
         bool,
         _in_filter("--hot-pixels", help="Remove and list pixels that fire far more often than those around them."),
@@ -62,6 +62,7 @@ def run_filter(
     ],
     *,
     parts: FilterOptions,
+    layout: cli.FileOptions,
     format: cli.Format = None,
     topic: cli.Topic = None,
     common: cli.Common,
@@ -76,7 +77,7 @@ def run_filter(
     began = time.perf_counter()
     if parts == FilterOptions():
         raise AmiwarpError("no filter is chosen; give --window, --background-ms or another one, see --help")
-    recording = open_recording(source, topic=topic)
+    recording = open_recording(source, topic=topic, **layout.given())
     events = recording.events
     background_us = 0
     if parts.background_ms is not None:
@@ -84,7 +85,7 @@ def run_filter(
     chosen = EventFilter(
         window=None if parts.window is None else cli.span(parts.window, events.t_first, events.t_last),
         region=None if parts.region is None else _region(parts.region),
-        polarity=None if parts.polarity is None else int(parts.polarity == "on"),
+        polarity=None if parts.only is None else int(parts.only == "on"),
         hot_pixels=find_hot_pixels(events, events.size) if parts.hot_pixels else None,
         refractory_us=parts.refractory_us,
         background_us=background_us,
@@ -92,7 +93,7 @@ def run_filter(
         every=parts.every,
     )
     with cli.progress("filtering") as advance:
-        summary = filter_recording(source, out, chosen, topic=topic, format=format, progress=advance)
+        summary = filter_recording(recording, out, chosen, format=format, progress=advance)
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {"file": str(out), **asdict(summary), "seconds": seconds}
     cli.report(common, data, _lines(data))

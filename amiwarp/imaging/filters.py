@@ -18,7 +18,7 @@ from amiwarp.events.truth import EventTruth
 from amiwarp.io import formats
 from amiwarp.io.export import convert
 from amiwarp.io.files import check_output, scratch_folder
-from amiwarp.io.formats import OutputFormat, open_recording
+from amiwarp.io.formats import OutputFormat
 from amiwarp.io.native_format import RecordingWriter, copy_records
 from amiwarp.kernels import events as event_kernels
 from amiwarp.kernels.launch import launch, load
@@ -54,7 +54,7 @@ class EventFilter:
     """Left, top, right and bottom of the kept part of the image [px]. Right and bottom are exclusive."""
     polarity: int | None = None
     """The kept polarity: 1 for ON, 0 for OFF."""
-    hot_pixels: NDArray[np.bool_] | None = None
+    hot_pixels: NDArray[np.bool_] | None = field(default=None, compare=False)
     """Pixels whose events are removed, shape ``(height, width)``, as :func:`find_hot_pixels` returns them."""
     refractory_us: int = 0
     """Time after a kept event in which further events of its pixel are removed [us]."""
@@ -347,11 +347,10 @@ class FilterSummary:
 
 @guarded
 def filter_recording(
-    source_path: str | os.PathLike[str],
+    recording: Recording,
     out_path: str | os.PathLike[str],
     chosen: EventFilter,
     *,
-    topic: str | None = None,
     format: OutputFormat | str | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
@@ -362,14 +361,12 @@ def filter_recording(
 
     Parameters
     ----------
-    source_path : str or path-like
-        The recording to read, in any supported format.
+    recording : Recording
+        The recording, in memory or opened with :func:`open_recording`.
     out_path : str or path-like
         The file to write. Its extension gives the format, see :class:`OutputFormat`.
     chosen : EventFilter
         Which events are kept.
-    topic : str, optional
-        The topic or camera to read, if the input holds several, see :func:`open_recording`.
     format : OutputFormat or str, optional
         The format to write, if not that of the extension.
     progress : callable, optional
@@ -385,19 +382,18 @@ def filter_recording(
     Raises
     ------
     AmiwarpError
-        If the input cannot be read, no event is kept, or the output cannot be written. Then no output remains.
+        If no event is kept, or the output cannot be written. Then no output remains.
 
     Examples
     --------
     >>> events = amiwarp.Events.from_arrays(x=[1, 2, 2], y=[0, 0, 0], t=[0, 10, 20], p=[1, 0, 1])
-    >>> amiwarp.save_recording("noisy.h5", amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4)))
-    >>> amiwarp.filter_recording("noisy.h5", "calm.h5", amiwarp.EventFilter(refractory_us=15)).removed
+    >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4))
+    >>> amiwarp.filter_recording(recording, "calm.h5", amiwarp.EventFilter(refractory_us=15)).removed
     {'refractory_us': 1}
     """
     out_path = Path(out_path)
     check_output(out_path, overwrite=overwrite)
     output = formats.output_format(out_path, format)
-    recording = open_recording(source_path, topic=topic)
     if output is OutputFormat.NATIVE:
         return _write_kept(recording, out_path, chosen, progress, overwrite)
     # Other formats are converted from amiwarp's.
@@ -415,6 +411,7 @@ def _write_kept(
     running = RunningFilter(chosen, source.size)
     truth = recording.truth
     about = {name: value for name, value in recording.metadata.items() if name != "format"}
+    earlier = [str(about["filter"])] if "filter" in about else []
     start = 0
     kept_times: list[int] = []
     with RecordingWriter(
@@ -424,7 +421,7 @@ def _write_kept(
         camera=recording.camera,
         prism=recording.prism,
         encoder=recording.encoder,
-        metadata={**about, "filter": described(chosen)},
+        metadata={**about, "filter": "; then ".join([*earlier, described(chosen)])},
         overwrite=overwrite,
         truth_parameters=None if truth is None else truth.parameters,
         truth_labels=None if truth is None else truth.labels,
@@ -441,7 +438,9 @@ def _write_kept(
             if progress is not None:
                 progress("filtering events", start / len(source))
         if not len(writer):
-            raise AmiwarpError(f"{path}: the filter keeps none of {len(source):,} events; choose less strict values")
+            raise AmiwarpError(
+                f"{recording.name}: the filter keeps none of {len(source):,} events; choose less strict values"
+            )
         copy_records(recording, writer)
         if recording.frames is not None:
             for index, t in enumerate(recording.frames.t.tolist()):

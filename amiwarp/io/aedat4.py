@@ -35,6 +35,8 @@ MAGIC = b"#!AER-DAT4.0\r\n"
 
 HEADER_BYTES = 1 << 24
 """Longest header that is read [bytes]."""
+LARGEST_FRAME = 1 << 24
+"""Content of a small packet up to which Zstandard is undone [bytes]: a black frame gains any factor."""
 LARGEST_PACKET = 1 << 28
 """Largest packet that is read, before and after its compression is undone [bytes]."""
 BATCH_BYTES = 1 << 21
@@ -49,6 +51,8 @@ RESTART_US = 100_000
 """Least step back of the time that can be a restart of the camera's clock [us]."""
 RESTART_EVENTS = 64
 """Number of events before and behind a restart whose times are compared."""
+LEAST_BEHIND = 3
+"""Fewest events behind a step back that decide whether the clock has started again."""
 MOST_RESTARTS = 100
 """Largest number of restarts. With more steps back, the times are damaged, and are left as they are."""
 
@@ -292,12 +296,12 @@ class _Decompressor:
 
     def __call__(self, data: bytes | memoryview) -> bytes | None:
         """Return the content of a packet, or None if it is damaged or too large."""
-        # More than LZ4 can gain. Events of a camera gain a twentieth of it.
-        most = min(LARGEST_PACKET, 256 * len(data) + (1 << 16))
         if self._compression is Compression.NONE:
             return bytes(data)
         if self._compression in (Compression.ZSTD, Compression.ZSTD_HIGH):
-            return _undo_zstd(data, most)
+            return _undo_zstd(data, min(LARGEST_PACKET, 256 * len(data) + LARGEST_FRAME))
+        # More than LZ4 can gain. Events of a camera gain a twentieth of it.
+        most = min(LARGEST_PACKET, 256 * len(data) + (1 << 16))
         try:
             content = self._undo_lz4(data, most)
         except (RuntimeError, MemoryError):
@@ -547,6 +551,8 @@ class Clock:
     """Positions of the packets in which the clock starts again, and what is added to the times from there on [us]."""
     _last: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """Latest times, as stored [us]."""
+    _is_open: bool = False
+    """Whether too few events follow the last step back to decide what it is."""
 
     @property
     def shift(self) -> int:
@@ -559,7 +565,7 @@ class Clock:
         ``places`` are the positions of their packets, ``starts`` the index of the first event of each.
         """
         count = self._last.size
-        if bool((t[1:] < t[:-1]).any()) or (count and self._last[-1] > t[0]):
+        if self._is_open or bool((t[1:] < t[:-1]).any()) or (count and self._last[-1] > t[0]):
             stored = np.concatenate([self._last, t])
             back = np.flatnonzero(stored[1:] < stored[:-1] - RESTART_US) + 1
         else:
@@ -568,15 +574,22 @@ class Clock:
         last = stored[-RESTART_EVENTS:].copy()
         if self.shift:
             t += self.shift
-        for at in back[back >= count].tolist() if back.size <= MOST_RESTARTS else ():
+        self._is_open = False
+        # A step just before the end of the last call was not decided then.
+        undecided = max(count - LEAST_BEHIND + 1, 0)
+        for at in back[back >= undecided].tolist() if back.size <= MOST_RESTARTS else ():
+            if stored.size - at < LEAST_BEHIND:
+                self._is_open = True
+                break
             before = np.sort(stored[max(at - RESTART_EVENTS, 0) : at])
             behind = np.sort(stored[at : at + RESTART_EVENTS])
             shift = self.shift + int(stored[at - 1]) - int(stored[at])
             # Times in the middle: a single wrong one changes them little.
             step = int(behind[behind.size // 2]) - int(before[(before.size - 1) // 2])
             if step < -RESTART_US and shift < TIME_LIMIT and len(self.restarts) < MOST_RESTARTS:
-                self.restarts.append((places[bisect.bisect_right(starts, at - count) - 1], shift))
-                t[at - count :] = stored[at:] + shift
+                first = max(at - count, 0)
+                self.restarts.append((places[bisect.bisect_right(starts, first) - 1], shift))
+                t[first:] = stored[count + first :] + shift
         self._last = last
 
 

@@ -345,18 +345,21 @@ def _known_part(shown: DisplayedWindow, colour: Colour) -> tuple[slice, slice]:
 def unknown_rows(shown: DisplayedWindow, colour: Colour) -> tuple[tuple[str, str], ...]:
     """Return the row of the legend that counts the drawn events whose density or residual is unknown.
 
-    The model moves them out of the image or the region. Returns no row if there are none.
+    A model moves them out of the image or the region. Returns no row if there are none.
     """
     if colour not in (Colour.DENSITY, Colour.RESIDUAL):
         return ()
-    part = _known_part(shown, colour)
-    on_left, on_right = (
-        int(np.count_nonzero(np.isfinite(xy).all(axis=1) & outside(xy, *part)))
-        for xy in (shown.first.before, shown.after)
-    )
-    if on_left:
-        return ((LIGHT_GREY, f"unknown: {on_left:,} on the left, {on_right:,} on the right"),)
-    return ((LIGHT_GREY, f"unknown: {on_right:,} events"),) if on_right else ()
+    first = _count_outside(shown.first.before, _known_part(shown.first, colour))
+    second = _count_outside(shown.after, _known_part(shown, colour))
+    if first:
+        return ((LIGHT_GREY, f"unknown: {first:,} of the first cloud, {second:,} of the second"),)
+    return ((LIGHT_GREY, f"unknown: {second:,} events"),) if second else ()
+
+
+def _count_outside(xy: NDArray[np.float32], part: tuple[slice, slice]) -> int:
+    """Return the number of points that are drawn, and lie outside rows and columns of an image."""
+    drawn = np.isfinite(xy).all(axis=1)
+    return int(np.count_nonzero(drawn & outside(xy, *part)))
 
 
 def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | None:
