@@ -81,7 +81,7 @@ class LaterEvents(EventSource):
         return len(self.source) - self.first
 
     @cached_property
-    def t_first(self) -> int:  # type: ignore[override]  # reading it may take a pass over a file
+    def t_first(self) -> int:  # reading it may take a pass over a file
         return int(self.source.slice(self.first, self.first + 1).t[0])
 
     @property
