@@ -398,7 +398,7 @@ def test_doubt_names_the_option(tmp_path: Path, name: str) -> None:
         ({"size": (640, 0)}, "height of size"),
         ({"scale_xy": 32}, "no multiple of 32; give another --scale-xy"),
         ({"chip": "DVS128"}, "needs no chip; leave out --chip"),
-        ({"size": (320, 240)}, r"lie outside the frame \(320, 240\)"),
+        ({"size": (320, 240)}, r"lie outside the 320x240 frame"),
     ],
 )
 def test_options_that_do_not_fit(tmp_path: Path, options: dict[str, Any], message: str) -> None:
@@ -558,3 +558,22 @@ def test_real_matlab_file(data_dir: Path) -> None:
     assert (recording.events.size, len(events)) == ((240, 180), 120_000)
     for name, expected in (("t", np.rint(t * 1e6)), ("x", x), ("y", y), ("p", p)):
         np.testing.assert_array_equal(getattr(events, name), expected, err_msg=name)
+
+
+@pytest.mark.parametrize("start", [1_700_000_000_000_000_000, 1_700_000_000_000])
+def test_times_since_1970_in_a_layout_of_microseconds_are_in_doubt(tmp_path, start):
+    """Nanoseconds in amiwarp's own layout, and milliseconds in a table, are not taken for microseconds."""
+    t = start + np.arange(300) * 300
+    x = np.arange(300) % 64
+    nanoseconds = start > 10**15
+    if nanoseconds:
+        np.savez(tmp_path / "a.npz", x=x, y=x, t=t, p=x % 2)
+        path = tmp_path / "a.npz"
+    else:
+        path = tmp_path / "a.csv"
+        np.savetxt(path, np.c_[t, x, x, x % 2], "%d", ",", header="t,x,y,p", comments="")
+    with pytest.raises(AmiwarpError, match=r"since 1970.*--time-unit"):
+        open_recording(path)
+    read = open_recording(path, time_unit="ns" if nanoseconds else "ms").events
+    factor = 0.001 if nanoseconds else 1000
+    assert read.t_last - read.t_first == pytest.approx(299 * 300 * factor, abs=1)

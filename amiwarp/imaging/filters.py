@@ -21,7 +21,7 @@ from amiwarp.io.files import check_output, scratch_folder
 from amiwarp.io.formats import OutputFormat
 from amiwarp.io.native_format import RecordingWriter, copy_records
 from amiwarp.kernels import events as event_kernels
-from amiwarp.kernels.launch import launch, load
+from amiwarp.kernels.launch import launch, load, start_once
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.tasks import Progress
 from amiwarp.validation import TIME_LIMIT, guarded, real, vector, whole
@@ -130,6 +130,7 @@ class RunningFilter:
     """Number of events so far that reached the last part, ``every``."""
 
     def __post_init__(self) -> None:
+        start_once()
         width, height = vector(self.size, 2, "size of the sensor", _side)
         self.size = width, height
         self._hot_counts = np.zeros((height, width), np.int64)
@@ -313,6 +314,7 @@ def find_hot_pixels(events: Events | EventSource, size: tuple[int, int]) -> NDAr
     >>> np.argwhere(amiwarp.find_hot_pixels(events, (16, 12))).tolist()
     [[4, 5]]
     """
+    start_once()
     width, height = vector(size, 2, "size of the sensor", _side)
     count = np.zeros(height * width, np.int32)
     for block in [events] if isinstance(events, Events) else events.blocks():

@@ -518,6 +518,8 @@ MOST_PER_US = 1000
 """Largest rate of events that is plausible [1/us]."""
 EPOCH_NS, EPOCH_US = (10**17, 4 * 10**18), (10**14, 4 * 10**15)
 """Ranges of times since 1970, from 1973 to 2096 [ns, us]."""
+EPOCH_MS = 10**12, 4 * 10**12
+"""Range of times since 1970, from 2001 to 2096 [ms]. As microseconds they are weeks after the start of a camera."""
 
 
 def _find_unit(column: Column, given: GivenLayout, hints: Hints) -> tuple[str, str | None]:
@@ -525,9 +527,12 @@ def _find_unit(column: Column, given: GivenLayout, hints: Hints) -> tuple[str, s
     if given.time_unit is not None:
         return given.time_unit, None
     named = role_of(column.name)[1] if column.name else None
-    stated = column.unit or named or hints.unit
+    stated = column.unit or named
     if stated is not None:
         return stated, None
+    if hints.unit is not None:
+        _check_promised_unit(column.values, hints.unit)
+        return hints.unit, None
     t = column.values
     known = t[np.isfinite(t) & (np.abs(t) < TIME_LIMIT)] if t.dtype.kind == "f" else t
     if not known.size:
@@ -535,6 +540,16 @@ def _find_unit(column: Column, given: GivenLayout, hints: Hints) -> tuple[str, s
     if known.dtype.kind == "f" and (known != np.floor(known)).any():
         return _unit_of_fractions(known, hints)
     return _unit_of_whole(known)
+
+
+def _check_promised_unit(t: NDArray[Any], unit: str) -> None:
+    """Raise :class:`AmiwarpError` if times that a format promises in us or s are those of nanoseconds since 1970."""
+    whole = t.dtype.kind in "iu" and t.size > 0
+    if whole and unit != "ns" and EPOCH_NS[0] <= int(t.min()) and int(t.max()) <= EPOCH_NS[1]:
+        raise AmiwarpError(
+            f"times from {int(t.min())} are those of nanoseconds since 1970, but this layout has {unit}; give the unit "
+            "with --time-unit ns, or us if that is right"
+        )
 
 
 def _unit_of_fractions(t: NDArray[Any], hints: Hints) -> tuple[str, str | None]:
@@ -553,6 +568,11 @@ def _unit_of_fractions(t: NDArray[Any], hints: Hints) -> tuple[str, str | None]:
 def _unit_of_whole(t: NDArray[Any]) -> tuple[str, str]:
     """Return the unit of times that are whole numbers, and why."""
     low, high = int(t.min()), int(t.max())
+    if EPOCH_MS[0] <= low and high <= EPOCH_MS[1]:
+        raise AmiwarpError(
+            f"the unit of time is in doubt: times from {low} may be milliseconds since 1970, or microseconds; give it "
+            "with --time-unit ms or us"
+        )
     for unit, (first, last) in (("ns", EPOCH_NS), ("us", EPOCH_US)):
         if first <= low and high <= last:
             return unit, "times are whole numbers, as those since 1970"

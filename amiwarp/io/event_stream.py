@@ -43,7 +43,9 @@ def _packets(path: Path, atis: bool, height: int, notes: dict[str, int]) -> Iter
 
     from amiwarp.kernels.event_stream import EVENT_BYTES, Progress, decode_stream
     from amiwarp.kernels.evt import EventArrays
-    from amiwarp.kernels.launch import load
+    from amiwarp.kernels.launch import load, start_once
+
+    start_once()
 
     load(decode_stream, wp.get_device("cpu"))
     now = 0

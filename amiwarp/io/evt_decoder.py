@@ -69,7 +69,9 @@ class EvtDecoder:
         import warp as wp
 
         from amiwarp.kernels import evt
-        from amiwarp.kernels.launch import launch, load
+        from amiwarp.kernels.launch import launch, load, start_once
+
+        start_once()
 
         device = wp.get_device(self.device)
         if isinstance(words, np.ndarray):

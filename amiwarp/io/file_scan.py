@@ -420,7 +420,9 @@ class FileEvents(EventSource):
         import warp as wp
 
         from amiwarp.kernels.event_order import Survey, raise_times, survey_events
-        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.launch import launch, start_once
+
+        start_once()
 
         if not len(events):
             return True

@@ -291,8 +291,10 @@ def _plain_table(text: bytes, form: TextForm) -> NDArray[np.float64] | None:
         return None
     import warp as wp
 
-    from amiwarp.kernels.launch import launch
+    from amiwarp.kernels.launch import launch, start_once
     from amiwarp.kernels.text_numbers import MOST_DIGITS, read_numbers
+
+    start_once()
 
     blocks = -(-len(ends) // THREAD_LINES)
     values = wp.empty((form.width, len(ends)), dtype=wp.float64, device="cpu")

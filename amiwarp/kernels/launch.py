@@ -466,6 +466,12 @@ def start_quietly() -> list[str]:
     return [device.alias for device in wp.get_devices()]
 
 
+@cache
+def start_once() -> None:
+    """Initialise Warp as :func:`start_quietly` does, at the first call. For readers, which no device was chosen for."""
+    start_quietly()
+
+
 @contextlib.contextmanager
 def _without(line: str) -> Iterator[None]:
     """Print what native code writes to stderr, except for one expected line."""
