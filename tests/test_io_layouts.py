@@ -489,6 +489,12 @@ def test_openmv(tmp_path: Path) -> None:
     assert assumptions_of(recording.metadata)[0].value == "type s ms us x y"
 
 
+def test_text_has_no_columns_of_openmv(tmp_path: Path) -> None:
+    path = made(tmp_path, lines(openmv(P)))
+    with pytest.raises(AmiwarpError, match=r"has 6 columns without names; say which are which with --columns"):
+        open_recording(path)
+
+
 def test_events_in_the_order_of_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     order = np.lexsort((T, X))
     path = made(tmp_path, lines(np.c_[T, X, Y, P][order], separator=",", head="t,x,y,p\n"))

@@ -170,6 +170,8 @@ class Hints:
     """Unit of times with fractions that the format promises."""
     compensated: bool = False
     """Whether x and y with fractions are those of compensated events."""
+    is_text: bool = False
+    """Whether the file is text, which OpenMV does not write."""
 
 
 Coding: TypeAlias = Mapping[int, bool]
@@ -305,7 +307,7 @@ def find_layout(columns: Sequence[Column], given: GivenLayout, hints: Hints) -> 
     given.check()
     if columns and not any(column.values.size for column in columns):
         raise AmiwarpError("holds no events; give another recording")
-    if _is_openmv(columns) and given.columns is None:
+    if _is_openmv(columns) and given.columns is None and not hints.is_text:
         return _openmv_layout()
     roles, assumptions = _find_roles(columns, given, hints)
     chosen = {role: columns[at] for role, at in roles.items()}

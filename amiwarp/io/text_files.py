@@ -167,7 +167,9 @@ def _find_text_layout(head: bytes, form: TextForm, given: GivenLayout) -> Layout
     columns = [Column(names[at] if names else None, _whole_if_possible(values)) for at, values in enumerate(numbers.T)]
     if names is not None and not any(names):
         columns = [replace(column, name=None) for column in columns]
-    hints = Hints(order=ROLES, fractions="s") if names is None else Hints()
+    hints = Hints(is_text=True)
+    if names is None:
+        hints = replace(hints, order=ROLES, fractions="s")
     layout = find_layout(columns, given, hints)
     t_words = [words[layout.columns["t"]] for words in rows]
     in_decimals = all(SECONDS.fullmatch(word) for word in t_words) and _can_be_seconds(numbers[:, layout.columns["t"]])
