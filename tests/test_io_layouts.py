@@ -177,6 +177,18 @@ LAYOUTS: dict[str, tuple[Maker, dict[str, Any]]] = {
     "npz: arr_0 of seconds": (archive(np.c_[X, Y, SECONDS, SIGNED]), {}),
     "npz: one array of any name": (archive(dvs=np.c_[X, Y, T, P]), {}),
     "npz: names by option": (archive(a=X, b=Y, c=T, d=P, e=np.eye(2)), {"columns": "t=c,x=a,y=b,p=d"}),
+    "npz: text and objects beside": (
+        archive(xs=X, ys=Y, ts=T, ps=P, sensor="davis", names=np.array(["a", "b"]), notes=np.array([{}, None])), {},
+    ),
+    "npz: text beside names by option": (
+        archive(a=X, b=Y, c=T, d=P, label=np.array(["u", "v"])), {"columns": "t=c,x=a,y=b,p=d"},
+    ),
+    "npz: order by option beside other arrays": (
+        archive(events=np.c_[T, Y, X, P], K=np.eye(3), D=np.zeros(5), index=np.arange(4)), {"columns": "t,y,x,p"},
+    ),
+    "npz: names by option beside events": (
+        archive(events=np.zeros((N, 4)), a=X, b=Y, c=T, d=P), {"columns": "t=c,x=a,y=b,p=d"},
+    ),
     "npz: floating t": (archive(x=X, y=Y, t=SECONDS, p=P), {}),
     "npy by columns": (array(np.asfortranarray(ROWS)), {}),
     "npy by rows": (array(np.c_[X, Y, P, T].astype("<u4")), {}),
@@ -362,6 +374,7 @@ REFUSED: dict[str, tuple[Maker, str]] = {
     ),
     "two small columns": (array(np.c_[T % 2, P, T % 2, P]), r"order of t, x, y and p is in doubt .* --columns"),
     "names that do not fit": (lines(ROWS, separator=",", head="t,x,y,p,label\n"), r"names 5 columns .* rows have 4"),
+    "text as polarity": (archive(xs=X, ys=Y, ts=T, ps=WORDS), r"array ps is <U5; expected integers"),
     "columns of other lengths": (hdf5(x=X, y=Y[:5], t=T, p=P), r"columns of events differ in length"),
     "two sets of columns": (
         hdf5(a__x=X, a__y=Y, a__t=T, a__p=P, b__x=X, b__y=Y, b__t=T, b__p=P),

@@ -29,12 +29,14 @@ from amiwarp.io.columns import (
     Layout,
     check_duration,
     find_layout,
+    given_roles,
+    is_wanted,
     names_roles,
     role_of,
 )
 from amiwarp.io.file_scan import SENSORS, FileEvents, Packet
 from amiwarp.io.files import errors_name, input_path, open_input
-from amiwarp.io.plain_files import Array, array_header, lengths, next_rows, open_any_array, open_array
+from amiwarp.io.plain_files import Array, array_header, is_of_kind, lengths, next_rows, open_any_array, open_array
 from amiwarp.io.reading_process import packets, run_with_arrays
 
 Pieces: TypeAlias = Callable[[tuple[int, ...], dict[str, int]], Iterator[tuple[NDArray[Any], ...]]]
@@ -145,13 +147,15 @@ def _npz_table(path: Path, names: Sequence[str], given: GivenLayout) -> Table:
         archive = stack.enter_context(zipfile.ZipFile(input_path(path)))
         return stack.enter_context(open_any_array(archive, name, KINDS))
 
-    if given.columns is not None and len(names) >= len(ROLES):
-        return _arrays_table(names, opened)
-    if set(ROLES) <= set(names):
+    wanted = () if given.columns is None else tuple(given_roles(given.columns).values())
+    named = names_roles(names)
+    if given.columns is None and set(ROLES) <= set(names):
         return _own_table(opened)
-    if names_roles(names):
-        return _arrays_table(names, opened)
     whole = [name for name in WHOLE_EVENTS if name in names] or (list(names) if len(names) == 1 else [])
+    arrays_are_wanted = all(any(is_wanted(name, [each]) for name in names) for each in wanted)
+    several_by_option = given.columns is not None and len(names) >= len(ROLES) and (arrays_are_wanted or not whole)
+    if named or several_by_option:
+        return _arrays_table(_readable(path, names, wanted), opened)
     if not whole:
         missing = ", ".join(name for name in "xytp" if name not in names)
         listed = ", ".join(names)[:300] or "none"
@@ -161,6 +165,16 @@ def _npz_table(path: Path, names: Sequence[str], given: GivenLayout) -> Table:
         )
     promised = Hints(order=ROLES, fractions="s") if whole[0] == "events" else Hints()
     return _array_table(partial(opened, whole[0]), f"array {whole[0]}", promised)
+
+
+def _readable(path: Path, names: Sequence[str], wanted: Sequence[str]) -> list[str]:
+    """Return the names of an archive's arrays without those of text or objects, unless events are expected there."""
+    with zipfile.ZipFile(input_path(path)) as archive:
+        return [
+            name
+            for name in names
+            if role_of(name)[0] is not None or is_wanted(name, wanted) or is_of_kind(archive, name, KINDS)
+        ]
 
 
 OpenedByName: TypeAlias = Callable[[str, contextlib.ExitStack], tuple[Array, bool]]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeAlias
 
@@ -83,6 +83,11 @@ def given_roles(text: str) -> dict[str, str]:
             "order in the file, such as x,y,p,t (- for a column without use)"
         )
     return roles
+
+
+def is_wanted(name: str, wanted: Collection[str]) -> bool:
+    """Return whether a column of this name, with or without its groups, is among the wanted names."""
+    return name in wanted or name.rpartition("/")[2] in wanted
 
 
 def given_polarity(text: str) -> dict[int, bool]:

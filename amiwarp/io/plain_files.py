@@ -139,28 +139,51 @@ def open_array(archive: zipfile.ZipFile, name: str, kinds: str = "iub") -> Itera
 @contextlib.contextmanager
 def open_any_array(archive: zipfile.ZipFile, name: str, kinds: str) -> Iterator[tuple[Array, bool]]:
     """Open an array of the archive as :func:`open_array`, also one that is stored by columns. Yield whether it is."""
+    with _stored_array(archive, name) as (stream, file_bytes):
+        yield array_header(stream, f"array {name}", file_bytes, kinds)
+
+
+def is_of_kind(archive: zipfile.ZipFile, name: str, kinds: str) -> bool:
+    """Return whether an array of the archive has a type of these kinds, without objects."""
+    with _stored_array(archive, name) as (stream, _):
+        _, _, dtype = _read_header(stream, f"array {name}")
+        return _has_kind(dtype, kinds)
+
+
+@contextlib.contextmanager
+def _stored_array(archive: zipfile.ZipFile, name: str) -> Iterator[tuple[IO[bytes], int]]:
+    """Open an array of the archive at its header. Yield the stream, and its length [bytes]."""
     about = archive.getinfo(f"{name}.npy")
     if about.compress_type not in PACKED:
         raise AmiwarpError(
             f"array {name} is compressed by method {about.compress_type}; save the array with numpy.savez"
         )
     with archive.open(about) as stream:
-        yield array_header(stream, f"array {name}", about.file_size, kinds)
+        yield stream, about.file_size
 
 
 def array_header(stream: IO[bytes], name: str, file_bytes: int, kinds: str) -> tuple[Array, bool]:
     """Read the header of an array of ``file_bytes`` bytes, and check it. Return whether it is stored by columns."""
-    version = npy.read_magic(stream)
-    read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
-    if read is None:
-        raise AmiwarpError(f"{name} has a header of version {version}; expected 1.0 or 2.0")
-    shape, by_columns, dtype = read(stream)
-    # Object arrays would be unpickled, which is unsafe.
-    if dtype.hasobject or dtype.kind not in kinds:
+    shape, by_columns, dtype = _read_header(stream, name)
+    if not _has_kind(dtype, kinds):
         raise AmiwarpError(f"{name} is {dtype}; expected integers (t in microseconds), no pickled objects")
     if math.prod(shape) * dtype.itemsize != file_bytes - stream.tell():
         raise AmiwarpError(f"{name} declares shape {shape}, which the archive does not hold; copy the file again")
     return (stream, shape, dtype), by_columns and len(shape) > 1
+
+
+def _read_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read the header of an array: its shape, whether it is stored by columns, and its type."""
+    version = npy.read_magic(stream)
+    read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
+    if read is None:
+        raise AmiwarpError(f"{name} has a header of version {version}; expected 1.0 or 2.0")
+    return read(stream)
+
+
+def _has_kind(dtype: np.dtype[Any], kinds: str) -> bool:
+    """Return whether a type is of these kinds. Object arrays would be unpickled, which is unsafe."""
+    return not dtype.hasobject and dtype.kind in kinds
 
 
 def _header(stream: IO[bytes], name: str, file_bytes: int, kinds: str) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.columns import ROLES, SAMPLE, given_roles, names_roles, role_of, unit_of
+from amiwarp.io.columns import ROLES, SAMPLE, given_roles, is_wanted, names_roles, role_of, unit_of
 from amiwarp.io.reading_process import Reply
 
 PIECE = 1 << 17
@@ -66,7 +66,7 @@ def sources_of(arrays: Mapping[str, Any], columns: str | None) -> list[Source]:
     vectors = [source for name, array in arrays.items() for source in _vectors(name, array)]
     if columns is not None:
         wanted = given_roles(columns).values()
-        named = [source for source in vectors if _is_wanted(str(source.name), wanted)]
+        named = [source for source in vectors if is_wanted(str(source.name), wanted)]
         if len({source.name for source in named}) == len(ROLES):
             return named
     groups: dict[str, list[Source]] = {}
@@ -90,10 +90,6 @@ def sources_of(arrays: Mapping[str, Any], columns: str | None) -> list[Source]:
         f"no arrays are named as t, x, y and p; its arrays are {listed}; choose with --columns, such as "
         "t=ts,x=xs,y=ys,p=ps"
     )
-
-
-def _is_wanted(name: str, wanted: Any) -> bool:
-    return name in wanted or name.rpartition("/")[2] in wanted
 
 
 def _example(group: str, found: Mapping[str, list[Source]]) -> str:
