@@ -169,6 +169,7 @@ LAYOUTS: dict[str, tuple[Maker, dict[str, Any]]] = {
     "npz: -1 in 32 bits": (archive(x=X, y=Y, t=T, p=np.where(P, 1, 2**32 - 1).astype("u4")), {}),
     "npz: -1 in 16 bits": (archive(x=X, y=Y, t=T, p=np.where(P, 1, -1).astype("u2")), {}),
     "npz: 1 and 2 by option": (archive(x=X, y=Y, t=T, p=2 - P), {"polarity": "1=on,2=off"}),
+    "npz: True is OFF by option": (archive(x=X, y=Y, t=T, p=P == 0), {"polarity": "0=on,1=off"}),
     "npz: x times 32": (archive(x=(X * 32).astype("u2"), y=(Y * 32).astype("u2"), t=T, p=P), {"scale_xy": 32}),
     "npz: events in floating microseconds": (archive(events=ROWS.astype(float)), {}),
     "npz: events of integers": (archive(events=ROWS), {}),
@@ -553,6 +554,16 @@ def test_rare_polarities_are_damage(tmp_path: Path) -> None:
         AmiwarpError, match=rf"line 501 is '{T[500]} {X[500]} {Y[500]} 7'; expected 't x y p' with t in us"
     ):
         open_recording(made(tmp_path, lines(np.c_[T, X, Y, p])))
+
+
+def test_truth_values_without_a_meaning(tmp_path: Path) -> None:
+    path = made(tmp_path, archive(x=X, y=Y, t=T, p=P.astype(bool)))
+    with pytest.raises(AmiwarpError, match=r"a polarity is 1; expected 0; say what it means with --polarity"):
+        open_recording(path, polarity="0=on")
+    path = made(tmp_path, archive(x=X, y=Y, t=T, p=np.ones(N, bool)))
+    assert not of(open_recording(path, polarity="1=off")).p.any()
+    path = made(tmp_path, archive(x=X, y=Y, t=T, p=np.zeros(N, bool)))
+    assert of(open_recording(path, polarity="0=on")).p.all()
 
 
 @pytest.mark.parametrize(

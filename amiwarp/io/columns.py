@@ -272,7 +272,7 @@ class Layout:
     def polarities(self, p: NDArray[Any]) -> NDArray[np.uint8]:
         """Return polarities: 1 for ON, 0 for OFF. Raises :class:`AmiwarpError` for a value without a meaning."""
         if p.dtype == np.bool_:
-            return p.view(np.uint8) if self.coding[1] else (~p).view(np.uint8)
+            p = p.view(np.uint8)
         on, known = np.zeros(p.shape, np.bool_), np.zeros(p.shape, np.bool_)
         for value, is_on in self.coding.items():
             if _fits(value, p.dtype):
