@@ -482,6 +482,19 @@ def test_times_since_1970(tmp_path: Path) -> None:
     assert_same(recording, EPOCH)
 
 
+@pytest.mark.parametrize("kernel_lines", [100, 10_000], ids=["kernel", "NumPy"])
+def test_half_a_microsecond_is_rounded_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kernel_lines: int) -> None:
+    monkeypatch.setattr("amiwarp.io.text_files.KERNEL_LINES", kernel_lines)
+    t = np.arange(-3, N - 3) * 1000 + 500
+    late = 2**63 - 1 - 1000 * np.arange(N)[::-1]
+    for times, expected in ((t, np.arange(-2, N - 2)), (t - 1, np.arange(-3, N - 3))):
+        for maker in (lines(np.c_[times, X, Y, P]), archive(x=X, y=Y, t=times.astype(float), p=P),
+                      archive(x=X, y=Y, t=times, p=P)):  # fmt: skip
+            np.testing.assert_array_equal(of(open_recording(made(tmp_path, maker), time_unit="ns")).t, expected)
+    path = made(tmp_path, archive(x=X, y=Y, t=late, p=P))
+    np.testing.assert_array_equal(of(open_recording(path, time_unit="ns")).t, late // 1000 + 1)
+
+
 def test_long_recordings_need_their_unit(tmp_path: Path) -> None:
     """The first events may look plausible."""
     t = np.concatenate([np.arange(70_000), [3600 * 10**6 + 1]])

@@ -242,18 +242,27 @@ class Layout:
     def times(self, t: NDArray[Any]) -> NDArray[np.int64]:
         """Return times [us]."""
         factor = TIME_UNITS[self.unit]
+        if self.unit == "ns":
+            return self._times_of_nanoseconds(t)
         if t.dtype.kind == "f":
             with np.errstate(over="ignore"):
                 return rounded_times(t.astype(np.float64) * factor)
         if self.unit == "us":
             return rounded_times(t)
-        if self.unit == "ns":
-            if t.size and int(t.max()) >= 2**63:
-                raise AmiwarpError(f"a time is {int(t.max())} ns, beyond int64; the file is damaged")
-            return (t.astype(np.int64) + 500) // 1000
         if t.size and max(abs(int(t.min())), abs(int(t.max()))) * factor >= TIME_LIMIT:
             raise AmiwarpError(f"times reach {int(t.max())} {self.unit}, beyond int64 in us; the unit must be another")
         return t.astype(np.int64) * int(factor)
+
+    def _times_of_nanoseconds(self, t: NDArray[Any]) -> NDArray[np.int64]:
+        """Return times [us] of times [ns]: half a microsecond is rounded up, for integers and floating numbers."""
+        if t.dtype.kind == "f":
+            t = t.astype(np.float64)
+        elif t.size and int(t.max()) >= 2**63:
+            raise AmiwarpError(f"a time is {int(t.max())} ns, beyond int64; the file is damaged")
+        else:
+            t = t.astype(np.int64)
+        with np.errstate(invalid="ignore"):  # times that are not finite, which are refused
+            return rounded_times(t // 1000 + (t % 1000 >= 500))
 
     def pixels(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return coordinates [px]: integers, or floating ones of compensated events."""
