@@ -403,6 +403,8 @@ def test_doubt_names_the_option(tmp_path: Path, name: str) -> None:
     [
         ({"columns": "t=ts,x=xs"}, "does not name t, x, y and p once each"),
         ({"columns": "x,y,t"}, "does not name t, x, y and p once each"),
+        ({"columns": "t=y,t=t,x=x,y=y,p=p"}, "does not name t, x, y and p once each"),
+        ({"columns": "t,x,y,p,p"}, "does not name t, x, y and p once each"),
         ({"columns": "t=a,x=b,y=c,p=d"}, "has no column 'a', which --columns gives for t; it has t, x, y, p"),
         ({"time_unit": "h"}, "--time-unit 'h' is unknown; choose among s, ms, us, ns"),
         ({"polarity": "1=yes"}, "--polarity '1=yes' is not a list of values"),

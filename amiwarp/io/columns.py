@@ -77,7 +77,7 @@ def given_roles(text: str) -> dict[str, str]:
     for word in words:
         role, _, name = word.partition("=")
         roles[role.strip()] = name.strip()
-    if sorted(roles) != sorted(ROLES) or len(words) < len(ROLES) or not all(roles.values()):
+    if sorted(roles) != sorted(ROLES) or len(words) != len(ROLES) or not all(roles.values()):
         raise AmiwarpError(
             f"--columns {text!r} does not name t, x, y and p once each; write t=NAME,x=NAME,y=NAME,p=NAME, or their "
             "order in the file, such as x,y,p,t (- for a column without use)"
