@@ -518,6 +518,13 @@ def test_openmv(tmp_path: Path) -> None:
     assert assumptions_of(recording.metadata)[0].value == "type s ms us x y"
 
 
+@pytest.mark.parametrize("head", ["", "t,x,y,p\r", "# recorded\r"], ids=["values", "names", "a comment"])
+def test_lines_must_end_with_a_newline(tmp_path: Path, head: str) -> None:
+    path = made(tmp_path, lines(ROWS, separator=",", head=head, end="\r"))
+    with pytest.raises(AmiwarpError, match=r"events: line 1 holds a carriage return; lines must end with a newline"):
+        open_recording(path)
+
+
 def test_text_has_no_columns_of_openmv(tmp_path: Path) -> None:
     path = made(tmp_path, lines(openmv(P)))
     with pytest.raises(AmiwarpError, match=r"has 6 columns without names; say which are which with --columns"):

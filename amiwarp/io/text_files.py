@@ -13,6 +13,7 @@ and lines that start with ``#`` or ``%`` are comments. A comment may give the na
 from __future__ import annotations
 
 import contextlib
+import io
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -103,7 +104,12 @@ def _find_form(path: Path, head: bytes) -> TextForm:
     names: tuple[str, ...] | None = None
     size: tuple[int, int] | None = None
     position, number = len(BOM) * head.startswith(BOM), 0
-    for line in head[position:].splitlines(keepends=True):
+    for line in io.BytesIO(head[position:]):  # which only a newline ends, as in the reader of all lines
+        if b"\r" in line.rstrip(b"\r\n"):
+            raise AmiwarpError(
+                f"{path}: line {number + 1} holds a carriage return; lines must end with a newline; replace the "
+                "carriage returns by newlines"
+            )
         words = TextRow.of(line).words(line) if holds_values(line) else []
         if not words:
             comments.append(line.decode("utf-8", "replace").strip().lstrip("#%\ufeff").strip())
@@ -154,7 +160,7 @@ def _find_text_layout(head: bytes, form: TextForm, given: GivenLayout) -> Layout
         )
     rows: list[list[bytes]] = []
     values: list[list[float]] = []
-    lines = head[form.start :].splitlines()
+    lines = head[form.start :].split(b"\n")
     is_cut = len(head) >= HEAD_BYTES  # the last line may go on
     for line in lines[:-1] if is_cut else lines:
         words = form.row.words(line) if holds_values(line) else []
