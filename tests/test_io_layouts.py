@@ -18,7 +18,7 @@ from scipy.io import loadmat, savemat
 
 from amiwarp import AmiwarpError, Camera, Events, Recording, convert, open_recording
 from amiwarp.calib.checks import size_warnings
-from amiwarp.io import text_files
+from amiwarp.io import table_server, text_files
 from amiwarp.io.columns import role_of
 from amiwarp.io.file_scan import assumptions_of
 from reference.io_samples_extra import write_raw_of_a_sensor
@@ -600,6 +600,29 @@ def test_truth_values_without_a_meaning(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_names_of_columns(name: str, role: str | None, unit: str | None) -> None:
     assert role_of(name) == (role, unit)
+
+
+def test_rows_across_groups_of_parquet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pq.ParquetWriter(tmp_path / "a.parquet", pa.schema([("t", pa.int64())])) as writer:
+        for start, stop in ((0, 3), (3, 4), (4, 4), (4, 9)):
+            writer.write_table(pa.table({"t": np.arange(start, stop)}))
+    column = table_server._parquet_arrays(str(tmp_path / "a.parquet"))["t"]
+    assert column.shape == (9,)
+    for start in range(9):
+        for stop in range(start + 1, 10):
+            np.testing.assert_array_equal(column[start:stop], np.arange(start, stop), strict=True)
+    read: list[int] = []
+    rows = table_server._ParquetColumn._rows
+
+    def noted(self: Any, group: int) -> Any:
+        read.append(group)
+        return rows(self, group)
+
+    monkeypatch.setattr(table_server._ParquetColumn, "_rows", noted)
+    for start, stop, groups in ((0, 3, [0]), (3, 4, [1]), (2, 5, [0, 1, 2, 3]), (4, 9, [3])):
+        read.clear()
+        column[start:stop]
+        assert read == groups
 
 
 def test_real_matlab_file(data_dir: Path) -> None:

@@ -251,19 +251,19 @@ def _matlab_arrays(path: str) -> dict[str, NDArray[Any]]:
 class _ParquetColumn:
     """Column of a Parquet table. The rows of one group are in memory at a time."""
 
-    def __init__(self, table: Any, name: str, dtype: np.dtype[Any]) -> None:
-        self._table, self._name = table, name
-        self.shape, self.dtype = (int(table.metadata.num_rows),), dtype
+    def __init__(self, table: Any, bounds: NDArray[np.int64], name: str, dtype: np.dtype[Any]) -> None:
+        """``bounds``: the first row of each group, and the number of rows."""
+        self._table, self._bounds, self._name = table, bounds, name
+        self.shape, self.dtype = (int(bounds[-1]),), dtype
         self._group: tuple[int, NDArray[Any]] | None = None
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
-        parts, first = [], 0
-        for group in range(self._table.metadata.num_row_groups):
-            count = self._table.metadata.row_group(group).num_rows
-            start, stop = max(rows.start - first, 0), min(rows.stop - first, count)
-            if start < stop:
-                parts.append(self._rows(group)[start:stop])
-            first += count
+        first_group = int(np.searchsorted(self._bounds[1:], rows.start, side="right"))
+        last_group = int(np.searchsorted(self._bounds[:-1], rows.stop, side="left"))
+        parts = []
+        for group in range(first_group, last_group):
+            first = int(self._bounds[group])
+            parts.append(self._rows(group)[max(rows.start - first, 0) : rows.stop - first])
         return np.concatenate(parts) if parts else np.zeros(0, self.dtype)
 
     def _rows(self, group: int) -> NDArray[Any]:
@@ -282,6 +282,8 @@ def _parquet_arrays(path: str) -> dict[str, Any]:
 
     parquet: Any = optional_module("pyarrow.parquet", "dataset", "Parquet files need PyArrow")
     table = parquet.ParquetFile(path)
+    groups = range(table.metadata.num_row_groups)
+    bounds = np.cumsum([0, *(table.metadata.row_group(group).num_rows for group in groups)], dtype=np.int64)
     found = {}
     for field in table.schema_arrow:
         with contextlib.suppress(NotImplementedError):  # columns of text and the like are left out
@@ -289,5 +291,5 @@ def _parquet_arrays(path: str) -> dict[str, Any]:
             name = f"{field.name} [ns]" if dtype.kind in "mM" else field.name
             kind = np.dtype(np.int64) if dtype.kind in "mM" else dtype
             if kind.kind in "iufb":
-                found[name] = _ParquetColumn(table, field.name, kind)
+                found[name] = _ParquetColumn(table, bounds, field.name, kind)
     return found
