@@ -257,8 +257,10 @@ def run_page(page: Path, given: Path, plain: Path) -> dict[str, Any]:
             except RuntimeError as error:
                 return {"problems": [(1, f"given: {error}")], "files": []}
         before = written(Path(name))
-        with tempfile.NamedTemporaryFile() as needs:
-            variables = plain_installation.environment(environment(page), plain, Path(needs.name))
+        with tempfile.TemporaryDirectory() as notes:
+            needs = Path(notes, "needs")
+            needs.touch()
+            variables = plain_installation.environment(environment(page), plain, needs)
             done = subprocess.run(
                 [sys.executable, __file__, "--page", str(page)], cwd=name, env=variables,
                 capture_output=True, text=True, check=False,
