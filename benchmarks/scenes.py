@@ -110,7 +110,7 @@ def event_scene(name: str, n: int, *, points: int = 0, width: int = WIDTH, heigh
     camera = Camera.from_fov(width, height, FOV)
     scene = EventScene(
         name, camera, Prism(apex_from_deflection(DEFLECTION, INDEX), INDEX),
-        Events(np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.int64), np.empty(n, np.uint8)),
+        Events(np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.int64), np.zeros(n, np.uint8)),
         np.empty(n),
     )  # fmt: skip
     border = math.ceil(scene.radius) + 1

@@ -296,9 +296,9 @@ def test_refused_truth_leaves_a_file_that_can_be_read(tmp_path: Path, recording:
 @pytest.mark.parametrize(
     ("rotation", "message"),
     [
-        (np.full((3, 3), np.inf), "rotation holds a value that is not within -1 .. 1"),
-        (np.diag([np.inf, 1.0, 1.0]), "rotation holds a value that is not within -1 .. 1"),
-        (np.diag([np.nan, 1.0, 1.0]), "rotation holds a value that is not within -1 .. 1"),
+        (np.full((3, 3), np.inf), "'rotation' hold inf .*; give finite numbers"),
+        (np.diag([np.inf, 1.0, 1.0]), "'rotation' hold inf .*; give finite numbers"),
+        (np.diag([np.nan, 1.0, 1.0]), "'rotation' hold nan .*; give finite numbers"),
         (np.diag([1e200, 1.0, 1.0]), "rotation holds a value that is not within -1 .. 1"),
         (np.zeros((3, 3)), "rotation is no rotation matrix"),
         (np.diag([1.0, 1.0, -1.0]), "right-handed"),

@@ -1081,7 +1081,7 @@ class EllipseModel(Model):
         theta : numpy.ndarray
             Prism angle of the encoder [rad], shape (n,).
         compensated : numpy.ndarray
-            The same points without the prism [px], shape (n, 2). Pairs with a value that is not finite are left out.
+            The same points without the prism [px], shape (n, 2). Pairs with NaN or infinity in any array are left out.
         degree : int, default 4
             Total degree of the polynomials.
 
