@@ -397,6 +397,8 @@ def test_event_stream_files_that_are_cut_or_damaged(tmp_path):
     path.write_bytes(whole[:-2])  # the last event lacks a byte, and its reset
     recording = open_recording(path)
     assert (len(recording.events), recording.metadata["truncated_bytes"]) == (len(EVENTS) - 1, 4)
+    path.write_bytes(whole[:-1])  # no reset follows
+    assert open_recording(path).metadata == {"format": "es"}
     outside = bytearray(whole)
     outside[-2] = 1  # row 256 + from the bottom
     path.write_bytes(outside)

@@ -64,14 +64,14 @@ EVENT = np.dtype({"names": ["t", "x", "y", "p"], "formats": ["<i8", "<i2", "<i2"
 """An event as a packet stores it."""
 
 
-class Compression(enum.IntEnum):
-    """Compression of the packets, as the header stores it."""
+class Compression(enum.StrEnum):
+    """Compression of the packets, in the order of the numbers that the header stores."""
 
-    NONE = 0
-    LZ4 = 1
-    LZ4_HIGH = 2
-    ZSTD = 3
-    ZSTD_HIGH = 4
+    NONE = "none"
+    LZ4 = "lz4"
+    LZ4_HIGH = "lz4_high"
+    ZSTD = "zstd"
+    ZSTD_HIGH = "zstd_high"
 
 
 LZ4_MARK, ZSTD_MARK = b"\x04\x22\x4d\x18", b"\x28\xb5\x2f\xfd"
@@ -257,7 +257,10 @@ def _read_header(path: Path) -> Aedat4File:
         try:
             # Positions count from behind the size.
             root = _number(U4, header, 0)
-            compression = Compression(_field(header, root, 0, I4))
+            number = _field(header, root, 0, I4)
+            if number not in range(len(Compression)):
+                raise ValueError(f"the compression has the number {number}; expected 0 to {len(Compression) - 1}")
+            compression = list(Compression)[number]
             table = _field(header, root, 1, I8)
             text, length = _vector(header, root, 2, 1)
             streams = dict(_streams(ElementTree.fromstring(header[text : text + length].decode("utf-8"))))
@@ -887,7 +890,9 @@ def _file_header(about: Outline) -> bytes:
     """Return the header with its size. The position of the table is not known yet."""
     text = DESCRIPTION.format(width=about.width, height=about.height).encode()
     # The table stands at byte 24, with its fields at 16, 8 and 4: compression, position of the table, text.
-    head = FILE_HEAD.pack(24, b"IOHE", 10, 20, 16, 8, 4, 10, 16, -1, Compression.LZ4, len(text))
+    head = FILE_HEAD.pack(
+        24, b"IOHE", 10, 20, 16, 8, 4, 10, 16, -1, list(Compression).index(Compression.LZ4), len(text)
+    )
     padding = bytes(8 - (len(head) + len(text)) % 8)  # at least the byte that ends a text
     data = head + text + padding
     return U4.pack(len(data)) + data
