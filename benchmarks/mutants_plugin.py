@@ -62,10 +62,10 @@ def pytest_sessionstart() -> None:
 
         send = ReadingProcess.send
 
-        def noted(process: ReadingProcess, function: Function, *arguments: object) -> None:
+        def noted(process: ReadingProcess, function: Function, *arguments: object, **options: object) -> None:
             named = [name_of(function), *(text for text in arguments if isinstance(text, str))]
             _modules.update(text.partition(":")[0] for text in named if text.startswith("amiwarp."))
-            send(process, function, *arguments)
+            send(process, function, *arguments, **options)  # type: ignore[arg-type]
 
         ReadingProcess.send = noted  # type: ignore[method-assign]
 

@@ -315,7 +315,7 @@ def test_many_faults_are_refused(tmp_path, name):
 
 def test_pixels_that_no_sensor_has_are_named_without_a_size(tmp_path):
     path = tmp_path / "left.txt"
-    path.write_text("".join(f"{k * 1e-3} -2 5 1\n" for k in range(20)))
+    path.write_text("".join(f"{k * 1e-3} {-2 - k} {k} 1\n" for k in range(20)))
     with pytest.raises(AmiwarpError, match=r"left.txt: 20 of 20 events lie outside pixels 0 .. 65535; the file"):
         open_recording(path)
 

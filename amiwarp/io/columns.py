@@ -507,7 +507,9 @@ def _fits_promise(facts: Sequence[_Facts], order: tuple[str, ...]) -> bool:
     by_role = {role: facts[at] for at, role in enumerate(order)}
     t, x, y, p = (by_role[role] for role in ROLES)
     is_time = t.rising or (t.fractions and not x.fractions and not y.fractions)
-    return is_time and p.polarity and x.pixels and y.pixels
+    # Where only the last column can be the polarity, wrong coordinates do not make it another order.
+    are_places = (x.pixels and y.pixels) or not (x.polarity or y.polarity)
+    return is_time and p.polarity and are_places
 
 
 def _fits_order(by_role: Mapping[str, _Facts]) -> bool:

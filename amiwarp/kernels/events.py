@@ -152,7 +152,7 @@ for _coordinate in (wp.uint16, wp.float32):
 
 # Search for background activity: events without an earlier event at a neighbouring pixel.
 
-NEVER = wp.constant(wp.int64(1 - 2**63))  # time of a pixel without events; compilers warn of -2**63
+NEVER = wp.constant(wp.int64(-(2**63)))  # time of a pixel without events
 
 
 @wp.func
