@@ -160,6 +160,48 @@ def test_a_board_is_found_and_its_absence_explained() -> None:
     assert other.missing(np.asarray(noise)) == "a board of 12 x 4 inner corners is not seen"
 
 
+def steep_picture(board: amiwarp.Board, turn: Rotation, middle: list[float]) -> tuple[NDArray[np.uint8], NDArray]:
+    """Return a noisy picture of a board behind a lens of 520 px, 640 x 480, and its true corners [px]."""
+    side = board.square_m
+    left, right, bottom = -2.0 * side, (board.columns + 1) * side, (board.rows + 1) * side
+    edges = np.array([[left, left, 0.0], [right, left, 0.0], [right, bottom, 0.0], [left, bottom, 0.0]])
+
+    def seen_at(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        there = turn.apply(points - board.points.max(axis=0) / 2.0) + middle
+        return there[:, :2] / there[:, 2:] * 520.0 + [319.5, 239.5]
+
+    flat, fine = board.picture(40), 4
+    height, width = flat.shape
+    corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+    place = cv2.getPerspectiveTransform(corners, np.float32(seen_at(edges) * fine + 0.5 * (fine - 1)))
+    large = cv2.warpPerspective(flat, place, (640 * fine, 480 * fine), borderValue=128)
+    picture = cv2.GaussianBlur(cv2.resize(large, (640, 480), interpolation=cv2.INTER_AREA), (0, 0), 0.8)
+    noisy = 30.0 + 0.7 * picture + np.random.default_rng(0).normal(0.0, 10.0, picture.shape)
+    return np.clip(noisy, 0.0, 255.0).astype(np.uint8), seen_at(board.points)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_steep_board_with_small_squares_is_found(monkeypatch: pytest.MonkeyPatch, mirrored: bool) -> None:
+    """OpenCV's detector of corners does not find it. ``mirrored``: the other one numbers it as in a mirror."""
+    board = amiwarp.Board(9, 6, 0.03)
+    about = math.radians(245.9)
+    tilt = Rotation.from_rotvec(math.radians(53.2) * np.array([math.cos(about), math.sin(about), 0.0]))
+    turn = tilt * Rotation.from_rotvec([0.0, 0.0, math.radians(34.4)])
+    picture, true = steep_picture(board, turn, [0.119, 0.023, 0.456])
+    detect = cv2.findChessboardCorners
+
+    def in_a_mirror(*given: object, **flags: object) -> tuple[bool, NDArray[np.float32]]:
+        _, corners = detect(*given, **flags)
+        return True, corners.reshape(6, 9, 2)[:, ::-1].reshape(54, 1, 2).copy()
+
+    if mirrored:
+        monkeypatch.setattr(cv2, "findChessboardCorners", in_a_mirror)
+    found = board.find(picture)
+    assert found is not None
+    known = true if np.linalg.norm(found.xy[0] - true[0]) < 20.0 else true[::-1]  # either end may be the first
+    assert np.abs(found.xy - known).max() < 0.4
+
+
 def test_a_charuco_board_is_found_in_parts_and_not_in_a_mirror() -> None:
     board = amiwarp.Board(6, 5, 0.03, "DICT_4X4_50")
     picture = cv2.resize(photographed(board), (960, 720))
