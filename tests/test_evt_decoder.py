@@ -37,6 +37,7 @@ def test_blocks_and_pieces_are_decoded_as_numpy_does(
     version: str, length: int, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(evt_decoder, "BLOCK_WORDS", {True: length, False: length})
+    monkeypatch.setattr(evt_decoder, "GROUP_BLOCKS", 7)
     rng = np.random.default_rng(7)
     for trial in range(12):
         words = random_words(version, int(rng.integers(0, 400)), rng)

@@ -13,6 +13,8 @@ WORD_TYPES = {"2.0": "<u4", "2.1": "<u8", "3.0": "<u2"}
 """Type of a word by the version of EVT."""
 BLOCK_WORDS = {True: 1 << 14, False: 1 << 12}
 """Number of words that one thread decodes, on a CPU (True) and on CUDA (False)."""
+GROUP_BLOCKS = 256
+"""Number of blocks that one thread links."""
 
 
 class Triggers(NamedTuple):
@@ -90,21 +92,25 @@ class EvtDecoder:
 
         # First pass: what each block changes, then the state at its start and the place of its first event.
         changes = wp.empty(blocks, dtype=evt.Change, device=device)
-        states = wp.zeros(blocks + 1, dtype=evt.State, device=device)
-        if self._state is not None:
-            wp.copy(states, self._state, count=1)
-        first_event = wp.empty(blocks + 1, dtype=int, device=device)
-        first_trigger = wp.empty(blocks + 1, dtype=int, device=device)
-        untimed = wp.empty(1, dtype=int, device=device)
         launch(survey, blocks, layout, [changes], device=device, smallest=1)
-        linked = [states, first_event, first_trigger, untimed]
-        load(evt.link_blocks, device)
-        wp.launch(evt.link_blocks, 1, [changes, bits], linked, device=device)
+        groups = -(-blocks // GROUP_BLOCKS)
+        group_changes = wp.empty(groups, dtype=evt.Change, device=device)
+        launch(evt.merge_blocks, groups, [changes, GROUP_BLOCKS, bits], [group_changes], device=device, smallest=1)
+        group_states = wp.zeros(groups + 1, dtype=evt.State, device=device)
+        if self._state is not None:
+            wp.copy(group_states, self._state, count=1)
+        group_places = wp.empty(groups + 1, dtype=evt.Place, device=device)
+        load(evt.link_groups, device)
+        wp.launch(evt.link_groups, 1, [group_changes, bits], [group_states, group_places], device=device)
+        states = wp.empty(blocks, dtype=evt.State, device=device)
+        places = wp.empty(blocks, dtype=evt.Place, device=device)
+        inputs = [changes, GROUP_BLOCKS, bits, group_states, group_places]
+        launch(evt.link_blocks, groups, inputs, [states, places], device=device, smallest=1)
 
         # Second pass: the events.
-        events = _last(first_event)
-        edges = _last(first_trigger)
-        self.untimed += _last(untimed)
+        total = group_places[groups:].numpy()[0]
+        events, edges = int(total["event"]), int(total["trigger"])
+        self.untimed += int(total["untimed"])
         event_arrays = evt.EventArrays()
         event_arrays.x = wp.empty(events, dtype=wp.uint16, device=device)
         event_arrays.y = wp.empty(events, dtype=wp.uint16, device=device)
@@ -114,12 +120,7 @@ class EvtDecoder:
         trigger_arrays.channel = wp.empty(edges, dtype=wp.uint8, device=device)
         trigger_arrays.t = wp.empty(edges, dtype=wp.int64, device=device)
         trigger_arrays.rising = wp.empty(edges, dtype=wp.uint8, device=device)
-        inputs = [*layout, states, first_event, first_trigger]
+        inputs = [*layout, states, places]
         launch(decode, blocks, inputs, [event_arrays, trigger_arrays], device=device, smallest=1)
-        self._state = wp.clone(states[blocks:])
+        self._state = wp.clone(group_states[groups:])
         return event_arrays, trigger_arrays
-
-
-def _last(values: Any) -> int:
-    """Return the last element of an array on a device."""
-    return int(values[values.shape[0] - 1 :].numpy()[0])

@@ -2,8 +2,9 @@
 
 An EVT word changes the decoder's state (time, row, column of the next vector) or is an event. So that all blocks can be
 decoded at the same time, :func:`survey_evt2` and :func:`survey_evt3` note what each block changes, whatever the state
-before it; :func:`link_blocks` follows the changes from block to block; :func:`decode_evt2` and :func:`decode_evt3` then
-decode each block from the state at its start. One thread reads one block.
+before it. Then the changes are followed: :func:`merge_blocks` finds what groups of blocks change, :func:`link_groups`
+follows the groups with one thread, and :func:`link_blocks` the blocks of each group. :func:`decode_evt2` and
+:func:`decode_evt3` decode each block from the state at its start. One thread reads one block.
 
 The words are described at https://docs.prophesee.ai/stable/data/encoding_formats/index.html.
 """
@@ -82,6 +83,15 @@ class Change:
     """Number of events before the first TIME_HIGH."""
     early_triggers: int
     """Number of edges before the first TIME_HIGH."""
+
+
+@wp.struct
+class Place:
+    """Where the output of a block begins, and how many events and edges before it came before the first TIME_HIGH."""
+
+    event: int
+    trigger: int
+    untimed: int
 
 
 @wp.struct
@@ -227,8 +237,7 @@ def decode_evt2(
     length: int,
     swapped: int,
     states: wp.array(dtype=State),
-    first_event: wp.array(dtype=int),
-    first_trigger: wp.array(dtype=int),
+    places: wp.array(dtype=Place),
     start: int,
     events: EventArrays,
     triggers: TriggerArrays,
@@ -237,8 +246,8 @@ def decode_evt2(
     block = wp.tid() + start
     timed = states[block].timed
     high = states[block].high
-    event = first_event[block]
-    trigger = first_trigger[block]
+    event = places[block].event
+    trigger = places[block].trigger
     for i in range(block * length, wp.min((block + 1) * length, words.shape[0])):
         head = head_of(words[i], swapped)
         kind = int(head >> wp.uint32(28))
@@ -320,8 +329,7 @@ def decode_evt3(
     words: wp.array(dtype=wp.uint16),
     length: int,
     states: wp.array(dtype=State),
-    first_event: wp.array(dtype=int),
-    first_trigger: wp.array(dtype=int),
+    places: wp.array(dtype=Place),
     start: int,
     events: EventArrays,
     triggers: TriggerArrays,
@@ -334,8 +342,8 @@ def decode_evt3(
     row = wp.uint16(states[block].row)
     base = states[block].base
     polarity = wp.uint8(states[block].polarity)
-    event = first_event[block]
-    trigger = first_trigger[block]
+    event = places[block].event
+    trigger = places[block].trigger
     for i in range(block * length, wp.min((block + 1) * length, words.shape[0])):
         word = int(load_uint16(words, i))
         kind = word >> 12
@@ -419,44 +427,111 @@ def followed(state: State, change: Change, bits: int) -> State:
     return after
 
 
-@wp.kernel
-def link_blocks(
-    changes: wp.array(dtype=Change),
-    bits: int,
-    states: wp.array(dtype=State),
-    first_event: wp.array(dtype=int),
-    first_trigger: wp.array(dtype=int),
-    untimed: wp.array(dtype=int),
-):
-    """Find the state at the start of each block, and the index of its first event and edge. One thread.
+@wp.func
+def merged(first: Change, second: Change, bits: int) -> Change:
+    """Return the change by two blocks that follow one another. ``bits``: number of bits of TIME_HIGH."""
+    both = first
+    both.events += second.events
+    both.triggers += second.triggers
+    if first.first_high == NONE:
+        both.first_high = second.first_high
+        both.rise = second.rise
+        both.low_after = second.low_after
+        if second.low_before != NONE:
+            both.low_before = second.low_before
+        both.early_events = first.events + second.early_events
+        both.early_triggers = first.triggers + second.early_triggers
+    else:
+        if second.low_before != NONE:
+            both.low_after = second.low_before
+        if second.first_high != NONE:
+            size = wp.int64(1) << wp.int64(bits)
+            last = (wp.int64(first.first_high) + first.rise) & (size - wp.int64(1))
+            step = wp.int64(step_of(second.first_high, int(last), bits))
+            both.rise += step + second.rise
+            if step != wp.int64(0):
+                both.low_after = 0
+            if second.low_after != NONE:
+                both.low_after = second.low_after
+    if second.row != NONE:
+        both.row = second.row
+    if second.base != NONE:
+        both.base = second.base
+        both.moved = second.moved
+        both.polarity = second.polarity
+    else:
+        both.moved += second.moved
+    return both
 
-    ``states[0]`` is given. ``untimed``: number of events and edges before the first TIME_HIGH. The other outputs have
-    one element more than there are blocks.
+
+@wp.func
+def after_block(place: Place, state: State, change: Change) -> Place:
+    """Return the place after a block that begins in a state."""
+    events = change.events
+    triggers = change.triggers
+    if state.timed == 0:
+        if change.first_high == NONE:
+            events = 0
+            triggers = 0
+        else:
+            events -= change.early_events
+            triggers -= change.early_triggers
+    after = Place()
+    after.event = place.event + events
+    after.trigger = place.trigger + triggers
+    after.untimed = place.untimed + change.events - events + change.triggers - triggers
+    return after
+
+
+@wp.kernel
+def merge_blocks(changes: wp.array(dtype=Change), size: int, bits: int, start: int, groups: wp.array(dtype=Change)):
+    """Find what each group of ``size`` blocks changes."""
+    group = wp.tid() + start
+    change = changes[group * size]
+    for block in range(group * size + 1, wp.min((group + 1) * size, changes.shape[0])):
+        change = merged(change, changes[block], bits)
+    groups[group] = change
+
+
+@wp.kernel
+def link_groups(
+    groups: wp.array(dtype=Change), bits: int, states: wp.array(dtype=State), places: wp.array(dtype=Place)
+):
+    """Find the state and the place at the start of each group, and at the end of all. One thread.
+
+    ``states[0]`` is given. Both outputs have one element more than there are groups.
     """
     # Local variables: one thread would wait for each value that it reads back from a GPU's memory.
     state = states[0]
-    event = int(0)
-    trigger = int(0)
-    left_out = int(0)
-    for block in range(changes.shape[0]):
+    place = Place()
+    for group in range(groups.shape[0]):
+        change = groups[group]
+        states[group] = state
+        places[group] = place
+        place = after_block(place, state, change)
+        state = followed(state, change, bits)
+    states[groups.shape[0]] = state
+    places[groups.shape[0]] = place
+
+
+@wp.kernel
+def link_blocks(
+    changes: wp.array(dtype=Change),
+    size: int,
+    bits: int,
+    group_states: wp.array(dtype=State),
+    group_places: wp.array(dtype=Place),
+    start: int,
+    states: wp.array(dtype=State),
+    places: wp.array(dtype=Place),
+):
+    """Find the state and the place at the start of each block, from those of its group of ``size`` blocks."""
+    group = wp.tid() + start
+    state = group_states[group]
+    place = group_places[group]
+    for block in range(group * size, wp.min((group + 1) * size, changes.shape[0])):
         change = changes[block]
         states[block] = state
-        first_event[block] = event
-        first_trigger[block] = trigger
-        events = change.events
-        triggers = change.triggers
-        if state.timed == 0:
-            if change.first_high == NONE:
-                events = int(0)
-                triggers = int(0)
-            else:
-                events -= change.early_events
-                triggers -= change.early_triggers
-            left_out += change.events - events + change.triggers - triggers
-        event += events
-        trigger += triggers
+        places[block] = place
+        place = after_block(place, state, change)
         state = followed(state, change, bits)
-    states[changes.shape[0]] = state
-    first_event[changes.shape[0]] = event
-    first_trigger[changes.shape[0]] = trigger
-    untimed[0] = left_out
