@@ -169,7 +169,7 @@ def write_prophesee_hdf5(path: Path, events: Events, **filters: Any) -> None:
 def typestore(ros1: bool) -> Any:
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     time = "time" if ros1 else "builtin_interfaces/Time"
-    for package in ("dvs_msgs", "prophesee_event_msgs"):
+    for package in ("dvs_msgs", "prophesee_event_msgs", "dv_ros_msgs" if ros1 else "dv_ros2_msgs"):
         store.register(get_types_from_msg(EVENT.replace("time", time), f"{package}/msg/Event"))
         store.register(get_types_from_msg(ARRAY.replace("dvs_msgs", package), f"{package}/msg/EventArray"))
     store.register(get_types_from_msg(PACKET, "event_camera_msgs/msg/EventPacket"))

@@ -48,7 +48,7 @@ from amiwarp.events.recording import inside_image
 from amiwarp.io import read_encoder_csv
 from amiwarp.io.hdf5_files import CHUNK
 from amiwarp.io.prophesee import Evt3Encoder
-from amiwarp.io.ros import PACKET_DEFINITION, opened_bag
+from amiwarp.io.ros_bags import PACKET_DEFINITION, opened_bag
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.prism_angle import EncoderParams, encoder_params, theta_u32_at
 from amiwarp.optics.models import MODELS, rungs

@@ -11,7 +11,7 @@ from amiwarp.events.recording import Events
 from amiwarp.io import evt_decoder, file_scan
 from amiwarp.io.evt_decoder import EvtDecoder
 from amiwarp.io.file_scan import FileEvents
-from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, swap_halves
+from reference.evt_words import Evt2Decoder, Evt3Decoder, swap_halves
 
 TIME_HIGH_2, TIME_HIGH_3, TIME_LOW_3 = 0x8 << 28, 0x8000, 0x6000
 

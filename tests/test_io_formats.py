@@ -37,8 +37,9 @@ from amiwarp.io import ecf, read_encoder_triggers
 from amiwarp.io import file_scan as scan
 from amiwarp.io.evt_decoder import EvtDecoder
 from amiwarp.io.export import left_out
-from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, _halves_are_swapped, words_of
+from amiwarp.io.prophesee import Halves, halves_of, words_of
 from amiwarp.io.ros import _types_of, read_packets
+from reference.evt_words import Evt2Decoder, Evt3Decoder
 from reference.io_samples import make_events, refusal, to_faery, write_aedat4
 from reference.io_samples_extra import (
     ENCODERS,
@@ -109,21 +110,21 @@ def test_cut_files_are_read_in_part_or_refused(tmp_path, name):
 
 
 def test_evt_words_as_faery_decodes_them(data_dir):
-    for name, version in (("evt3_driving_1280x720.raw", "3"), ("evt2_balls_640x480.raw", "2")):
+    for name, version in (("evt3_driving_1280x720.raw", "3.0"), ("evt2_balls_640x480.raw", "2.0")):
         path = data_dir / "evt" / name
         data = path.read_bytes()
         start = data.rindex(b"\n% ", 0, 1000)
         words = words_of(data[data.index(b"\n", start + 1) + 1 :], version)
-        decoder = EvtDecoder(f"{version}.0")
+        decoder = EvtDecoder(version)
         # Pieces of odd length.
         found = [decoder.decode(words[at : at + 10_007])[0] for at in range(0, len(words), 10_007)]
         x, y, t, p = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        with evt.Decoder(path, (2048, 2048), f"evt{version}") as packets_:
+        with evt.Decoder(path, (2048, 2048), f"evt{version[0]}") as packets_:
             expected = np.concatenate([packet["events"] for packet in packets_ if "events" in packet])
         for given, field in ((x, "x"), (y, "y"), (p, "p")):
             np.testing.assert_array_equal(given, expected[field])
         # faery raises a time to the largest in any word before it: by up to 11 us in the file of EVT 3.
-        assert 0 <= (expected["t"].astype(np.int64) - t).max() <= (11 if version == "3" else 0)
+        assert 0 <= (expected["t"].astype(np.int64) - t).max() <= (11 if version == "3.0" else 0)
 
 
 @pytest.mark.parametrize(("words", "decoder"), [(evt2_words, Evt2Decoder(vectors=False)), (evt3_words, Evt3Decoder())])
@@ -882,7 +883,7 @@ def test_the_order_of_halves_is_told_by_times_that_may_stand_still(shift):
     """The other halves hold vectors that look like words of the time, but fall."""
     time, vectors = np.repeat(np.arange(50), 2) | 0x8 << 28, 0x8 << 28 | 2000 - np.arange(100)
     words = time.astype(np.uint64) << np.uint64(shift) | vectors.astype(np.uint64) << np.uint64(32 - shift)
-    assert _halves_are_swapped(words) == (shift == 0)
+    assert halves_of(words) == Halves(shift == 0, certain=True)
 
 
 def test_raw_sizes_that_no_sensor_generation_has(tmp_path):

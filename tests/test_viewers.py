@@ -29,10 +29,10 @@ from amiwarp import (
     save_recording,
 )
 from amiwarp.compensation.streams import Compensated
-from amiwarp.io.ros import PacketDecoder
 from amiwarp.plotting import viewers
 from amiwarp.plotting.viewers import COMPENSATED, RECORDED, LiveViewer, Window, save_for_viewer
 from reference.calibration_sample import exact_calibration
+from reference.evt_words import Evt3Decoder
 from tests.test_cli import run
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
@@ -136,12 +136,12 @@ def test_foxglove_reads_images_angles_and_events(recording, tmp_path, device):
     store = rosbags.get_typestore(rosbags.Stores.ROS2_HUMBLE)
     types = rosbags.get_types_from_msg(schema.data.decode(), schema.name)
     store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
-    decoder, parts = PacketDecoder(), []
+    decoder, parts = Evt3Decoder(), []
     for time, _, data in messages["/event_camera/events"]:
         message = store.deserialize_cdr(data, schema.name)
         assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == time
         assert (message.width, message.height, message.encoding) == (64, 48, "evt3")
-        parts.append(decoder.decode(message)[0])
+        parts.append(decoder.decode(message.events.view("<u2"))[0])
     for column, values in zip((events.x, events.y, events.t, events.p), zip(*parts, strict=True), strict=True):
         np.testing.assert_array_equal(np.concatenate(values), column)
 

@@ -36,7 +36,10 @@ from amiwarp.io.reading_process import packets
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
 from amiwarp.validation import rounded_times
 
-Packet: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]] | Events
+Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
+"""Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
+
+Packet: TypeAlias = Columns | Events
 """Packet of events: arrays x, y [px], t [us] and p (ON if positive) as stored in the file: integers or booleans of one
 shape ``(n,)``. x and y of compensated events are floating. Events of a sensor, whose arrays nobody else holds, are
 checked by a kernel, in less than a tenth of the time."""

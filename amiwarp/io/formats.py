@@ -24,6 +24,7 @@ from amiwarp.io.columns import GivenLayout
 from amiwarp.io.file_scan import GivenSource, given_source
 from amiwarp.io.files import check_regular, errors_name, name_kind, note_folders, open_input
 from amiwarp.io.json_files import read_json
+from amiwarp.io.ros_bags import MCAP, ROS1, SQLITE, ZSTANDARD, packed_head
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import choice, guarded, instance, shown, whole
 
@@ -166,6 +167,8 @@ def detect_format(path: Path) -> Format:
         return Format.TEXT
     if head.startswith(b"%") and not head.startswith(b"%PDF"):
         return Format.DAT
+    if head.startswith(ZSTANDARD) and packed_head(path).startswith((ROS1, SQLITE, MCAP)):
+        return Format.ROSBAG
     if kind := name_kind(head):
         raise AmiwarpError(f"{path}: {kind}")
     known = ", ".join(member.value for member in Format)

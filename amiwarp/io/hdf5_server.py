@@ -23,10 +23,9 @@ from amiwarp.events.truth import EVENT_COLUMNS, MAPS
 from amiwarp.io import ecf
 from amiwarp.io.columns import ROLES, names_roles
 from amiwarp.io.evt_decoder import EventColumns
-from amiwarp.io.file_scan import microseconds, whole_pixels
+from amiwarp.io.file_scan import Columns, microseconds, whole_pixels
 from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32
 from amiwarp.io.native_format import FORMAT
-from amiwarp.io.prophesee import Columns
 from amiwarp.io.reading_process import Reply, forget, keep, kept
 
 # Layouts of other data sets' HDF5 files: M3ED, MVSEC and Prophesee's. Runs in the reading process.

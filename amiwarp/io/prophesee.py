@@ -2,10 +2,10 @@
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,132 +18,50 @@ from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.formats import LONGEST_US, Outline
 from amiwarp.validation import TIME_LIMIT
 
-# Decoders of Prophesee's EVT words with NumPy: EVT 2.0, 2.1 and 3.0, for streams that arrive in pieces.
-#
-# The words are those of Prophesee's documentation of the formats. Messages of ROS are decoded with these, in the
-# process that reads the bag; files with :class:`EvtDecoder`.
-
-Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
-"""Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
-
-TIME_HIGH, TRIGGER = 0x8, 0xA
-"""Types of words that all versions share."""
+# Words of the encodings.
 
 
 def words_of(data: bytes | NDArray[np.uint8], version: str) -> NDArray[Any]:
-    """Return the whole words of some bytes: uint16 for EVT 3.0, uint32 for 2.0, uint64 for 2.1."""
-    dtype = np.dtype({"3": "<u2", "2": "<u4"}.get(version, "<u8"))
-    count = len(data) // dtype.itemsize
-    return np.frombuffer(data, dtype, count)
+    """Return the whole words of some bytes, in a version of EVT."""
+    dtype = np.dtype(WORD_TYPES[version])
+    return np.frombuffer(data, dtype, len(data) // dtype.itemsize)
 
 
-def swap_halves(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Swap the 32-bit halves of EVT 2.1 words, as the IMX636 sends them (``endianness=legacy``)."""
-    return (words >> np.uint64(32)) | (words << np.uint64(32))
+TIME_HIGH = 0x8
+"""Type of the words with the upper bits of the time."""
+
+TYPES = (0x0, 0x1, TIME_HIGH, 0xA, 0xE, 0xF)
+"""Types of EVT 2.1 words: events, time, triggers, and words for other uses."""
 
 
-def _latest(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return for each element the index of the last true element up to it, or -1."""
-    return np.maximum.accumulate(np.where(mask, np.arange(mask.size), -1))
+@dataclass(frozen=True, slots=True)
+class Halves:
+    """Order of the 32-bit halves of EVT 2.1 words."""
+
+    swapped: bool
+    """Whether the half with type and time comes first, as the IMX636 writes them (``endianness=legacy``)."""
+    certain: bool
+    """Whether only this order fits."""
 
 
-@dataclass(slots=True)
-class Evt2Decoder:
-    """Decoder of EVT 2.0 and 2.1. Events before the first time word have no time and are dropped."""
+def halves_of(words: NDArray[np.uint64]) -> Halves | None:
+    """Return the order in which the halves of some words have known types and times that rise, or None.
 
-    vectors: bool
-    """Whether the words are those of EVT 2.1, with 32 pixels each."""
-    high: int | None = None
-    """Last time word, unwrapped [64 us], or None."""
-
-    def decode(self, words: NDArray[Any]) -> tuple[Columns, Columns]:
-        """Return the events and the triggers of the words that follow those of the last call."""
-        head = (words >> np.uint64(32)).astype(np.int64) if self.vectors else words.astype(np.int64)
-        kind = head >> 28
-        is_high = kind == TIME_HIGH
-        highs = unwrapped(head[is_high] & 0xFFFFFFF, 28, self.high)
-        times = np.concatenate([[self.high or 0], highs])[np.cumsum(is_high)]
-        known = np.cumsum(is_high) > 0 if self.high is None else np.ones(head.size, np.bool_)
-        t = (times << 6) | (head >> 22) & 0x3F
-        if highs.size:
-            self.high = int(highs[-1])
-        events = known & (kind <= 1)
-        trigger = known & (kind == TRIGGER)
-        edges = head[trigger]
-        triggers = edges >> 8 & 0x1F, np.zeros(edges.size, np.int64), t[trigger], edges & 1
-        x, y, p = head[events] >> 11 & 0x7FF, head[events] & 0x7FF, kind[events]
-        if not self.vectors:
-            return (x, y, t[events], p), triggers
-        valid = (words[events] & np.uint64(0xFFFFFFFF)).astype("<u4").view(np.uint8)
-        which, bit = np.nonzero(np.unpackbits(valid, bitorder="little").reshape(-1, 32))
-        return (x[which] + bit, y[which], t[events][which], p[which]), triggers
-
-
-@dataclass(slots=True)
-class Evt3Decoder:
-    """Decoder of EVT 3.0, whose words change a state. Events before the first time word are dropped."""
-
-    high: int | None = None
-    """Last TIME_HIGH, unwrapped [4096 us], or None."""
-    state: dict[str, int] = field(default_factory=lambda: {"low": 0, "y": 0, "base": 0, "p": 0})
-    """Last time within TIME_HIGH [us], row, column of the next vector [px], and polarity of vectors."""
-
-    def decode(self, words: NDArray[np.uint16]) -> tuple[Columns, Columns]:
-        """Return the events and the triggers of the words that follow those of the last call."""
-        kind, load = (words >> 12).astype(np.int8), (words & 0xFFF).astype(np.int64)
-        t, known = self._times(kind, load)
-        y = self._filled("y", kind == 0x0, load & 0x7FF)
-        triggers = known & (kind == TRIGGER)
-        at = np.flatnonzero(triggers)
-        edges = load[at] >> 8, np.zeros(at.size, np.int64), t[at], load[at] & 1
-        vector = (kind == 0x4) | (kind == 0x5)
-        base, polarity = self._bases(kind, load, vector)
-        vectors = np.flatnonzero(vector & known)
-        mask = np.where(kind[vectors] == 0x4, load[vectors], load[vectors] & 0xFF).astype("<u2")
-        row, bit = np.nonzero(np.unpackbits(mask.view(np.uint8), bitorder="little").reshape(-1, 16))
-        count = (known & (kind == 0x2)).astype(np.int64)
-        count[vectors] = np.bincount(row, minlength=vectors.size)
-        which = np.repeat(np.arange(kind.size), count)
-        x, p = load[which] & 0x7FF, load[which] >> 11
-        of_vector = vector[which]
-        x[of_vector], p[of_vector] = base[vectors][row] + bit, polarity[vectors][row]
-        return (x, y[which], t[which], p), edges
-
-    def _times(self, kind: NDArray[Any], load: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return the time of each word [us], and whether it is known."""
-        is_high = kind == TIME_HIGH
-        highs = unwrapped(load[is_high], 12, self.high)
-        before = highs[0] if self.high is None and highs.size else self.high or 0
-        all_highs = np.concatenate([[before], highs])
-        known = np.cumsum(is_high) > 0 if self.high is None else np.ones(kind.size, np.bool_)
-        # A new TIME_HIGH starts at its beginning, until the next TIME_LOW.
-        is_low = kind == 0x6
-        is_low[np.flatnonzero(is_high)[np.diff(all_highs) != 0]] = True
-        low = self._filled("low", is_low, np.where(is_high, 0, load))
-        if highs.size:
-            self.high = int(highs[-1])
-        return (all_highs[np.cumsum(is_high)] << 12) | low, known
-
-    def _filled(self, name: str, mask: NDArray[np.bool_], values: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the last masked value up to each word, starting from the state, and update the state."""
-        filled = np.concatenate([values, [self.state[name]]])[_latest(mask)]
-        if filled.size:
-            self.state[name] = int(filled[-1])
-        return filled
-
-    def _bases(
-        self, kind: NDArray[Any], load: NDArray[np.int64], vector: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the column of the first pixel and the polarity of each vector. A vector moves the base behind it."""
-        is_base = kind == 0x3
-        polarity = self._filled("p", is_base, load >> 11)
-        width = np.where(kind == 0x4, 12, 8) * vector
-        moved = np.cumsum(width) - width
-        start, latest = self.state["base"], _latest(is_base)
-        base = np.where(latest < 0, start + moved, (load & 0x7FF)[latest] + moved - moved[latest])
-        if base.size:
-            self.state["base"] = int(base[-1] + width[-1])
-        return base, polarity
+    If both fit, times that stand still are less likely, then fewer times.
+    """
+    found = {}
+    for swapped, heads in ((True, words & np.uint64(0xFFFFFFFF)), (False, words >> np.uint64(32))):
+        kind = heads >> np.uint64(28)
+        times = (heads[kind == TIME_HIGH] & np.uint64(0xFFFFFFF)).astype(np.int64)
+        steps = np.diff(unwrapped(times, 28))
+        typed = np.count_nonzero(np.isin(kind, TYPES)) * 100 >= 99 * kind.size
+        if times.size and typed and np.count_nonzero(steps < 0) * 10 <= steps.size:
+            found[swapped] = (bool(steps.any()), times.size)
+    if not found:
+        return None
+    best = max(found, key=lambda swapped: found[swapped])
+    others = [fit for swapped, fit in found.items() if swapped != best]
+    return Halves(best, certain=not others or (found[best][0] and not others[0][0]))
 
 
 # Readers of Prophesee's files: RAW with the decoder in Warp, DAT with NumPy.
@@ -195,13 +113,13 @@ class EvtFile:
     word: int
     """Size of a word [bytes]."""
     swapped: bool
-    """Whether the 32-bit halves of the words are swapped, see :func:`swap_halves`."""
+    """Whether the 32-bit halves of the words are swapped, see :class:`Halves`."""
     origin: int
     """Time that is added to those of the words [us]: ``t0`` of the header, which amiwarp and faery write."""
 
     def words(self, data: bytes) -> NDArray[Any]:
         """Return the whole words of some bytes of the file, with halves as they are stored."""
-        return np.frombuffer(data, WORD_TYPES[VERSION_OF[self.word]], len(data) // self.word)
+        return words_of(data, VERSION_OF[self.word])
 
     def decoder(self) -> EvtDecoder:
         """Return a new decoder of the file's words."""
@@ -286,20 +204,8 @@ def _is_swapped(path: Path, offset: int, layout: str) -> bool:
         return "endianness=legacy" in layout
     with open_input(path) as file:
         file.seek(offset)
-        return _halves_are_swapped(words_of(file.read(EVT_BYTES), "2.1"))
-
-
-def _halves_are_swapped(words: NDArray[np.uint64]) -> bool:
-    """Return whether EVT 2.1 words have their 32-bit halves swapped, as the IMX636 writes them.
-
-    Only in the right order do the words of the time's upper bits rise.
-    """
-
-    def time_words(heads: NDArray[np.uint64]) -> tuple[bool, int]:
-        times = heads[heads >> np.uint64(28) == TIME_HIGH].astype(np.int64)
-        return bool((np.diff(times) >= 0).all()), times.size
-
-    return time_words(words & np.uint64(0xFFFFFFFF)) >= time_words(words >> np.uint64(32))
+        found = halves_of(words_of(file.read(EVT_BYTES), "2.1"))
+        return found is None or found.swapped
 
 
 def open_dat(path: Path) -> Recording:

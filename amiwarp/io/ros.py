@@ -5,99 +5,76 @@ import heapq
 import itertools
 import os
 import struct
+import weakref
 from collections.abc import Generator, Iterable, Iterator
-from functools import partial
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.recording import Events, Recording, regroup
-from amiwarp.io.file_scan import FileEvents, Packet, read_sensors
+from amiwarp.io.file_scan import FileEvents, Packet, sensors_of
 from amiwarp.io.files import errors_name, scratch_folder
 from amiwarp.io.formats import Bag, Outline
-from amiwarp.io.prophesee import Columns, Evt2Decoder, Evt3Decoder, Evt3Encoder, origin_of, swap_halves, words_of
+from amiwarp.io.prophesee import Evt3Encoder, origin_of
 from amiwarp.io.reading_process import Reply, packets, run
+from amiwarp.io.ros_bags import (
+    ARRAYS,
+    PACKET_DEFINITION,
+    Message,
+    MessageNumbers,
+    choose,
+    deserialised,
+    messages_of,
+    note_largest_gap,
+    opened_bag,
+    typestore,
+    unpacked,
+)
+from amiwarp.io.ros_words import (
+    EVT,
+    Layout,
+    check_byte_order,
+    edge_packets,
+    event_packets,
+    layout_of,
+    stamp_packets,
+)
 
 # Decoders of the ROS messages that hold events: arrays of events, and packets of a sensor's own words.
 #
-# The messages are those of the packages dvs_msgs, prophesee_event_msgs, event_camera_msgs and, its former name,
-# event_array_msgs. Arrays of events are decoded with NumPy, because a Python object per event would be slow.
+# The messages are those of the packages dvs_msgs, prophesee_event_msgs, dv_ros_msgs, dv_ros2_msgs, event_camera_msgs
+# and, its former name, event_array_msgs. Arrays of events are decoded with NumPy, because a Python object per event
+# would be slow. Words of Prophesee's sensors are in :mod:`amiwarp.io.ros_words`.
 
-ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
-"""Types of messages that hold an array of events."""
-
-PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
-"""Types of messages that hold the words of a sensor."""
-
-ARRAY_FIELDS = ("header", "height", "width", "events")
-EVENT_FIELDS = ("x", "y", "ts", "polarity")
-"""Order of the fields in both packages of :data:`ARRAYS`. Other orders are refused."""
-
-PACKET_DEFINITION = """std_msgs/Header header
-uint32 height
-uint32 width
-uint64 seq
-uint64 time_base
-string encoding
-bool is_bigendian
-uint8[] events
-"""
-"""Definition of :data:`PACKETS`, for bags that store none."""
+Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
+"""Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
 
 NOTHING: Columns = (np.zeros(0, np.int64),) * 4
 """No events."""
 
 
-class EventPacket(Protocol):
-    """Message of one of the types :data:`PACKETS`."""
-
-    height: int
-    width: int
-    time_base: int
-    encoding: str
-    is_bigendian: bool
-    events: NDArray[np.uint8]
-
-
-class PacketDecoder:
-    """Decoder of the messages of one topic, in their order."""
-
-    def __init__(self) -> None:
-        self._decoders: dict[str, Any] = {}
-
-    def decode(self, message: EventPacket) -> tuple[Columns, Columns]:
-        """Return the events and the triggers of a message. Times are the sensor's, not those of the computer."""
-        if message.is_bigendian:
-            raise AmiwarpError("has packets of big-endian words, which are not read; record on a little-endian machine")
-        base, data = int(message.time_base), np.ascontiguousarray(message.events, np.uint8)
-        if message.encoding in EVT:
-            return self._evt(message.encoding, data)
-        if message.encoding == "mono":
-            return _mono(base, data), NOTHING
-        if message.encoding == "trigger":
-            x, _, t, p = _mono(base, data)
-            return NOTHING, (np.zeros_like(x), np.zeros_like(x), t, p)
-        if message.encoding == "libcaer":
-            return _libcaer(base, data), NOTHING
-        if message.encoding == "libcaer_cmp":
-            return _libcaer_cmp(base, data), NOTHING
-        known = ", ".join((*EVT, "mono", "trigger", "libcaer", "libcaer_cmp"))
-        raise AmiwarpError(f"has packets with the encoding '{message.encoding[:40]}'; expected one of {known}")
-
-    def _evt(self, encoding: str, data: NDArray[np.uint8]) -> tuple[Columns, Columns]:
-        words = words_of(data, EVT[encoding])
-        if encoding not in self._decoders:
-            self._decoders[encoding] = Evt3Decoder() if encoding == "evt3" else Evt2Decoder(encoding == "evt21")
-        events, edges = self._decoders[encoding].decode(swap_halves(words) if encoding == "evt21" else words)
-        return events, edges
-
-
-EVT = {"evt3": "3", "evt2": "2", "evt21": "2.1"}
-"""Encodings with Prophesee's words, and their versions."""
+def decode_packet(message: Any) -> tuple[Columns, Columns]:
+    """Return the events and the triggers of a message without EVT words. Times are the sensor's, not the computer's."""
+    check_byte_order(message)
+    base, data = int(message.time_base), np.ascontiguousarray(message.events, np.uint8)
+    if message.encoding == "mono":
+        return _mono(base, data), NOTHING
+    if message.encoding == "trigger":
+        x, _, t, p = _mono(base, data)
+        return NOTHING, (np.zeros_like(x), np.zeros_like(x), t, p)
+    if message.encoding == "libcaer":
+        return _libcaer(base, data), NOTHING
+    if message.encoding == "libcaer_cmp":
+        return _libcaer_cmp(base, data), NOTHING
+    known = ", ".join((*EVT, "mono", "trigger", "libcaer", "libcaer_cmp"))
+    raise AmiwarpError(
+        f"has packets with the encoding '{message.encoding[:40]}'; expected one of {known}, in the whole topic"
+    )
 
 
 def _mono(base: int, data: NDArray[np.uint8]) -> Columns:
@@ -191,12 +168,9 @@ def _columns(events: NDArray[Any]) -> Columns:
     return events["x"], events["y"], t, events["p"]
 
 
-# Reader of ROS bags: ROS 1 bags, and the SQLite and MCAP files of ROS 2, with rosbags.
+# Reader of ROS bags.
 #
 # Everything that touches the file runs in the reading process. The event times are those of the sensor.
-
-ROS1, SQLITE, MCAP = b"#ROSBAG V2.0\n", b"SQLite format 3\0", b"\x89MCAP0\r\n"
-"""First bytes of the files of bags."""
 
 OTHER = {
     "sensor_msgs/msg/Image": "frames",
@@ -206,30 +180,87 @@ OTHER = {
 """Types of messages that are counted, and the names of the counts."""
 
 
+@dataclass(frozen=True, eq=False)
+class EventTopic:
+    """Topic of events in a bag."""
+
+    path: Path
+    """The bag, or a copy that is not compressed."""
+    name: str
+    """Name of the topic."""
+    layout: Layout | None
+    """Layout of the words in the messages; None if they hold none of Prophesee's sensors."""
+
+    def events(self, notes: dict[str, int]) -> Iterator[Packet]:
+        """Yield the events."""
+        if self.layout is None:
+            return packets(read_packets, self.path, self.name, False, notes)
+        return event_packets(self.path, self.name, self.layout, notes)
+
+    def edges(self) -> Iterator[Packet]:
+        """Yield the edges of the triggers."""
+        if self.layout is None:
+            return packets(read_packets, self.path, self.name, True, {})
+        return edge_packets(self.path, self.name, self.layout)
+
+    def stamps(self) -> Iterator[tuple[NDArray[np.int64], ...]]:
+        """Yield for each message with events: the times of its first event [us], its recording and its header [ns]."""
+        if self.layout is None:
+            return packets(read_stamps, self.path, self.name, {})
+        return stamp_packets(self.path, self.name, self.layout)
+
+    def sensors(self, function: str) -> Iterator[tuple[NDArray[Any], ...]]:
+        """Yield what a function of this module reads next to the events."""
+        return packets(f"{__name__}:{function}", self.path, self.name, {})
+
+
 def open_rosbag(path: Path, topic: str | None = None) -> Recording:
     """Open the events of a topic of a bag: a file, or the folder of a ROS 2 bag."""
-    source = path.absolute()
-    with errors_name(path, lambda: "opening the bag"):
-        about = run(read_head, source, topic)
-    read = partial(packets, read_packets, source, about["topic"], False)
-    size = tuple(about["size"]) if min(about["size"]) else None
-    events = FileEvents(path, read, size=size)
-    imu, frames, notes = read_sensors(path, about["counts"], __name__, about["topic"])
-    metadata = {"format": about["format"], "topic": about["topic"], **about["counts"], **events.metadata, **notes}
-    return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
+    with contextlib.ExitStack() as copy:
+        with errors_name(path, lambda: "opening the bag"):
+            found, about = _event_topic(copy.enter_context(unpacked(path)), topic)
+        events = FileEvents(path, found.events, size=tuple(about["size"]) if min(about["size"]) else None)
+        imu, frames, notes = sensors_of(path, about["counts"], found.sensors)
+        # Events and frames are read from the copy as long as they are used.
+        weakref.finalize(found, _end_copy, copy.pop_all(), os.getpid())
+    metadata = {"format": about["format"], "topic": found.name, **about["counts"], **events.metadata, **notes}
+    if about["word_order"] is not None:
+        metadata["word_order"] = about["word_order"]
+    name = Path(path.name.removesuffix(".zstd")).stem
+    return Recording(events=events, metadata=metadata, name=name, imu=imu, frames=frames)
+
+
+_of_others: list[contextlib.ExitStack] = []
+"""Copies of the process that this one was forked from, which would end with these objects."""
+
+
+def _end_copy(copy: contextlib.ExitStack, owner: int) -> None:
+    """Remove the copy of a bag, in the process that made it."""
+    if os.getpid() == owner:
+        copy.close()
+    else:
+        _of_others.append(copy)
 
 
 def trigger_packets(path: Path, topic: str | None = None) -> Iterator[Packet]:
     """Yield the trigger edges of the packets of a topic."""
-    source = path.absolute()
-    about = run(read_head, source, topic)
-    return packets(read_packets, source, about["topic"], True, {})
+    with unpacked(path) as source:
+        yield from _event_topic(source, topic)[0].edges()
+
+
+def _event_topic(path: Path, topic: str | None) -> tuple[EventTopic, dict[str, Any]]:
+    """Return a topic of a bag, and what :func:`read_head` says of it."""
+    about = run(read_head, path, topic)
+    layout = Layout(about["encoding"], about["swapped"]) if about["encoding"] in EVT else None
+    return EventTopic(path, about["topic"], layout), about
 
 
 def read_head(path: str, topic: str | None) -> Reply:
-    """Return the format, topic, sensor size and counts of other messages of a bag. Runs in the reading process."""
+    """Return the format, topic, sensor size, encoding and counts of other messages of a bag. Runs in the reading
+    process.
+    """
     with opened_bag(path) as (bag, ros1):
-        connection = _choose(bag, topic, 1 if ros1 else 2)
+        connection = choose(bag, topic, 1 if ros1 else 2)
         counts: dict[str, int] = {}
         others = len({other.topic for other in bag.connections} - {connection.topic})
         if others:
@@ -238,43 +269,74 @@ def read_head(path: str, topic: str | None) -> Reply:
             if other.msgtype in OTHER:
                 name = OTHER[other.msgtype]
                 counts[name] = counts.get(name, 0) + other.msgcount
-        size = (0, 0)
-        for _, _, raw in bag.messages(connections=[connection]):
-            size = _size(connection, raw, ros1=ros1)
-            break
-        return {
+        about = {
             "format": "rosbag1" if ros1 else "rosbag2",
             "topic": connection.topic,
-            "size": size,
+            "size": (0, 0),
+            "encoding": "",
+            "swapped": False,
+            "word_order": None,
             "counts": counts,
-        }, []
+        }
+        found = messages_of(bag, [connection], ros1=ros1)
+        if connection.msgtype in ARRAYS:
+            for one in itertools.islice(found, 1):
+                about["size"] = decode_array(one.raw, ros1=ros1)[:2]
+            return about, []
+        read = (deserialised(connection, one.raw, ros1=ros1) for one in found)
+        for first in itertools.islice(read, 1):
+            about["size"] = int(first.width), int(first.height)
+            about["encoding"] = first.encoding
+            if first.encoding in EVT:
+                layout, about["word_order"] = layout_of(first.encoding, itertools.chain([first], read))
+                about["swapped"] = layout.swapped
+        return about, []
 
 
 def read_packets(notes: dict[str, int], path: str, topic: str, triggers: bool) -> Iterator[Columns]:
-    """Yield the events, or the triggers, of each message of a topic. Runs in the reading process."""
+    """Yield the events, or the triggers, of each message of a topic without EVT words. Runs in the reading process."""
+    numbers = MessageNumbers(notes)
+    latest = 0
+    for one, ros1 in _topic_messages(notes, path, topic):
+        number, events, edges = _decoded(one, ros1=ros1)
+        if number is not None:
+            note_largest_gap(notes, numbers.missing(one.connection.id, number), latest)
+        if len(events[2]):
+            latest = int(events[2][-1])
+        notes["read"] = notes.get("read", 0) + 1
+        notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
+        yield edges if triggers else events
+
+
+def _topic_messages(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[Message, bool]]:
+    """Yield the messages of a topic, and whether the bag is of ROS 1. Note their number."""
     with opened_bag(path) as (bag, ros1):
         connections = [found for found in bag.connections if found.topic == topic]
-        decode = _decoder(connections[0], ros1=ros1)
         notes["total"] = max(sum(found.msgcount for found in connections), 1)
-        for _, _, raw in bag.messages(connections=connections):
-            events, edges = decode(raw)
-            notes["read"] = notes.get("read", 0) + 1
-            notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
-            yield edges if triggers else events
+        for one in messages_of(bag, connections, ros1=ros1):
+            yield one, ros1
+
+
+def _decoded(one: Message, *, ros1: bool) -> tuple[int | None, Columns, Columns]:
+    """Return the number of a message, or None in arrays of ROS 2, which have none; its events; and its triggers."""
+    if one.connection.msgtype not in ARRAYS:
+        message = deserialised(one.connection, one.raw, ros1=ros1)
+        return int(message.seq), *decode_packet(message)
+    typestore(one.connection, ros1=ros1)
+    x, y, t, p = decode_array(one.raw, ros1=ros1)[2]
+    number = struct.unpack_from("<I", one.raw)[0] if ros1 else None
+    return number, (x, y, t, p), (x[:0], y[:0], t[:0], p[:0])
 
 
 def read_stamps(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[Any, ...]]:
-    """Yield for each message of a topic of a ROS 2 bag that holds events: the times of its first event [us], of its
-    recording and of its header [ns]. Runs in the reading process.
+    """Yield for each message of a topic of a ROS 2 bag that holds events, but no EVT words: the times of its first
+    event [us], of its recording and of its header [ns]. Runs in the reading process.
     """
-    with opened_bag(path) as (bag, ros1):
-        connections = [found for found in bag.connections if found.topic == topic]
-        decode = _decoder(connections[0], ros1=ros1)
-        for _, recorded, raw in bag.messages(connections=connections):
-            t = decode(raw)[0][2]
-            if len(t):
-                seconds, rest = struct.unpack_from("<iI", raw, 4)  # all types of messages with events begin so
-                yield tuple(np.array([value], np.int64) for value in (t[0], recorded, seconds * 10**9 + rest))
+    for one, ros1 in _topic_messages(notes, path, topic):
+        t = _decoded(one, ros1=ros1)[1][2]
+        if len(t):
+            seconds, rest = struct.unpack_from("<iI", one.raw, 4)  # all types of messages with events begin so
+            yield tuple(np.array([value], np.int64) for value in (t[0], one.recorded, seconds * 10**9 + rest))
 
 
 def read_topics(path: str, topic: str) -> Reply:
@@ -301,114 +363,9 @@ def read_others(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[
     with opened_bag(path) as (bag, _):
         others = [one for one in bag.connections if one.topic != topic]
         places = {one.id: at for at, one in enumerate(others)}
-        for one, recorded, raw in bag.messages(connections=others) if others else ():
-            numbers = (np.array([value], np.int64) for value in (len(raw), recorded, places[one.id]))
-            yield np.frombuffer(raw, np.uint8), *numbers
-
-
-@contextlib.contextmanager
-def opened_bag(path: str) -> Iterator[tuple[Any, bool]]:
-    """Open a bag by its content, not its ending. Return the library's reader, and whether the bag is of ROS 1."""
-    optional_module("rosbags", "ros", "is a ROS bag, which needs rosbags")
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2.reader import DirectoryReader
-    from rosbags.rosbag2.storage_mcap import McapReader
-    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-
-    head = b""
-    if not os.path.isdir(path):
-        with open(path, "rb") as file:
-            head = file.read(16)
-    ros1 = head.startswith(ROS1)
-    readers: dict[bytes, Any] = {ROS1: Reader1, SQLITE: Sqlite3Reader, MCAP: McapReader}
-    kind = next((reader for magic, reader in readers.items() if head.startswith(magic)), DirectoryReader)
-    bag = kind(Path(path))
-    bag.open()
-    try:
-        yield bag, ros1
-    finally:
-        bag.close()
-
-
-def _choose(bag: Any, topic: str | None, version: int) -> Any:
-    """Return the connection of the topic with events. Raises :class:`AmiwarpError` if there are several or none."""
-    found = {one.topic: one for one in bag.connections if one.msgtype in (*ARRAYS, *PACKETS) and one.msgcount}
-    if topic is None and len(found) == 1:
-        return next(iter(found.values()))
-    listed = ", ".join(f"{name} ({one.msgcount} messages)" for name, one in sorted(found.items())[:20])
-    if found and topic is None:
-        raise AmiwarpError(
-            f"is a ROS {version} bag with events in several topics: {listed}; "
-            "choose one with amiwarp convert --topic, in Python with topic="
-        )
-    if found and topic in found:
-        return found[topic]
-    if found:
-        raise AmiwarpError(f"has no events in the topic '{topic}'; the topics with events are {listed}")
-    others = sorted({f"{one.topic} ({one.msgtype.replace('/msg/', '/')})" for one in bag.connections})
-    shown = ", ".join(others[:20]) or "none"
-    raise AmiwarpError(f"is a ROS {version} bag without event topics; its topics are {shown}; give a bag with events")
-
-
-def _decoder(connection: Any, *, ros1: bool) -> Any:
-    """Return a function that decodes a message of a connection to events and triggers."""
-    if connection.msgtype in ARRAYS:
-        _typestore(connection, ros1=ros1)
-
-        def decode(raw: bytes) -> tuple[Columns, Columns]:
-            events = decode_array(raw, ros1=ros1)[2]
-            return events, tuple(column[:0] for column in events)  # type: ignore[return-value]
-
-        return decode
-    packet = PacketDecoder()
-    return lambda raw: packet.decode(deserialised(connection, raw, ros1=ros1))
-
-
-def _size(connection: Any, raw: bytes, *, ros1: bool) -> tuple[int, int]:
-    """Return the sensor size in a message [px]; 0 if it is not set."""
-    if connection.msgtype in ARRAYS:
-        return decode_array(raw, ros1=ros1)[:2]
-    message = deserialised(connection, raw, ros1=ros1)
-    return int(message.width), int(message.height)
-
-
-_stores: dict[tuple[Any, ...], Any] = {}
-"""Type stores by message type and definition. Making one takes 10 ms."""
-
-
-def deserialised(connection: Any, raw: bytes, *, ros1: bool) -> Any:
-    """Return a message as an object with its fields."""
-    store = _typestore(connection, ros1=ros1)
-    return (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(raw, connection.msgtype)
-
-
-def _typestore(connection: Any, *, ros1: bool) -> Any:
-    """Return a type store with the message type, as the bag defines it if it does."""
-    from rosbags.interfaces import MessageDefinitionFormat
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    key = (connection.msgtype, connection.msgdef.data, ros1)
-    if key in _stores:
-        return _stores[key]
-    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-    stored = connection.msgdef.format == MessageDefinitionFormat.MSG
-    if stored or connection.msgtype in PACKETS:
-        types = get_types_from_msg(connection.msgdef.data if stored else PACKET_DEFINITION, connection.msgtype)
-        store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
-        if connection.msgtype in ARRAYS:
-            _check_order(types, connection.msgtype)
-    _stores[key] = store
-    return store
-
-
-def _check_order(types: Any, name: str) -> None:
-    """Raise :class:`AmiwarpError` if an array of events is not defined as its package publishes it."""
-    event = types.get(name.replace("EventArray", "Event"))
-    for fields, expected in ((types[name], ARRAY_FIELDS), (event, EVENT_FIELDS)):
-        given = tuple(field[0] for field in fields[1]) if fields is not None else ()
-        if given != expected:
-            shown = ", ".join(given) or "nothing"
-            raise AmiwarpError(f"defines {name} with the fields {shown}; expected {', '.join(expected)}")
+        for one in messages_of(bag, others, ros1=False) if others else ():
+            numbers = (len(one.raw), one.recorded, places[one.connection.id])
+            yield np.frombuffer(one.raw, np.uint8), *(np.array([value], np.int64) for value in numbers)
 
 
 # Reader of the messages ``sensor_msgs/Imu`` and ``sensor_msgs/Image`` in ROS bags. Runs in the reading process.
@@ -470,8 +427,8 @@ def _sensor_messages(path: str, topic: str, kind: str) -> Iterator[Any]:
             listed = ", ".join(sorted(found)[:10]) or "none"
             raise AmiwarpError(f"expected one topic of {kind.replace('/msg', '')}; the topics are {listed}")
         connections = [one for one in bag.connections if one.topic in chosen]
-        for connection, _, raw in bag.messages(connections=connections):
-            yield deserialised(connection, raw, ros1=ros1)
+        for one in messages_of(bag, connections, ros1=ros1):
+            yield deserialised(one.connection, one.raw, ros1=ros1)
 
 
 def _time(message: Any) -> int:
@@ -534,11 +491,13 @@ class PacketEncoder:
 def write_ros2(part: Path, blocks: Iterable[Events], about: Outline) -> None:
     """Write all events. The extension of the file decides between MCAP and SQLite."""
     kind = about.path.suffix.lower()
-    encoder = PacketEncoder(about)
-    from rosbags.rosbag2 import StoragePlugin, Writer
+    with scratch_folder(part.parent) as folder, contextlib.ExitStack() as source:
+        if about.bag is not None:
+            about = replace(about, bag=Bag(source.enter_context(unpacked(about.bag.path)), about.bag.topic))
+        encoder = PacketEncoder(about)
+        from rosbags.rosbag2 import StoragePlugin, Writer
 
-    storage = StoragePlugin.MCAP if kind == ".mcap" else StoragePlugin.SQLITE3
-    with scratch_folder(part.parent) as folder:
+        storage = StoragePlugin.MCAP if kind == ".mcap" else StoragePlugin.SQLITE3
         bag = folder / "bag"
         # Older programs read version 8 too, the earliest that rosbags writes.
         with Writer(bag, version=8, storage_plugin=storage) as writer, contextlib.ExitStack() as opened:
@@ -564,7 +523,7 @@ class _Clock:
         """Read the times of the messages of a bag."""
         parts = [(np.zeros(1, np.int64),) * 3]
         if bag is not None:
-            parts = list(packets(read_stamps, bag.path, bag.topic, {}))
+            parts = list(_event_topic(bag.path, bag.topic)[0].stamps())
         t, self._recorded, self._stamps = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         self._t = np.maximum.accumulate(t)
 

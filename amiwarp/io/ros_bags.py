@@ -1,0 +1,319 @@
+"""ROS bags and their messages, with rosbags: ROS 1 bags, and the SQLite and MCAP files of ROS 2, also compressed.
+
+Everything that touches a bag runs in the reading process.
+"""
+
+import contextlib
+import errno
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from amiwarp.errors import AmiwarpError, optional_module
+from amiwarp.io.files import open_input, scratch_folder
+from amiwarp.io.reading_process import Reply, run
+
+# Types of messages that hold events.
+
+ARRAYS = (
+    "dvs_msgs/msg/EventArray",
+    "prophesee_event_msgs/msg/EventArray",
+    "dv_ros_msgs/msg/EventArray",
+    "dv_ros2_msgs/msg/EventArray",
+)
+"""Types of messages that hold an array of events."""
+
+PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
+"""Types of messages that hold the words of a sensor."""
+
+ARRAY_FIELDS = ("header", "height", "width", "events")
+EVENT_FIELDS = ("x", "y", "ts", "polarity")
+"""Order of the fields in all packages of :data:`ARRAYS`. Other orders are refused."""
+
+PACKET_DEFINITION = """std_msgs/Header header
+uint32 height
+uint32 width
+uint64 seq
+uint64 time_base
+string encoding
+bool is_bigendian
+uint8[] events
+"""
+"""Definition of :data:`PACKETS`, for bags that store none."""
+
+# Opening of bags.
+
+ROS1, SQLITE, MCAP = b"#ROSBAG V2.0\n", b"SQLite format 3\0", b"\x89MCAP0\r\n"
+"""First bytes of the files of bags."""
+
+
+@contextlib.contextmanager
+def opened_bag(path: str) -> Iterator[tuple[Any, bool]]:
+    """Open a bag by its content, not its ending. Return the library's reader, and whether the bag is of ROS 1."""
+    optional_module("rosbags", "ros", "is a ROS bag, which needs rosbags")
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2.reader import DirectoryReader
+    from rosbags.rosbag2.storage_mcap import McapReader
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+    head = b""
+    if not os.path.isdir(path):
+        with open(path, "rb") as file:
+            head = file.read(16)
+    ros1 = head.startswith(ROS1)
+    readers: dict[bytes, Any] = {ROS1: Reader1, SQLITE: Sqlite3Reader, MCAP: McapReader}
+    kind = next((reader for magic, reader in readers.items() if head.startswith(magic)), DirectoryReader)
+    bag = kind(Path(path))
+    bag.open()
+    try:
+        yield bag, ros1
+    finally:
+        bag.close()
+
+
+class Message(NamedTuple):
+    """Message of a bag."""
+
+    connection: Any
+    """Connection of rosbags: topic, type and publisher."""
+    recorded: int
+    """Time of its recording [ns]."""
+    raw: Any
+    """Its bytes."""
+
+
+def messages_of(bag: Any, connections: list[Any], *, ros1: bool) -> Iterator[Message]:
+    """Yield the messages of some connections of a bag.
+
+    A file from a folder whose messages are compressed one by one does not say so: only ``metadata.yaml`` does.
+    """
+    for connection, recorded, raw in bag.messages(connections=connections):
+        # Messages of ROS 2 begin with the encapsulation of CDR, whose first byte is 0.
+        if not ros1 and raw[:4] == ZSTANDARD:
+            raw = _unpacked_message(raw)
+        yield Message(connection, recorded, raw)
+
+
+def choose(bag: Any, topic: str | None, version: int) -> Any:
+    """Return the connection of the topic with events. Raises :class:`AmiwarpError` if there are several or none."""
+    found = {one.topic: one for one in bag.connections if one.msgtype in (*ARRAYS, *PACKETS) and one.msgcount}
+    if topic is None and len(found) == 1:
+        return next(iter(found.values()))
+    listed = ", ".join(f"{name} ({one.msgcount} messages)" for name, one in sorted(found.items())[:20])
+    if found and topic is None:
+        raise AmiwarpError(
+            f"is a ROS {version} bag with events in several topics: {listed}; "
+            "choose one with amiwarp convert --topic, in Python with topic="
+        )
+    if found and topic in found:
+        return found[topic]
+    if found:
+        raise AmiwarpError(f"has no events in the topic '{topic}'; the topics with events are {listed}")
+    others = sorted({f"{one.topic} ({one.msgtype.replace('/msg/', '/')})" for one in bag.connections})
+    shown = ", ".join(others[:20]) or "none"
+    raise AmiwarpError(f"is a ROS {version} bag without event topics; its topics are {shown}; give a bag with events")
+
+
+_stores: dict[tuple[Any, ...], Any] = {}
+"""Type stores by message type and definition. Making one takes 10 ms."""
+
+
+def deserialised(connection: Any, raw: bytes, *, ros1: bool) -> Any:
+    """Return a message as an object with its fields."""
+    store = typestore(connection, ros1=ros1)
+    return (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(raw, connection.msgtype)
+
+
+def typestore(connection: Any, *, ros1: bool) -> Any:
+    """Return a type store with the message type, as the bag defines it if it does."""
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    key = (connection.msgtype, connection.msgdef.data, ros1)
+    if key in _stores:
+        return _stores[key]
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    stored = connection.msgdef.format == MessageDefinitionFormat.MSG
+    if stored or connection.msgtype in PACKETS:
+        types = get_types_from_msg(connection.msgdef.data if stored else PACKET_DEFINITION, connection.msgtype)
+        store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
+        if connection.msgtype in ARRAYS:
+            _check_order(types, connection.msgtype)
+    _stores[key] = store
+    return store
+
+
+def _check_order(types: Any, name: str) -> None:
+    """Raise :class:`AmiwarpError` if an array of events is not defined as its package publishes it."""
+    event = types.get(name.replace("EventArray", "Event"))
+    for fields, expected in ((types[name], ARRAY_FIELDS), (event, EVENT_FIELDS)):
+        given = tuple(field[0] for field in fields[1]) if fields is not None else ()
+        if given != expected:
+            shown = ", ".join(given) or "nothing"
+            raise AmiwarpError(f"defines {name} with the fields {shown}; expected {', '.join(expected)}")
+
+
+# Numbers of messages, which tell how many were lost.
+
+RESTART = -1
+"""Stands for a number that does not continue the one before, as after a new start of the driver."""
+
+LARGEST_GAP = 1 << 32
+"""Largest number of missing messages. A larger step is another count."""
+
+
+class MessageNumbers:
+    """Numbers of the messages of a topic, which its publishers count."""
+
+    def __init__(self, notes: dict[str, int]) -> None:
+        """Take the dictionary of counts, which gets the messages that are missing."""
+        self._notes = notes
+        self._last: dict[int, int] = {}  # by publisher
+
+    def missing(self, publisher: int, number: int) -> int:
+        """Return how many messages are missing before that with this number, or :data:`RESTART`.
+
+        Publishers that do not count give all messages the same number.
+        """
+        step = number - self._last.get(publisher, number)
+        self._last[publisher] = number
+        if step in (0, 1):
+            return 0
+        if not 0 < step <= LARGEST_GAP:
+            return RESTART
+        self._notes["missing_packets"] = self._notes.get("missing_packets", 0) + step - 1
+        self._notes["packet_gaps"] = self._notes.get("packet_gaps", 0) + 1
+        return step - 1
+
+
+def note_largest_gap(notes: dict[str, int], missing: int, t: int) -> None:
+    """Note a gap if it is the largest so far, with the time of the last event before it [us]."""
+    if missing > notes.get("largest_packet_gap", 0):
+        notes["largest_packet_gap"] = missing
+        notes["largest_packet_gap_us"] = t
+
+
+# Compressed bags: a file that the Zstandard program or rosbag2 has compressed, or the folder of such files. rosbag2 can
+# also compress each message, which needs no copy.
+
+ZSTANDARD = b"\x28\xb5\x2f\xfd"
+"""First bytes of a Zstandard archive."""
+
+LARGEST_RATIO = 100
+"""Largest ratio of the sizes after and before unpacking. Words of sensors reach 10."""
+
+SMALLEST_LIMIT = 1 << 30
+"""Size to which every file may be unpacked [bytes]."""
+
+LARGEST_MESSAGE = 1 << 28
+"""Largest message after unpacking [bytes]."""
+
+PIECE_BYTES = 1 << 20
+"""Number of bytes that are unpacked at once."""
+
+
+def _unpacked_message(raw: bytes) -> bytes:
+    """Return a message that was compressed alone."""
+    import zstandard
+
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=LARGEST_MESSAGE).stream_reader(raw) as reader:
+            data = reader.read(LARGEST_MESSAGE + 1)
+    except zstandard.ZstdError as error:
+        raise AmiwarpError(f"a compressed message cannot be unpacked: {error}; the bag is damaged") from error
+    if len(data) > LARGEST_MESSAGE:
+        raise AmiwarpError(f"a message unpacks to over {LARGEST_MESSAGE} bytes; the bag is damaged")
+    return data
+
+
+def packed_head(path: Path) -> bytes:
+    """Return the first bytes of what a Zstandard archive holds, or nothing if it is damaged."""
+    import zstandard
+
+    try:
+        with open_input(path) as file, zstandard.ZstdDecompressor().stream_reader(file) as reader:
+            return reader.read(16)
+    except zstandard.ZstdError:
+        return b""
+
+
+def is_packed(path: Path) -> bool:
+    """Return whether a bag is a Zstandard archive, or a folder of such files."""
+    if path.is_dir():
+        return any(file.suffix == ".zstd" for file in path.iterdir())
+    with open_input(path) as file:
+        return file.read(4) == ZSTANDARD
+
+
+@contextlib.contextmanager
+def unpacked(path: Path) -> Iterator[Path]:
+    """Give a bag that is not compressed: the bag itself, or a copy, which is removed at the end.
+
+    The copy lies in the system's folder for temporary files: the folder of a recording may be read-only.
+    """
+    if not is_packed(path):
+        yield path.absolute()
+        return
+    with scratch_folder(Path(tempfile.gettempdir())) as scratch:
+        yield scratch / run(unpack, path.absolute(), str(scratch))
+
+
+def unpack(path: str, scratch: str) -> Reply:
+    """Unpack a bag into a folder, and return the name that it has there. Runs in the reading process."""
+    source, target = Path(path), Path(scratch) / "bag"
+    try:
+        if source.is_dir():
+            _unpack_folder(source, target)
+        else:
+            _unpack_file(source, target)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        raise AmiwarpError(
+            f"is compressed, and {scratch} has no space for its copy; set TMPDIR to a folder with more space"
+        ) from error
+    return target.name, []
+
+
+def _unpack_folder(source: Path, target: Path) -> None:
+    """Unpack the files of a folder, and write its metadata without their compression."""
+    with open(source / "metadata.yaml", encoding="utf-8") as file:
+        metadata = file.read()
+    metadata = re.sub(r"(\bcompression_(?:mode|format):).*", r'\1 ""', metadata)
+    metadata = re.sub(r"(\.(?:db3|mcap))\.zstd\b", r"\1", metadata)
+    target.mkdir()
+    (target / "metadata.yaml").write_text(metadata, encoding="utf-8")
+    for file in sorted(source.glob("*.zstd")):
+        _unpack_file(file, target / file.stem)
+
+
+def _unpack_file(source: Path, target: Path) -> None:
+    """Unpack an archive of one file."""
+    import zstandard
+
+    most = max(LARGEST_RATIO * source.stat().st_size, SMALLEST_LIMIT)
+    written = 0
+    try:
+        with open(source, "rb") as packed, open(target, "xb") as plain:
+            stated = zstandard.frame_content_size(packed.read(32))
+            packed.seek(0)
+            decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_MESSAGE)
+            with decompressor.stream_reader(packed, read_across_frames=True) as reader:
+                while piece := reader.read(PIECE_BYTES):
+                    written += len(piece)
+                    if written > most:
+                        raise AmiwarpError(
+                            f"{source.name} unpacks to over {most:,} bytes, too many for its size; the file is damaged"
+                        )
+                    plain.write(piece)
+    except zstandard.ZstdError as error:
+        raise AmiwarpError(
+            f"{source.name} cannot be unpacked after {written:,} bytes: {error}; the file is damaged"
+        ) from error
+    if written < stated:
+        raise AmiwarpError(
+            f"{source.name} ends after {written:,} of {stated:,} bytes of the bag; copy the whole file again"
+        )

@@ -1,0 +1,346 @@
+"""Packets of Prophesee's EVT words in ROS bags: lost packets, long pauses, the order of halves, and the decoding.
+
+The reading process reads the messages. It finds what the packets do not tell a decoder of words: where packets are
+missing, so that the row and the time of the next events are unknown; where a pause was longer than the sensor's clock
+counts; and where this clock starts again. The program decodes the words, as it does those of RAW files.
+"""
+
+import itertools
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Events
+from amiwarp.io.evt_decoder import EventColumns, EvtDecoder, Triggers
+from amiwarp.io.file_scan import Packet, unwrapped
+from amiwarp.io.prophesee import halves_of, words_of
+from amiwarp.io.reading_process import packets
+from amiwarp.io.ros_bags import RESTART, MessageNumbers, deserialised, messages_of, note_largest_gap, opened_bag
+
+EVT = {"evt3": "3.0", "evt2": "2.0", "evt21": "2.1"}
+"""Encodings with Prophesee's words, and their versions."""
+
+TIME_HIGH, TRIGGER = 0x8, 0xA
+"""Types of words that all versions share."""
+ROW, SINGLE, VECTOR_BASE, VECTOR_12, VECTOR_8, TIME_LOW = 0x0, 0x2, 0x3, 0x4, 0x5, 0x6
+"""Types of EVT 3.0 words."""
+
+NO_EVENT = {"3.0": 0xF000, "2.0": 0xF0000000, "2.1": 0xF0000000_F0000000}
+"""Word that decoders pass over, by version."""
+
+PAUSE_ERROR_US = 1_000_000
+"""Largest difference between the lengths of a pause by the stamps and by the sensor's clock [us]. The computer stamps
+packets late, by up to this time."""
+
+LONGEST_PAUSE_US = 100_000_000_000
+"""Longest pause [us], 28 h. A larger step of the stamps is a clock of the computer that was set."""
+
+ORDER_WORDS = 1 << 18
+"""Number of words of EVT 2.1 from which the order of their halves is found."""
+
+BITS = np.unpackbits(np.arange(1 << 16, dtype="<u2").view(np.uint8).reshape(-1, 2), axis=1).sum(axis=1, dtype=np.uint8)
+"""Number of set bits of each number of 16 bits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How the words of an encoding are laid out."""
+
+    encoding: str
+    """Name of the encoding in the messages."""
+    swapped: bool = False
+    """Whether the 32-bit halves of EVT 2.1 words are swapped."""
+
+    @property
+    def version(self) -> str:
+        """Version of EVT."""
+        return EVT[self.encoding]
+
+    @property
+    def bits(self) -> int:
+        """Number of bits of a word below its type, and of a TIME_HIGH."""
+        return 12 if self.version == "3.0" else 28
+
+    @property
+    def unit_us(self) -> int:
+        """Unit of TIME_HIGH [us]."""
+        return 1 << 12 if self.version == "3.0" else 1 << 6
+
+    def heads(self, words: NDArray[Any]) -> NDArray[Any]:
+        """Return what holds the type of each word: the word, or a half of EVT 2.1."""
+        return words if self.version != "2.1" else words.view("<u4")[0 if self.swapped else 1 :: 2]
+
+    def counts(self, words: NDArray[Any]) -> NDArray[np.uint8]:
+        """Return the number of events of each word."""
+        kind = self.heads(words) >> self.bits
+        if self.version == "3.0":
+            single = (kind == SINGLE).astype(np.uint16)
+            pixels = np.where(kind == VECTOR_12, words & 0xFFF, np.where(kind == VECTOR_8, words & 0xFF, single))
+            return BITS[pixels]
+        is_event = (kind <= 1).astype(np.uint8)
+        if self.version == "2.0":
+            return is_event
+        pixels = words.view("<u4")[1 if self.swapped else 0 :: 2]
+        return (BITS[pixels & 0xFFFF] + BITS[pixels >> 16]) * is_event
+
+
+def layout_of(encoding: str, messages: Iterable[Any]) -> tuple[Layout, str | None]:
+    """Return the layout of the words in some messages, and a note if it is not certain.
+
+    Raises :class:`AmiwarpError` if the words fit no layout.
+    """
+    if encoding != "evt21":
+        return Layout(encoding), None
+    parts = []
+    count = 0
+    for message in messages:
+        parts.append(words_of(message.events, "2.1"))
+        count += len(parts[-1])
+        if count >= ORDER_WORDS:
+            break
+    if not count:
+        return Layout(encoding), None
+    found = halves_of(np.concatenate(parts))
+    if found is None:
+        raise AmiwarpError(
+            "has EVT 2.1 words without times that rise, in either order of their 32-bit halves; "
+            "the bag is damaged, or its encoding is not evt21"
+        )
+    order = "swapped" if found.swapped else "not swapped"
+    note = None if found.certain else f"assumed to be {order}: the words have times that rise in both orders"
+    return Layout(encoding, found.swapped), note
+
+
+# Reading of the messages, in the reading process.
+
+
+@dataclass(slots=True)
+class Unknown:
+    """What the words so far do not determine: after lost packets, or at the beginning.
+
+    Events that need it are taken out. Words of the time, of rows and of columns stay.
+    """
+
+    layout: Layout
+    kinds: tuple[int, ...] = ()
+    """Types of the words that must come first, TIME_HIGH before TIME_LOW."""
+
+    def start(self) -> None:
+        """Forget all that earlier words have determined."""
+        three = self.layout.version == "3.0"
+        self.kinds = (TIME_HIGH, TIME_LOW, ROW, VECTOR_BASE) if three else (TIME_HIGH,)
+
+    def without_events(self, words: NDArray[Any]) -> tuple[NDArray[Any], int]:
+        """Return words without the events whose time or place is unknown, and how many events and edges that are."""
+        kind = self.layout.heads(words) >> self.layout.bits
+        always = np.ones(kind.size, np.bool_)
+        known = dict.fromkeys((TIME_HIGH, TIME_LOW, ROW, VECTOR_BASE), always)
+        for each in self.kinds:
+            found = kind == each
+            if each == TIME_LOW:  # one before the TIME_HIGH may belong to another TIME_HIGH
+                found &= known[TIME_HIGH]
+            known[each] = np.logical_or.accumulate(found)
+        self.kinds = tuple(each for each in self.kinds if not known[each][-1:].any())
+        timed = known[TIME_HIGH] & known[TIME_LOW]
+        vector = np.zeros(kind.size, np.bool_)
+        single = kind <= 1
+        if self.layout.version == "3.0":
+            vector = (kind == VECTOR_12) | (kind == VECTOR_8)
+            single = kind == SINGLE
+        placed = known[ROW] & (known[VECTOR_BASE] | ~vector)
+        lost = (single | vector) & ~(timed & placed)
+        edges = (kind == TRIGGER) & ~timed
+        count = int(self.layout.counts(words[lost]).sum(dtype=np.int64)) + int(np.count_nonzero(edges))
+        kept = words.copy()
+        kept[(lost & single) | edges] = NO_EVENT[self.layout.version]
+        kept[lost & vector] &= 0xF000  # a vector without pixels still moves the next one
+        return kept, count
+
+
+@dataclass(slots=True)
+class SensorClock:
+    """Clock of the sensor, which wraps around, next to the stamps of the computer, which are late."""
+
+    layout: Layout
+    notes: dict[str, int]
+    """Counts, which get the long pauses and the restarts of the clock."""
+    high: int | None = None
+    """Last TIME_HIGH without its wraps, or None."""
+    time: int | None = None
+    """Time of the first event of an earlier message [us], or None."""
+    stamp: int = 0
+    """Stamp of that message [ns]."""
+
+    def shift(self, words: NDArray[Any], stamp: int, following: int, *, restarted: bool) -> int:
+        """Return what is added to the times from a message on [us].
+
+        ``following``: stamp of the next message [ns]. A stamp that is later than it is in error, and is not used.
+        """
+        time, before = self._first_time(words), self.time
+        if time is None or following - stamp < -1000 * PAUSE_ERROR_US:
+            return 0
+        elapsed = (stamp - self.stamp) // 1000
+        self.time, self.stamp = time, stamp
+        if before is None:
+            return 0
+        period = self.layout.unit_us << self.layout.bits
+        missing = elapsed - (time - before)
+        wraps = (missing + period // 2) // period
+        is_pause = 0 <= elapsed <= LONGEST_PAUSE_US and wraps >= 0 and abs(missing - wraps * period) <= PAUSE_ERROR_US
+        if restarted and not is_pause:
+            self.notes["clock_restarts"] = self.notes.get("clock_restarts", 0) + 1
+            return missing
+        if not is_pause or wraps == 0:
+            return 0
+        self.notes["long_pauses"] = self.notes.get("long_pauses", 0) + 1
+        return wraps * period
+
+    def _first_time(self, words: NDArray[Any]) -> int | None:
+        """Return the time of the first event of the next words, without the lower bits [us]; None if unknown.
+
+        Words without events have that of their end.
+        """
+        heads = self.layout.heads(words)
+        kind = heads >> self.layout.bits
+        places = np.flatnonzero(kind == TIME_HIGH)
+        values = (heads[places] & ((1 << self.layout.bits) - 1)).astype(np.int64)
+        highs = unwrapped(values, self.layout.bits, self.high)
+        is_event = self.layout.counts(words) > 0
+        first = int(is_event.argmax()) if is_event.any() else words.size
+        count = int(np.searchsorted(places, first))
+        high = int(highs[count - 1]) if count else self.high
+        if highs.size:
+            self.high = int(highs[-1])
+        return None if high is None else high * self.layout.unit_us
+
+
+def read_words(
+    notes: dict[str, int], path: str, topic: str, encoding: str, swapped: bool
+) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield for each message of a topic: its words, their number, what is added to the times from there on [us], how
+    many messages are missing before it (or RESTART), and the times of its recording and of its header [ns].
+    """
+    layout = Layout(encoding, swapped)
+    numbers, clock, unknown = MessageNumbers(notes), SensorClock(layout, notes), Unknown(layout)
+    unknown.start()
+    with opened_bag(path) as (bag, ros1):
+        connections = [found for found in bag.connections if found.topic == topic]
+        notes["total"] = max(sum(found.msgcount for found in connections), 1)
+        found = messages_of(bag, connections, ros1=ros1)
+        read = ((one, deserialised(one.connection, one.raw, ros1=ros1)) for one in found)
+        for (one, message), following in _with_next(read):
+            words = checked_words(message, encoding)
+            missing = numbers.missing(one.connection.id, int(message.seq))
+            stamp = _stamp(message)
+            after = stamp if following is None else _stamp(following[1])
+            shift = clock.shift(words, stamp, after, restarted=missing == RESTART)
+            if missing:
+                unknown.start()
+            if unknown.kinds:
+                words, dropped = unknown.without_events(words)
+                notes["dropped_unplaced_events"] = notes.get("dropped_unplaced_events", 0) + dropped
+            notes["read"] = notes.get("read", 0) + 1
+            numbers_of = (len(words), shift, missing, one.recorded, stamp)
+            yield words, *(np.array([value], np.int64) for value in numbers_of)
+
+
+def _with_next(values: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
+    """Yield each value with the next one; the last with None."""
+    return itertools.pairwise(itertools.chain(values, (None,)))
+
+
+def checked_words(message: Any, encoding: str) -> NDArray[Any]:
+    """Return the words of a message. Raises :class:`AmiwarpError` for those of another encoding."""
+    if message.encoding != encoding:
+        raise AmiwarpError(
+            f"has packets of the encodings '{encoding}' and '{message.encoding[:40]}' in one topic; give a bag of one"
+        )
+    check_byte_order(message)
+    return words_of(message.events, EVT[encoding])
+
+
+def check_byte_order(message: Any) -> None:
+    """Raise :class:`AmiwarpError` if the words of a message are those of a big-endian machine."""
+    if message.is_bigendian:
+        raise AmiwarpError("has packets of big-endian words, which are not read; record on a little-endian machine")
+
+
+def _stamp(message: Any) -> int:
+    """Return the time in a message's header [ns]."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+# Decoding, in the program.
+
+
+class Decoded(NamedTuple):
+    """Events of consecutive messages."""
+
+    events: EventColumns
+    """The events."""
+    edges: Triggers
+    """Edges of triggers."""
+    words: NDArray[Any]
+    """The words."""
+    lengths: NDArray[np.int64]
+    """Number of words of each message."""
+    recorded: NDArray[np.int64]
+    """Time of the recording of each message [ns]."""
+    stamps: NDArray[np.int64]
+    """Time in the header of each message [ns]."""
+
+
+def decoded(path: Path, topic: str, layout: Layout, notes: dict[str, int]) -> Iterator[Decoded]:
+    """Yield the events of the messages of a topic, many messages at a time, and note what was counted."""
+    decoder = EvtDecoder(layout.version, swapped=layout.swapped)
+    offset = latest = 0
+    found = packets(read_words, path, topic, layout.encoding, layout.swapped, notes)
+    for words, lengths, shifts, missing, recorded, stamps in found:
+        ends = np.cumsum(lengths)
+        # The messages before a gap are decoded first only if it is the largest so far, so that its time is known.
+        largest = np.maximum.accumulate(np.concatenate([[notes.get("largest_packet_gap", 0)], missing]))[:-1]
+        apart = np.flatnonzero((shifts != 0) | (missing == RESTART) | (missing > largest))
+        cuts = np.unique(np.concatenate([[0], apart, [len(lengths)]])).tolist()
+        for start, stop in itertools.pairwise(cuts):
+            part = words[ends[start] - lengths[start] : ends[stop - 1]]
+            note_largest_gap(notes, int(missing[start]), latest)
+            offset += int(shifts[start])
+            events, edges = decoder.decode(part)
+            if missing[start] == RESTART and events.t.size:
+                offset += max(latest - int(events.t[0]) - offset, 0)
+            if offset:
+                np.add(events.t, offset, out=events.t)
+                np.add(edges.t, offset, out=edges.t)
+            if events.t.size:
+                latest = int(events.t[-1])
+            notes["triggers"] = notes.get("triggers", 0) + len(edges.t)
+            yield Decoded(events, edges, part, lengths[start:stop], recorded[start:stop], stamps[start:stop])
+
+
+def event_packets(path: Path, topic: str, layout: Layout, notes: dict[str, int]) -> Iterator[Packet]:
+    """Yield the events of a topic."""
+    for part in decoded(path, topic, layout, notes):
+        yield Events(*part.events)
+
+
+def edge_packets(path: Path, topic: str, layout: Layout) -> Iterator[Packet]:
+    """Yield the edges of the triggers of a topic."""
+    for part in decoded(path, topic, layout, {}):
+        channel, t, rising = part.edges
+        yield channel, np.zeros_like(channel), t, rising
+
+
+def stamp_packets(path: Path, topic: str, layout: Layout) -> Iterator[tuple[NDArray[np.int64], ...]]:
+    """Yield for messages with events: the times of the first event [us], of the recording and of the header [ns]."""
+    for part in decoded(path, topic, layout, {}):
+        events_before = np.concatenate([[0], np.cumsum(layout.counts(part.words), dtype=np.int64)])
+        ends = np.cumsum(part.lengths)
+        first = events_before[ends - part.lengths]
+        holds = events_before[ends] > first
+        yield part.events.t[first[holds]], part.recorded[holds], part.stamps[holds]

@@ -1,0 +1,486 @@
+"""Bags as drivers and recorders write them: lost packets, long pauses, both orders of EVT 2.1, compressed files."""
+
+import errno
+import gc
+import os
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+
+from amiwarp import AmiwarpError, Events, convert, open_recording
+from amiwarp.io import read_encoder_triggers, ros_bags
+from amiwarp.io.prophesee import Halves, halves_of
+from amiwarp.io.ros_bags import RESTART, MessageNumbers
+from reference.io_samples import make_events, refusal
+from reference.io_samples_extra import (
+    SIZE,
+    arrays,
+    evt2_words,
+    packet_message,
+    packets,
+    typestore,
+    write_ros1,
+    write_ros2,
+)
+from tests.test_io_readers import assert_equal
+
+EVENTS = make_events()
+SECOND = 1_000_000_000
+PERIOD = 1 << 24
+"""Time after which the clock of EVT 3.0 wraps [us]."""
+
+HIGH, LOW, ROW, ON, BASE = 0x8000, 0x6000, 0x0000, 0x2800, 0x3800
+
+
+def message(
+    words: Any, seq: int = 0, stamp: float = 0.0, *, encoding: str = "evt3", ros1: bool = False, base: int = 0
+) -> Any:
+    """Return a packet of words. ``stamp`` [s]."""
+    dtype = {"evt3": "<u2", "evt2": "<u4", "evt21": "<u8"}.get(encoding)
+    made = packet_message(typestore(ros1), encoding, np.array(words, dtype), base, ros1=ros1)
+    made.seq = seq
+    nanoseconds = round(stamp * SECOND)
+    made.header.stamp.sec, made.header.stamp.nanosec = divmod(nanoseconds, SECOND)
+    return made
+
+
+def one_event(t: int, x: int = 5, y: int = 7) -> list[int]:
+    """Return the words of an event in EVT 3.0."""
+    return [HIGH | t >> 12 & 0xFFF, LOW | t & 0xFFF, ROW | y, ON | x]
+
+
+def bag(tmp_path: Path, messages: list[Any], *, ros1: bool = False, name: str = "a") -> Path:
+    """Write messages into a bag."""
+    if not ros1:
+        return write_ros2(tmp_path / name, {"/events": messages})
+    write_ros1(tmp_path / f"{name}.bag", {"/events": messages})
+    return tmp_path / f"{name}.bag"
+
+
+def rows(path: Path) -> tuple[list[list[int]], dict[str, Any]]:
+    """Return [x, y, t] of the events of a bag, and its metadata."""
+    recording = open_recording(path)
+    events = recording.events.slice(0, 10_000_000)
+    return np.column_stack([events.x, events.y, events.t]).tolist(), recording.metadata
+
+
+# Lost packets.
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_lost_packets_are_named_and_leave_no_stale_row_or_time(tmp_path: Path, ros1: bool) -> None:
+    stale = [ON | 1, HIGH | 2, ON | 2, 0x4003, 0xA001, LOW | 9, ON | 3, 0x5001, 0xA001]
+    placed = [ROW | 30, 0x4007, ON | 4, BASE | 40, 0x4001, 0x5001]
+    messages = [
+        message(one_event(4096 + 50), 10, ros1=ros1),
+        message([*stale, *placed], 14, ros1=ros1),
+        message(one_event(9000), 15, ros1=ros1),
+        message(one_event(9001), 17, ros1=ros1),
+    ]
+    t = 2 * 4096 + 9
+    found, about = rows(bag(tmp_path, messages, ros1=ros1))
+    assert found == [[5, 7, 4146], [4, 30, t], [40, 30, t], [52, 30, t], [5, 7, 9000], [5, 7, 9001]]
+    assert about["missing_packets"] == 4
+    assert about["packet_gaps"] == 2
+    assert about["largest_packet_gap"] == 3
+    assert about["largest_packet_gap_us"] == 4146
+    # 1, 2, two pixels and an edge without time; 3 and a pixel without row; three pixels without column
+    assert about["dropped_unplaced_events"] == 1 + 1 + 2 + 1 + 1 + 1 + 3
+    assert about["triggers"] == 1
+
+
+def test_the_state_after_lost_packets_may_come_in_a_later_packet(tmp_path: Path) -> None:
+    messages = [
+        message(one_event(5000), 0),
+        message([HIGH | 3, ON | 1], 2),
+        message([ON | 2, LOW | 4, ON | 3], 3),
+        message([ROW | 9, ON | 6], 4),
+        message([ON | 8], 5),
+    ]
+    found, about = rows(bag(tmp_path, messages))
+    assert found == [[5, 7, 5000], [6, 9, (3 << 12) + 4], [8, 9, (3 << 12) + 4]]
+    assert about["dropped_unplaced_events"] == 3
+
+
+@pytest.mark.parametrize("encoding", ["evt2", "evt21"])
+def test_lost_packets_of_evt_2(tmp_path: Path, encoding: str) -> None:
+    vectors = encoding == "evt21"
+    shift = 32 if vectors else 0
+    pixels = 0b101 if vectors else 0
+
+    def words(*heads: int) -> list[int]:
+        return [head << shift | pixels * (head >> 28 <= 1) for head in heads]
+
+    high, event, edge = 0x8 << 28, 1 << 28 | 3 << 22 | 64 << 11 | 9, 0xA << 28 | 1
+    messages = [
+        message(words(high | 100, event), 1, encoding=encoding),
+        message(words(event, edge, high | 103, event, edge), 3, encoding=encoding),
+    ]
+    found, about = rows(bag(tmp_path, messages))
+    columns = [64, 66] if vectors else [64]
+    assert found == [[x, 9, 64 * each + 3] for each in (100, 103) for x in columns]
+    assert (about["missing_packets"], about["dropped_unplaced_events"]) == (1, len(columns) + 1)
+    assert about["triggers"] == 1
+
+
+def test_numbers_that_start_again_or_stand_still_are_no_lost_packets(tmp_path: Path) -> None:
+    messages = [message(one_event(1000), 2**64 - 1), message(one_event(2000), 0), message(one_event(3000), 1)]
+    found, about = rows(bag(tmp_path, messages))
+    assert [t for _, _, t in found] == [1000, 2000, 3000]
+    assert not {"missing_packets", "packet_gaps", "largest_packet_gap"} & set(about)
+    notes: dict[str, int] = {}
+    numbers = MessageNumbers(notes)
+    given = [0, 1, 3, 3, 2**63, 2**63 + 1, 4]
+    assert [numbers.missing(0, number) for number in given] == [0, 0, 1, 0, RESTART, 0, RESTART]
+    assert numbers.missing(1, 900) == 0  # another publisher
+    assert numbers.missing(0, 5) == 0
+    assert notes == {"missing_packets": 1, "packet_gaps": 1}
+
+
+def test_a_restarted_driver_has_no_stale_row_and_its_clock_goes_on_by_the_stamps(tmp_path: Path) -> None:
+    messages = [
+        message(one_event(8_000_000), 500, 100.0),
+        message(one_event(8_001_000), 501, 100.001),
+        message([HIGH, LOW | 100, ON | 1, ROW | 3, ON | 2], 0, 103.001),
+        message(one_event(1100), 1, 103.002),
+    ]
+    found, about = rows(bag(tmp_path, messages))
+    assert found[:2] == [[5, 7, 8_000_000], [5, 7, 8_001_000]]
+    assert [row[:2] for row in found[2:]] == [[2, 3], [5, 7]]
+    assert found[2][2] == pytest.approx(11_001_000, abs=4096)  # the unit of the upper bits of the time
+    assert found[3][2] - found[2][2] == 1000
+    assert (about["clock_restarts"], about["dropped_unplaced_events"]) == (1, 1)
+    assert "missing_packets" not in about
+    assert "repaired_time_events" not in about
+
+
+def test_a_restart_never_leads_back_in_time(tmp_path: Path) -> None:
+    long = [word for t in range(8_000_000, 8_300_000, 5000) for word in one_event(t)]
+    messages = [message(long, 500, 100.0), message(one_event(0), 0, 100.0), message(one_event(40), 1, 100.0)]
+    found, about = rows(bag(tmp_path, messages))
+    assert [row[2] for row in found[-3:]] == [8_295_000, 8_295_000, 8_295_040]
+    assert "repaired_time_events" not in about
+
+
+@pytest.mark.parametrize("encoding", ["mono", "array"])
+def test_lost_messages_of_other_encodings_are_named(tmp_path: Path, encoding: str) -> None:
+    """Arrays of ROS 1 have the number of their header."""
+    messages = arrays(EVENTS, ros1=True) if encoding == "array" else packets("mono", EVENTS, ros1=True)
+    for number, each in enumerate(messages):
+        later = number + 7 if number > 1 else number
+        if encoding == "array":
+            each.header.seq = later
+        else:
+            each.seq = later
+    recording = open_recording(bag(tmp_path, messages, ros1=True))
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+    before = 1 + 2 if encoding == "array" else 400
+    known = (7, 1, 7, EVENTS.t[before - 1])
+    names = ("missing_packets", "packet_gaps", "largest_packet_gap", "largest_packet_gap_us")
+    assert tuple(recording.metadata[name] for name in names) == known
+
+
+def test_info_names_lost_packets(tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    from amiwarp.cli.app import app
+
+    path = bag(tmp_path, [message(one_event(1000), 0), message(one_event(2000), 9)])
+    result = CliRunner().invoke(app, ["info", str(path)])
+    text = " ".join(result.output.split())
+    assert "missing_packets 8, packet_gaps 1, largest_packet_gap 8, largest_packet_gap_us 1,000" in text
+
+
+# Pauses.
+
+
+@pytest.mark.parametrize("pause", [9.0, 16.0, 17.0, 40.0, 3600.0])
+def test_a_pause_longer_than_the_clock_of_the_sensor_is_known_from_the_stamps(tmp_path: Path, pause: float) -> None:
+    us = round(pause * 1e6)
+    messages = [
+        message(one_event(5_000_000), 0, 50.0),
+        message(one_event(5_000_500), 1, 50.0005),
+        # the second packet waits for 0.6 s in the computer
+        message(one_event(5_000_500 + us), 2, 50.0005 + pause + 0.6),
+        message(one_event(5_000_900 + us), 3, 50.0009 + pause),
+    ]
+    found, about = rows(bag(tmp_path, messages))
+    assert [row[2] for row in found] == [5_000_000, 5_000_500, 5_000_500 + us, 5_000_900 + us]
+    assert about["long_pauses"] == 1
+
+
+@pytest.mark.parametrize("encoding", ["evt2", "evt21"])
+def test_a_pause_of_evt_2(tmp_path: Path, encoding: str) -> None:
+    """Its clock wraps after 4.8 h."""
+    times = [3_000_000, 3_000_000 + 10 * 3600 * 10**6]
+    vectors = encoding == "evt21"
+    messages = []
+    for t in times:
+        events = Events.from_arrays([3], [4], [t], [1])
+        messages.append(message(evt2_words(events, vectors=vectors), len(messages), t / 1e6 + 7, encoding=encoding))
+    found, about = rows(bag(tmp_path, messages))
+    assert [row[2] for row in found] == times
+    assert about["long_pauses"] == 1
+
+
+STAMPS = {
+    "late": [0.0, 0.001, 1.002, 0.003, 0.004],
+    "one far too late, by a whole turn": [0.0, 0.001, 0.002 + PERIOD / 1e6, 0.003, 0.004],
+    "set forward": [0.0, 0.001, 110.002, 110.003, 110.004],
+    "set forward from 1970, by whole turns": [0.0, 0.001, *(k / 1000 + 100_000_000 * PERIOD / 1e6 for k in (2, 3, 4))],
+    "set forward a little": [0.0, 0.001, 12.002, 12.003, 12.004],
+    "set back": [1000.0, 1000.001, 0.002, 0.003, 0.004],
+    "set back by a turn": [100.0, 100.001, 100.002 - PERIOD / 1e6, 100.003 - PERIOD / 1e6, 100.004 - PERIOD / 1e6],
+    "missing": [0.0, 0.0, 0.0, 0.0, 0.0],
+}
+
+
+@pytest.mark.parametrize("name", STAMPS)
+def test_wrong_stamps_make_no_pause(tmp_path: Path, name: str) -> None:
+    times = [5_000_000 + 1000 * k for k in range(5)]
+    messages = [message(one_event(t), k, stamp) for k, (t, stamp) in enumerate(zip(times, STAMPS[name], strict=True))]
+    found, about = rows(bag(tmp_path, messages))
+    assert [row[2] for row in found] == times
+    assert "long_pauses" not in about
+
+
+def test_pauses_whose_words_tell_all_turns_are_left_as_they_are(tmp_path: Path) -> None:
+    """amiwarp's own bags write words of the time also in pauses."""
+    t = EVENTS.t + (np.arange(len(EVENTS)) > 300) * 40_000_000 + (np.arange(len(EVENTS)) > 400) * 12_000_000
+    events = Events(EVENTS.x, EVENTS.y, t, EVENTS.p)
+    np.savez(tmp_path / "a.npz", x=events.x, y=events.y, t=t, p=events.p, width=SIZE[0], height=SIZE[1])
+    convert(tmp_path / "a.npz", tmp_path / "a.mcap")
+    recording = open_recording(tmp_path / "a.mcap")
+    assert_equal(recording.events.slice(0, 999), events)
+    assert not {"long_pauses", "missing_packets", "dropped_unplaced_events"} & set(recording.metadata)
+
+
+def test_triggers_and_copies_follow_the_clock_of_the_events(tmp_path: Path) -> None:
+    pause = 40_000_000
+    edges = [[0xA001], [0xA001]]
+    messages = [
+        message([*one_event(1000), *edges[0]], 0, 50.0),
+        message([HIGH | 1, LOW], 1, 50.1),
+        message([*one_event(1000 + pause), ON | 6, *edges[1]], 2, 90.0),
+        message(one_event(2000 + pause), 3, 90.001),
+    ]
+    path = bag(tmp_path, messages)
+    assert np.diff(read_encoder_triggers(path, 0).t).tolist() == [pause]
+    convert(path, tmp_path / "copy.mcap")
+    known = [[5, 7, 1000], [5, 7, 1000 + pause], [6, 7, 1000 + pause], [5, 7, 2000 + pause]]
+    assert rows(tmp_path / "copy.mcap")[0] == known
+    store = typestore(False)
+    with ros_bags.opened_bag(str(tmp_path / "copy.mcap")) as (copy, _):
+        read = [store.deserialize_cdr(raw, one.msgtype) for one, _, raw in copy.messages(connections=copy.connections)]
+    stamps = [each.header.stamp.sec + each.header.stamp.nanosec / 1e9 for each in read]
+    assert stamps == pytest.approx([50.0, 90.0, 90.001], abs=1e-9)
+
+
+# The order of the halves of EVT 2.1.
+
+
+@pytest.mark.parametrize("swapped", [True, False])
+def test_both_orders_of_evt21_in_bags(tmp_path: Path, swapped: bool) -> None:
+    words = evt2_words(EVENTS, vectors=True)
+    if swapped:
+        words = words >> np.uint64(32) | words << np.uint64(32)
+    messages = [message(part, k, encoding="evt21") for k, part in enumerate(np.array_split(words, 3))]
+    recording = open_recording(bag(tmp_path, messages))
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+    assert "word_order" not in recording.metadata
+
+
+def test_an_uncertain_order_of_evt21_is_said_and_none_is_refused(tmp_path: Path) -> None:
+    high = 0x80000005
+    event = 1 << 28 | 64 << 11 | 9
+    both = [high << 32 | 0x80000001, (high + 1) << 32 | 0x80000002, (high + 2) << 32, event << 32 | 1]
+    recording = open_recording(bag(tmp_path, [message(both, encoding="evt21")]))
+    assert len(recording.events) == 1
+    assert "assumed to be not swapped" in recording.metadata["word_order"]
+    falling = [(high - k) << 32 | 1 for k in range(4)] + [event << 32 | 1]
+    path = bag(tmp_path, [message(falling, encoding="evt21")], name="b")
+    assert "without times that rise, in either order of their 32-bit halves" in str(refusal(open_recording, path))
+    unknown = [0x30000000_30000000 + k for k in range(50)]
+    path = bag(tmp_path, [message(unknown, encoding="evt21")], name="c")
+    assert "either order" in str(refusal(open_recording, path))
+
+
+def test_the_order_of_halves_is_found_from_vectors_of_one_pixel() -> None:
+    """The last of 32 pixels has the bits of a word of the time, which stands still."""
+    words = evt2_words(Events(EVENTS.x // 32 * 32 + 31, EVENTS.y, EVENTS.t, EVENTS.p), vectors=True)
+    swapped = words >> np.uint64(32) | words << np.uint64(32)
+    assert halves_of(words) == Halves(False, certain=True)
+    assert halves_of(swapped) == Halves(True, certain=True)
+    assert halves_of(words[:0]) is None
+
+
+def test_encodings_do_not_change_within_a_topic(tmp_path: Path) -> None:
+    messages = [message(one_event(1000), 0), message([0x80000001, 1 << 28], 1, encoding="evt2")]
+    text = str(refusal(open_recording, bag(tmp_path, messages)))
+    assert "has packets of the encodings 'evt3' and 'evt2' in one topic" in text
+    messages = [*packets("mono", EVENTS), message(one_event(1000), 1)]
+    text = str(refusal(open_recording, bag(tmp_path, messages, name="b")))
+    assert "has packets with the encoding 'evt3'; expected one of" in text
+
+
+# Messages of iniVation's packages.
+
+
+@pytest.mark.parametrize(("package", "ros1"), [("dv_ros_msgs", True), ("dv_ros2_msgs", False)])
+def test_arrays_of_inivation(tmp_path: Path, package: str, ros1: bool) -> None:
+    path = bag(tmp_path, arrays(EVENTS, ros1=ros1, package=package), ros1=ros1)
+    recording = open_recording(path)
+    assert recording.events.size == SIZE
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+
+
+# Compressed bags.
+
+
+@pytest.fixture
+def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder for temporary files."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+def compressed(tmp_path: Path, kind: str, storage: str) -> Path:
+    """Write the events into a bag that is compressed by files or messages, as rosbag2 does, and return its folder."""
+    folder = tmp_path / "packed"
+    store = typestore(False)
+    modes = {"message": CompressionMode.MESSAGE, "file": CompressionMode.FILE}
+    writer = Writer2(folder, version=9, storage_plugin=StoragePlugin[storage])
+    writer.set_compression(modes[kind], CompressionFormat.ZSTD)
+    with writer:
+        name = "event_camera_msgs/msg/EventPacket"
+        connection = writer.add_connection("/events", name, typestore=store)
+        for at, each in enumerate(packets("evt3", EVENTS)):
+            each.seq = at
+            writer.write(connection, at, store.serialize_cdr(each, name))
+    return folder
+
+
+def in_this_process(function: Any, *given: Any) -> Any:
+    """Run a function of the reading process here, where its limits can be changed."""
+    return function(*map(str, given))[0]
+
+
+def zstd(path: Path, data: bytes) -> Path:
+    """Write compressed data."""
+    path.write_bytes(zstandard.compress(data))
+    return path
+
+
+@pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+@pytest.mark.parametrize("kind", ["file", "message"])
+def test_compressed_bags_of_ros_2(tmp_path: Path, scratch: Path, kind: str, storage: str) -> None:
+    folder = compressed(tmp_path, kind, storage)
+    file = next(each for each in folder.iterdir() if each.name != "metadata.yaml")
+    assert (file.suffix == ".zstd") == (kind == "file")
+    for path in (folder, file):
+        recording = open_recording(path)
+        assert_equal(recording.events.slice(0, 999), EVENTS)
+        assert recording.name == "packed"
+        assert recording.metadata["format"] == "rosbag2"
+        assert bool(os.listdir(scratch)) == (kind == "file")
+        convert(path, tmp_path / f"{file.stem}.{path.is_dir()}.h5")
+        convert(path, tmp_path / f"{file.stem}.{path.is_dir()}.mcap")
+        assert_equal(open_recording(tmp_path / f"{file.stem}.{path.is_dir()}.mcap").events.slice(0, 999), EVENTS)
+        del recording
+        gc.collect()
+        assert os.listdir(scratch) == []
+
+
+@pytest.mark.parametrize("name", ["a.db3.zstd", "a.mcap.zstd", "a.bag.zstd"])
+def test_a_lone_compressed_bag(tmp_path: Path, scratch: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("amiwarp.io.file_scan.KEEP_EVENTS", 10)  # so that the copy is read again
+    if ".bag" in name:
+        write_ros1(tmp_path / "plain", {"/events": packets("evt3", EVENTS, ros1=True)})
+        plain = tmp_path / "plain"
+    else:
+        storage = "MCAP" if ".mcap" in name else "SQLITE3"
+        plain = write_ros2(tmp_path / "plain", {"/events": packets("evt3", EVENTS)}, storage=storage)
+    path = zstd(tmp_path / name, plain.read_bytes())
+    recording = open_recording(path)
+    assert (recording.name, recording.events.path) == ("a", path)  # type: ignore[attr-defined]
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+    events = recording.events
+    del recording
+    gc.collect()
+    assert_equal(events.slice(0, 999), EVENTS)  # which are still used
+    del events
+    gc.collect()
+    assert os.listdir(scratch) == []
+
+
+def test_damaged_compressed_bags_are_named_and_leave_no_copy(
+    tmp_path: Path, scratch: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = write_ros2(tmp_path / "plain", {"/events": packets("evt3", make_events(60_000))}).read_bytes()
+    whole = zstd(tmp_path / "a.db3.zstd", plain).read_bytes()
+    cut = tmp_path / "cut.db3.zstd"
+    cut.write_bytes(whole[:-200])
+    assert re.search(r"cut\.db3\.zstd.* ends after [\d,]+ of [\d,]+ bytes", str(refusal(open_recording, cut)))
+    bad = tmp_path / "bad.db3.zstd"
+    bad.write_bytes(whole[: len(whole) // 2] + bytes(50) + whole[len(whole) // 2 + 50 :])
+    message_ = str(refusal(open_recording, bad))
+    assert message_.startswith(str(bad))
+    assert "damaged" in message_ or "malformed" in message_
+    bomb = zstd(tmp_path / "bomb.db3.zstd", plain + bytes(1 << 26))
+    with monkeypatch.context() as patch:
+        patch.setattr(ros_bags, "SMALLEST_LIMIT", len(plain))
+        patch.setattr(ros_bags, "LARGEST_RATIO", 10)
+        patch.setattr(ros_bags, "run", in_this_process)
+        most = max(len(plain), 10 * bomb.stat().st_size)
+        text = str(refusal(open_recording, bomb))
+    assert f"bomb.db3.zstd unpacks to over {most:,} bytes, too many for its size" in text
+    other = zstd(tmp_path / "other.zstd", b"no bag")
+    assert "is a Zstandard archive; unpack it first" in str(refusal(open_recording, other))
+    assert os.listdir(scratch) == []
+
+
+def test_a_full_disk_and_an_interrupt_leave_no_copy(
+    tmp_path: Path, scratch: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = write_ros2(tmp_path / "plain", {"/events": packets("evt3", EVENTS)}).read_bytes()
+    path = zstd(tmp_path / "a.db3.zstd", plain)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ros_bags, "_unpack_file", full)
+        patch.setattr(ros_bags, "run", in_this_process)
+        text = str(refusal(open_recording, path))
+        assert f"is compressed, and {scratch}" in text
+        assert "set TMPDIR to a folder with more space" in text
+    assert os.listdir(scratch) == []
+
+    def interrupted(*_: object) -> None:
+        assert os.listdir(scratch)
+        raise KeyboardInterrupt
+
+    for where in ("amiwarp.io.ros_bags.run", "amiwarp.io.ros.run"):
+        with monkeypatch.context() as patch:
+            patch.setattr(where, interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                open_recording(path)
+        assert os.listdir(scratch) == []
+
+
+def test_a_compressed_message_that_grows_too_much_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros_bags, "LARGEST_MESSAGE", 1 << 20)
+    assert ros_bags._unpacked_message(zstandard.compress(bytes(1 << 20))) == bytes(1 << 20)
+    with pytest.raises(AmiwarpError, match=r"a message unpacks to over 1048576 bytes"):
+        ros_bags._unpacked_message(zstandard.compress(bytes((1 << 20) + 1)))
+    with pytest.raises(AmiwarpError, match=r"a compressed message cannot be unpacked"):
+        ros_bags._unpacked_message(b"\x28\xb5\x2f\xfd" + bytes(range(40)))
