@@ -43,6 +43,9 @@ LONGEST_PAUSE_US = 100_000_000_000
 ORDER_WORDS = 1 << 18
 """Number of words of EVT 2.1 from which the order of their halves is found."""
 
+FIRST_WORDS = 64
+"""Number of words among which the first event of a message is searched for, before all are."""
+
 BITS = np.unpackbits(np.arange(1 << 16, dtype="<u2").view(np.uint8).reshape(-1, 2), axis=1).sum(axis=1, dtype=np.uint8)
 """Number of set bits of each number of 16 bits."""
 
@@ -138,6 +141,8 @@ class Unknown:
     def without_events(self, words: NDArray[Any]) -> tuple[NDArray[Any], int]:
         """Return words without the events whose time or place is unknown, and how many events and edges that are."""
         kind = self.layout.heads(words) >> self.layout.bits
+        if self.kinds == (VECTOR_BASE,) and not ((kind == VECTOR_12) | (kind == VECTOR_8)).any():
+            return words, 0  # some sensors send no vectors, and never a base
         always = np.ones(kind.size, np.bool_)
         known = dict.fromkeys((TIME_HIGH, TIME_LOW, ROW, VECTOR_BASE), always)
         for each in self.kinds:
@@ -210,13 +215,19 @@ class SensorClock:
         places = np.flatnonzero(kind == TIME_HIGH)
         values = (heads[places] & ((1 << self.layout.bits) - 1)).astype(np.int64)
         highs = unwrapped(values, self.layout.bits, self.high)
-        is_event = self.layout.counts(words) > 0
-        first = int(is_event.argmax()) if is_event.any() else words.size
-        count = int(np.searchsorted(places, first))
+        count = int(np.searchsorted(places, self._first_event(words)))
         high = int(highs[count - 1]) if count else self.high
         if highs.size:
             self.high = int(highs[-1])
         return None if high is None else high * self.layout.unit_us
+
+    def _first_event(self, words: NDArray[Any]) -> int:
+        """Return the index of the first word with an event, or the number of words. It is one of the first, mostly."""
+        for head in (words[:FIRST_WORDS], words):
+            is_event = self.layout.counts(head) > 0
+            if is_event.any():
+                return int(is_event.argmax())
+        return words.size
 
 
 def read_words(
