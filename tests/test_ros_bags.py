@@ -6,6 +6,7 @@ import os
 import re
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,10 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from amiwarp import AmiwarpError, Events, convert, open_recording
 from amiwarp.io import read_encoder_triggers, ros_bags
-from amiwarp.io.prophesee import Halves, halves_of
-from amiwarp.io.ros_bags import RESTART, MessageNumbers
+from amiwarp.io.prophesee import Halves, halves_of, words_of
+from amiwarp.io.ros_bags import RESTART, MessageNumbers, number_of
+from amiwarp.io.ros_words import Layout, Unknown
+from reference.evt_words import Evt2Decoder, Evt3Decoder, swap_halves
 from reference.io_samples import make_events, refusal
 from reference.io_samples_extra import (
     SIZE,
@@ -29,6 +32,7 @@ from reference.io_samples_extra import (
     write_ros1,
     write_ros2,
 )
+from tests.test_evt_decoder import random_words
 from tests.test_io_readers import assert_equal
 
 EVENTS = make_events()
@@ -144,6 +148,12 @@ def test_numbers_that_start_again_or_stand_still_are_no_lost_packets(tmp_path: P
     assert notes == {"missing_packets": 1, "packet_gaps": 1}
 
 
+def test_messages_without_a_number_have_that_of_their_header() -> None:
+    assert number_of(SimpleNamespace(seq=np.uint64(5), header=SimpleNamespace(seq=9))) == 5
+    assert number_of(SimpleNamespace(header=SimpleNamespace(seq=9))) == 9
+    assert number_of(SimpleNamespace(header=SimpleNamespace())) == 0
+
+
 def test_a_restarted_driver_has_no_stale_row_and_its_clock_goes_on_by_the_stamps(tmp_path: Path) -> None:
     messages = [
         message(one_event(8_000_000), 500, 100.0),
@@ -214,6 +224,19 @@ def test_a_pause_longer_than_the_clock_of_the_sensor_is_known_from_the_stamps(tm
     found, about = rows(bag(tmp_path, messages))
     assert [row[2] for row in found] == [5_000_000, 5_000_500, 5_000_500 + us, 5_000_900 + us]
     assert about["long_pauses"] == 1
+
+
+def test_a_pause_is_found_also_if_its_first_packets_have_no_word_of_the_time(tmp_path: Path) -> None:
+    pause = 40_000_000
+    messages = [
+        message(one_event(5000), 0, 50.0),
+        message([ON | 1], 1, 50.001),
+        message([ON | 2, LOW | 9], 3, 90.001),
+        message([LOW | 9, ROW | 4, *one_event(5004 + pause)], 4, 90.002),
+    ]
+    found, about = rows(bag(tmp_path, messages))
+    assert found == [[5, 7, 5000], [1, 7, 5000], [5, 7, 5004 + pause]]
+    assert (about["long_pauses"], about["missing_packets"], about["dropped_unplaced_events"]) == (1, 1, 1)
 
 
 @pytest.mark.parametrize("encoding", ["evt2", "evt21"])
@@ -484,3 +507,56 @@ def test_a_compressed_message_that_grows_too_much_is_refused(monkeypatch: pytest
         ros_bags._unpacked_message(zstandard.compress(bytes((1 << 20) + 1)))
     with pytest.raises(AmiwarpError, match=r"a compressed message cannot be unpacked"):
         ros_bags._unpacked_message(b"\x28\xb5\x2f\xfd" + bytes(range(40)))
+
+
+# Words of any kind, against a model that reads one word after the other.
+
+
+def words_without_unknown(words: list[int], state: set[str]) -> list[int]:
+    """Return EVT 3.0 words without the events whose time or place is not in the state, which the words extend."""
+    kept = []
+    for word in words:
+        kind = word >> 12
+        if kind in (0x2, 0x4, 0x5):
+            needed = {"high", "low", "row"} | ({"base"} if kind != 0x2 else set())
+            if not needed <= state:
+                word = 0xF000 if kind == 0x2 else word & 0xF000
+        if kind == 0xA and not {"high", "low"} <= state:
+            word = 0xF000
+        if kind == 0x6 and "high" in state:
+            state.add("low")
+        state |= {name for name, each in (("high", 0x8), ("row", 0x0), ("base", 0x3)) if kind == each}
+        kept.append(word)
+    return kept
+
+
+def test_what_is_unknown_after_lost_packets_follows_the_words() -> None:
+    rng = np.random.default_rng(5)
+    layout = Layout("evt3")
+    for _ in range(200):
+        unknown = Unknown(layout)
+        unknown.start()
+        state: set[str] = set()
+        for length in rng.integers(0, 12, 4):
+            words = rng.integers(0, 1 << 16, length).astype("<u2")
+            kept, count = unknown.without_events(words)
+            known = words_without_unknown(words.tolist(), state)
+            assert kept.tolist() == known
+            lost = layout.counts(words).sum(dtype=int) - layout.counts(kept).sum(dtype=int)
+            edges = np.count_nonzero((words >> 12 == 0xA) & (kept >> 12 != 0xA))
+            assert count == lost + edges
+        assert len(unknown.kinds) == 4 - len(state)
+
+
+@pytest.mark.parametrize("encoding", ["evt3", "evt2", "evt21"])
+@pytest.mark.parametrize("swapped", [True, False])
+def test_events_of_each_word_are_counted(encoding: str, swapped: bool) -> None:
+    layout = Layout(encoding, swapped and encoding == "evt21")
+    words = random_words(layout.version, 3000, np.random.default_rng(2))
+    decoder: Any = Evt3Decoder() if encoding == "evt3" else Evt2Decoder(vectors=encoding == "evt21")
+    timed = words_of(np.array([0x8001 if encoding == "evt3" else 0x80000001], words.dtype).tobytes(), layout.version)
+    decoder.decode(timed << np.uint64(32) if encoding == "evt21" else timed)
+    expected = [len(decoder.decode(words[k : k + 1])[0][2]) for k in range(len(words))]
+    assert max(expected) > 1 or encoding == "evt2"
+    given = swap_halves(words) if layout.swapped else words
+    assert layout.counts(given).tolist() == expected

@@ -31,6 +31,7 @@ from amiwarp.io.ros_bags import (
     deserialised,
     messages_of,
     note_largest_gap,
+    number_of,
     opened_bag,
     typestore,
     unpacked,
@@ -321,7 +322,7 @@ def _decoded(one: Message, *, ros1: bool) -> tuple[int | None, Columns, Columns]
     """Return the number of a message, or None in arrays of ROS 2, which have none; its events; and its triggers."""
     if one.connection.msgtype not in ARRAYS:
         message = deserialised(one.connection, one.raw, ros1=ros1)
-        return int(message.seq), *decode_packet(message)
+        return number_of(message), *decode_packet(message)
     typestore(one.connection, ros1=ros1)
     x, y, t, p = decode_array(one.raw, ros1=ros1)[2]
     number = struct.unpack_from("<I", one.raw)[0] if ros1 else None
@@ -521,7 +522,7 @@ class _Clock:
 
     def __init__(self, bag: Bag | None) -> None:
         """Read the times of the messages of a bag."""
-        parts = [(np.zeros(1, np.int64),) * 3]
+        parts: list[tuple[NDArray[np.int64], ...]] = [(np.zeros(1, np.int64),) * 3]
         if bag is not None:
             parts = list(_event_topic(bag.path, bag.topic)[0].stamps())
         t, self._recorded, self._stamps = (np.concatenate(columns) for columns in zip(*parts, strict=True))

@@ -189,6 +189,12 @@ class MessageNumbers:
         return step - 1
 
 
+def number_of(message: Any) -> int:
+    """Return the number of a message, or that of its header, which only ROS 1 counts; 0 if it has none."""
+    number = getattr(message, "seq", None)
+    return int(getattr(message.header, "seq", 0) if number is None else number)
+
+
 def note_largest_gap(notes: dict[str, int], missing: int, t: int) -> None:
     """Note a gap if it is the largest so far, with the time of the last event before it [us]."""
     if missing > notes.get("largest_packet_gap", 0):
@@ -280,8 +286,8 @@ def unpack(path: str, scratch: str) -> Reply:
 
 def _unpack_folder(source: Path, target: Path) -> None:
     """Unpack the files of a folder, and write its metadata without their compression."""
-    with open(source / "metadata.yaml", encoding="utf-8") as file:
-        metadata = file.read()
+    with open(source / "metadata.yaml", encoding="utf-8") as text:
+        metadata = text.read()
     metadata = re.sub(r"(\bcompression_(?:mode|format):).*", r'\1 ""', metadata)
     metadata = re.sub(r"(\.(?:db3|mcap))\.zstd\b", r"\1", metadata)
     target.mkdir()

@@ -20,7 +20,15 @@ from amiwarp.io.evt_decoder import EventColumns, EvtDecoder, Triggers
 from amiwarp.io.file_scan import Packet, unwrapped
 from amiwarp.io.prophesee import halves_of, words_of
 from amiwarp.io.reading_process import packets
-from amiwarp.io.ros_bags import RESTART, MessageNumbers, deserialised, messages_of, note_largest_gap, opened_bag
+from amiwarp.io.ros_bags import (
+    RESTART,
+    MessageNumbers,
+    deserialised,
+    messages_of,
+    note_largest_gap,
+    number_of,
+    opened_bag,
+)
 
 EVT = {"evt3": "3.0", "evt2": "2.0", "evt21": "2.1"}
 """Encodings with Prophesee's words, and their versions."""
@@ -141,7 +149,7 @@ class Unknown:
     def without_events(self, words: NDArray[Any]) -> tuple[NDArray[Any], int]:
         """Return words without the events whose time or place is unknown, and how many events and edges that are."""
         kind = self.layout.heads(words) >> self.layout.bits
-        if self.kinds == (VECTOR_BASE,) and not ((kind == VECTOR_12) | (kind == VECTOR_8)).any():
+        if self.kinds == (VECTOR_BASE,) and not ((kind >= VECTOR_BASE) & (kind <= VECTOR_8)).any():
             return words, 0  # some sensors send no vectors, and never a base
         always = np.ones(kind.size, np.bool_)
         known = dict.fromkeys((TIME_HIGH, TIME_LOW, ROW, VECTOR_BASE), always)
@@ -206,20 +214,20 @@ class SensorClock:
         return wraps * period
 
     def _first_time(self, words: NDArray[Any]) -> int | None:
-        """Return the time of the first event of the next words, without the lower bits [us]; None if unknown.
+        """Return the time of the first event of the next words, without the lower bits [us].
 
-        Words without events have that of their end.
+        Before the first TIME_HIGH, it is that of the TIME_HIGH; without events, that of the end. None: no TIME_HIGH.
         """
         heads = self.layout.heads(words)
         kind = heads >> self.layout.bits
         places = np.flatnonzero(kind == TIME_HIGH)
         values = (heads[places] & ((1 << self.layout.bits) - 1)).astype(np.int64)
         highs = unwrapped(values, self.layout.bits, self.high)
+        if not highs.size:
+            return None
+        self.high = int(highs[-1])
         count = int(np.searchsorted(places, self._first_event(words)))
-        high = int(highs[count - 1]) if count else self.high
-        if highs.size:
-            self.high = int(highs[-1])
-        return None if high is None else high * self.layout.unit_us
+        return int(highs[max(count - 1, 0)]) * self.layout.unit_us
 
     def _first_event(self, words: NDArray[Any]) -> int:
         """Return the index of the first word with an event, or the number of words. It is one of the first, mostly."""
@@ -246,7 +254,7 @@ def read_words(
         read = ((one, deserialised(one.connection, one.raw, ros1=ros1)) for one in found)
         for (one, message), following in _with_next(read):
             words = checked_words(message, encoding)
-            missing = numbers.missing(one.connection.id, int(message.seq))
+            missing = numbers.missing(one.connection.id, number_of(message))
             stamp = _stamp(message)
             after = stamp if following is None else _stamp(following[1])
             shift = clock.shift(words, stamp, after, restarted=missing == RESTART)
