@@ -34,6 +34,7 @@ from reference.io_samples_extra import (
 )
 from tests.test_evt_decoder import random_words
 from tests.test_io_readers import assert_equal
+from tests.test_io_sensors import image_message
 
 EVENTS = make_events()
 SECOND = 1_000_000_000
@@ -169,6 +170,13 @@ def test_a_restarted_driver_has_no_stale_row_and_its_clock_goes_on_by_the_stamps
     assert (about["clock_restarts"], about["dropped_unplaced_events"]) == (1, 1)
     assert "missing_packets" not in about
     assert "repaired_time_events" not in about
+
+
+def test_a_clock_that_goes_on_after_new_numbers_is_not_shifted(tmp_path: Path) -> None:
+    messages = [message(one_event(8_000_000), 500, 100.0), message(one_event(8_001_000), 0, 100.3)]
+    found, about = rows(bag(tmp_path, messages))
+    assert [row[2] for row in found] == [8_000_000, 8_001_000]
+    assert "clock_restarts" not in about
 
 
 def test_a_restart_never_leads_back_in_time(tmp_path: Path) -> None:
@@ -330,7 +338,7 @@ def test_an_uncertain_order_of_evt21_is_said_and_none_is_refused(tmp_path: Path)
     falling = [(high - k) << 32 | 1 for k in range(4)] + [event << 32 | 1]
     path = bag(tmp_path, [message(falling, encoding="evt21")], name="b")
     assert "without times that rise, in either order of their 32-bit halves" in str(refusal(open_recording, path))
-    unknown = [0x30000000_30000000 + k for k in range(50)]
+    unknown = [0x30000000_30000000 + k for k in range(50)] + [high << 32]
     path = bag(tmp_path, [message(unknown, encoding="evt21")], name="c")
     assert "either order" in str(refusal(open_recording, path))
 
@@ -441,6 +449,28 @@ def test_a_lone_compressed_bag(tmp_path: Path, scratch: Path, name: str, monkeyp
     gc.collect()
     assert_equal(events.slice(0, 999), EVENTS)  # which are still used
     del events
+    gc.collect()
+    assert os.listdir(scratch) == []
+
+
+def test_an_archive_of_several_frames_and_images_that_outlive_the_events(tmp_path: Path, scratch: Path) -> None:
+    pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    images = [image_message(typestore(True), True, 1_000_000 + k, "mono8", pixels + k) for k in range(2)]
+    write_ros1(tmp_path / "plain", {"/dvs/events": arrays(EVENTS, ros1=True), "/dvs/image_raw": images})
+    plain = (tmp_path / "plain").read_bytes()
+    half = len(plain) // 2
+    path = tmp_path / "a.bag.zst"
+    path.write_bytes(zstandard.compress(plain[:half]) + zstandard.compress(plain[half:]))
+    recording = open_recording(path)
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+    frames = recording.frames
+    assert frames is not None
+    assert recording.name == "a"
+    del recording
+    gc.collect()
+    np.testing.assert_array_equal(frames[1], pixels + 1)
+    frames.close()  # type: ignore[attr-defined]
+    del frames
     gc.collect()
     assert os.listdir(scratch) == []
 

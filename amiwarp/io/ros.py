@@ -227,8 +227,8 @@ def open_rosbag(path: Path, topic: str | None = None) -> Recording:
     metadata = {"format": about["format"], "topic": found.name, **about["counts"], **events.metadata, **notes}
     if about["word_order"] is not None:
         metadata["word_order"] = about["word_order"]
-    name = Path(path.name.removesuffix(".zstd")).stem
-    return Recording(events=events, metadata=metadata, name=name, imu=imu, frames=frames)
+    plain = path.with_suffix("") if path.suffix in (".zst", ".zstd") else path
+    return Recording(events=events, metadata=metadata, name=plain.stem, imu=imu, frames=frames)
 
 
 _of_others: list[contextlib.ExitStack] = []
