@@ -172,6 +172,21 @@ def test_a_restarted_driver_has_no_stale_row_and_its_clock_goes_on_by_the_stamps
     assert "repaired_time_events" not in about
 
 
+def test_a_restart_is_found_also_if_its_first_packets_have_no_word_of_the_time(tmp_path: Path) -> None:
+    messages = [
+        message(one_event(8_000_000), 500, 100.0),
+        message([ROW | 3, ON | 1], 0, 103.0),
+        message([LOW | 5, ON | 2], 1, 103.001),
+        message(one_event(4100), 2, 103.002),
+        message(one_event(4200), 3, 103.003),
+    ]
+    found, about = rows(bag(tmp_path, messages))
+    assert len(found) == 3
+    assert found[1][2] == pytest.approx(11_002_000, abs=4096)
+    assert found[2][2] - found[1][2] == 100
+    assert (about["clock_restarts"], about["dropped_unplaced_events"]) == (1, 2)
+
+
 def test_a_clock_that_goes_on_after_new_numbers_is_not_shifted(tmp_path: Path) -> None:
     messages = [message(one_event(8_000_000), 500, 100.0), message(one_event(8_001_000), 0, 100.3)]
     found, about = rows(bag(tmp_path, messages))
@@ -350,6 +365,12 @@ def test_the_order_of_halves_is_found_from_vectors_of_one_pixel() -> None:
     assert halves_of(words) == Halves(False, certain=True)
     assert halves_of(swapped) == Halves(True, certain=True)
     assert halves_of(words[:0]) is None
+
+
+def test_big_endian_words_of_evt21_are_named(tmp_path: Path) -> None:
+    big = message(evt2_words(EVENTS, vectors=True).astype(">u8").view("<u8"), encoding="evt21")
+    big.is_bigendian = True
+    assert "big-endian words" in str(refusal(open_recording, bag(tmp_path, [big])))
 
 
 def test_encodings_do_not_change_within_a_topic(tmp_path: Path) -> None:

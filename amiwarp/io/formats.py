@@ -48,7 +48,7 @@ class Format(Option):
     AEDAT2 = "aedat2"
     """AEDAT 2.0 file, which jAER records with the DVS128 and the DAVIS cameras."""
     ROSBAG = "rosbag"
-    """ROS 1 bag, or ROS 2 bag (SQLite or MCAP)."""
+    """ROS 1 bag, or ROS 2 bag (SQLite or MCAP), also compressed with Zstandard."""
     ES = "es"
     """Event Stream (.es) file."""
     TEXT = "text"

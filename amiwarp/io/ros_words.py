@@ -110,7 +110,7 @@ def layout_of(encoding: str, messages: Iterable[Any]) -> tuple[Layout, str | Non
     parts = []
     count = 0
     for message in messages:
-        parts.append(words_of(message.events, "2.1"))
+        parts.append(checked_words(message, encoding))
         count += len(parts[-1])
         if count >= ORDER_WORDS:
             break
@@ -188,24 +188,28 @@ class SensorClock:
     """Time of the first event of an earlier message [us], or None."""
     stamp: int = 0
     """Stamp of that message [ns]."""
+    restarted: bool = False
+    """Whether the numbers of messages have started again since then."""
 
     def shift(self, words: NDArray[Any], stamp: int, following: int, *, restarted: bool) -> int:
         """Return what is added to the times from a message on [us].
 
         ``following``: stamp of the next message [ns]. A stamp that is later than it is in error, and is not used.
         """
+        self.restarted |= restarted
         time, before = self._first_time(words), self.time
         if time is None or following - stamp < -1000 * PAUSE_ERROR_US:
             return 0
         elapsed = (stamp - self.stamp) // 1000
-        self.time, self.stamp = time, stamp
+        was_restarted = self.restarted
+        self.time, self.stamp, self.restarted = time, stamp, False
         if before is None:
             return 0
         period = self.layout.unit_us << self.layout.bits
         missing = elapsed - (time - before)
         wraps = (missing + period // 2) // period
         is_pause = 0 <= elapsed <= LONGEST_PAUSE_US and wraps >= 0 and abs(missing - wraps * period) <= PAUSE_ERROR_US
-        if restarted and not is_pause:
+        if was_restarted and not is_pause:
             self.notes["clock_restarts"] = self.notes.get("clock_restarts", 0) + 1
             return missing
         if not is_pause or wraps == 0:
@@ -277,7 +281,8 @@ def checked_words(message: Any, encoding: str) -> NDArray[Any]:
     """Return the words of a message. Raises :class:`AmiwarpError` for those of another encoding."""
     if message.encoding != encoding:
         raise AmiwarpError(
-            f"has packets of the encodings '{encoding}' and '{message.encoding[:40]}' in one topic; give a bag of one"
+            f"has packets of the encodings '{encoding}' and '{message.encoding[:40]}' in one topic; "
+            "filter the bag to one of them"
         )
     check_byte_order(message)
     return words_of(message.events, EVT[encoding])
@@ -331,7 +336,7 @@ def decoded(path: Path, topic: str, layout: Layout, notes: dict[str, int]) -> It
             note_largest_gap(notes, int(missing[start]), latest)
             offset += int(shifts[start])
             events, edges = decoder.decode(part)
-            if missing[start] == RESTART and events.t.size:
+            if (shifts[start] or missing[start] == RESTART) and events.t.size:  # time never goes back
                 offset += max(latest - int(events.t[0]) - offset, 0)
             if offset:
                 np.add(events.t, offset, out=events.t)
