@@ -179,11 +179,12 @@ def test_a_restart_is_found_also_if_its_first_packets_have_no_word_of_the_time(t
         message([LOW | 5, ON | 2], 1, 103.001),
         message(one_event(4100), 2, 103.002),
         message(one_event(4200), 3, 103.003),
+        message(one_event(4300), 4, 115.004),  # the computer's clock was set
     ]
     found, about = rows(bag(tmp_path, messages))
-    assert len(found) == 3
+    assert len(found) == 4
     assert found[1][2] == pytest.approx(11_002_000, abs=4096)
-    assert found[2][2] - found[1][2] == 100
+    assert [row[2] - found[1][2] for row in found[2:]] == [100, 200]
     assert (about["clock_restarts"], about["dropped_unplaced_events"]) == (1, 2)
 
 
