@@ -1,6 +1,7 @@
 """Small valid files of data sets and of ROS, written by h5py, NumPy and rosbags, or by their specification; and
 programs that are not amiwarp, which read the files that it writes."""
 
+import csv
 import struct
 from collections.abc import Callable
 from functools import partial
@@ -12,7 +13,7 @@ import h5py
 import hdf5plugin  # noqa: F401 - its import registers the compression
 import numpy as np
 import pytest
-from faery.extension import evt
+from faery.extension import dat, evt
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
@@ -342,8 +343,40 @@ def by_faery(path: Path) -> Columns:
     with evt.Decoder(path, None, None) as decoder:
         assert (decoder.version, decoder.dimensions) == ("evt3", SIZE)
         packets = [packet["events"] for packet in decoder if "events" in packet]
-    events = np.concatenate(packets) if packets else np.zeros(0, [(name, "<u8") for name in "txyp"])
-    return events["x"], events["y"], events["t"], events["p"]
+    return _columns_of_faery(packets, "p")
+
+
+def by_words(path: Path) -> Columns:
+    """Decode EVT 2.1 word by word, by Prophesee's specification, with the lines of the header that OpenEB needs."""
+    header, end, data = path.read_bytes().partition(b"% end\n")
+    lines = dict(line[2:].split(" ", 1) for line in header.decode().splitlines())
+    width, height = SIZE
+    assert (lines["evt"], lines["geometry"], end) == ("2.1", f"{width}x{height}", b"% end\n")
+    assert lines["format"] == f"EVT21;height={height};width={width};endianness=little"
+    origin, high, rows = int(lines.get("t0", 0)), -1, []
+    for word in np.frombuffer(data, "<u8").tolist():
+        kind = word >> 60
+        if kind == 8:
+            assert (word & 0xFFFFFFFF, (word >> 32 & 0xFFFFFFF) > high) == (0, True)
+            high = word >> 32 & 0xFFFFFFF
+            continue
+        base, y = word >> 43 & 0x7FF, word >> 32 & 0x7FF
+        assert (kind in (0, 1), base % 32, high >= 0, word & 0xFFFFFFFF > 0) == (True, 0, True, True)
+        t = origin + (high << 6 | word >> 54 & 63)
+        rows += [(base + bit, y, t, kind) for bit in range(32) if word >> bit & 1]
+    return tuple(np.array(rows, np.int64).reshape(-1, 4).T)
+
+
+def by_faery_dat(path: Path) -> Columns:
+    with dat.Decoder(path, None, None) as decoder:
+        assert (decoder.version, decoder.event_type, decoder.dimensions) == ("dat2", "cd", SIZE)
+        packets = list(decoder)
+    return _columns_of_faery(packets, "payload")
+
+
+def _columns_of_faery(packets: list[np.ndarray], polarity: str) -> Columns:
+    events = np.concatenate(packets) if packets else np.zeros(0, [(name, "<u8") for name in ("t", "x", "y", polarity)])
+    return events["x"], events["y"], events["t"], events[polarity]
 
 
 def by_eventcv(path: Path) -> Columns:
@@ -378,6 +411,35 @@ def by_decimals(path: Path) -> Columns:
     return table[:, 1], table[:, 2], table[:, 0], table[:, 3]
 
 
+def by_csv(path: Path) -> Columns:
+    """Read a table as Python's own library does, which gives columns their names."""
+    with path.open(newline="") as file:
+        table = csv.DictReader(file)
+        rows = [[int(row[name]) for name in "xytp"] for row in table]
+        assert table.fieldnames == ["t", "x", "y", "p", f"geometry {SIZE[0]}x{SIZE[1]} (t in us)"]
+    return tuple(np.array(rows, np.int64).reshape(-1, 4).T)
+
+
+def by_rosbags_ros1(path: Path) -> Columns:
+    """Read the arrays of a ROS 1 bag with the definitions that it holds."""
+    rows, at = [], 0
+    with AnyReader([path]) as reader:
+        for connection in reader.connections:
+            assert (connection.topic, connection.msgtype) == ("/dvs/events", "dvs_msgs/msg/EventArray")
+            assert connection.digest == "5e8beee5a6c107e504c2e78903c224b8"  # as rosbag prints it of rpg_dvs_ros
+        for connection, recorded, data in reader.messages():
+            array = reader.deserialize(data, connection.msgtype)
+            assert (array.width, array.height, array.header.seq) == (*SIZE, at)
+            rows += [(e.x, e.y, e.ts.sec * 10**9 + e.ts.nanosec, e.polarity) for e in array.events]
+            first = rows[-len(array.events)][2]
+            assert array.header.stamp.sec * 10**9 + array.header.stamp.nanosec == first
+            assert recorded == max(first, 1)  # ROS does not play messages at 0
+            at += 1
+    x, y, t, p = np.array(rows, np.int64).reshape(-1, 4).T
+    assert not (t % 1000).any()
+    return x, y, t // 1000, p
+
+
 def by_rosbags(path: Path) -> Columns:
     """Read a bag with the definitions that it holds. Its packets, one after the other, are the words of a RAW file."""
     words, stamps, counts = [], [], []
@@ -406,9 +468,13 @@ CLIENTS: dict[str, tuple[str, Callable[[Path], Columns]]] = {
     # format: (extension, client)
     "dsec": (".h5", by_dsec),
     "evt3": (".raw", by_faery),
+    "evt21": (".raw", by_words),
+    "dat": (".dat", by_faery_dat),
     "aedat4": (".aedat4", by_eventcv),
     "npz": (".npz", by_numpy),
     "text": (".txt", by_decimals),
+    "csv": (".csv", by_csv),
+    "ros1": (".bag", by_rosbags_ros1),
     "ros2 mcap": (".mcap", by_rosbags),
     "ros2 db3": (".db3", by_rosbags),
 }

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import struct
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -54,6 +55,7 @@ from amiwarp.kernels.prism_angle import EncoderParams, encoder_params, theta_u32
 from amiwarp.optics.models import MODELS, rungs
 from reference import optics as oracle
 from reference.calibration_sample import exact_calibration
+from reference.io_samples_extra import array_message, typestore
 from tests.conftest import TRUE_PRISM
 
 
@@ -327,9 +329,13 @@ FORMATS = {
     "out.txt": (None, None),
     "round.npz": (None, "nearest"),
     "round.txt": (None, "dithered"),
+    "out.csv": (None, None),
     "out.raw": (None, "dithered"),
+    "evt21.raw": ("evt21", "nearest"),
+    "out.dat": (None, "nearest"),
     "out.aedat4": (None, "nearest"),
     "dsec.h5": ("dsec", "dithered"),
+    "out.bag": (None, "nearest"),
     "out.mcap": (None, "nearest"),
     "out.db3": (None, "dithered"),
 }
@@ -386,8 +392,7 @@ def test_other_formats_hold_what_the_native_one_holds(
     assert found.events - found.dropped == converted.events
     assert (found.dropped > 0) == (rounding is not None)
     assert found.format == converted.format
-    size = ("sensor size",) if file.endswith(".txt") else ()
-    assert found.left_out == (*size, "encoder", "camera", "prism", "ground truth", "metadata")
+    assert found.left_out == ("encoder", "camera", "prism", "ground truth", "metadata")
     ours, theirs = events_of(tmp_path / file), events_of(tmp_path / "converted" / file)
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -398,7 +403,7 @@ def test_other_formats_hold_what_the_native_one_holds(
         expected = [x[kept], y[kept], expected[2][kept], expected[3][kept]]
     if rounding != "dithered":
         for a, b in zip(ours, expected, strict=True):
-            np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 if file == "out.txt" else 0)
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 if file in ("out.txt", "out.csv") else 0)
 
 
 def test_a_format_of_whole_pixels_needs_rounding(recording: Recording, exact: Calibration, tmp_path: Path) -> None:
@@ -550,6 +555,61 @@ def test_other_topics_are_named_if_they_are_left_out(recording: Recording, exact
     assert convert(tmp_path / "in.mcap", tmp_path / "out.raw").left_out == ("other topics", "metadata")
     assert convert(tmp_path / "in.mcap", tmp_path / "copy.db3").left_out == ()
     assert bag_of_rosbags(tmp_path / "copy.db3")[1]["/note"] == bag_of_rosbags(tmp_path / "in.mcap")[1]["/note"]
+
+
+def test_a_ros_1_bag_keeps_its_other_topics_and_clocks(recording: Recording, tmp_path: Path) -> None:
+    """Messages of two publishers of one topic, one of them latched, and of an unknown type."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import get_types_from_msg
+
+    events = recording.events.slice(0, 20_000)
+    store = typestore(True)
+    store.register(get_types_from_msg("float64[] values\nstring name", "rig_msgs/msg/State"))
+    kinds = store.types
+    given: list[tuple[int, int]] = []
+    with Writer(tmp_path / "in.bag") as writer:
+        event_topic = writer.add_connection("/dvs/left/events", "dvs_msgs/msg/EventArray", typestore=store)
+        notes = [
+            writer.add_connection("/note", "std_msgs/msg/String", typestore=store, callerid=name, latching=latching)
+            for name, latching in (("/rig", 1), ("/user", 0), (None, None))
+        ]
+        state_topic = writer.add_connection("/rig/state", "rig_msgs/msg/State", typestore=store)
+        for number, connection in enumerate(notes):
+            text = store.serialize_ros1(kinds["std_msgs/msg/String"](f"note {number}"), "std_msgs/msg/String")
+            writer.write(connection, HOST_NS - 5 + number, text)
+        for number, packet in enumerate(MemoryEvents(events, 200, 150).blocks(duration_us=3_000)):
+            message = array_message(store, packet, ros1=True)
+            stamp = HOST_NS + 1000 * int(packet.t[0])
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+            writer.write(event_topic, stamp + DELAY_NS, store.serialize_ros1(message, message.__msgtype__))
+            given.append((stamp + DELAY_NS, stamp))
+            state = kinds["rig_msgs/msg/State"](np.arange(number, dtype=np.float64), "é" * number)
+            writer.write(state_topic, HOST_NS + 7_000_000 * number, store.serialize_ros1(state, state.__msgtype__))
+    summary = convert(tmp_path / "in.bag", tmp_path / "out.bag", size=(200, 150))
+    assert (summary.events, summary.left_out) == (len(events), ())
+    assert open_recording(tmp_path / "out.bag").metadata["topic"] == "/dvs/left/events"
+    for a, b in zip(events_of(tmp_path / "out.bag"), (events.x, events.y, events.t, events.p), strict=True):
+        np.testing.assert_array_equal(a, b)
+    seen = []
+    for name in ("in.bag", "out.bag"):
+        with opened_bag(str(tmp_path / name)) as (bag, _):
+            others = [one for one in bag.connections if "events" not in one.topic]
+            seen.append(
+                [
+                    (one.topic, one.msgtype, one.digest, one.msgdef, one.ext, t, bytes(raw))
+                    for one, t, raw in bag.messages(connections=others)
+                ]
+            )
+            arrays = [one for one in bag.connections if "events" in one.topic]
+            clocks = [
+                (t, seconds * 10**9 + rest)
+                for _, t, raw in bag.messages(connections=arrays)
+                for seconds, rest in [struct.unpack_from("<II", raw, 4)]
+            ]
+            assert clocks == given
+    assert len(seen[0]) == len(given) + 3
+    assert sorted(seen[1], key=repr) == sorted(seen[0], key=repr)
+    assert "other topics" in convert(tmp_path / "in.bag", tmp_path / "out.mcap").left_out
 
 
 def test_inside_image_at_its_border() -> None:

@@ -310,10 +310,10 @@ NAMES: dict[tuple[str, str], tuple[str, tuple[str, ...]]] = {
     ("lens", "out"): ("lens a.h5 {}", ("h5", "png", *NOT_WRITTEN)),
     ("lens", "calibration"): ("lens a.h5 new.json --calibration {}", ("h5", "yaml", *NOT_WRITTEN)),
     ("lens", "figure"): ("lens a.h5 new.json --figure {}", ("h5", "json", *NOT_WRITTEN)),
-    ("compensate", "out"): ("compensate a.h5 {} --calibration cal.json", ("json", "csv", "bag", "jpg", "")),
+    ("compensate", "out"): ("compensate a.h5 {} --calibration cal.json", ("json", "xyz", "jpg", "")),
     ("compensate", "iwe"): ("compensate a.h5 new.h5 --calibration cal.json --iwe {}", ("h5", "tif", *NOT_WRITTEN)),
-    ("filter", "out"): ("filter a.h5 {} --every 2", ("json", "csv", "bag", "jpg", "")),
-    ("convert", "out"): ("convert a.h5 {}", ("json", "csv", "bag", "jpg", "")),
+    ("filter", "out"): ("filter a.h5 {} --every 2", ("json", "xyz", "jpg", "")),
+    ("convert", "out"): ("convert a.h5 {}", ("json", "xyz", "jpg", "")),
     ("live", "out"): ("live a.h5 --fast --calibration cal.json --out {}", ("npz", "txt", *NOT_WRITTEN)),
     ("live", "record"): ("live a.h5 --fast --calibration cal.json --record {}", ("npz", "txt", *NOT_WRITTEN)),
     ("reconstruct", "out"): ("reconstruct a.h5 {} --calibration cal.json", ("h5", *NOT_WRITTEN)),
@@ -443,7 +443,7 @@ def test_functions_refuse_a_name_that_means_another_format(place: Path) -> None:
     )  # fmt: skip
     before = sorted(place.rglob("*"))
     for name, call in CALLS.items():
-        for ending in (".h5", ".png") if name == "save_flow_dsec" else (".jpg", ".bag", ".csv"):
+        for ending in (".h5", ".png") if name == "save_flow_dsec" else (".jpg", ".xyz"):
             with pytest.raises(AmiwarpError, match=rf"false\{ending}: .*; (give|choose)"):
                 call(Path(f"false{ending}"), given)
     assert sorted(place.rglob("*")) == before

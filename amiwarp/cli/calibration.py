@@ -486,8 +486,8 @@ def run_compensate(
     """Compensate the prism's motion: move every event to its position without the prism.
 
     Positions are sub-pixel, and all events are kept, in order; --round gives whole pixels and drops events outside the
-    image. Memory use does not depend on the length of the recording. From a ROS 2 bag to a ROS 2 bag, all other topics
-    are copied.
+    image. Memory use does not depend on the length of the recording. From a ROS bag to one of the same version of ROS,
+    all other topics are copied.
 
     A PNG shows counts from 0 (black) to their 99.5th percentile over pixels with events (white), with gamma 0.5.
     """

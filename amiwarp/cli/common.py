@@ -291,7 +291,8 @@ class EncoderOptions:
 
 
 Format = Annotated[
-    OutputFormat | None, typer.Option(help="Format to write, if not that of the extension: dsec.", show_default=False)
+    OutputFormat | None,
+    typer.Option(help="Format to write, if not that of the extension: dsec (.h5), evt21 (.raw).", show_default=False),
 ]
 """Option that chooses a format whose extension means another one."""
 
@@ -303,8 +304,8 @@ HdfCodec = Annotated[Codec, typer.Option(help="Compression of HDF5. Programs wit
 Round = Annotated[
     Rounding | None,
     typer.Option(
-        help="Round compensated events to whole pixels, as RAW, AEDAT 4, DSEC and ROS 2 need. nearest: to the nearest "
-        "pixel; dithered: up or down at random (--seed), unbiased. Events outside the image are dropped.",
+        help="Round compensated events to whole pixels, as RAW, DAT, AEDAT 4, DSEC and ROS need. nearest: to the "
+        "nearest pixel; dithered: up or down at random (--seed), unbiased. Events outside the image are dropped.",
         show_default=False,
     ),
 ]

@@ -412,8 +412,8 @@ def run_convert(
 ) -> None:
     """Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.
 
-    Other formats hold the events only; the command lists what it leaves out. From a ROS 2 bag to a ROS 2 bag, all other
-    topics are copied. Memory use does not depend on the length of the recording.
+    Other formats hold the events only; the command lists what it leaves out. From a ROS bag to one of the same version
+    of ROS, all other topics are copied. Memory use does not depend on the length of the recording.
 
     Files for the viewers Rerun and Foxglove show images of the events, recorded and, with --calibration, compensated,
     and the prism's angle.

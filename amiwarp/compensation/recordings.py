@@ -287,8 +287,8 @@ def compensate(
 
     The native format, npz and text (to 1e-6 px) hold sub-pixel coordinates. The other formats need ``rounding``. A
     native file gets the calibrated camera, the IMU samples, and the ground truth of instants; frames, which show the
-    image through the optic, and the ground truth of single events are left out. From a ROS 2 bag to a ROS 2 bag, the
-    messages of all other topics are copied.
+    image through the optic, and the ground truth of single events are left out. From a bag to one of the same version
+    of ROS, the messages of all other topics are copied.
 
     Parameters
     ----------
@@ -378,7 +378,7 @@ def compensate(
         with contextlib.closing(_counted(recording.events, compensator, count)) as blocks:
             dropped = export(
                 recording.events, out_path, chosen, (width, height), codec=codec, progress=None, overwrite=overwrite,
-                blocks=blocks, rounding=rounding, seed=seed, bag=bag_of(recording),
+                blocks=blocks, rounding=rounding, seed=seed, bag=bag_of(recording, chosen),
             )  # fmt: skip
         missing = left_out(recording, chosen)
         seconds = time.perf_counter() - began

@@ -26,7 +26,7 @@ from amiwarp.io.file_scan import ASSUMED, ASSUMED_SIZE, RECORDS, FileEvents, ass
 from amiwarp.io.files import NewFile, check_output, errors_name
 from amiwarp.io.formats import LIMITS, Bag, Codec, Outline, OutputFormat, Rounding, open_recording
 from amiwarp.io.native_format import write_recording
-from amiwarp.io.plain_files import write_array
+from amiwarp.io.plain_files import size_file, write_array, write_size
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import NominalPrism
 from amiwarp.tasks import Progress
@@ -55,7 +55,8 @@ def export(
     """Write the events of a source, and return how many were dropped because they are outside the image.
 
     ``blocks`` are written instead of the source's events: the same events with other coordinates. ``rounding`` and
-    ``seed`` apply to compensated events. Raises :class:`AmiwarpError` for events that the format cannot hold.
+    ``seed`` apply to compensated events. Text has its size in a second file, :func:`size_file`. Raises
+    :class:`AmiwarpError` for events that the format cannot hold.
     """
     path, limits = Path(path), LIMITS[chosen]
     ends = (source.t_first, source.t_last) if len(source) else (0, 0)
@@ -65,9 +66,15 @@ def export(
     write: Writer = formats.io_function(formats.WRITERS[chosen])
     foreign: list[Exception] = []
     written = _written(source.blocks() if blocks is None else blocks, pixels, outline, len(source), progress, foreign)
-    with NewFile(path, overwrite=overwrite) as new:
+    with contextlib.ExitStack() as files:  # both files appear at the end, or neither
+        new = files.enter_context(NewFile(path, overwrite=overwrite))
+        beside = None
+        if chosen is OutputFormat.TEXT:
+            beside = files.enter_context(NewFile(size_file(path), overwrite=overwrite))
         try:
             write(new.part, written, outline)
+            if beside is not None:
+                write_size(beside.part, new.part, outline)
         except BaseException as error:
             if error in foreign:
                 raise
@@ -149,10 +156,10 @@ class Pixels:
         if self._limits.fractional:
             return events
         names = " or ".join(Rounding)
-        exact = (end for end, one in formats.EXTENSIONS.items() if one in LIMITS and LIMITS[one].fractional)
+        exact = [end for end, one in formats.EXTENSIONS.items() if one in LIMITS and LIMITS[one].fractional]
         raise AmiwarpError(
             f"events are compensated and have fractional pixels, {self._limits.label} holds whole pixels; "
-            f"give --round (rounding= in Python) {names}, or write .h5, {' or '.join(exact)}"
+            f"give --round (rounding= in Python) {names}, or write .h5, {', '.join(exact[:-1])} or {exact[-1]}"
         )
 
     def _rounded(self, events: Events, rounding: Rounding) -> Events:
@@ -248,9 +255,10 @@ def convert(
 
     Only the native format holds the encoder, the camera, the prism, the ground truth, the IMU samples, the frames and
     the metadata. All formats keep x, y, t and p of every event exactly, with three exceptions. Of compensated events,
-    text holds the coordinates to 1e-6 px, and formats of whole pixels need ``rounding``. In a ROS 2 bag the times begin
-    at 0 if the last is later than 28 h, as are times since 1970: only the stamps of its messages hold those. From a
-    ROS 2 bag to a ROS 2 bag, the messages of all other topics are copied.
+    text and csv hold the coordinates to 1e-6 px, and formats of whole pixels need ``rounding``. In a ROS 2 bag the
+    times begin at 0 if the last is later than 28 h, as are times since 1970: only the stamps of its messages hold
+    those. From a bag to a bag of the same version of ROS, the messages of all other topics are copied. The sensor size
+    of text is in a second file, ``OUT.txt.json``.
 
     Parameters
     ----------
@@ -281,7 +289,8 @@ def convert(
     overwrite : bool, default False
         Whether an existing output may be replaced.
     format : OutputFormat or str, optional
-        The format to write, if not that of the extension. The layout of DSEC (``"dsec"``) needs it.
+        The format to write, if not that of the extension. The layout of DSEC (``"dsec"``) and EVT 2.1 (``"evt21"``)
+        need it.
     codec : Codec or str, default "blosc"
         Compression of HDF5. Programs without HDF5's Blosc filter read ``"gzip"``.
     rounding : Rounding or str, optional
@@ -344,7 +353,7 @@ def convert(
     else:
         dropped = export(
             recording.events, out_path, chosen, frame, codec=codec, progress=progress, overwrite=overwrite,
-            rounding=rounding, seed=seed, bag=bag_of(recording),
+            rounding=rounding, seed=seed, bag=bag_of(recording, chosen),
         )  # fmt: skip
     return _summary(recording, frame, chosen, rounding, dropped)
 
@@ -373,10 +382,14 @@ def _summary(
     )
 
 
-def bag_of(recording: Recording) -> Bag | None:
-    """Return the ROS 2 bag and the topic that a recording is read from, or None for other recordings."""
+BAGS = {OutputFormat.ROS1: "rosbag1", OutputFormat.ROS2: "rosbag2"}
+"""Format in the metadata of a bag whose other topics a bag of a format takes over."""
+
+
+def bag_of(recording: Recording, chosen: OutputFormat) -> Bag | None:
+    """Return the bag and the topic that a recording is read from, if a bag of the same version of ROS is written."""
     source, about = recording.events, recording.metadata
-    if not isinstance(source, FileEvents) or about.get("format") != "rosbag2":
+    if not isinstance(source, FileEvents) or chosen not in BAGS or about.get("format") != BAGS[chosen]:
         return None
     return Bag(source.path, str(about["topic"]))
 
@@ -388,11 +401,10 @@ def left_out(recording: Recording, chosen: OutputFormat) -> tuple[str, ...]:
     known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {}), "other_topics", "columns", "time_unit"}
     known |= {name for name in recording.metadata if name.startswith(ASSUMED)}
     from_bag = str(recording.metadata.get("format")).startswith("rosbag")
-    copied = chosen is OutputFormat.ROS2 and bag_of(recording) is not None
+    copied = bag_of(recording, chosen) is not None
     if copied:
         known |= {"topic", *RECORDS}
     found = {
-        "sensor size": not LIMITS[chosen].holds_size,
         "encoder": recording.encoder is not None,
         "camera": recording.camera is not None,
         "prism": recording.prism is not None,

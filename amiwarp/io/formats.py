@@ -415,12 +415,20 @@ class OutputFormat(Option):
     """HDF5 with the layout of DSEC's event files (.h5)."""
     EVT3 = "evt3"
     """Prophesee RAW, EVT 3.0 (.raw)."""
+    EVT21 = "evt21"
+    """Prophesee RAW, EVT 2.1 (.raw)."""
+    DAT = "dat"
+    """Prophesee DAT, version 2 (.dat)."""
     AEDAT4 = "aedat4"
     """iniVation AEDAT 4.0 (.aedat4)."""
     NPZ = "npz"
     """NumPy archive with the arrays x, y, t and p (.npz)."""
     TEXT = "text"
     """Text of the Event Camera Dataset: lines ``t x y p``, with t in seconds (.txt)."""
+    CSV = "csv"
+    """Table of t, x, y, p between commas below a line of names, with t in whole microseconds (.csv)."""
+    ROS1 = "ros1"
+    """ROS 1 bag of dvs_msgs arrays (.bag)."""
     ROS2 = "ros2"
     """ROS 2 bag of event_camera_msgs packets in EVT 3.0 (.mcap or .db3)."""
 
@@ -459,25 +467,34 @@ EXTENSIONS = {
     ".h5": OutputFormat.NATIVE,
     ".hdf5": OutputFormat.NATIVE,
     ".raw": OutputFormat.EVT3,
+    ".dat": OutputFormat.DAT,
     ".aedat4": OutputFormat.AEDAT4,
     ".npz": OutputFormat.NPZ,
     ".txt": OutputFormat.TEXT,
+    ".csv": OutputFormat.CSV,
+    ".bag": OutputFormat.ROS1,
     ".mcap": OutputFormat.ROS2,
     ".db3": OutputFormat.ROS2,
 }
-"""Format of each file extension. DSEC's files have the extension of native ones and are chosen by name."""
+"""Format of each file extension. Formats of :data:`CHOSEN_BY_NAME` share one of these extensions."""
 
-EXTENSION_HELP = ".h5 (native), .raw (Prophesee EVT 3.0), .aedat4, .npz, .txt, .mcap or .db3 (ROS 2 bag)"
-COMPENSATED_HELP = (
-    ".h5 (native), .npz or .txt with sub-pixels; with --round .raw (Prophesee EVT 3.0), .aedat4, .mcap or .db3 (ROS 2 "
+CHOSEN_BY_NAME = {OutputFormat.DSEC: OutputFormat.NATIVE, OutputFormat.EVT21: OutputFormat.EVT3}
+"""Formats that no extension means, and the format whose extensions they have."""
+
+EXTENSION_HELP = (
+    ".h5 (native), .raw (Prophesee EVT 3.0), .dat, .aedat4, .npz, .txt, .csv, .bag (ROS 1 bag), .mcap or .db3 (ROS 2 "
     "bag)"
+)
+COMPENSATED_HELP = (
+    ".h5 (native), .npz, .txt or .csv with sub-pixels; with --round .raw (Prophesee EVT 3.0), .dat, .aedat4, .bag (ROS "
+    "1 bag), .mcap or .db3 (ROS 2 bag)"
 )
 """Extensions in the help of the commands, for any events and for compensated ones."""
 
 POSE_ENDINGS = (".txt", ".tum")
 """File extensions of poses in the format of TUM."""
 
-FILE_ENDINGS = {*EXTENSIONS, ".json", ".csv", ".png", ".svg", ".tif", ".tiff", ".npy", ".mp4", ".gif"}
+FILE_ENDINGS = {*EXTENSIONS, ".json", ".png", ".svg", ".tif", ".tiff", ".npy", ".mp4", ".gif"}
 """File extensions that no folder for outputs may have."""
 
 
@@ -495,8 +512,6 @@ class Limits:
     """Latest time [us]."""
     span: int = 2**63
     """Longest time between the first and the last event [us]."""
-    holds_size: bool = True
-    """Whether it holds the sensor size."""
     fractional: bool = False
     """Whether it holds the sub-pixel coordinates of compensated events."""
 
@@ -528,7 +543,7 @@ class Outline:
     codec: Codec
     """Compression of HDF5."""
     bag: Bag | None = None
-    """ROS 2 bag that the events come from, whose other topics are copied to a ROS 2 bag."""
+    """Bag that the events come from, whose other topics are copied to a bag of the same version of ROS."""
 
 
 MAX_MS = 100_000_000
@@ -538,14 +553,23 @@ index would be huge."""
 LONGEST_US = MAX_MS * 1000
 """Longest recording that is written in EVT 3.0 [us], 28 h. Each 17 s take three words, with and without events."""
 
+LONGEST_EVT21_US, LONGEST_DAT_US = 2**34 - 1, 2**32 - 1
+"""Longest recording that is written in EVT 2.1 and as DAT [us], 4.8 h and 71 min: their clocks of 34 and 32 bits do not
+wrap, because not every reader notices that."""
+
 LIMITS = {
     OutputFormat.DSEC: Limits("the DSEC layout", span=2**32 - 1),
     OutputFormat.EVT3: Limits("RAW EVT 3.0", side=2048, t_first=0, span=LONGEST_US),
+    OutputFormat.EVT21: Limits("RAW EVT 2.1", side=2048, t_first=0, span=LONGEST_EVT21_US),
+    OutputFormat.DAT: Limits("DAT", side=2**14, t_first=0, span=LONGEST_DAT_US),
     OutputFormat.AEDAT4: Limits("AEDAT 4", side=2**15, t_first=0),
     OutputFormat.NPZ: Limits("npz", fractional=True),
     # Readers take the seconds as float64, which is exact to the microsecond up to these times, 71 years.
-    OutputFormat.TEXT: Limits("text", t_first=-(2**51), t_last=2**51, holds_size=False, fractional=True),
-    # A time in ROS has 32 bits for the seconds.
+    OutputFormat.TEXT: Limits("text", t_first=-(2**51), t_last=2**51, fractional=True),
+    # Readers may take the microseconds as float64, too.
+    OutputFormat.CSV: Limits("csv", t_first=-(2**53), t_last=2**53, fractional=True),
+    # A time in ROS has 32 bits for the seconds: without a sign in ROS 1, with a sign in ROS 2.
+    OutputFormat.ROS1: Limits("a ROS 1 bag", t_first=0, t_last=2**32 * 10**6 - 1),
     OutputFormat.ROS2: Limits("a ROS 2 bag", side=2048, t_first=0, t_last=2**31 * 10**6 - 1, span=LONGEST_US),
 }
 """Limits of the formats other than the native one."""
@@ -553,9 +577,13 @@ LIMITS = {
 WRITERS = {
     OutputFormat.DSEC: "native_format:write_dsec",
     OutputFormat.EVT3: "prophesee:write_evt3",
+    OutputFormat.EVT21: "prophesee:write_evt21",
+    OutputFormat.DAT: "prophesee:write_dat",
     OutputFormat.AEDAT4: "aedat4:write_aedat4",
     OutputFormat.NPZ: "plain_files:write_npz",
     OutputFormat.TEXT: "plain_files:write_text",
+    OutputFormat.CSV: "plain_files:write_csv",
+    OutputFormat.ROS1: "ros:write_ros1",
     OutputFormat.ROS2: "ros:write_ros2",
 }
 """Function that writes all events in each format other than the native one, see :func:`io_function`."""
@@ -582,7 +610,7 @@ def output_format(path: Path, given: OutputFormat | str | None) -> OutputFormat:
 
 def _endings(chosen: OutputFormat) -> list[str]:
     """Return the extensions of a format."""
-    own = OutputFormat.NATIVE if chosen is OutputFormat.DSEC else chosen
+    own = CHOSEN_BY_NAME.get(chosen, chosen)
     return [ending for ending, one in EXTENSIONS.items() if one is own]
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, ClassVar, Self, TypeAlias
@@ -27,8 +28,10 @@ from amiwarp.io.formats import (
     check_ending,
     looks_like_bin,
 )
+from amiwarp.io.json_files import read_json
 from amiwarp.optics.camera import LARGEST_SIZE, Camera, RadialTangential
 from amiwarp.tasks import in_order
+from amiwarp.validation import whole
 
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
@@ -44,9 +47,14 @@ def read_calib(path: Path, width: int, height: int) -> Camera:
         return Camera(width, height, fx, fy, cx, cy, RadialTangential(*numbers[4:]))
 
 
-# Writer of text in the format of the Event Camera Dataset: one event ``t x y p`` per line, t in seconds, p 1 or 0.
+# Writers of text, one event per line, p 1 or 0: the format of the Event Camera Dataset, ``t x y p`` with t in seconds,
+# and tables ``t,x,y,p`` with t in whole microseconds below a line of names.
 #
 # x and y of compensated events have six decimals; ``nan`` marks those without coordinates.
+#
+# Both keep the sensor size where it disturbs no other reader. A table has it as a fifth name without values, which
+# pandas and others read as an empty column. The Event Camera Dataset has no place for it, and its readers take a
+# further line for an event. So the size is in a file of its own, with the number of bytes of the text it belongs to.
 
 LINES = 1 << 17
 """Number of events that are formatted at a time."""
@@ -59,29 +67,56 @@ Digits = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 
 
 def write_text(part: Path, blocks: Iterable[Events], about: Outline) -> None:
-    """Write all events, formatted in parallel threads."""
-    jobs = (partial(format_events, events) for events in regroup(blocks, count=LINES))
-    with part.open("xb") as file, contextlib.closing(in_order(jobs)) as lines:
+    """Write all events as the Event Camera Dataset does. :func:`write_size` writes the sensor size."""
+    with part.open("xb") as file:
+        _write_lines(file, blocks, format_events)
+
+
+def write_csv(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events as a table between commas, with the sensor size among the names of the columns."""
+    names = f"t,x,y,p,geometry {about.width}x{about.height} (t in us)\n"
+    with part.open("xb") as file:
+        file.write(names.encode())
+        _write_lines(file, blocks, format_rows)
+
+
+def _write_lines(file: IO[bytes], blocks: Iterable[Events], form: Callable[[Events], bytes]) -> None:
+    """Write all events as lines of text, formatted in parallel threads."""
+    jobs = (partial(form, events) for events in regroup(blocks, count=LINES))
+    with contextlib.closing(in_order(jobs)) as lines:
         for text in lines:
             file.write(text)
 
 
 def format_events(events: Events) -> bytes:
-    """Return the lines of some events, at least one."""
-    columns = _decimals(events.t)
+    """Return lines ``t x y p`` of some events, at least one, with t in seconds."""
+    return _lines(_decimals(events.t), events, " ")
+
+
+def format_rows(events: Events) -> bytes:
+    """Return lines ``t,x,y,p`` of some events, at least one, with t in microseconds."""
+    return _lines([_minus(events.t), _digits(np.abs(events.t))], events, ",")
+
+
+def _lines(times: list[Digits], events: Events, separator: str) -> bytes:
+    """Return the lines of some events, at least one, with their times as given."""
+    columns = times
     for values in (events.x, events.y, events.p):
         digits = [_digits(values)] if values.dtype.kind == "u" else _fractional(values)
-        columns += [_mark(" ", len(events)), *digits]
+        columns += [_mark(separator, len(events)), *digits]
     columns.append(_mark("\n", len(events)))
     characters = np.concatenate([column for column, _ in columns])
     return characters.T[np.concatenate([kept for _, kept in columns]).T].tobytes()
 
 
+def _minus(values: NDArray[np.int64]) -> Digits:
+    return np.full((1, len(values)), ord("-"), np.uint8), (values < 0)[None]
+
+
 def _decimals(millionths: NDArray[np.int64]) -> list[Digits]:
     """Return integers divided by a million, with six decimals."""
     whole, rest = np.divmod(np.abs(millionths), 1_000_000)
-    minus = np.full((1, len(whole)), ord("-"), np.uint8), (millionths < 0)[None]
-    return [minus, _digits(whole), _mark(".", len(whole)), _digits(rest.astype(np.uint32), places=6)]
+    return [_minus(millionths), _digits(whole), _mark(".", len(whole)), _digits(rest.astype(np.uint32), places=6)]
 
 
 def _fractional(values: NDArray[Any]) -> list[Digits]:
@@ -93,6 +128,32 @@ def _fractional(values: NDArray[Any]) -> list[Digits]:
             kept[:, unknown] = False
         columns += [(np.full((1, len(values)), ord(letter), np.uint8), unknown[None]) for letter in "nan"]
     return columns
+
+
+def size_file(path: Path) -> Path:
+    """Return the file with the sensor size of a text file of the Event Camera Dataset's format."""
+    return path.with_name(f"{path.name}.json")
+
+
+def write_size(part: Path, text: Path, about: Outline) -> None:
+    """Write the sensor size of the finished file ``text``."""
+    fields = {"width": about.width, "height": about.height, "bytes": text.stat().st_size}
+    part.write_text(json.dumps(fields) + "\n", encoding="ascii", newline="\n")
+
+
+def read_size(path: Path) -> tuple[int, int] | None:
+    """Return the sensor size that :func:`write_size` wrote for a text file [px].
+
+    None if there is no such file, or if it is about another text than this one.
+    """
+    beside = size_file(path)
+    if not beside.is_file():
+        return None
+    fields = read_json(beside, "the sensor size of a text file")
+    if fields.get("bytes") != path.stat().st_size:
+        return None
+    width, height = (whole(fields.get(name), f"{beside}: {name}", 1, LARGEST_SIZE) for name in ("width", "height"))
+    return width, height
 
 
 def _mark(character: str, count: int) -> Digits:

@@ -1,4 +1,4 @@
-"""Prophesee's files and words: RAW (EVT 2.0, 2.1, 3.0) is read and written; DAT files are read."""
+"""Prophesee's files and words: RAW (EVT 2.0, 2.1, 3.0) and DAT are read; EVT 2.1, EVT 3.0 and DAT are written."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -15,7 +15,7 @@ from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording
 from amiwarp.io.evt_decoder import WORD_TYPES, EventColumns, EvtDecoder, Triggers
 from amiwarp.io.file_scan import FileEvents, Packet, last_word, nearest, read_pieces, read_words, unwrapped
 from amiwarp.io.files import errors_name, open_input
-from amiwarp.io.formats import LONGEST_US, Outline
+from amiwarp.io.formats import LONGEST_DAT_US, LONGEST_EVT21_US, LONGEST_US, Outline
 from amiwarp.validation import TIME_LIMIT
 
 # Words of the encodings.
@@ -144,11 +144,16 @@ def _read_evt_header(path: Path) -> EvtFile:
     word = {"2.0": 4, "2": 4, "2.1": 8, "21": 8, "3.0": 2, "3": 2}.get(version)
     if word is None:
         raise AmiwarpError(f"{path}: EVT version in the header is '{version[:40]}'; expected 2.0, 2.1 or 3.0")
+    swapped = word == 8 and _is_swapped(path, offset, fields.get("format", ""))
+    return EvtFile(path, fields, "2.1" if word == 8 else version, offset, word, swapped, _origin(path, fields))
+
+
+def _origin(path: Path, fields: dict[str, str]) -> int:
+    """Return the time that is added to all times of a file [us]: ``t0`` of the header, or 0."""
     origin = fields.get("t0", "0")
     if not re.fullmatch(r"[0-9]{1,19}", origin) or int(origin) > TIME_LIMIT:
         raise AmiwarpError(f"{path}: t0 in the header is '{origin[:40]}'; expected a time of 0 to {TIME_LIMIT} us")
-    swapped = word == 8 and _is_swapped(path, offset, fields.get("format", ""))
-    return EvtFile(path, fields, "2.1" if word == 8 else version, offset, word, swapped, int(origin))
+    return int(origin)
 
 
 def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
@@ -227,12 +232,20 @@ def open_dat(path: Path) -> Recording:
         raise AmiwarpError(f"{path}: DAT version is '{version[:40]}'; expected 1 or 2")
     width, height = fields.get("width", ""), fields.get("height", "")
     size = (int(width), int(height)) if width.isdecimal() and height.isdecimal() else None
-    read, last = partial(_dat_packets, path, offset + 2, version), partial(last_word, path, offset + 2, "<u4")
+    origin = _origin(path, fields)
+    read = partial(_dat_packets, path, offset + 2, version, origin)
+    last = partial(_last_dat_time, path, offset + 2, origin)
     events = FileEvents(path, read, size=size, last_time=last)
     return Recording(events=events, metadata={"format": f"dat{version}", **events.metadata}, name=path.stem)
 
 
-def _dat_packets(path: Path, offset: int, version: str, notes: dict[str, int]) -> Iterator[Packet]:
+def _last_dat_time(path: Path, offset: int, origin: int, estimate: int) -> int | None:
+    """Return the time of the last event [us]."""
+    last = last_word(path, offset, "<u4", estimate - origin)
+    return None if last is None else last + origin
+
+
+def _dat_packets(path: Path, offset: int, version: str, origin: int, notes: dict[str, int]) -> Iterator[Packet]:
     # Bits of the second word, according to Prophesee's documentation of the format.
     bits, y_shift, p_shift = ((9, 8), 9, 17) if version == "1" else ((14, 14), 14, 28)
     last: int | None = None
@@ -244,7 +257,7 @@ def _dat_packets(path: Path, offset: int, version: str, notes: dict[str, int]) -
         last = int(t[-1])
         x = rest & ((1 << bits[0]) - 1)
         y = (rest >> y_shift) & ((1 << bits[1]) - 1)
-        yield x, y, t, (rest >> p_shift) & 1
+        yield x, y, t + origin, (rest >> p_shift) & 1
 
 
 # Encoder of events in Prophesee's EVT 3.0, and writer of RAW files with them.
@@ -264,9 +277,9 @@ STOPS = (0x000, 0x7FF, 0xFFF)
 """Values that the upper bits of the time never skip. Decoders take other large steps for a step back or for a wrap."""
 
 
-def origin_of(about: Outline) -> int:
-    """Return the time at which the clock of EVT 3.0 starts [us]: 0, or the first event if that is very late."""
-    return 0 if about.t_last <= LONGEST_US else about.t_first
+def origin_of(about: Outline, longest_us: int = LONGEST_US) -> int:
+    """Return the time at which the clock of EVT words starts [us]: 0, or the first event if the last is very late."""
+    return 0 if about.t_last <= longest_us else about.t_first
 
 
 class Evt3Encoder:
@@ -314,22 +327,104 @@ def _stops_between(low: int, high: int) -> NDArray[np.uint16]:
     return (stops[(stops > low) & (stops < high)] & 0xFFF).astype(np.uint16)
 
 
-def write_evt3(part: Path, blocks: Iterable[Events], about: Outline) -> None:
-    """Write all events into a RAW file. Its header has the lines that Prophesee's own programs need."""
-    size = f"height={about.height};width={about.width}"
-    origin = origin_of(about)
-    header = [
+def _raw_header(about: Outline, version: str, name: str, origin: int, more: str = "") -> bytes:
+    """Return the header of a RAW file, with the lines that Prophesee's own programs need."""
+    lines = [
         "camera_integrator_name Prophesee",
-        "evt 3.0",
-        f"format EVT3;{size}",
+        f"evt {version}",
+        f"format {name};height={about.height};width={about.width}{more}",
         f"geometry {about.width}x{about.height}",
         "plugin_integrator_name Prophesee",
         "plugin_name hal_plugin_prophesee",
         *([f"t0 {origin}"] if origin else []),
         "end",
     ]
+    return "".join(f"% {line}\n" for line in lines).encode()
+
+
+def write_evt3(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events into a RAW file in EVT 3.0."""
+    origin = origin_of(about)
     encoder = Evt3Encoder(origin)
     with part.open("xb") as file:
-        file.write("".join(f"% {line}\n" for line in header).encode())
+        file.write(_raw_header(about, "3.0", "EVT3", origin))
         for events in blocks:
             file.write(encoder.encode(events).astype("<u2").data)
+
+
+# Writer of RAW files in EVT 2.1.
+#
+# EVT 2.1 consists of 64-bit words: the upper 28 bits of the time, or the lower 6 bits with row, column, polarity and
+# the 32 pixels from that column on, one bit for each with an event. Successive events share a word as long as their
+# columns rise, because a decoder returns them in the order of the columns: so the order of the events is kept. The
+# format is described at https://docs.prophesee.ai/stable/data/encoding_formats/evt21.html.
+
+VECTOR = 32
+"""Pixels of a word."""
+
+
+class Evt21Encoder:
+    """Encoder of events that follow one another in time, from ``origin`` [us] on."""
+
+    def __init__(self, origin: int) -> None:
+        self._origin = origin
+        self._high: int | None = None
+
+    def encode(self, events: Events) -> NDArray[np.uint64]:
+        """Return the words of some events, at least one."""
+        t = (events.t - self._origin).astype(np.uint64)
+        x = events.x.astype(np.uint64)
+        y = events.y.astype(np.uint64)
+        head = events.p.astype(np.uint64) << np.uint64(60)
+        head |= (t & np.uint64(0x3F)) << np.uint64(54)
+        head |= (x & ~np.uint64(VECTOR - 1)) << np.uint64(43)
+        head |= y << np.uint64(32)
+        high = t >> np.uint64(6)
+        changes = np.empty(len(events), np.bool_)
+        changes[0] = self._high != int(high[0])
+        np.not_equal(high[1:], high[:-1], out=changes[1:])
+        self._high = int(high[-1])
+        begins = np.ones(len(events), np.bool_)
+        begins[1:] = changes[1:] | (head[1:] != head[:-1]) | (x[1:] <= x[:-1])
+        starts = np.flatnonzero(begins)
+        bits = np.bitwise_or.reduceat(np.uint64(1) << (x & np.uint64(VECTOR - 1)), starts)
+        words = head[starts] | bits
+        timed = np.flatnonzero(changes[starts])
+        times = np.uint64(TIME_HIGH << 60) | (high[starts[timed]] << np.uint64(32))
+        return np.insert(words, timed, times)
+
+
+def write_evt21(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events into a RAW file in EVT 2.1."""
+    origin = origin_of(about, LONGEST_EVT21_US)
+    encoder = Evt21Encoder(origin)
+    with part.open("xb") as file:
+        file.write(_raw_header(about, "2.1", "EVT21", origin, ";endianness=little"))
+        for events in blocks:
+            file.write(encoder.encode(events).astype("<u8").data)
+
+
+# Writer of DAT files, version 2, of CD events: a header, then 8 bytes for each event.
+
+DAT_KIND = bytes([0x0C, 8])
+"""Type of the events, CD, and their size [bytes], between the header and the events."""
+
+
+def write_dat(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events into a DAT file."""
+    origin = origin_of(about, LONGEST_DAT_US)
+    header = [
+        "Data file containing CD events.",
+        "Version 2",
+        f"Height {about.height}",
+        f"Width {about.width}",
+        *([f"T0 {origin}"] if origin else []),
+    ]
+    with part.open("xb") as file:
+        file.write("".join(f"% {line}\n" for line in header).encode())
+        file.write(DAT_KIND)
+        for events in blocks:
+            words = np.empty((len(events), 2), "<u4")
+            words[:, 0] = events.t - origin
+            words[:, 1] = events.x | events.y.astype(np.uint32) << 14 | events.p.astype(np.uint32) << 28
+            file.write(words.data)

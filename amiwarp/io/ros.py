@@ -1,4 +1,4 @@
-"""Readers and writer of ROS bags, with rosbags: ROS 1 bags, and the SQLite and MCAP files of ROS 2."""
+"""Readers and writers of ROS bags, with rosbags: ROS 1 bags, and the SQLite and MCAP files of ROS 2."""
 
 import contextlib
 import heapq
@@ -6,7 +6,7 @@ import itertools
 import os
 import struct
 import weakref
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
@@ -54,6 +54,18 @@ from amiwarp.io.ros_words import (
 
 Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
+
+EVENT_DEFINITION = """uint16 x
+uint16 y
+time ts
+bool polarity
+"""
+ARRAY_DEFINITION = """Header header
+uint32 height
+uint32 width
+Event[] events
+"""
+"""Definitions of dvs_msgs/Event and dvs_msgs/EventArray in ROS 1."""
 
 NOTHING: Columns = (np.zeros(0, np.int64),) * 4
 """No events."""
@@ -330,35 +342,46 @@ def _decoded(one: Message, *, ros1: bool) -> tuple[int | None, Columns, Columns]
 
 
 def read_stamps(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[Any, ...]]:
-    """Yield for each message of a topic of a ROS 2 bag that holds events, but no EVT words: the times of its first
-    event [us], of its recording and of its header [ns]. Runs in the reading process.
+    """Yield for each message of a topic that holds events, but no EVT words: the times of its first event [us], of its
+    recording and of its header [ns]. Runs in the reading process.
     """
     for one, ros1 in _topic_messages(notes, path, topic):
         t = _decoded(one, ros1=ros1)[1][2]
         if len(t):
-            seconds, rest = struct.unpack_from("<iI", one.raw, 4)  # all types of messages with events begin so
+            # All types of messages with events begin so, in ROS 1 after a number, in ROS 2 after the encapsulation.
+            seconds, rest = struct.unpack_from("<II" if ros1 else "<iI", one.raw, 4)
             yield tuple(np.array([value], np.int64) for value in (t[0], one.recorded, seconds * 10**9 + rest))
 
 
 def read_topics(path: str, topic: str) -> Reply:
-    """Return the other topics of a ROS 2 bag, with what a writer needs to know of them. Runs in the reading process."""
-    with opened_bag(path) as (bag, _):
+    """Return the other topics of a bag, with what a writer needs to know of them. Runs in the reading process."""
+    with opened_bag(path) as (bag, ros1):
         return [
             {
                 "topic": one.topic,
                 "type": one.msgtype,
                 "definition": one.msgdef.data,
                 "digest": one.digest,
-                "serialization": one.ext.serialization_format,
-                "qos": [[getattr(value, "value", value) for value in qos] for qos in one.ext.offered_qos_profiles],
+                **(_ros1_details(one.ext) if ros1 else _ros2_details(one.ext)),
             }
             for one in bag.connections
             if one.topic != topic
         ], []
 
 
+def _ros1_details(about: Any) -> dict[str, Any]:
+    return {"callerid": about.callerid, "latching": about.latching}
+
+
+def _ros2_details(about: Any) -> dict[str, Any]:
+    return {
+        "serialization": about.serialization_format,
+        "qos": [[getattr(value, "value", value) for value in qos] for qos in about.offered_qos_profiles],
+    }
+
+
 def read_others(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[Any, ...]]:
-    """Yield the other messages of a ROS 2 bag: bytes, length, time of recording [ns], and the index of the topic among
+    """Yield the other messages of a bag: bytes, length, time of recording [ns], and the index of the topic among
     those of :func:`read_topics`. Runs in the reading process.
     """
     with opened_bag(path) as (bag, _):
@@ -492,26 +515,47 @@ class PacketEncoder:
 def write_ros2(part: Path, blocks: Iterable[Events], about: Outline) -> None:
     """Write all events. The extension of the file decides between MCAP and SQLite."""
     kind = about.path.suffix.lower()
-    with scratch_folder(part.parent) as folder, contextlib.ExitStack() as source:
-        if about.bag is not None:
-            about = replace(about, bag=Bag(source.enter_context(unpacked(about.bag.path)), about.bag.topic))
+    with scratch_folder(part.parent) as folder, _plain_bag(about) as about:
         encoder = PacketEncoder(about)
         from rosbags.rosbag2 import StoragePlugin, Writer
 
         storage = StoragePlugin.MCAP if kind == ".mcap" else StoragePlugin.SQLITE3
         bag = folder / "bag"
         # Older programs read version 8 too, the earliest that rosbags writes.
-        with Writer(bag, version=8, storage_plugin=storage) as writer, contextlib.ExitStack() as opened:
+        with Writer(bag, version=8, storage_plugin=storage) as writer:
             topic = about.bag.topic if about.bag else TOPIC
             connection = writer.add_connection(topic, MESSAGE, typestore=encoder.store)
-            found = ((recorded, connection, data) for block in blocks for recorded, data in encoder(block))
-            streams = [opened.enter_context(contextlib.closing(found))]
-            if about.bag is not None:
-                copied = _others(writer, about.bag)
-                streams.append(opened.enter_context(contextlib.closing(copied)))
-            for recorded, to, data in heapq.merge(*streams, key=itemgetter(0)):
-                writer.write(to, recorded, data)
+            _write_messages(writer, connection, encoder, blocks, about.bag, _add_topic)
         os.replace(bag / f"bag{kind}", part)
+
+
+@contextlib.contextmanager
+def _plain_bag(about: Outline) -> Iterator[Outline]:
+    """Replace a compressed bag by a copy without compression, for the block."""
+    if about.bag is None:
+        yield about
+        return
+    with unpacked(about.bag.path) as path:
+        yield replace(about, bag=Bag(path, about.bag.topic))
+
+
+def _write_messages(
+    writer: Any,
+    connection: Any,
+    encode: Callable[[Events], Iterator[tuple[int, Any]]],
+    blocks: Iterable[Events],
+    bag: Bag | None,
+    add_topic: Callable[[Any, dict[str, Any]], Any],
+) -> None:
+    """Write the messages of all events, and those of the other topics of a bag, in the order of their recording."""
+    with contextlib.ExitStack() as opened:
+        found = ((recorded, connection, data) for block in blocks for recorded, data in encode(block))
+        streams = [opened.enter_context(contextlib.closing(found))]
+        if bag is not None:
+            copied = _others(writer, bag, add_topic)
+            streams.append(opened.enter_context(contextlib.closing(copied)))
+        for recorded, to, data in heapq.merge(*streams, key=itemgetter(0)):
+            writer.write(to, recorded, data)
 
 
 class _Clock:
@@ -545,10 +589,12 @@ class _Clock:
         return recorded, int(self._stamps[at]) + later
 
 
-def _others(writer: Any, bag: Bag) -> Generator[tuple[int, Any, Any], None, None]:
+def _others(
+    writer: Any, bag: Bag, add_topic: Callable[[Any, dict[str, Any]], Any]
+) -> Generator[tuple[int, Any, Any], None, None]:
     """Add the other topics of a bag to a writer, and yield their messages: time of the recording [ns], topic, bytes."""
     path = bag.path
-    topics = [_add_topic(writer, about) for about in run(read_topics, path, bag.topic)]
+    topics = [add_topic(writer, about) for about in run(read_topics, path, bag.topic)]
     source = packets(read_others, path, bag.topic, {})
     for data, lengths, recorded, places in source:
         ends = np.cumsum(lengths).tolist()
@@ -557,7 +603,7 @@ def _others(writer: Any, bag: Bag) -> Generator[tuple[int, Any, Any], None, None
 
 
 def _add_topic(writer: Any, about: dict[str, Any]) -> Any:
-    """Add a topic of another bag to a writer, and return it. Topics with several publishers are one."""
+    """Add a topic of another bag to a ROS 2 writer, and return it. Topics with several publishers are one."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
     from rosbags.typesys import Stores, get_typestore
 
@@ -591,3 +637,71 @@ def _types_of(definition: str, name: str) -> dict[str, Any]:
         return dict(get_types_from_msg(definition, name))
     files = [part.partition("\n")[2] for part in definition.split(rule)[1:]]
     return {name: fields for text in files for name, fields in get_types_from_idl(text).items()}
+
+
+# Writer of ROS 1 bags, with rosbags: arrays of dvs_msgs, as rpg_dvs_ros records them.
+#
+# The stamp of an array is the time of its first event, and so is its time in the bag. From a ROS 1 bag, both follow the
+# messages that held the events, and the messages of all other topics are copied, as in ROS 2 bags.
+
+ARRAY_TOPIC = "/dvs/events"
+"""Topic of the events, as rpg_dvs_ros calls it."""
+
+ARRAY = "dvs_msgs/msg/EventArray"
+"""Type of the messages."""
+
+EARLIEST_NS = 1
+"""Earliest time in a bag [ns]. ROS itself does not write or play messages at 0."""
+
+
+class ArrayEncoder:
+    """Encoder of events, in order of time, to serialised messages of the type :data:`ARRAY` of ROS 1."""
+
+    def __init__(self, about: Outline) -> None:
+        """Load rosbags. Raises :class:`AmiwarpError` if it is missing."""
+        types = optional_module("rosbags.typesys", "ros", f"{about.path}: ROS bags need rosbags")
+        self.store = types.get_typestore(types.Stores.ROS1_NOETIC)
+        """Definitions of the message and of its parts."""
+        for definition, name in ((EVENT_DEFINITION, "dvs_msgs/msg/Event"), (ARRAY_DEFINITION, ARRAY)):
+            self.store.register(types.get_types_from_msg(definition, name))
+        self._about, self._clock, self._count = about, _Clock(about.bag), 0
+
+    def __call__(self, block: Events) -> Iterator[tuple[int, bytes]]:
+        """Yield the arrays of a block: the time of the recording of each [ns], and the serialised message."""
+        about, frame = self._about, b"event_camera"
+        for events in self._clock.packets(block):
+            recorded, stamp = self._clock.times(int(events.t[0]))
+            head = struct.pack("<IIII", self._count % 2**32, stamp // 10**9, stamp % 10**9, len(frame)) + frame
+            head += struct.pack("<III", about.height, about.width, len(events))
+            rows = np.empty(len(events), PACKED)
+            rows["x"] = events.x
+            rows["y"] = events.y
+            rows["sec"], microseconds = np.divmod(events.t, 1_000_000)
+            rows["nsec"] = 1000 * microseconds
+            rows["p"] = events.p
+            self._count += 1
+            yield max(recorded, EARLIEST_NS), head + rows.tobytes()
+
+
+def write_ros1(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events."""
+    with _plain_bag(about) as about:
+        encoder = ArrayEncoder(about)
+        from rosbags.rosbag1 import Writer
+
+        with Writer(part) as writer:
+            topic = about.bag.topic if about.bag else ARRAY_TOPIC
+            connection = writer.add_connection(topic, ARRAY, typestore=encoder.store)
+            _write_messages(writer, connection, encoder, blocks, about.bag, _add_ros1_topic)
+
+
+def _add_ros1_topic(writer: Any, about: dict[str, Any]) -> Any:
+    """Add a topic of another bag to a ROS 1 writer, and return it. Publishers that do not differ are one."""
+    names = (about["topic"], about["type"], about["digest"], about["callerid"], about["latching"])
+    for known in writer.connections:
+        if (known.topic, known.msgtype, known.digest, *known.ext) == names:
+            return known
+    return writer.add_connection(
+        about["topic"], about["type"], msgdef=about["definition"], md5sum=about["digest"],
+        callerid=about["callerid"], latching=about["latching"],
+    )  # fmt: skip

@@ -5,6 +5,8 @@ which some exporters write, gives the sensor size. A ``calib.txt`` in the same f
 ``fx fy cx cy k1 k2 p1 p2 k3``. If most of the first events have fractional x or y, all are compensated, and ``nan``
 marks events without coordinates.
 
+The size may also be in a file beside it, as amiwarp writes it.
+
 Other tables have columns between commas, semicolons, tabs or spaces, and may begin with a line of names. Empty lines
 and lines that start with ``#`` or ``%`` are comments. A comment may give the names, or the size as ``geometry``.
 :mod:`amiwarp.io.columns` decides what the columns are.
@@ -41,7 +43,7 @@ from amiwarp.io.columns import (
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.files import LONGEST_LINE, errors_name, open_input
 from amiwarp.io.formats import BOM, TextRow, holds_values
-from amiwarp.io.plain_files import read_calib
+from amiwarp.io.plain_files import read_calib, read_size
 from amiwarp.optics.camera import LARGEST_SIZE
 
 READ_BYTES = 1 << 22
@@ -55,6 +57,9 @@ SECONDS = re.compile(rb"-?\d+\.\d{6,}")
 
 SIZE = re.compile(r"geometry\W{1,3}(\d+)\s*[,x ]\s*(\d+)|width\W{1,3}(\d+).*?height\W{1,3}(\d+)", re.I | re.S)
 """Pattern of the sensor size in comments."""
+
+NOTE = re.compile(r"geometry (\d{1,5})x(\d{1,5}) \(t in us\)")
+"""Pattern of the last name in the tables that amiwarp writes, below which there is no column."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +78,8 @@ class TextForm:
     """Names of the columns, or None."""
     size: tuple[int, int] | None
     """Sensor size that the file states [px], or None."""
+    unit: str | None = None
+    """Unit of time in the text that amiwarp writes, or None."""
 
 
 def open_text(path: Path, given: GivenLayout) -> Recording:
@@ -80,6 +87,9 @@ def open_text(path: Path, given: GivenLayout) -> Recording:
     with errors_name(path, lambda: "line 1"), open_input(path) as file:
         head = file.read(max(HEAD_BYTES, 2 * LONGEST_LINE))
         form = _find_form(path, head)
+    beside = read_size(path)
+    if beside is not None:  # amiwarp has written the text, with seconds
+        form = replace(form, size=beside, unit="s")
     with errors_name(path, lambda: "finding the columns"):
         layout = _find_text_layout(head, form, given)
     events = FileEvents(
@@ -103,6 +113,7 @@ def _find_form(path: Path, head: bytes) -> TextForm:
     comments: list[str] = []
     names: tuple[str, ...] | None = None
     size: tuple[int, int] | None = None
+    unit: str | None = None
     position, number = len(BOM) * head.startswith(BOM), 0
     for line in io.BytesIO(head[position:]):  # which only a newline ends, as in the reader of all lines
         if b"\r" in line.rstrip(b"\r\n"):
@@ -123,9 +134,14 @@ def _find_form(path: Path, head: bytes) -> TextForm:
                 )
             row = TextRow.of(line)
             return TextForm(position, number, row, len(words), names or _commented(comments, row, len(words)),
-                            size or _commented_size(comments))  # fmt: skip
+                            size or _commented_size(comments), unit)  # fmt: skip
         elif names is None:
             names = TextRow.of(line).names(line)
+            note = NOTE.fullmatch(names[-1])
+            if note is not None:
+                names = names[:-1]
+                size = int(note[1]), int(note[2])
+                unit = "us"
         else:
             break
         position, number = position + len(line), number + 1
@@ -173,7 +189,7 @@ def _find_text_layout(head: bytes, form: TextForm, given: GivenLayout) -> Layout
     columns = [Column(names[at] if names else None, _whole_if_possible(values)) for at, values in enumerate(numbers.T)]
     if names is not None and not any(names):
         columns = [replace(column, name=None) for column in columns]
-    hints = Hints(is_text=True)
+    hints = Hints(is_text=True, unit=form.unit)
     if names is None:
         hints = replace(hints, order=ROLES, fractions="s")
     layout = find_layout(columns, given, hints)
