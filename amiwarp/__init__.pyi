@@ -16,6 +16,7 @@ from .calib.settings import PhotometricSettings as PhotometricSettings
 from .calib.settings import Settings as Settings
 from .choices import CornerMethod as CornerMethod
 from .choices import Fill as Fill
+from .choices import FilmMode as FilmMode
 from .choices import Layers as Layers
 from .choices import Seeing as Seeing
 from .choices import Sharpness as Sharpness
@@ -121,6 +122,8 @@ from .optics.prism import UnsizedPrism as UnsizedPrism
 from .optics.prism import apex_from_deflection as apex_from_deflection
 from .optics.prism import deflection_from_apex as deflection_from_apex
 from .optics.vibration import VibrationModel as VibrationModel
+from .plotting.film import FilmSummary as FilmSummary
+from .plotting.film import render as render
 from .plotting.meshes import event_clouds as event_clouds
 from .reconstruction.depth_at_rest import depth as depth
 from .reconstruction.picture import Picture as Picture

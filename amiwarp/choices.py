@@ -113,6 +113,21 @@ class CornerMethod(Option):
     of the one before at their pixel, if both have the same polarity."""
 
 
+class FilmMode(Option):
+    """What the frames of a film of events show.
+
+    Examples
+    --------
+    >>> amiwarp.FilmMode("surface")
+    <FilmMode.SURFACE: 'surface'>
+    """
+
+    COUNTS = "counts"
+    """Numbers of OFF and ON events per pixel."""
+    SURFACE = "surface"
+    """Time surface: how long ago the latest event was at each pixel, as an exponential decay."""
+
+
 # Choices for reconstructed pictures: how to fill unknown parts, and how to display intensity.
 
 CONTRAST = 0.25

@@ -276,6 +276,8 @@ OWN: dict[str, dict[str, Any]] = {
     "convert": {"source_path": "in.h5"},
     "EventFilter.apply": {"size": (4, 3)},
     "filter_recording": {"chosen": aw.EventFilter(every=2)},
+    "render": {"path": _new(".mp4")},
+    "FilmSummary": {"frames": 1, "height": 2, "fps": 30.0, "speed": 1.0, "decay_us": None, "events": 5},
     "FilterSummary": {
         "events": 2,
         "kept": 1,

@@ -153,6 +153,7 @@ OVER_INPUTS = (
     ("compensate a.h5 {} --calibration cal.json --depth depth.npz", "depth.npz"),
     ("compensate a.h5 {} --calibration cal.json --encoder enc.csv", "enc.csv"),
     ("compensate a.h5 {} --calibration cal.json --encoder enc.csv --second-encoder enc2.csv", "enc2.csv"),
+    ("render a.h5 {}", "a.h5"),
     ("reconstruct a.h5 {} --calibration cal.json", "a.h5"),
     ("reconstruct a.h5 out.png --calibration cal.json --mask {}", "cal.json"),
     ("reconstruct a.h5 {} --network sum.onnx", "sum.onnx"),
@@ -270,6 +271,7 @@ def test_no_command_writes_over_what_it_reads(place: Path, line: str, read: str,
         "compensate a.h5 {}.h5 --calibration cal.json",
         "compensate a.h5 new.h5 --calibration cal.json --iwe {}.png",
         "compensate a.h5 new.h5 --calibration cal.json --iwe {}.npy",
+        "render a.h5 {}.mp4",
         "reconstruct a.h5 {}.png --calibration cal.json",
         "reconstruct a.h5 {}.png --network sum.onnx",
         "reconstruct a.h5 new.png --calibration cal.json --mask {}.png",
@@ -291,7 +293,7 @@ def test_what_exists_is_replaced_by_force_alone(place: Path, line: str) -> None:
     assert (result.exit_code, result.stdout) == (1, ""), result.output
     assert f"{there}: exists; give another name, or --force" in result.stderr
     assert snapshot(place) == before
-    if words[0] in ("convert", "compensate", "simulate", "record", "live"):
+    if words[0] in ("convert", "compensate", "simulate", "record", "live", "render"):
         assert run(*words, "--force").exit_code == 0
         assert there.read_bytes() != b"mine"
 
@@ -316,6 +318,7 @@ NAMES: dict[tuple[str, str], tuple[str, tuple[str, ...]]] = {
     ("convert", "out"): ("convert a.h5 {}", ("json", "xyz", "jpg", "")),
     ("live", "out"): ("live a.h5 --fast --calibration cal.json --out {}", ("npz", "txt", *NOT_WRITTEN)),
     ("live", "record"): ("live a.h5 --fast --calibration cal.json --record {}", ("npz", "txt", *NOT_WRITTEN)),
+    ("render", "out"): ("render a.h5 {}", ("h5", "png", *NOT_WRITTEN)),
     ("reconstruct", "out"): ("reconstruct a.h5 {} --calibration cal.json", ("h5", *NOT_WRITTEN)),
     ("pixels", "out"): ("pixels a.h5 cal.json {}", ("h5", "npy", *NOT_WRITTEN)),
     ("depth", "out"): ("depth a.h5 cal.json {}", ("h5", "npy", *NOT_WRITTEN)),
@@ -402,6 +405,7 @@ CALLS: dict[str, Callable[[Path, Any], object]] = {
     "filter_recording": lambda path, _: amiwarp.filter_recording(
         open_recording("a.h5"), path, amiwarp.EventFilter(every=2)
     ),
+    "render": lambda path, given: amiwarp.render(given.recording, path),
     "save_camera": lambda path, given: amiwarp.save_camera(path, given.simulation.camera),
     "save_flow_dsec": lambda path, given: amiwarp.save_flow_dsec(path, given.frames),
     "save_flow_mvsec": lambda path, given: amiwarp.save_flow_mvsec(path, given.frames),
@@ -549,6 +553,7 @@ ENDLESS = (
     "compensate a.h5 out.h5 --calibration cal.json --depth {}",
     "compensate a.h5 out.h5 --calibration cal.json --encoder {}",
     "compensate a.h5 out.h5 --calibration cal.json --encoder enc.csv --second-encoder {}",
+    "render {} out.mp4",
     "reconstruct {} out.png --calibration cal.json",
     "reconstruct a.h5 out.png --calibration {}",
     "reconstruct a.h5 out.png --network {}.onnx",

@@ -55,6 +55,11 @@ COMMANDS = {
         "Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand.",
         "amiwarp view recording.h5 --calibration calibration.json",
     ),
+    "render": Command(
+        "rendering",
+        "Write a film of a recording's events, with a prism or without, also in slow motion.",
+        "amiwarp render events.raw slow.mp4 --speed 0.05 --window 1:1.5",
+    ),
     "convert": Command(
         "recordings",
         "Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.",

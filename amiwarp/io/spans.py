@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.events.recording import Events, EventSource
+from amiwarp.events.recording import Events, EventSource, regroup
 from amiwarp.events.truth import EventValues
 from amiwarp.io.file_scan import FileEvents
 
@@ -79,16 +79,26 @@ def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Event
 
 def span_blocks(source: EventSource, span: Span) -> Iterator[Events]:
     """Yield all events of a time window in blocks, also those that were not read."""
-    end_us = span.start_us + span.length_us
     if span.count == len(span.events):
         yield span.events
-    elif isinstance(source, FileEvents):  # can only be read from its start
+    else:
+        yield from blocks_between(source, span.start_us, span.start_us + span.length_us)
+
+
+def blocks_between(source: EventSource, start_us: int, end_us: int, *, count: int = BLOCK) -> Iterator[Events]:
+    """Yield the events with ``start_us <= t < end_us`` in blocks of ``count``, none of them empty."""
+    yield from regroup(_pieces_between(source, start_us, end_us), count=count)
+
+
+def _pieces_between(source: EventSource, start_us: int, end_us: int) -> Iterator[Events]:
+    """Yield the events with ``start_us <= t < end_us`` in pieces as they are read."""
+    if isinstance(source, FileEvents):  # can only be read from its start
         for block in source.blocks():
-            first, stop = np.searchsorted(block.t, (span.start_us, end_us))
+            first, stop = np.searchsorted(block.t, (start_us, end_us))
             yield block[first:stop]
             if stop < len(block):
                 return
     else:
         stop = source.find(end_us)
-        for start in range(source.find(span.start_us), stop, BLOCK):
+        for start in range(source.find(start_us), stop, BLOCK):
             yield source.slice(start, min(start + BLOCK, stop))

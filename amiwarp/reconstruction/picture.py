@@ -726,6 +726,8 @@ MASK_SUFFIXES = (".png", ".tif", ".tiff")
 """File suffixes of masks."""
 VIDEO = ".mp4"
 """File suffix of videos."""
+FILM_SUFFIXES = (VIDEO, ".gif")
+"""File suffixes of films."""
 
 
 def limits(picture: Picture, contrast: float = CONTRAST) -> tuple[float, float]:
@@ -753,10 +755,10 @@ def tones(
     return np.nan_to_num(value).astype(np.float32)
 
 
-def check_path(path: Path, endings: tuple[str, ...] = (*STILL_SUFFIXES, VIDEO)) -> None:
+def check_path(path: Path, endings: tuple[str, ...] = (*STILL_SUFFIXES, VIDEO), *, overwrite: bool = False) -> None:
     """Raise :class:`AmiwarpError` for a file suffix that is not in ``endings``, or a folder that does not exist."""
     check_ending(path, "pictures are written", endings)
-    check_output(path)
+    check_output(path, overwrite=overwrite)
 
 
 def save_picture(
@@ -857,16 +859,21 @@ def _save_steady(
     return save_film(frames(), path, fps=fps)
 
 
-def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) -> int:
+def check_film(path: Path, *, overwrite: bool = False) -> Any:
+    """Return PyAV. Raises :class:`AmiwarpError` without it, and for a file that cannot be a film or be written."""
+    check_path(path, FILM_SUFFIXES, overwrite=overwrite)
+    return video_library(path)
+
+
+def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float, overwrite: bool = False) -> int:
     """Write frames as MP4 (H.264), or as GIF if ``path`` ends in .gif, and return the number of frames.
 
     Each frame has shape (height, width) or (height, width, 3). Raises :class:`AmiwarpError` for no frames, an unknown
     suffix, a folder that does not exist, or without PyAV.
     """
-    check_path(path, (VIDEO, ".gif"))
-    av = video_library(path)
+    av = check_film(path, overwrite=overwrite)
     count, kind = 0, path.suffix.lower().removeprefix(".")
-    with NewFile(path) as new, av.open(str(new.part), "w", format=kind) as container:
+    with NewFile(path, overwrite=overwrite) as new, av.open(str(new.part), "w", format=kind) as container:
         stream: Any = None
         for value in map(padded_to_even, frames):
             if stream is None:
