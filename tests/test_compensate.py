@@ -563,6 +563,7 @@ def test_a_ros_1_bag_keeps_its_other_topics_and_clocks(recording: Recording, tmp
     from rosbags.typesys import get_types_from_msg
 
     events = recording.events.slice(0, 20_000)
+    late = 3_000_000_000_123_456_789  # ns: beyond 2038, which a time with a sign does not hold
     store = typestore(True)
     store.register(get_types_from_msg("float64[] values\nstring name", "rig_msgs/msg/State"))
     kinds = store.types
@@ -576,15 +577,16 @@ def test_a_ros_1_bag_keeps_its_other_topics_and_clocks(recording: Recording, tmp
         state_topic = writer.add_connection("/rig/state", "rig_msgs/msg/State", typestore=store)
         for number, connection in enumerate(notes):
             text = store.serialize_ros1(kinds["std_msgs/msg/String"](f"note {number}"), "std_msgs/msg/String")
-            writer.write(connection, HOST_NS - 5 + number, text)
+            writer.write(connection, late - 5 + number, text)
         for number, packet in enumerate(MemoryEvents(events, 200, 150).blocks(duration_us=3_000)):
             message = array_message(store, packet, ros1=True)
-            stamp = HOST_NS + 1000 * int(packet.t[0])
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-            writer.write(event_topic, stamp + DELAY_NS, store.serialize_ros1(message, message.__msgtype__))
+            stamp = late + 1000 * int(packet.t[0])
+            raw = bytearray(store.serialize_ros1(message, message.__msgtype__))
+            struct.pack_into("<II", raw, 4, *divmod(stamp, 10**9))  # rosbags takes no such seconds
+            writer.write(event_topic, stamp + DELAY_NS, bytes(raw))
             given.append((stamp + DELAY_NS, stamp))
             state = kinds["rig_msgs/msg/State"](np.arange(number, dtype=np.float64), "é" * number)
-            writer.write(state_topic, HOST_NS + 7_000_000 * number, store.serialize_ros1(state, state.__msgtype__))
+            writer.write(state_topic, late + 7_000_000 * number, store.serialize_ros1(state, state.__msgtype__))
     summary = convert(tmp_path / "in.bag", tmp_path / "out.bag", size=(200, 150))
     assert (summary.events, summary.left_out) == (len(events), ())
     assert open_recording(tmp_path / "out.bag").metadata["topic"] == "/dvs/left/events"

@@ -200,6 +200,19 @@ def test_a_pause_is_dark_or_fades(tmp_path: Path, pictures: list[np.ndarray]) ->
         assert [bool(picture[4, 2].any()) for picture in pictures] == 15 * [False] + [True]
 
 
+def test_the_brightness_follows_slowly_and_ignores_a_hot_pixel(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    """First 9 events at each of 40 pixels, then one at each and a hundred at another."""
+    first = [(x, 1, 0) for x in range(40) for _ in range(9)]
+    second = [(x, 2, 2000) for x in range(40)] + [(0, 3, 2000)] * 100
+    x, y, t = np.array(first + second).T
+    events = Events.from_arrays(x, y, FIRST + t, np.ones(len(x), np.int64))
+    render(recording(events), tmp_path / "a.mp4", frame_us=1000, **PLAIN)
+    assert [len(pictures), pictures[0][1, 5, 0], pictures[1].max()] == [3, 255, 0]
+    top = 9.0 + 0.1 * (1.0 - 9.0)
+    assert pictures[2][2, 5, 0] == round(255 * (1.0 / top) ** 0.5)
+    assert pictures[2][3, 0, 0] == 255
+
+
 def test_compensated_events_are_shown_at_their_nearest_pixels(tmp_path: Path, pictures: list[np.ndarray]) -> None:
     x, y = np.array([3.4, 5.6, np.nan, -9.0], np.float32), np.array([2.0, 7.4, 1.0, 2.0], np.float32)
     events = Events(x, y, FIRST + np.arange(4), np.ones(4, np.uint8))

@@ -509,6 +509,22 @@ def test_events_share_the_words_of_evt21(tmp_path, cuts, gaps, steps):
     assert np.count_nonzero(words >> np.uint64(60) != 8) == 60 - np.count_nonzero(same)
 
 
+@pytest.mark.parametrize("name", ["dat", "evt21"])
+def test_the_clock_of_late_events_begins_at_the_first(tmp_path, name):
+    """Its time is in the header, also for the last time, which is read from the end of a large file."""
+    late = 1_700_000_000_000_000
+    events = events_at([late, late + 5, late + 70_000])
+    path = exported(tmp_path, name, MemoryEvents(events, *SIZE))
+    line = {"dat": b"% T0 1700000000000000\n", "evt21": b"% t0 1700000000000000\n"}[name]
+    assert line in path.read_bytes()
+    found = open_recording(path).events
+    assert (found.t_first, found.t_last, found.last_time()) == (late, late + 70_000, late + 70_000)
+    if name == "dat":
+        path.write_bytes(path.read_bytes().replace(b"T0 1700000000000000", b"T0 -5"))
+        with pytest.raises(AmiwarpError, match="t0 in the header is '-5'"):
+            open_recording(path)
+
+
 def test_a_csv_file_is_what_a_person_would_write(tmp_path):
     events = Events.from_arrays([0, 7, 319], [239, 100, 0], [-15, 0, 123_456_789_012], [1, 0, 1])
     path = exported(tmp_path, "csv", MemoryEvents(events, *SIZE))
