@@ -169,8 +169,9 @@ class Caption:
         from PIL import ImageFont
 
         low, high = FONT_SIZES
-        self._font = ImageFont.load_default(min(max(round(width * FONT_SHARE), low), high))
-        self._shape = round(1.6 * self._font.size), width
+        self._space = min(max(round(width * FONT_SHARE), low), high)
+        self._font = ImageFont.load_default(self._space)
+        self._shape = round(1.6 * self._space), width
         self._first_us, self._decimals, self._note = first_us, decimals, note
 
     def parts(self, shown: Shown) -> list[tuple[str, tuple[int, ...]]]:
@@ -187,14 +188,13 @@ class Caption:
         height, width = self._shape
         image = Image.new("RGB", (width, height))
         draw = ImageDraw.Draw(image)
-        space = self._font.size
-        left = space / 2
+        left = self._space / 2
         for text, colour in self.parts(shown):
             right = left + draw.textlength(text, font=self._font)
             if right > width:
                 break
             draw.text((left, height / 2), text, fill=colour, font=self._font, anchor="lm")
-            left = right + space
+            left = right + self._space
         return np.asarray(image)
 
 
