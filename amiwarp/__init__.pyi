@@ -77,6 +77,8 @@ from .imaging.tensors import windows as windows
 from .io.camera_files import load_camera as load_camera
 from .io.camera_files import save_camera as save_camera
 from .io.depth_map import DepthMap as DepthMap
+from .io.evt_decoder import EvtDecoder as EvtDecoder
+from .io.evt_decoder import Triggers as Triggers
 from .io.export import ConversionSummary as ConversionSummary
 from .io.export import convert as convert
 from .io.export import save_flow_dsec as save_flow_dsec

@@ -16,7 +16,7 @@ import amiwarp as aw
 from tests.networks import write_network
 
 NAMES = re.findall(r"import (\w+) as \1", Path(aw.__file__).with_suffix(".pyi").read_text())
-NOT_CALLED = {"AmiwarpError", "CalibrationOptions", "Model", "NotebookPage"}
+NOT_CALLED = {"AmiwarpError", "CalibrationOptions", "Model", "NotebookPage", "Triggers"}
 """Public classes that users catch, receive, derive from or annotate with, and do not make."""
 
 _count = itertools.count()
@@ -236,6 +236,8 @@ OWN: dict[str, dict[str, Any]] = {
     "Events.concatenate": {"blocks": [EVENTS, EVENTS[2:]]},
     "MemoryEvents.find": {"t": 5},
     "Encoder": _all(ENCODER),
+    "EvtDecoder": {"version": "2.1", "swapped": True, "device": "cpu"},
+    "EvtDecoder.decode": {"data": b"\x00\x80\x01\x60"},
     "Encoder.from_counts": {"count": [0, 1], "counts_per_turn": 100},
     "Encoder.constant_speed": {"rpm": 720.0},
     "Encoder.gaps": {"max_interval_us": 100.0},
@@ -497,6 +499,7 @@ OBJECTS: dict[str, Any] = {
     "Trajectory": STILL,
     "MemoryImages": IMAGES,
     "EventFilter": aw.EventFilter(every=2),
+    "EvtDecoder": aw.EvtDecoder("3.0"),
 }
 """Objects whose methods are called."""
 

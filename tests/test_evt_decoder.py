@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp import AmiwarpError, open_recording
@@ -47,20 +48,61 @@ def test_blocks_and_pieces_are_decoded_as_numpy_does(
         cuts = np.sort(rng.integers(0, len(words) + 1, 2))
         for piece in np.split(words, cuts):
             (x, y, t, p), edges = expected.decode(piece)
-            events, triggers = decoder.decode(swap_halves(piece) if swapped else piece)
-            assert [each.dtype for each in events] == [np.uint16, np.uint16, np.int64, np.uint8]
+            on_device, triggers = decoder.decode(swap_halves(piece) if swapped else piece)
+            events = on_device.to_host()
+            assert str(on_device.device) == device
             for found, known in ((events.x, np.minimum(x, 65535)), (events.y, y), (events.t, t), (events.p, p)):
                 np.testing.assert_array_equal(found, known)
-            for found, known in zip(triggers, (edges[0], edges[2], edges[3]), strict=True):
-                np.testing.assert_array_equal(found, known)
+            np.testing.assert_array_equal(triggers.channel, edges[0])
+            np.testing.assert_array_equal(triggers.t, edges[2])
+            np.testing.assert_array_equal(triggers.rising, edges[3])
 
 
 def decoded(version: str, words: list[int], **options: Any) -> tuple[list[list[int]], EvtDecoder]:
     """Return [x, y, p, t] of the events of some words, and the decoder."""
     decoder = EvtDecoder(version, **options)
-    events, _ = decoder.decode(np.array(words, evt_decoder.WORD_TYPES[version]))
+    on_device, _ = decoder.decode(np.array(words, evt_decoder.WORD_TYPES[version]))
+    events = on_device.to_host()
     rows = np.column_stack([events.x, events.y, events.p, events.t]).tolist()
     return rows, decoder
+
+
+@pytest.mark.parametrize(("version", "word"), [("2.0", np.uint32), ("2.1", np.uint64), ("3.0", np.uint16)])
+def test_words_may_be_bytes_or_arrays_of_any_library(version: str, word: type, device: str) -> None:
+    words = random_words(version, 300, np.random.default_rng(3))
+    data = words.tobytes()
+    known = EvtDecoder(version, device=device).decode(words)[0].to_host()
+    assert len(known) > 20
+    within = wp.array(np.frombuffer(b"\0" + data, np.uint8), device=device)[1:]  # begins within a word
+    signed = wp.array(words.view(np.dtype(word).str.replace("u", "i")), device=device)
+    plain = wp.array(words, dtype=wp.dtype_from_numpy(np.dtype(word)), device=device)
+    strided = np.repeat(words, 2)[::2]
+    for given in (
+        data,
+        bytearray(data),
+        memoryview(data),
+        np.frombuffer(data, np.uint8),
+        within,
+        signed,
+        plain,
+        strided,
+    ):
+        found = EvtDecoder(version, device=device).decode(given)[0]
+        assert str(found.device) == device
+        for name in "xytp":
+            np.testing.assert_array_equal(getattr(found, name).numpy(), getattr(known, name))
+    assert not len(EvtDecoder(version, device=device).decode(b"")[0])
+
+
+def test_data_that_are_no_words_are_refused() -> None:
+    decoder = EvtDecoder("2.0")
+    with pytest.raises(AmiwarpError, match="are 6 bytes, which end within a word of 4 bytes; keep the rest"):
+        decoder.decode(bytes(6))
+    for wrong in (np.zeros(4, np.uint16), np.zeros(4, np.float32), np.zeros((2, 2), np.uint32)):
+        with pytest.raises(AmiwarpError, match=r"expected bytes or uint32 of shape \(n,\) for EVT 2.0"):
+            decoder.decode(wrong)
+    with pytest.raises(AmiwarpError, match="version of EVT is '4'; choose among"):
+        EvtDecoder("4")
 
 
 def test_a_single_event_between_vectors_moves_no_vector() -> None:

@@ -24,6 +24,7 @@ from faery.extension import aedat, es, evt
 from amiwarp import (
     AmiwarpError,
     Camera,
+    DeviceEvents,
     Events,
     MemoryEvents,
     OutputFormat,
@@ -118,7 +119,8 @@ def test_evt_words_as_faery_decodes_them(data_dir):
         decoder = EvtDecoder(version)
         # Pieces of odd length.
         found = [decoder.decode(words[at : at + 10_007])[0] for at in range(0, len(words), 10_007)]
-        x, y, t, p = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        events = DeviceEvents.concatenate(found).to_host()
+        x, y, t, p = events.x, events.y, events.t, events.p
         with evt.Decoder(path, (2048, 2048), f"evt{version[0]}") as packets_:
             expected = np.concatenate([packet["events"] for packet in packets_ if "events" in packet])
         for given, field in ((x, "x"), (y, "y"), (p, "p")):

@@ -5,12 +5,12 @@ equal values or packed. The codec is described by https://github.com/prophesee-a
 """
 
 import struct
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.evt_decoder import EventColumns
 
 MOST_EVENTS = 65535
 """Largest number of events in a chunk."""
@@ -20,6 +20,19 @@ HEAD = struct.Struct("<Iq")
 """Start of a chunk: number of events, with two bits that tell how they are packed; first time [us]."""
 LONGEST_GAP = 15
 """Largest number of bytes, of four bits each, that store a gap of time [us]."""
+
+
+class EventColumns(NamedTuple):
+    """Events, arrays of shape ``(n,)``."""
+
+    x: NDArray[np.uint16]
+    """Column [px]."""
+    y: NDArray[np.uint16]
+    """Row [px]."""
+    t: NDArray[np.int64]
+    """Time [us]."""
+    p: NDArray[np.uint8]
+    """Polarity: 1 is ON, 0 is OFF."""
 
 
 def decode_chunk(data: bytes) -> EventColumns:

@@ -1,13 +1,18 @@
 """Decoder of Prophesee's EVT words, for files and streams that arrive in pieces, on a CPU or a GPU."""
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.errors import AmiwarpError
+from amiwarp.validation import guarded, one_of
+
 if TYPE_CHECKING:
-    import warp as wp
+    from amiwarp.events.device_events import DeviceEvents
 
 WORD_TYPES = {"2.0": "<u4", "2.1": "<u8", "3.0": "<u2"}
 """Type of a word by the version of EVT."""
@@ -17,77 +22,109 @@ GROUP_BLOCKS = 256
 """Number of blocks that one thread links."""
 
 
-class Triggers(NamedTuple):
-    """Edges of external triggers, arrays of shape ``(n,)``."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Triggers:
+    """Edges of external triggers."""
 
     channel: NDArray[np.uint8]
-    """Number of the input."""
+    """Number of the input, shape ``(n,)``."""
     t: NDArray[np.int64]
-    """Time [us]."""
+    """Time [us], shape ``(n,)``."""
     rising: NDArray[np.uint8]
-    """1 for a rising edge, 0 for a falling one."""
+    """1 for a rising edge, 0 for a falling one, shape ``(n,)``."""
 
 
-class EventColumns(NamedTuple):
-    """Events, arrays of shape ``(n,)``."""
-
-    x: NDArray[np.uint16]
-    """Column [px]."""
-    y: NDArray[np.uint16]
-    """Row [px]."""
-    t: NDArray[np.int64]
-    """Time [us]."""
-    p: NDArray[np.uint8]
-    """Polarity: 1 is ON, 0 is OFF."""
-
-
-@dataclass
+@guarded
 class EvtDecoder:
-    """Decoder of the words of one stream, in their order."""
+    """Decoder of the words of one stream in Prophesee's EVT 2.0, 2.1 or 3.0, in pieces, on a CPU or a GPU.
 
-    version: str
-    """Version of EVT: "2.0", "2.1" or "3.0"."""
-    swapped: bool = False
-    """Whether the 32-bit halves of EVT 2.1 words are swapped, as the IMX636 sends them (``endianness=legacy``)."""
-    device: Any = "cpu"
-    """Warp device that decodes."""
-    untimed: int = 0
-    """Number of events and edges so far that came before the first time word. They have no time and are dropped."""
-    _state: "wp.array | None" = None
-    """State after the last word, on the device."""
+    Words on a GPU give events there; nothing is decoded on the host. Files are read by :func:`amiwarp.open_recording`.
 
-    def decode(self, words: NDArray[Any]) -> tuple[EventColumns, Triggers]:
-        """Return the events and the triggers of the words that follow those of the last call, shape ``(n,)``."""
-        events, triggers = self.decode_on_device(words)
-        columns = EventColumns(*(getattr(events, name).numpy() for name in EventColumns._fields))
-        edges = Triggers(*(getattr(triggers, name).numpy() for name in Triggers._fields))
-        return columns, edges
+    Parameters
+    ----------
+    version : {"2.0", "2.1", "3.0"}
+        Version of EVT.
+    swapped : bool, default False
+        Whether the 32-bit halves of EVT 2.1 words are swapped, as the IMX636 sends them (``endianness=legacy``).
+    device : str or warp.Device, optional
+        Device to decode on, by default the CPU.
 
-    def decode_on_device(self, words: Any) -> tuple[Any, Any]:
-        """Return events and triggers on the device: ``EventArrays`` and ``TriggerArrays`` of the kernels.
+    Raises
+    ------
+    AmiwarpError
+        If an argument is not usable.
 
-        ``words``: array of NumPy or Warp. An array on the device is not copied.
+    Notes
+    -----
+    The words are described at https://docs.prophesee.ai/stable/data/encoding_formats/index.html.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> decoder = amiwarp.EvtDecoder("3.0")
+    >>> words = np.array([0x8001, 0x6002, 0x0007, 0x2805], np.uint16)  # two of the time, a row, an event
+    >>> events, triggers = decoder.decode(words)
+    >>> events.x.numpy().tolist(), events.y.numpy().tolist(), events.t.numpy().tolist()
+    ([5], [7], [4098])
+    """
+
+    def __init__(self, version: str, *, swapped: bool = False, device: Any = None) -> None:
+        import warp as wp
+
+        from amiwarp.kernels.launch import start_once
+
+        start_once()
+        self._version = one_of(version, WORD_TYPES, "version of EVT")
+        self._swapped = swapped
+        self._device = wp.get_device("cpu" if device is None else device)
+        self._state: wp.array | None = None
+        self._untimed = 0
+
+    @property
+    def untimed(self) -> int:
+        """Number of events and edges so far that came before the first time word. They have no time and are dropped."""
+        return self._untimed
+
+    def decode(self, data: Any) -> tuple[DeviceEvents, Triggers]:
+        """Return the events and the edges of the words that follow those of the last call.
+
+        Parameters
+        ----------
+        data : bytes or array
+            Whole words, little-endian: bytes, or a contiguous array of NumPy, Warp, PyTorch, CuPy, JAX or any other
+            library with DLPack, of bytes or of integers of a word's size, shape (n,). An array on the decoder's device
+            is not copied, unless it begins within a word.
+
+        Returns
+        -------
+        events : DeviceEvents
+            The events on the decoder's device, in the order of the words. Times [us] are the sensor's, without wraps;
+            they are not checked, and a camera may send a few that step back.
+        triggers : Triggers
+            The edges of external triggers, in host memory.
+
+        Raises
+        ------
+        AmiwarpError
+            If the data does not end with a whole word or has another type.
         """
         import warp as wp
 
+        from amiwarp.events.device_events import DeviceEvents
         from amiwarp.kernels import evt
-        from amiwarp.kernels.launch import launch, load, start_once
+        from amiwarp.kernels.launch import launch, load
 
-        start_once()
-
-        device = wp.get_device(self.device)
-        if isinstance(words, np.ndarray):
-            given = np.ascontiguousarray(words, WORD_TYPES[self.version])
-            words = wp.array(given, dtype=wp.dtype_from_numpy(given.dtype), device=device, copy=not device.is_cpu)
+        device = self._device
+        words = self._words(data)
         length = BLOCK_WORDS[device.is_cpu]
         blocks = -(-words.shape[0] // length)
-        if self.version == "3.0":
+        if self._version == "3.0":
             survey, decode = evt.survey_evt3, evt.decode_evt3
             layout = [words, length]
             bits = 12
         else:
             survey, decode = evt.survey_evt2, evt.decode_evt2
-            layout = [words, length, int(self.swapped)]
+            layout = [words, length, int(self._swapped)]
             bits = 28
 
         # First pass: what each block changes, then the state at its start and the place of its first event.
@@ -110,7 +147,7 @@ class EvtDecoder:
         # Second pass: the events.
         total = group_places[groups:].numpy()[0]
         events, edges = int(total["event"]), int(total["trigger"])
-        self.untimed += int(total["untimed"])
+        self._untimed += int(total["untimed"])
         event_arrays = evt.EventArrays()
         event_arrays.x = wp.empty(events, dtype=wp.uint16, device=device)
         event_arrays.y = wp.empty(events, dtype=wp.uint16, device=device)
@@ -123,4 +160,43 @@ class EvtDecoder:
         inputs = [*layout, states, places]
         launch(decode, blocks, inputs, [event_arrays, trigger_arrays], device=device, smallest=1)
         self._state = wp.clone(group_states[groups:])
-        return event_arrays, trigger_arrays
+        found = DeviceEvents(event_arrays.x, event_arrays.y, event_arrays.t, event_arrays.p)
+        return found, Triggers(*(getattr(trigger_arrays, one.name).numpy() for one in fields(Triggers)))
+
+    def _words(self, data: Any) -> Any:
+        """Return the words of some data as an array on the device."""
+        import warp as wp
+
+        from amiwarp.events.device_events import import_array
+
+        word = np.dtype(WORD_TYPES[self._version])
+        dtype = wp.dtype_from_numpy(word)
+        if isinstance(data, (bytes, bytearray, memoryview)):
+            data = np.frombuffer(data, np.uint8)
+        if isinstance(data, np.ndarray):
+            given = np.ascontiguousarray(data)
+            self._check(given.shape, given.dtype, word)
+            words = given.view(word)
+            return wp.array(words, dtype=dtype, device=self._device, copy=not self._device.is_cpu)
+        given = import_array(data, "EVT words").to(self._device)
+        self._check(given.shape, np.dtype(wp.dtype_to_numpy(given.dtype)), word)
+        if given.size and given.ptr % word.itemsize:  # a GPU reads no word across its borders
+            given = wp.clone(given)
+        count = given.size * wp.types.type_size_in_bytes(given.dtype) // word.itemsize
+        words = wp.array(ptr=given.ptr, dtype=dtype, shape=count, device=self._device)
+        words._owner = given  # whose memory it is
+        return words
+
+    def _check(self, shape: tuple[int, ...], given: np.dtype[Any], word: np.dtype[Any]) -> None:
+        """Raise :class:`AmiwarpError` for data that are not whole words."""
+        sizes = (1, word.itemsize)
+        if len(shape) != 1 or given.kind not in "iu" or given.itemsize not in sizes:
+            raise AmiwarpError(
+                f"EVT words are {given} of shape {shape}; expected bytes or {word.name} of shape (n,) for EVT "
+                f"{self._version}"
+            )
+        if shape[0] * given.itemsize % word.itemsize:
+            raise AmiwarpError(
+                f"EVT words are {shape[0]} bytes, which end within a word of {word.itemsize} bytes; keep the rest for "
+                "the next call"
+            )

@@ -22,7 +22,6 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS
 from amiwarp.io import ecf
 from amiwarp.io.columns import ROLES, names_roles
-from amiwarp.io.evt_decoder import EventColumns
 from amiwarp.io.file_scan import Columns, microseconds, whole_pixels
 from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32
 from amiwarp.io.native_format import FORMAT
@@ -596,7 +595,7 @@ def _ecf_columns(dataset: Any, notes: dict[str, int]) -> Iterator[Columns]:
         rows = min(length, count - start)
         if mask & 1:  # the codec was left out for this chunk
             plain = np.frombuffer(data, dataset.dtype)
-            columns = EventColumns(*(plain[name] for name in EventColumns._fields))
+            columns = ecf.EventColumns(*(plain[name] for name in ecf.EventColumns._fields))
         else:
             columns = ecf.decode_chunk(data)
         if len(columns.t) < rows:

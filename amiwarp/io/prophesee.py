@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording
-from amiwarp.io.evt_decoder import WORD_TYPES, EventColumns, EvtDecoder, Triggers
+from amiwarp.io.evt_decoder import WORD_TYPES, EvtDecoder, Triggers
 from amiwarp.io.file_scan import FileEvents, Packet, last_word, nearest, read_pieces, read_words, unwrapped
 from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.formats import LONGEST_DAT_US, LONGEST_EVT21_US, LONGEST_US, Outline
@@ -175,14 +175,14 @@ def trigger_packets(path: Path) -> Iterator[Packet]:
         yield edges.channel, np.zeros_like(edges.channel), edges.t + about.origin, edges.rising
 
 
-def _decoded(about: EvtFile, notes: dict[str, int]) -> Iterator[tuple[EventColumns, Triggers]]:
+def _decoded(about: EvtFile, notes: dict[str, int]) -> Iterator[tuple[Events, Triggers]]:
     """Yield the events and the triggers of a RAW file, and note what was counted."""
     decoder = about.decoder()
     for data in read_pieces(about.path, about.offset, EVT_BYTES, notes):
         events, edges = decoder.decode(about.words(data))
         notes["triggers"] = notes.get("triggers", 0) + len(edges.t)
         notes["dropped_untimed_events"] = decoder.untimed
-        yield events, edges
+        yield events.to_host(), edges
 
 
 def _evt_events(about: EvtFile, notes: dict[str, int]) -> Iterator[Packet]:
@@ -190,7 +190,7 @@ def _evt_events(about: EvtFile, notes: dict[str, int]) -> Iterator[Packet]:
     for events, _ in _decoded(about, notes):
         if about.origin:
             np.add(events.t, about.origin, out=events.t)
-        yield Events(*events)
+        yield events
 
 
 def _last_evt_time(about: EvtFile, estimate: int) -> int | None:
@@ -199,7 +199,7 @@ def _last_evt_time(about: EvtFile, estimate: int) -> int | None:
     with open_input(about.path) as file:
         file.seek(about.offset + max(count - EVT_BYTES // about.word, 0) * about.word)
         words = about.words(file.read(EVT_BYTES))
-    t = about.decoder().decode(words)[0].t
+    t = about.decoder().decode(words)[0].t.numpy()
     return nearest(int(t[-1]) + about.origin, 34, estimate) if t.size else None
 
 

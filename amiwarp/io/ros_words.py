@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events
-from amiwarp.io.evt_decoder import EventColumns, EvtDecoder, Triggers
+from amiwarp.io.evt_decoder import EvtDecoder, Triggers
 from amiwarp.io.file_scan import Packet, unwrapped
 from amiwarp.io.prophesee import halves_of, words_of
 from amiwarp.io.reading_process import packets
@@ -306,7 +306,7 @@ def _stamp(message: Any) -> int:
 class Decoded(NamedTuple):
     """Events of consecutive messages."""
 
-    events: EventColumns
+    events: Events
     """The events."""
     edges: Triggers
     """Edges of triggers."""
@@ -335,7 +335,8 @@ def decoded(path: Path, topic: str, layout: Layout, notes: dict[str, int]) -> It
             part = words[ends[start] - lengths[start] : ends[stop - 1]]
             note_largest_gap(notes, int(missing[start]), latest)
             offset += int(shifts[start])
-            events, edges = decoder.decode(part)
+            on_device, edges = decoder.decode(part)
+            events = on_device.to_host()
             if (shifts[start] or missing[start] == RESTART) and events.t.size:  # time never goes back
                 offset += max(latest - int(events.t[0]) - offset, 0)
             if offset:
@@ -350,14 +351,14 @@ def decoded(path: Path, topic: str, layout: Layout, notes: dict[str, int]) -> It
 def event_packets(path: Path, topic: str, layout: Layout, notes: dict[str, int]) -> Iterator[Packet]:
     """Yield the events of a topic."""
     for part in decoded(path, topic, layout, notes):
-        yield Events(*part.events)
+        yield part.events
 
 
 def edge_packets(path: Path, topic: str, layout: Layout) -> Iterator[Packet]:
     """Yield the edges of the triggers of a topic."""
     for part in decoded(path, topic, layout, {}):
-        channel, t, rising = part.edges
-        yield channel, np.zeros_like(channel), t, rising
+        edges = part.edges
+        yield edges.channel, np.zeros_like(edges.channel), edges.t, edges.rising
 
 
 def stamp_packets(path: Path, topic: str, layout: Layout) -> Iterator[tuple[NDArray[np.int64], ...]]:
