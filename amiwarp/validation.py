@@ -181,6 +181,9 @@ TIME_LIMIT = 2**62
 The difference and the sum of any two times then fit int64.
 """
 
+TIME_HINT = "; times are whole microseconds (int64): give 100_000 for 0.1 s"
+"""End of the message for a time that is no whole number."""
+
 TIME_UNITS = {"us": 1.0, "s": 1e6}
 """Microseconds in each unit of times that arrays may have."""
 
@@ -455,7 +458,8 @@ class _Parameter:
             if type(value) is int and INT64[0] <= value <= INT64[1]:
                 return value  # a shortcut
             what, floating = f"{self._label}: {self._name}", float in (kind, *typing.get_args(kind))
-            found = real(value, what) if floating else whole(value, what, *INT64)
+            hint = TIME_HINT if self._name == "t" or self._name.startswith("t_") else ""
+            found = real(value, what) if floating else whole(value, what, *INT64, hint)
             return found if isinstance(value, np.generic | np.ndarray) else value
         if self._name == "device":
             unmet = _no_device(value, kind, here="workers" not in self._function.__annotations__)

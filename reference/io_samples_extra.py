@@ -416,7 +416,7 @@ def by_csv(path: Path) -> Columns:
     with path.open(newline="") as file:
         table = csv.DictReader(file)
         rows = [[int(row[name]) for name in "xytp"] for row in table]
-        assert table.fieldnames == ["t", "x", "y", "p", f"geometry {SIZE[0]}x{SIZE[1]} (t in us)"]
+        assert table.fieldnames == ["t", "x", "y", "p"]
     return tuple(np.array(rows, np.int64).reshape(-1, 4).T)
 
 

@@ -288,6 +288,7 @@ OWN: dict[str, dict[str, Any]] = {
         "duration_us": 5,
         "kept_us": 0,
         "left_out": (),
+        "removed_records": {},
     },
     "Board": {"columns": 3, "rows": 4, "square_m": 0.03},
     "Board.save": {"path": _new(".svg")},

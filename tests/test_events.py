@@ -10,7 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import amiwarp
-from amiwarp import AmiwarpError, DeviceEvents, Events, EventSource, MemoryEvents, Truth
+from amiwarp import AmiwarpError, DeviceEvents, DeviceMemoryEvents, Events, EventSource, MemoryEvents, Truth
+from amiwarp.calib.bad_pixels import MaskedEventSource
+from amiwarp.calib.start_burst import LaterEvents
 from amiwarp.events.device_events import device_for
 from amiwarp.events.recording import check_events, regroup
 from amiwarp.events.truth import MemoryMasks
@@ -130,7 +132,7 @@ def test_memory_source():
     assert source.between(20, 45).t.tolist() == [20, 20, 30]
     assert source.between(46, 60).t.tolist() == []
     assert source.slice(3, 99).t.tolist() == [30, 45]
-    assert source.slice(-2, 1).t.tolist() == [10]
+    assert source.slice(0, 1).t.tolist() == [10]
     assert [block.t.tolist() for block in source.blocks(count=2)] == [[10, 20], [20, 30], [45]]
     assert [block.t.tolist() for block in source.blocks(duration_us=15)] == [[10, 20, 20], [30], [45]]
 
@@ -156,6 +158,46 @@ def test_slices_of_sources_are_those_of_arrays(stored, tmp_path):
         list(source)
     with pytest.raises(AmiwarpError, match="for one event"):
         events[3]
+
+
+SOURCES = ("memory", "native", "npz", "device", "masked", "later")
+
+
+@pytest.mark.parametrize("kind", SOURCES)
+def test_sources_refuse_what_would_silently_be_empty(kind, tmp_path):
+    """Seconds, reversed windows and negative indices; and the arrays of all events, which are read on demand."""
+    events = make(list(range(10, 110, 10)))
+    source = MemoryEvents(events, 64, 48)
+    if kind in ("native", "npz"):
+        amiwarp.save_recording(tmp_path / "native.h5", amiwarp.Recording(source))
+        amiwarp.convert(tmp_path / "native.h5", tmp_path / "npz.npz")
+        source = amiwarp.open_recording(next(tmp_path.glob(f"{kind}.*"))).events
+    elif kind == "device":
+        source = DeviceMemoryEvents(DeviceEvents.from_arrays(events.x, events.y, events.t, events.p), 64, 48)
+    elif kind == "masked":
+        source = MaskedEventSource(source, np.zeros((48, 64), np.bool_))
+    elif kind == "later":
+        source = LaterEvents(source, 2)
+    for window in ((0.1, 0.2), (1, 40.5)):
+        with pytest.raises(AmiwarpError, match=r"is not a whole number; times are whole microseconds \(int64\): give"):
+            source.between(*window)
+    with pytest.raises(AmiwarpError, match=r"between\(50, 40\) ends before its start; give the start, then the end"):
+        source.between(50, 40)
+    assert len(source.between(50, 50)) == 0
+    assert source.between(50, 51).t.tolist() == [50]
+    assert len(source.between(0, 5)) == 0
+    with pytest.raises(AmiwarpError, match=r"slice\(-5, 3\) has a negative index, .*; events\[-5:\] are the last five"):
+        source.slice(-5, 3)
+    for ends in (("a", 3), (0, "b"), (0.5, 3)):
+        with pytest.raises(AmiwarpError, match="is not a whole number"):
+            source.slice(*ends)
+    for name in ("x", "y", "t", "p"):
+        with pytest.raises(AttributeError, match=rf"has no attribute '{name}': .* events\[:\]\.{name} for all"):
+            getattr(source, name)
+    with pytest.raises(AttributeError, match=r"has no attribute 'times'$"):
+        source.times  # noqa: B018
+    assert isinstance(source, EventSource)
+    assert len(source[:]) == len(source)
 
 
 EVENT_CD = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])

@@ -15,7 +15,9 @@ from amiwarp import (
     AmiwarpError,
     Camera,
     Events,
+    ImuSamples,
     MemoryEvents,
+    MemoryImages,
     Prism,
     Recording,
     filter_recording,
@@ -235,6 +237,49 @@ def test_a_file_is_filtered_with_all_that_it_holds(tmp_path: Path, texture: np.n
     assert "background_us 5000" in str(found.metadata["filter"])
     filter_recording(found, tmp_path / "again.h5", EventFilter(every=2))
     assert str(open_recording(tmp_path / "again.h5").metadata["filter"]).endswith("background_us 5000; then every 2")
+
+
+def sensors(t: list[int]) -> dict[str, Any]:
+    """Return IMU samples and frames at some times, whose values tell their index."""
+    values = np.arange(3.0 * len(t)).reshape(-1, 3)
+    images = [np.full((2, 3), index, np.uint8) for index in range(len(t))]
+    return {"imu": ImuSamples(np.array(t), values, -values), "frames": MemoryImages(np.array(t), images)}
+
+
+def test_a_window_cuts_other_records(tmp_path: Path) -> None:
+    times = [9_000, 19_999, 20_000, 25_000, 29_999, 30_000, 60_000]
+    counts = {"imu_samples": 7, "frames": 7, "triggers": 5, "note": "kept"}
+    recording = Recording(MemoryEvents(some_events(), WIDTH, HEIGHT), metadata=counts, **sensors(times))
+    summary = filter_recording(recording, tmp_path / "out.h5", EventFilter(window=(20_000, 30_000)))
+    assert (summary.removed_records, summary.left_out) == ({"imu_samples": 4, "frames": 4}, ("triggers",))
+    found = open_recording(tmp_path / "out.h5")
+    assert found.imu is not None
+    assert found.frames is not None
+    assert found.imu.t.tolist() == found.frames.t.tolist() == times[2:5]
+    assert found.imu.angular_velocity[:, 0].tolist() == [6.0, 9.0, 12.0]
+    assert found.imu.acceleration[:, 0].tolist() == [-6.0, -9.0, -12.0]
+    assert [int(image[0, 0]) for image in found.frames] == [2, 3, 4]
+    assert {name: found.metadata.get(name) for name in counts} == {
+        "imu_samples": 3, "frames": 3, "triggers": None, "note": "kept",
+    }  # fmt: skip
+    whole = filter_recording(recording, tmp_path / "every.h5", EventFilter(every=2))
+    assert (whole.removed_records, whole.left_out) == ({}, ())
+    found = open_recording(tmp_path / "every.h5")
+    assert found.imu is not None
+    assert found.imu.t.tolist() == times
+    assert found.metadata["triggers"] == 5
+
+
+def test_a_window_without_other_records(tmp_path: Path) -> None:
+    recording = Recording(MemoryEvents(some_events(), WIDTH, HEIGHT), **sensors([60_000]))
+    save_recording(tmp_path / "in.h5", recording)
+    first = recording.events.t_first
+    window = f"0:{(30_000 - first) * 1e-6}"
+    result = run("filter", tmp_path / "in.h5", tmp_path / "out.h5", "--window", window)
+    assert "removed by time: 1 IMU samples, 1 frames" in result.stdout
+    found = open_recording(tmp_path / "out.h5")
+    assert (found.imu, found.frames) == (None, None)
+    assert (len(found.events), found.events.t_last < 30_000) == (np.count_nonzero(some_events().t < 30_000), True)
 
 
 def test_other_formats_and_lines_of_text(tmp_path: Path) -> None:

@@ -612,7 +612,7 @@ def test_hdf5_without_known_events_is_named(tmp_path):
         file["labels"] = np.zeros(3)
     message = str(refusal(open_recording, tmp_path / "a.h5"))
     assert "no arrays are named as t, x, y and p; its arrays are data, labels" in message
-    assert "--columns, such as t=ts,x=xs,y=ys,p=ps" in message
+    assert "--columns, such as t=NAME,x=NAME,y=NAME,p=NAME" in message
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file.create_dataset("davis/left/events", shape=(10**15, 4), dtype="f8", chunks=(1000, 4))
     assert "declares 1000000000000000 rows, which it does not hold" in str(refusal(open_recording, tmp_path / "b.h5"))

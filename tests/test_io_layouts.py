@@ -6,6 +6,7 @@ The layouts are those that users of other readers write or report. Each file is 
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,10 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.io import loadmat, savemat
 
-from amiwarp import AmiwarpError, Camera, Events, Recording, convert, open_recording
+from amiwarp import AmiwarpError, Camera, Events, MemoryEvents, Recording, convert, open_recording, save_recording
 from amiwarp.calib.checks import size_warnings
 from amiwarp.io import table_server, text_files
-from amiwarp.io.columns import role_of
+from amiwarp.io.columns import role_of, roles_of, unit_in
 from amiwarp.io.file_scan import assumptions_of
 from reference.io_samples_extra import write_raw_of_a_sensor
 
@@ -51,6 +52,16 @@ def archive(*arrays: Any, compressed: bool = False, **named: Any) -> Maker:
     def write(path: Path) -> None:
         with open(path, "wb") as file:
             (np.savez_compressed if compressed else np.savez)(file, *arrays, **named)
+
+    return write
+
+
+def in_utf16(maker: Maker, encoding: str, mark: bytes) -> Maker:
+    """Return a function that writes a maker's text in UTF-16."""
+
+    def write(path: Path) -> None:
+        maker(path)
+        path.write_bytes(mark + path.read_bytes().decode().encode(encoding))
 
     return write
 
@@ -116,6 +127,26 @@ def openmv(kinds: Any) -> Any:
 RECORDS = records(("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "?"), values=(T, X, Y, P))
 ROWS = np.c_[T, X, Y, P]
 SECOND_ROWS = [(f"{t:.6f}", x, y, p) for t, x, y, p in zip(SECONDS, X, Y, P, strict=True)]
+COMMAS = [(t.replace(".", ","), *rest) for t, *rest in SECOND_ROWS]
+START = datetime(2024, 5, 1, 12)
+START_US = 1_714_564_800_000_000
+"""The same time since 1970 [us]."""
+
+
+def dates(separator: str = "T", zone: str = "", *, hours: int = 0) -> list[tuple[Any, ...]]:
+    """Return rows whose times are dates, in a zone some hours east."""
+    shift = timedelta(hours=hours)
+    return [
+        ((START + shift + timedelta(microseconds=int(t))).isoformat(separator, "microseconds") + zone, x, y, p)
+        for t, x, y, p in ROWS.tolist()
+    ]
+
+
+def worded(off: str, on: str) -> list[tuple[Any, ...]]:
+    """Return rows whose polarities are words."""
+    return [(t, x, y, (off, on)[p]) for t, x, y, p in ROWS.tolist()]
+
+
 WORDS = np.array(["False", "True"])[P]
 SIGNED = 2 * P - 1
 
@@ -148,6 +179,46 @@ LAYOUTS: dict[str, tuple[Maker, dict[str, Any]]] = {
               separator=";", head="t_ms;x;y;p\n"),
         {},
     ),
+    "csv with quoted decimal commas": (
+        lines([(f'"{t}"', *rest) for t, *rest in COMMAS], separator=",", head="t,x,y,p\n"), {"time_unit": "s"},
+    ),
+    "csv with quoted decimal commas between semicolons": (
+        lines([(f'"{t}"', *rest) for t, *rest in COMMAS], separator=";"), {},
+    ),
+    "text with decimal commas between tabs": (lines(COMMAS, separator="\t", head="t\tx\ty\tp\n"), {}),
+    "text with decimal commas between spaces": (lines(COMMAS), {}),
+    "text in UTF-16 of Excel": (
+        in_utf16(lines(ROWS, separator="\t", head="t\tx\ty\tp\r\n", end="\r\n"), "utf-16-le", b"\xff\xfe"), {},
+    ),
+    "text in UTF-16, big-endian": (in_utf16(lines(SECOND_ROWS), "utf-16-be", b"\xfe\xff"), {}),
+    "csv with + and -": (lines(worded("-", "+"), separator=",", head="t,x,y,p\n"), {}),
+    "csv with y and n": (lines(worded("n", "y"), separator=",", head="t,x,y,p\n"), {}),
+    "csv with ON and OFF": (lines(worded("OFF", "ON"), separator=";", head="t;x;y;p\n"), {}),
+    "text with true and false": (lines(worded("false", "true")), {}),
+    "csv with a last comma in the names": (lines(ROWS, separator=",", head="t,x,y,p,\n"), {}),
+    "csv with a last comma in the lines": (lines(ROWS, separator=",", head="t,x,y,p\n", end=",\n"), {}),
+    "csv with last commas everywhere": (lines(ROWS, separator=",", head="t,x,y,p,,\n", end=",,\r\n"), {}),
+    "csv with empty columns": (
+        lines([("", t, "", " ", x, y, p) for t, x, y, p in ROWS.tolist()], separator=",",
+              head="id,t,label,track,x,y,p\n"),
+        {},
+    ),
+    "text: names in an earlier comment": (
+        lines(np.c_[Y, X, T, P], head="# columns: y x t_us p\n# 1000 events\n"), {},
+    ),
+    "text: names between commas in a comment of MATLAB": (lines(np.c_[Y, X, T, P], head="% y,x,t_us,p\n"), {}),
+    "text: names with units apart": (lines(np.c_[Y, X, T, P], head="y x time [us] p\n"), {}),
+    "csv of pandas, read and written again": (
+        lines(zip(range(N), *ROWS.T, strict=True), separator=",", head="Unnamed: 0,t,x,y,p\n"), {},
+    ),
+    "csv: usec, u, v, on_off": (lines(ROWS, separator=",", head="usec,u,v,on_off\n"), {}),
+    "csv: nanoseconds, pixel_x, pixel_y, polarity_bool": (
+        lines(np.c_[T * 1000, X, Y, P], separator=",", head="nanoseconds,pixel_x,pixel_y,polarity_bool\n"), {},
+    ),
+    "csv: flow beside the pixels": (
+        lines(np.c_[T, X, Y, P, Y, X], separator=",", head="time_in_us,x,y,sign,u,v\n"), {},
+    ),
+    "npz: u, v": (archive(u=X, v=Y, msec=T / 1e3, sign=SIGNED), {}),
     "text below many comments": (lines(ROWS, head="# a long story about the recording\n" * 200), {}),
     "csv with a mark and quotes": (
         lines([[f'"{v}"' for v in row] for row in ROWS], separator=",", head='\ufeff"Timestamp(us)","X","Y","P"\n'),
@@ -336,6 +407,51 @@ def test_the_kernel_leaves_other_lines_to_numpy(
 
 
 REFUSED: dict[str, tuple[Maker, str]] = {
+    "a speed is no row": (
+        lines(ROWS, separator=",", head="t,x,v,p\n"),
+        r"no column is named as y; .* --columns, such as t=t,x=x,y=NAME,p=p$",
+    ),
+    "one array of another name": (
+        archive(xs=X, ys=Y, ts=T, q=P), r"no array .* xs, ys, ts, q; .* --columns, such as t=ts,x=xs,y=ys,p=NAME$",
+    ),
+    "one dataset of another name": (
+        hdf5(a__x=X, a__y=Y, a__t=T, a__q=P, K=np.eye(3)), r"no arrays .* --columns, such as t=a/t,x=a/x,y=a/y,p=NAME$",
+    ),
+    "times in two parts": (
+        lines(np.c_[T, T, X, Y, P], separator=",", head="sec,nsec,x,y,p\n"),
+        r"columns sec and nsec can both be t; .* such as t=sec,x=x,y=y,p=p; if they are parts of one time, join them",
+    ),
+    "times in two parts, one with a usual name": (
+        lines(np.c_[T, T, X, Y, P], separator=",", head="time_s,nsec,x,y,p\n"),
+        r"columns time_s and nsec can both be t; .* join them in one column first",
+    ),
+    "numbers of rows without a name": (
+        lines(zip(range(N), *ROWS.T, strict=True), head="t x y p\n"),
+        r"names 4 columns \(t, x, y, p\), and its rows have 5; .* --columns, such as -,t,x,y,p$",
+    ),
+    "commas between thousands": (
+        lines([(f'"{t + 1000:,}"', *rest) for t, *rest in ROWS.tolist()], separator=","),
+        r"line 1 or one after it holds '1,191', whose comma can be a decimal one or separate thousands",
+    ),
+    "text in UTF-16 without a mark": (
+        in_utf16(lines(ROWS), "utf-16-le", b""), r"is text in UTF-16 without a mark at its beginning; save it in UTF-8",
+    ),
+    "a column of text": (
+        lines([(*row, "car") for row in ROWS.tolist()], separator=",", head="t,x,y,p,label\n"),
+        r"is text, but line 2 '191,639,479,0,car' holds 'car', which is no number; .* leave out other columns",
+    ),
+    "times of day": (
+        lines([(stamp[11:], *rest) for stamp, *rest in dates()], separator=",", head="t,x,y,p\n"),
+        r"line 2 '12:00:00.000191,.*' holds '12:00:00.000191', which is no number; .* such as 2024-05-01T12:",
+    ),
+    "a date that is none": (
+        lines([("2024-05-32T12:00:00", *rest) for _, *rest in dates()], separator=","),
+        r"holds '2024-05-32T12:00:00', which is no number",
+    ),
+    "prose": (
+        lambda path: path.write_text("hello world\nthis is no table\n") and None,
+        r"is text, but line 1 'hello world' holds no numbers; expected rows of t, x, y and p",
+    ),
     "polarity 1 and 2": (archive(x=X, y=Y, t=T, p=2 - P), r"values 1, 2, of which .* --polarity, such as 1=on,2=off"),
     "polarity 0 and -1": (archive(x=X, y=Y, t=T, p=-P), r"values -1, 0, of which .* --polarity"),
     "polarity -1, 0, 1": (array(np.c_[T, X, Y, RANDOM.integers(-1, 2, N)]), r"values -1, 0, 1, of which"),
@@ -595,11 +711,31 @@ def test_truth_values_without_a_meaning(tmp_path: Path) -> None:
         ("time [ms]", "t", "ms"), ("timestamp(ns)", "t", "ns"), ("timestampUs", "t", "us"), ("TD/ts", "t", None),
         ("event_t_us", "t", "us"), ("x", "x", None), ("xs", "x", None), ("col", "x", None), ("x_px", "x", None),
         ("row", "y", None), ("polarities", "p", None), ("'Pol'", "p", None), ("on", "p", None),
+        ("usec", None, None), ("u", None, None),  # which only count where no column has a usual name
         ("t0", None, None), ("x2", None, None), ("time_offset", None, None), ("exposure_us", None, None),
     ],
 )  # fmt: skip
 def test_names_of_columns(name: str, role: str | None, unit: str | None) -> None:
     assert role_of(name) == (role, unit)
+
+
+@pytest.mark.parametrize(
+    ("names", "found", "unit"),
+    [
+        ("usec u v on_off", "t x y p", "us"), ("timestamp_us col row pol", "t x y p", "us"),
+        ("ts_ns col row sign", "t x y p", "ns"), ("msec xaddr yaddr polarity_bool", "t x y p", "ms"),
+        ("time_in_us pixel_x pixel_y is_positive", "t x y p", "us"), ("nanoseconds x_pos y_pos sgn", "t x y p", "ns"),
+        ("id unix_time pos_x pos_y p frame", "- t x y p -", None), ("t x y p u v usec sign", "t x y p - - - -", None),
+        ("event_time_ms x-addr y-addr event_pol", "t x y p", "ms"), ("seconds x y p", "t x y p", "s"),
+        ("dt x y p", "- x y p", None), ("t x v p", "t x - p", None), ("s x y p", "- x y p", None),
+        ("t i j p", "t - - p", None), ("timeUs X Y Polarity", "t x y p", "us"), ("dates x y p", "t x y p", None),
+    ],
+)  # fmt: skip
+def test_roles_of_names(names: str, found: str, unit: str | None) -> None:
+    listed, roles = names.split(), roles_of(names.split())
+    at = {place: role for role, places in roles.items() for place in places}
+    assert [at.get(place, "-") for place in range(len(listed))] == found.split()
+    assert next((unit_in(name) for name, role in zip(listed, found.split(), strict=True) if role == "t"), None) == unit
 
 
 def test_rows_across_groups_of_parquet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -635,20 +771,120 @@ def test_real_matlab_file(data_dir: Path) -> None:
         np.testing.assert_array_equal(getattr(events, name), expected, err_msg=name)
 
 
-@pytest.mark.parametrize("start", [1_700_000_000_000_000_000, 1_700_000_000_000])
-def test_times_since_1970_in_a_layout_of_microseconds_are_in_doubt(tmp_path, start):
-    """Nanoseconds in amiwarp's own layout, and milliseconds in a table, are not taken for microseconds."""
-    t = start + np.arange(300) * 300
-    x = np.arange(300) % 64
-    nanoseconds = start > 10**15
-    if nanoseconds:
-        np.savez(tmp_path / "a.npz", x=x, y=x, t=t, p=x % 2)
-        path = tmp_path / "a.npz"
-    else:
-        path = tmp_path / "a.csv"
-        np.savetxt(path, np.c_[t, x, x, x % 2], "%d", ",", header="t,x,y,p", comments="")
-    with pytest.raises(AmiwarpError, match=r"since 1970.*--time-unit"):
+MAKERS: dict[str, Callable[[Any], Maker]] = {
+    "npz": lambda t: archive(x=X[: len(t)], y=Y[: len(t)], t=t, p=P[: len(t)]),
+    "npy": lambda t: array(
+        np.rec.fromarrays([t, X[: len(t)], Y[: len(t)], P[: len(t)]], names="t,x,y,p").view(np.ndarray)
+    ),
+    "csv": lambda t: lines(np.c_[t, X[: len(t)], Y[: len(t)], P[: len(t)]], separator=",", head="t,x,y,p\n"),
+    "HDF5": lambda t: hdf5(events__x=X[: len(t)], events__y=Y[: len(t)], events__t=t, events__p=P[: len(t)]),
+}
+"""Layouts with times in microseconds by the promise of the format, and a table without such a promise."""
+
+
+@pytest.mark.parametrize("layout", MAKERS)
+def test_times_in_another_unit_than_the_layout_has(tmp_path: Path, layout: str) -> None:
+    """Nanoseconds since 1970 are read and said; what may be milliseconds or seconds is refused."""
+    of_layout = MAKERS[layout]
+    recording = open_recording(made(tmp_path, of_layout((T + EPOCH) * 1000 + 400)))
+    assert_same(recording, EPOCH)
+    (said,) = (each for each in assumptions_of(recording.metadata) if each.what == "time unit")
+    assert (said.value, said.option) == ("ns", "--time-unit")
+    for divisor, unit, given in ((1000, "milliseconds", "ms"), (1_000_000, "seconds", "s")):
+        t = (T * 30 + EPOCH) // divisor
+        path = made(tmp_path, of_layout(t))
+        with pytest.raises(AmiwarpError, match=rf"from {t[0]} may be {unit} since 1970, .* --time-unit {given} or us"):
+            open_recording(path)
+        assert open_recording(path, time_unit=given).events.t_first == t[0] * divisor
+        assert open_recording(path, time_unit="us").events.t_first == t[0]
+
+
+def test_a_rate_that_no_camera_has(tmp_path: Path) -> None:
+    t = COUNT // 30_000
+    for maker in (archive(x=COUNT % 640, y=COUNT % 7, t=t, p=COUNT % 2),
+                  hdf5(events__x=COUNT % 640, events__y=COUNT % 7, events__t=t, events__p=COUNT % 2)):  # fmt: skip
+        path = made(tmp_path, maker)
+        with pytest.raises(AmiwarpError, match=r"the first 60,000 events span 1; give it with --time-unit"):
+            open_recording(path)
+        assert open_recording(path, time_unit="ms").events.t_last == 1000
+
+
+def test_times_of_own_files_are_believed(tmp_path: Path) -> None:
+    """A camera that has run for weeks has times that could be milliseconds since 1970, too."""
+    t = T + 1_700_000_000_000
+    whole = Events.from_arrays(X, Y, t, P)
+    for name in ("a.npz", "a.h5", "dsec.h5"):
+        form = "dsec" if name == "dsec.h5" else None
+        save = tmp_path / "source.h5"
+        save_recording(save, Recording(MemoryEvents(whole, 640, 480)), overwrite=True)
+        convert(save, tmp_path / name, format=form)
+        np.testing.assert_array_equal(of(open_recording(tmp_path / name)).t, t)
+
+
+@pytest.mark.parametrize("head", ["", "t,x,y,p\n"], ids=["without names", "with names"])
+@pytest.mark.parametrize(
+    ("separator", "zone", "hours"),
+    [("T", "", 0), (" ", "", 0), ("T", "Z", 0), ("T", "+02:00", 2), (" ", "-0330", -3.5)],
+)
+def test_times_may_be_dates(tmp_path: Path, head: str, separator: str, zone: str, hours: float) -> None:
+    recording = open_recording(made(tmp_path, lines(dates(separator, zone, hours=hours), separator=",", head=head)))
+    assert_same(recording, START_US)
+    assert recording.metadata["time_zone"] == "UTC, unless a time states another zone"
+    assert not [each for each in assumptions_of(recording.metadata) if each.what == "time unit"]
+    with pytest.raises(AmiwarpError, match="times are dates, but --time-unit is ms; leave it out"):
+        open_recording(tmp_path / "events", time_unit="ms")
+
+
+def test_dates_in_nanoseconds_are_rounded(tmp_path: Path) -> None:
+    rows = [(f"{stamp}{rest}", *others) for (stamp, *others), rest in zip(dates(), ["499", "500"] * N, strict=False)]
+    found = of(open_recording(made(tmp_path, lines(rows, separator=";", head="time_ns;x;y;p\n"))))
+    np.testing.assert_array_equal(found.t, np.maximum.accumulate(T + START_US + np.arange(N) % 2))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+@pytest.mark.parametrize("cut", ["0.2", "0.2 3", "0.200000 3 4", "0.200000 3 4 -", "0.200000 3 4 1 7"])
+def test_a_last_line_that_is_cut_off_is_dropped(tmp_path: Path, encoding: str, cut: str) -> None:
+    path = made(tmp_path, lines(SECOND_ROWS, end="\n"))
+    path.write_bytes((path.read_text() + cut).encode(encoding))
+    recording = open_recording(path)
+    assert_same(recording)
+    assert recording.metadata["truncated_bytes"] == len(cut)
+    path.write_bytes((path.read_text(encoding) + "\n").encode(encoding))
+    with pytest.raises(AmiwarpError, match=rf"line 1001 is '{cut}'"):
         open_recording(path)
-    read = open_recording(path, time_unit="ns" if nanoseconds else "ms").events
-    factor = 0.001 if nanoseconds else 1000
-    assert read.t_last - read.t_first == pytest.approx(299 * 300 * factor, abs=1)
+
+
+def test_a_time_that_lost_digits_is_cut_off(tmp_path: Path) -> None:
+    path = made(tmp_path, lines(np.c_[X, Y, P, T]))
+    text = path.read_text().rstrip("\n")
+    path.write_text(text)
+    recording = open_recording(path)
+    assert_same(recording)
+    assert "truncated_bytes" not in recording.metadata
+    path.write_text(text[:-1])
+    recording = open_recording(path)
+    assert (len(recording.events), recording.metadata["truncated_bytes"]) == (N - 1, len(text.split("\n")[-1]) - 1)
+
+
+def test_an_empty_value_does_not_shift_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty value and one too many are not those of a sound row, for the kernel neither."""
+    for kernel_lines in (100, 10_000):
+        monkeypatch.setattr("amiwarp.io.text_files.KERNEL_LINES", kernel_lines)
+        for wrong in (",5,6,1,0", "5,,6,1,0", "5,6,,1,0"):
+            rows = [f"{t},{x},{y},{p}" for t, x, y, p in ROWS.tolist()]
+            path = tmp_path / "a.csv"
+            path.write_text("t,x,y,p\n" + "\n".join([*rows[:500], wrong, *rows[500:]]) + "\n")
+            with pytest.raises(AmiwarpError, match=rf"line 502 is '{wrong}'"):
+                open_recording(path)
+
+
+def test_rare_names_are_said(tmp_path: Path) -> None:
+    recording = open_recording(made(tmp_path, lines(ROWS, separator=",", head="t_us,u,v,pol\n")))
+    said = assumptions_of(recording.metadata)[0]
+    assert (said.what, said.value, said.option) == ("columns", "x = u, y = v", "--columns")
+
+
+def test_a_first_time_may_lack_the_comma(tmp_path: Path) -> None:
+    rows = [("0", 0, 0, 1), *COMMAS]
+    recording = open_recording(made(tmp_path, lines(rows, separator="\t", head="t_s\tx\ty\tp\n")))
+    np.testing.assert_array_equal(of(recording).t, [0, *T])

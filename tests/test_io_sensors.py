@@ -261,7 +261,7 @@ def test_aedat2_samples_have_the_ranges_of_the_header(tmp_path: Path, monkeypatc
     write_aedat2(tmp_path / "a.aedat", EVENTS, between=extra)
     recording = open_recording(tmp_path / "a.aedat")
     assert (recording.metadata["imu_samples"], recording.metadata["imu_ranges"]) == (
-        4, "assumed: 8 g and 1000 deg/s, the defaults of jAER",
+        3, "assumed: 8 g and 1000 deg/s, the defaults of jAER",
     )  # fmt: skip
     imu = recording.imu
     assert imu is not None
@@ -285,9 +285,9 @@ def test_aedat2_samples_have_the_ranges_of_the_header(tmp_path: Path, monkeypatc
 def test_real_samples_of_a_davis240(data_dir: Path) -> None:
     recording = open_recording(data_dir / "aedat/aedat2_davis240_IMU_translBoxes.aedat")
     imu = recording.imu
-    # The file ends within the last of the 4834 samples.
+    # The file ends within a sample, which is the 4834th.
     assert imu is not None
-    assert len(imu) == 4833
+    assert len(imu) == recording.metadata["imu_samples"] == 4833
     assert imu.t[:2].tolist() == [294_976_899, 294_977_304]
     np.testing.assert_allclose(imu.acceleration[0], np.array([42, -4129, -111]) / 4096 * G, rtol=1e-12)
     np.testing.assert_allclose(imu.angular_velocity[0], np.radians(np.array([-117, -67, -1]) / 32.8), rtol=1e-12)

@@ -115,7 +115,7 @@ def test_amiwarp_reads_what_it_writes(tmp_path, name):
     assert_columns((found.x, found.y, found.t, found.p), events)
     assert set(recording.metadata) == {"format"} | ({"topic"} if name.startswith("ros") else set())
     assert recording.events.size == SIZE
-    beside = ["out.txt.json"] if name == "text" else []
+    beside = {"text": ["out.txt.json"], "csv": ["out.csv.json"]}.get(name, [])
     assert sorted(os.listdir(tmp_path)) == [f"out{CLIENTS[name][0]}", *beside, "source.h5"]
 
 
@@ -528,7 +528,7 @@ def test_the_clock_of_late_events_begins_at_the_first(tmp_path, name):
 def test_a_csv_file_is_what_a_person_would_write(tmp_path):
     events = Events.from_arrays([0, 7, 319], [239, 100, 0], [-15, 0, 123_456_789_012], [1, 0, 1])
     path = exported(tmp_path, "csv", MemoryEvents(events, *SIZE))
-    assert path.read_text() == "t,x,y,p,geometry 320x240 (t in us)\n-15,0,239,1\n0,7,100,0\n123456789012,319,0,1\n"
+    assert path.read_text() == "t,x,y,p\n-15,0,239,1\n0,7,100,0\n123456789012,319,0,1\n"
 
 
 def test_pandas_reads_csv_without_options(tmp_path):
@@ -553,7 +553,8 @@ def test_a_size_that_no_event_shows_comes_back(tmp_path, name):
 def test_the_size_beside_a_text_belongs_to_this_text(tmp_path):
     path = exported(tmp_path, "text", MemoryEvents(make_events(50), *SIZE))
     beside = tmp_path / "out.txt.json"
-    assert json.loads(beside.read_text()) == {"width": 320, "height": 240, "bytes": path.stat().st_size}
+    stated = {"width": 320, "height": 240, "time_unit": "s", "bytes": path.stat().st_size}
+    assert json.loads(beside.read_text()) == stated
     path.write_text("0.000001 5 7 1\n")
     assert open_recording(path).events.size == (128, 128)
     beside.write_text(json.dumps({"width": 0, "height": 240, "bytes": path.stat().st_size}))

@@ -6,6 +6,8 @@ lamp makes the event rates of many neighbouring pixels oscillate together, at a 
 line in their spectrum.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.recording import Events, EventSource
+from amiwarp.validation import guarded
 
 MOST_TURNS, LEAST_TURNS, MOST_EVENTS = 8, 2, 2_500_000
 """Limits of the part of a recording that is searched for bad pixels: most turns of the prism, fewest turns, most
@@ -142,6 +145,7 @@ def without_pixels(events: Events, mask: NDArray[np.bool_]) -> Events:
     return events[~mask[events.y, events.x]] if mask.any() else events
 
 
+@guarded
 @dataclass(frozen=True, eq=False, repr=False)
 class MaskedEventSource(EventSource):
     """Event source that drops the events of masked pixels on reading. ``len`` still counts them."""

@@ -12,7 +12,16 @@ from functools import cached_property
 import numpy as np
 
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import Events, EventSource, MemoryEvents, Recording, regroup
+from amiwarp.events.recording import (
+    Events,
+    EventSource,
+    MemoryEvents,
+    Recording,
+    check_slice,
+    check_window,
+    regroup,
+)
+from amiwarp.validation import guarded
 
 FEWEST_EVENTS = 200
 """Smallest number of events at the first time stamp that may be a burst."""
@@ -68,6 +77,7 @@ def reaching_back(path: Encoder, t: int) -> Encoder:
     return replace(path, t=np.concatenate([[t], path.t]), angle=np.concatenate([[angle], path.angle]))
 
 
+@guarded
 @dataclass(frozen=True, eq=False, repr=False)
 class LaterEvents(EventSource):
     """Events of a source from an index on. All earlier events have the first time stamp."""
@@ -93,13 +103,16 @@ class LaterEvents(EventSource):
         return self.source.size
 
     def slice(self, start: int, stop: int) -> Events:
-        return self.source.slice(self.first + max(start, 0), self.first + max(stop, 0))
+        check_slice(start, stop)
+        return self.source.slice(self.first + start, self.first + stop)
 
     def find(self, t: int) -> int:
         return max(self.source.find(t) - self.first, 0)
 
     def between(self, t_start: int, t_end: int) -> Events:
-        return self.source.between(max(t_start, self.source.t_first + 1), t_end)
+        check_window(t_start, t_end)
+        later = self.source.t_first + 1
+        return self.source.between(max(t_start, later), max(t_end, later))
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
         return regroup(self._chunks(), count=count, duration_us=duration_us)

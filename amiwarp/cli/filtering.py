@@ -70,7 +70,8 @@ def run_filter(
     """Keep part of a recording: time, region, polarity; remove hot pixels, noise, and events beyond a rate.
 
     Prints the number of events that each part has removed, and the rates before and after. In amiwarp's format,
-    encoder, camera, prism, ground truth, IMU samples and frames are kept.
+    encoder, camera, prism, ground truth, IMU samples and frames are kept; with --window, the IMU samples and frames
+    within it.
     """
     from amiwarp.imaging.filters import EventFilter, filter_recording, find_hot_pixels
 
@@ -115,6 +116,9 @@ def _lines(d: dict[str, Any]) -> Iterator[str]:
     yield f"{d['file']}: {kept}, {d['seconds']:.2f} s, {rate:.3g} Mev/s"
     for name, count in d["removed"].items():
         yield f"removed by {NAMES[name]}: {count:,}"
+    records = [f"{count:,} {RECORD_NAMES[name]}" for name, count in d["removed_records"].items()]
+    if records:
+        yield f"removed by time: {', '.join(records)}"
     before = 1e6 * d["events"] / max(d["duration_us"], 1)
     after = 1e6 * d["kept"] / max(d["kept_us"], 1)
     yield f"rate: {before:,.0f} events/s before, {after:,.0f} events/s after"
@@ -125,6 +129,9 @@ def _lines(d: dict[str, Any]) -> Iterator[str]:
     if d["left_out"]:
         yield f"note: the format leaves out: {', '.join(d['left_out'])}"
 
+
+RECORD_NAMES = {"imu_samples": "IMU samples", "frames": "frames"}
+"""Names of the records of other sensors."""
 
 NAMES = {
     "window": "time",

@@ -556,14 +556,20 @@ class DeviceMemoryEvents(EventSource):
         Parameters
         ----------
         start, stop : int
-            First index, and index after the last. Both are clipped to the existing events.
+            First index, and index after the last, at least 0. Both are clipped to the existing events.
 
         Returns
         -------
         DeviceEvents
             The events.
+
+        Raises
+        ------
+        AmiwarpError
+            If an index is negative.
         """
-        return self[max(start, 0) : max(stop, 0)]
+        checks.check_slice(start, stop)
+        return self[start:stop]
 
     def find(self, t: int) -> int:
         return int(find_indices(self._events, np.array([t]))[0])
@@ -583,7 +589,13 @@ class DeviceMemoryEvents(EventSource):
         -------
         DeviceEvents
             The events.
+
+        Raises
+        ------
+        AmiwarpError
+            If the end is before the start.
         """
+        checks.check_window(t_start, t_end)
         start, stop = find_indices(self._events, np.array([t_start, t_end])).tolist()
         return self[start:stop]
 

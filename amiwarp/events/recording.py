@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -175,6 +175,23 @@ def slice_bounds(which: object, length: int, what: str = "events") -> tuple[int,
     return start, max(start, stop)
 
 
+def check_slice(start: int, stop: int) -> None:
+    """Raise :class:`AmiwarpError` for a negative index in ``slice``, which counts from the first event."""
+    if min(start, stop) < 0:
+        raise AmiwarpError(
+            f"slice({start}, {stop}) has a negative index, and counts from the first event; events[-5:] are the last "
+            "five, as of a list"
+        )
+
+
+def check_window(t_start: int, t_end: int) -> None:
+    """Raise :class:`AmiwarpError` for a time window [us] that ends before its start."""
+    if t_end < t_start:
+        raise AmiwarpError(
+            f"between({t_start}, {t_end}) ends before its start; give the start, then the end, in whole microseconds"
+        )
+
+
 def described(kind: str, *facts: str, span: tuple[int, int] | None, count: int) -> str:
     """Return a representation of at most one line of events: their number, ``facts``, time span and mean rate."""
     facts = (f"{count:,} event{'' if count == 1 else 's'}", *facts)
@@ -230,7 +247,8 @@ class Events:
             )
         if self.x.dtype != self.y.dtype or self.x.dtype not in (np.dtype(np.uint16), np.dtype(np.float32)):
             raise AmiwarpError(
-                f"events' x is {self.x.dtype}, y is {self.y.dtype}; expected both uint16 or both float32"
+                f"events' x is {self.x.dtype}, y is {self.y.dtype}; expected both uint16, or both float32 for "
+                "compensated events, of which NaN marks those without a position"
             )
         if self.p.size and self.p.max() > 1:
             raise wrong_polarity(self.p)
@@ -436,6 +454,18 @@ class EventSource(Protocol):
         """Return the events of a slice without steps, whose negative indices count from the end."""
         return self.slice(*slice_bounds(which, len(self)))
 
+    if not TYPE_CHECKING:  # for type checkers, a source has no other attributes than those below
+
+        def __getattr__(self, name: str) -> Any:
+            """Raise AttributeError, which says where the arrays of events are."""
+            hint = ""
+            if name in COLUMNS:
+                hint = (
+                    f": its events are read on demand; give some, such as events[:].{name} for all, "
+                    f"events[:1000].{name} for the first, or events.between(t_start, t_end).{name}"
+                )
+            raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'{hint}")
+
     def __repr__(self) -> str:
         span = (self.t_first, self.t_last) if len(self) else None
         return described(type(self).__name__, "{}x{} px".format(*self.size), span=span, count=len(self))
@@ -458,12 +488,17 @@ class EventSource(Protocol):
         Parameters
         ----------
         start, stop : int
-            First index, and index after the last. Both are clipped to the existing events.
+            First index, and index after the last, at least 0. Both are clipped to the existing events.
 
         Returns
         -------
         Events
             The events.
+
+        Raises
+        ------
+        AmiwarpError
+            If an index is negative or no whole number.
         """
 
     def find(self, t: int) -> int:
@@ -492,6 +527,11 @@ class EventSource(Protocol):
         -------
         Events
             The events.
+
+        Raises
+        ------
+        AmiwarpError
+            If a time is no whole number, such as one in seconds, or the end is before the start.
         """
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
@@ -560,12 +600,14 @@ class MemoryEvents(EventSource):
         return self._size
 
     def slice(self, start: int, stop: int) -> Events:
-        return self._events[max(start, 0) : max(stop, 0)]
+        check_slice(start, stop)
+        return self._events[start:stop]
 
     def find(self, t: int) -> int:
         return int(np.searchsorted(self._events.t, t))
 
     def between(self, t_start: int, t_end: int) -> Events:
+        check_window(t_start, t_end)
         start, stop = np.searchsorted(self._events.t, [t_start, t_end])
         return self._events[start:stop]
 

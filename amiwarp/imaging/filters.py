@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
-from amiwarp.events.recording import Events, EventSource, Recording, check_events
-from amiwarp.events.truth import EventTruth
+from amiwarp.events.recording import Events, EventSource, ImageStore, ImuSamples, Recording, check_events
+from amiwarp.events.truth import EventTruth, StoredInstants
 from amiwarp.io import formats
 from amiwarp.io.export import convert
+from amiwarp.io.file_scan import RECORDS
 from amiwarp.io.files import check_output, scratch_folder
 from amiwarp.io.formats import OutputFormat
 from amiwarp.io.native_format import RecordingWriter, copy_records
@@ -345,6 +346,8 @@ class FilterSummary:
     """Time from the first to the last event of the output [us]."""
     left_out: tuple[str, ...]
     """What the format of the output cannot hold."""
+    removed_records: dict[str, int]
+    """Number of IMU samples and frames outside the window, by name; empty without a window."""
 
 
 @guarded
@@ -359,7 +362,8 @@ def filter_recording(
 ) -> FilterSummary:
     """Write the events of a recording that a filter keeps, in constant memory.
 
-    In amiwarp's format, encoder, camera, prism, ground truth, IMU samples and frames are kept.
+    In amiwarp's format, encoder, camera, prism, ground truth, IMU samples and frames are kept; of IMU samples and
+    frames, those within the window.
 
     Parameters
     ----------
@@ -402,7 +406,7 @@ def filter_recording(
     with scratch_folder(out_path.parent) as folder:
         summary = _write_kept(recording, folder / "kept.h5", chosen, progress, False)
         left_out = convert(folder / "kept.h5", out_path, format=output, progress=progress, overwrite=overwrite).left_out
-    return replace(summary, left_out=left_out)
+    return replace(summary, left_out=tuple(dict.fromkeys((*left_out, *summary.left_out))))
 
 
 def _write_kept(
@@ -413,6 +417,17 @@ def _write_kept(
     running = RunningFilter(chosen, source.size)
     truth = recording.truth
     about = {name: value for name, value in recording.metadata.items() if name != "format"}
+    imu, frames = recording.imu, recording.frames
+    removed_records: dict[str, int] = {}
+    lost: tuple[str, ...] = ()
+    if chosen.window is not None:
+        imu, frames = _imu_within(imu, chosen.window), _frames_within(frames, chosen.window)
+        held = (("imu_samples", recording.imu, imu), ("frames", recording.frames, frames))
+        removed_records = {name: len(whole) - len(part or ()) for name, whole, part in held if whole is not None}
+        # The counts in the metadata are of the whole recording. Those of triggers in the window are not known.
+        lost = ("triggers",) if about.get("triggers") and recording.encoder is None else ()
+        about = {name: value for name, value in about.items() if name not in RECORDS}
+        about |= {name: len(part) for name, _, part in held if part is not None}
     earlier = [str(about["filter"])] if "filter" in about else []
     start = 0
     kept_times: list[int] = []
@@ -443,10 +458,10 @@ def _write_kept(
             raise AmiwarpError(
                 f"{recording.name}: the filter keeps none of {len(source):,} events; choose less strict values"
             )
-        copy_records(recording, writer)
-        if recording.frames is not None:
-            for index, t in enumerate(recording.frames.t.tolist()):
-                writer.append_image(t, recording.frames[index])
+        copy_records(replace(recording, imu=imu), writer)
+        if frames is not None:
+            for t, image in zip(frames.t.tolist(), frames, strict=True):
+                writer.append_image(t, image)
         count = len(writer)
     return FilterSummary(
         events=len(source),
@@ -455,8 +470,27 @@ def _write_kept(
         hot_pixels=running.hot_counts(),
         duration_us=source.t_last - source.t_first,
         kept_us=kept_times[-1] - kept_times[0],
-        left_out=(),
+        left_out=lost,
+        removed_records=removed_records,
     )
+
+
+def _imu_within(imu: ImuSamples | None, window: tuple[int, int]) -> ImuSamples | None:
+    """Return the IMU samples within a time window [us], whose end is exclusive; None if there are none."""
+    if imu is None:
+        return None
+    start, stop = np.searchsorted(imu.t, window).tolist()
+    if start == stop:
+        return None
+    return ImuSamples(imu.t[start:stop], imu.angular_velocity[start:stop], imu.acceleration[start:stop])
+
+
+def _frames_within(frames: ImageStore | None, window: tuple[int, int]) -> StoredInstants[NDArray[Any]] | None:
+    """Return the frames within a time window [us], whose end is exclusive; None if there are none."""
+    if frames is None:
+        return None
+    start, stop = np.searchsorted(frames.t, window).tolist()
+    return frames[start:stop] if start < stop else None
 
 
 def _part(truth: EventTruth, kept: NDArray[np.bool_]) -> EventTruth:

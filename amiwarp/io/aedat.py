@@ -75,16 +75,29 @@ def _sample_columns(records: Records, steps_per_g: float, steps_per_deg_s: float
     """Yield time [us], angular velocity [rad/s] and acceleration [m/s^2] of the complete samples."""
     words, t = np.zeros(0, np.int64), np.zeros(0, np.int64)
     for block, times in records:
-        at = (block >> 31 == 1) & (block >> 10 & 3 == 3)
+        at = _are_imu(block)
         words, t = np.concatenate([words, block[at]]), np.concatenate([t, times[at]])
-        starts = _starts(words >> 28 & 7)
+        starts, rest = _complete_samples(words)
         values = (words[starts[:, None] + np.arange(RECORDS_OF_SAMPLE)] >> 12 & 0xFFFF).astype(np.uint16).view(np.int16)
         turning = np.radians(values[:, 4:] / steps_per_deg_s)
         pulling = values[:, :3] / steps_per_g * file_scan.GRAVITY
         yield t[starts], *turning.T, *pulling.T
-        # The records of the last sample may continue in the next block.
-        rest = max(0, len(words) - RECORDS_OF_SAMPLE + 1, int(starts[-1]) + RECORDS_OF_SAMPLE if len(starts) else 0)
         words, t = words[rest:], t[rest:]
+
+
+def _are_imu(words: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which addresses are records of IMU samples."""
+    return np.asarray((words >> 31 == 1) & (words >> 10 & 3 == 3))
+
+
+def _complete_samples(words: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+    """Return the indices at which complete samples begin among records of the IMU, and the index after them.
+
+    The records of the last sample may continue in the next block, so that those after this index are needed again.
+    """
+    starts = _starts(words >> 28 & 7)
+    end = int(starts[-1]) + RECORDS_OF_SAMPLE if len(starts) else 0
+    return starts, max(0, len(words) - RECORDS_OF_SAMPLE + 1, end)
 
 
 def _starts(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -248,7 +261,13 @@ def _records(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[N
 
 
 def _aedat2_packets(path: Path, chip: Chip, offset: int, notes: dict[str, int]) -> Iterator[Packet]:
+    of_imu = np.zeros(0, np.int64)
     for words, t in _records(path, offset, notes):
+        if chip.davis:
+            of_imu = np.concatenate([of_imu, words[_are_imu(words)]])
+            starts, rest = _complete_samples(of_imu)
+            notes["imu_samples"] = notes.get("imu_samples", 0) + len(starts)
+            of_imu = of_imu[rest:]
         yield _davis(words, t, chip, notes) if chip.davis else _dvs128(words, t, notes)
 
 
@@ -257,9 +276,7 @@ def _davis(words: NDArray[np.int64], t: NDArray[np.int64], chip: Chip, notes: di
     kind = words[other] >> 10 & 3
     # A frame has two samples of each pixel: the type is 0 for the reset level, 1 for the signal. One pixel is counted.
     frames = np.count_nonzero((kind == 1) & (words[other] >> 12 & 0x7FFFF == 0))
-    # An IMU sample has seven values. The first, of type 0, stands for all.
-    samples = np.count_nonzero((kind == 3) & (words[other] >> 28 & 7 == 0))
-    for name, count in (("frames", frames), ("imu_samples", samples), ("triggers", (external & ~other).sum())):
+    for name, count in (("frames", frames), ("triggers", (external & ~other).sum())):
         notes[name] = notes.get(name, 0) + int(count)
     at = ~other & ~external
     kept = words[at]

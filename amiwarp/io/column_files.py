@@ -28,6 +28,7 @@ from amiwarp.io.columns import (
     Hints,
     Layout,
     check_duration,
+    example_of_columns,
     find_layout,
     given_roles,
     is_wanted,
@@ -150,7 +151,7 @@ def _npz_table(path: Path, names: Sequence[str], given: GivenLayout) -> Table:
     wanted = () if given.columns is None else tuple(given_roles(given.columns).values())
     named = names_roles(names)
     if given.columns is None and set(ROLES) <= set(names):
-        return _own_table(opened)
+        return _own_table(opened, {"width", "height"} <= set(names))
     whole = [name for name in WHOLE_EVENTS if name in names] or (list(names) if len(names) == 1 else [])
     arrays_are_wanted = all(any(is_wanted(name, [each]) for name in names) for each in wanted)
     several_by_option = given.columns is not None and len(names) >= len(ROLES) and (arrays_are_wanted or not whole)
@@ -161,7 +162,7 @@ def _npz_table(path: Path, names: Sequence[str], given: GivenLayout) -> Table:
         listed = ", ".join(names)[:300] or "none"
         raise AmiwarpError(
             f"{path}: is a ZIP archive without x, y, t and p: no array {missing}; its arrays are {listed}; choose with "
-            "--columns, such as t=ts,x=xs,y=ys,p=ps"
+            f"--columns, such as {example_of_columns(names)}"
         )
     promised = Hints(order=ROLES, fractions="s") if whole[0] == "events" else Hints()
     return _array_table(partial(opened, whole[0]), f"array {whole[0]}", promised)
@@ -181,15 +182,15 @@ OpenedByName: TypeAlias = Callable[[str, contextlib.ExitStack], tuple[Array, boo
 """Function that opens an array of an archive, as :data:`Opened`."""
 
 
-def _own_table(opened: OpenedByName) -> Table:
-    """Return the arrays x, y, t, p, as amiwarp writes them: integer times are in us."""
+def _own_table(opened: OpenedByName, has_size: bool) -> Table:
+    """Return the arrays x, y, t, p, as amiwarp writes them, always with a size: integer times are in us."""
     table = _arrays_table("xytp", opened)
     types = {str(column.name): column.values.dtype for column in table.columns}
     if (types["x"].kind == "f") != (types["y"].kind == "f"):
         given = f"array x is {types['x']}, y is {types['y']}"
         raise AmiwarpError(f"{given}; expected integers, or floating numbers for compensated events")
     unit = "us" if types["t"].kind in "iub" else None
-    return replace(table, hints=Hints(unit=unit, compensated=True))
+    return replace(table, hints=Hints(unit=unit, compensated=True, is_own=has_size))
 
 
 def _arrays_table(names: Sequence[str], opened: OpenedByName) -> Table:

@@ -143,9 +143,87 @@ def role_of(name: str) -> tuple[str | None, str | None]:
     return (found, None) if found in ("x", "y") and suffix in ("px", "pixel", "pixels") else (None, None)
 
 
+RARE_NAMES = {
+    "x": ("u", "colindex", "colidx", "columnindex", "xaddr", "xaddress", "addrx", "addressx", "xpos",
+          "xposition", "posx", "positionx", "xcoord", "xcoords", "xcoordinate", "xcoordinates", "coordx",
+          "coordinatex", "xidx", "xindex", "xpx", "xpixel", "pixelx", "pxx", "xloc", "locx"),
+    "y": ("v", "rowindex", "rowidx", "yaddr", "yaddress", "addry", "addressy", "ypos", "yposition", "posy",
+          "positiony", "ycoord", "ycoords", "ycoordinate", "ycoordinates", "coordy", "coordinatey", "yidx",
+          "yindex", "ypx", "ypixel", "pixely", "pxy", "yloc", "locy"),
+    "p": ("onoff", "offon", "sign", "signs", "sgn", "polar", "positive", "ispositive", "isonevent",
+          "polaritybool", "polbool", "polaritybinary", "polaritysign", "polaritysigned", "polarityvalue",
+          "polarity01", "pol01", "polarityonoff", "onoffpolarity"),
+}  # fmt: skip
+"""Names that stand for a role where no column has one of :data:`NAMES`: in lower case, of letters and digits only."""
+
+_UNIT_PATTERN = "|".join(sorted((name for names in UNIT_NAMES.values() for name in names), key=len, reverse=True))
+RARE_TIME = re.compile(
+    r"(?P<stem>t|ts|times?|(?:time)?stamps?|timestamps?|tstamp|epochs?|unix|unixtime|unixtimestamp|utc|utctime|abstime|"
+    r"reltime|trel|elapsed|elapsedtime|timeelapsed|eventtimes?|datetimes?|dates?)?(?:in)?"
+    rf"(?P<unit>{_UNIT_PATTERN})?"
+)
+"""Pattern of such names of times, with or without a unit: a unit alone is the name of a time, too."""
+
+
+def _rare_role_of(name: str) -> tuple[str | None, str | None]:
+    """Return the role of a column with one of :data:`RARE_NAMES`, and the unit of time in it."""
+    plain = re.split(r"[/.]", name.lower())[-1]
+    plain = re.sub(r"^\W*(?:events?|evts?|ev|dvs)[_\s-]+", "", plain)
+    plain = re.sub(r"[\W_]+", "", plain)
+    for role, names in RARE_NAMES.items():
+        if plain in names:
+            return role, None
+    match = RARE_TIME.fullmatch(plain)
+    if match is None or plain in ("", "s", "in"):
+        return None, None
+    return "t", unit_of(match["unit"] or "")
+
+
+def unit_in(name: str) -> str | None:
+    """Return the unit of time in the name of a column, or None."""
+    role, unit = role_of(name)
+    return _rare_role_of(name)[1] if role is None else unit
+
+
+def roles_of(names: Sequence[str]) -> dict[str, list[int]]:
+    """Return for each role the indices of the columns that can have it by their names.
+
+    Columns with :data:`RARE_NAMES` count only for a role that no other column has, and for x and y only together: next
+    to x, v is a speed. But a time in whole seconds may have its fractions in another column.
+    """
+    common = [role_of(name) for name in names]
+    rare = [_rare_role_of(name) for name in names]
+    found = {role: [at for at, (known, _) in enumerate(common) if known == role] for role in ROLES}
+    others = {
+        role: [at for at, (known, _) in enumerate(rare) if known == role and common[at][0] is None] for role in ROLES
+    }
+    if [common[at][1] for at in found["t"]] == ["s"]:
+        found["t"] += [at for at in others["t"] if rare[at][1] not in (None, "s")]
+    found["t"] = found["t"] or others["t"]
+    found["p"] = found["p"] or others["p"]
+    if not found["x"] and not found["y"]:
+        found["x"], found["y"] = others["x"], others["y"]
+    return found
+
+
 def names_roles(names: Iterable[str]) -> bool:
     """Return whether a file's columns of these names hold events."""
-    return {role_of(name)[0] for name in names} >= set(ROLES)
+    return all(roles_of(list(names)).values())
+
+
+def example_of_columns(names: Iterable[str]) -> str:
+    """Return an example of the option ``--columns`` with names of this file, and NAME for what none is named as.
+
+    Of names with groups, those of the group with the most roles are taken.
+    """
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(name.rpartition("/")[0], []).append(name)
+    best: dict[str, str] = {}
+    for members in groups.values():
+        found = {role: members[places[0]] for role, places in roles_of(members).items() if places}
+        best = found if len(found) > len(best) else best
+    return ",".join(f"{role}={best.get(role, 'NAME')}" for role in ROLES)
 
 
 # The layout.
@@ -177,6 +255,8 @@ class Hints:
     """Whether x and y with fractions are those of compensated events."""
     is_text: bool = False
     """Whether the file is text, which OpenMV does not write."""
+    is_own: bool = False
+    """Whether the layout is amiwarp's own in all details, so that its promised unit is believed for any rate."""
 
 
 Coding: TypeAlias = Mapping[int, bool]
@@ -368,7 +448,12 @@ def _find_roles(columns: Sequence[Column], given: GivenLayout, hints: Hints) -> 
     if given.columns is not None:
         return _given_columns(columns, given.columns), []
     if any(column.name for column in columns):
-        return _named_columns(columns), []
+        roles = _named_columns(columns)
+        guessed = [
+            f"{role} = {columns[at].name}" for role, at in roles.items() if role_of(columns[at].name or "")[0] is None
+        ]
+        why = "no column has the usual name"
+        return roles, [Assumption("columns", ", ".join(guessed), why, "--columns")] if guessed else []
     if len(columns) != len(ROLES):
         raise AmiwarpError(
             f"has {len(columns)} columns without names; say which are which with --columns, such as t,x,y,p"
@@ -404,31 +489,24 @@ def _given_columns(columns: Sequence[Column], text: str) -> dict[str, int]:
 def _named_columns(columns: Sequence[Column]) -> dict[str, int]:
     """Return the columns with the names of the roles."""
     names = [column.name or "" for column in columns]
-    found: dict[str, list[int]] = {role: [] for role in ROLES}
-    for at, name in enumerate(names):
-        role = role_of(name)[0]
-        if role is not None:
-            found[role].append(at)
+    found = roles_of(names)
     listed = ", ".join(name for name in names if name)[:300]
     for role, places in found.items():
         if len(places) > 1:
             several = " and ".join(names[place] for place in places)
+            units = {unit_in(names[place]) for place in places}
+            parts = "; if they are parts of one time, join them in one column first" if len(units) > 1 else ""
             raise AmiwarpError(
-                f"columns {several} can both be {role}; choose with --columns, such as {_example(names)}"
+                f"columns {several} can {'both' if len(places) == 2 else 'all'} be {role}; choose with --columns, such "
+                f"as {example_of_columns(names)}{parts}"
             )
     missing = [role for role, at in found.items() if not at]
     if missing:
         raise AmiwarpError(
             f"no column is named as {', '.join(missing)}; the columns are {listed}; choose with --columns, such as "
-            f"{_example(names)}"
+            f"{example_of_columns(names)}"
         )
     return {role: at[0] for role, at in found.items()}
-
-
-def _example(names: Sequence[str]) -> str:
-    """Return an example of the option ``--columns`` with names of this file."""
-    shown = [name for name in names if name] + ["…"] * len(ROLES)
-    return ",".join(f"{role}={name}" for role, name in zip(ROLES, shown, strict=False))
 
 
 @dataclass(frozen=True, slots=True)
@@ -538,19 +616,22 @@ EPOCH_NS, EPOCH_US = (10**17, 4 * 10**18), (10**14, 4 * 10**15)
 """Ranges of times since 1970, from 1973 to 2096 [ns, us]."""
 EPOCH_MS = 10**12, 4 * 10**12
 """Range of times since 1970, from 2001 to 2096 [ms]. As microseconds they are weeks after the start of a camera."""
+EPOCH_S = 10**9, 4 * 10**9
+"""Range of times since 1970, from 2001 to 2096 [s]. As microseconds they are half an hour after the start."""
+MOST_PER_STEP = 20
+"""Number of events per step of time from which on times in :data:`EPOCH_S` may be whole seconds."""
 
 
 def _find_unit(column: Column, given: GivenLayout, hints: Hints) -> tuple[str, str | None]:
     """Return the unit of time, and why it was assumed; None if the file states it."""
     if given.time_unit is not None:
         return given.time_unit, None
-    named = role_of(column.name)[1] if column.name else None
+    named = unit_in(column.name) if column.name else None
     stated = column.unit or named
     if stated is not None:
         return stated, None
     if hints.unit is not None:
-        _check_promised_unit(column.values, hints.unit)
-        return hints.unit, None
+        return _promised_unit(column.values, hints)
     t = column.values
     known = t[np.isfinite(t) & (np.abs(t) < TIME_LIMIT)] if t.dtype.kind == "f" else t
     if not known.size:
@@ -560,14 +641,57 @@ def _find_unit(column: Column, given: GivenLayout, hints: Hints) -> tuple[str, s
     return _unit_of_whole(known)
 
 
-def _check_promised_unit(t: NDArray[Any], unit: str) -> None:
-    """Raise :class:`AmiwarpError` if times that a format promises in us or s are those of nanoseconds since 1970."""
-    whole = t.dtype.kind in "iu" and t.size > 0
-    if whole and unit != "ns" and EPOCH_NS[0] <= int(t.min()) and int(t.max()) <= EPOCH_NS[1]:
+def _promised_unit(t: NDArray[Any], hints: Hints) -> tuple[str, str | None]:
+    """Return the unit of times that a format promises, and why it is another one; None if it is the promised one.
+
+    Raises :class:`AmiwarpError` if whole numbers can be no microseconds.
+    """
+    assert hints.unit is not None
+    if hints.unit != "us" or t.dtype.kind not in "iu" or not t.size:
+        return hints.unit, None
+    if _is_within(t, EPOCH_NS):
+        return "ns", "times are whole numbers, as those in nanoseconds since 1970, but this layout has us"
+    if not hints.is_own:
+        _check_whole(t)
+    return hints.unit, None
+
+
+def are_microseconds(t: NDArray[Any]) -> bool:
+    """Return whether times that a documented layout promises in microseconds can be such."""
+    try:
+        return _promised_unit(t, Hints(unit="us")) == ("us", None)
+    except AmiwarpError:
+        return False
+
+
+def _is_within(t: NDArray[Any], limits: tuple[int, int]) -> bool:
+    """Return whether all times lie within limits."""
+    return limits[0] <= int(t.min()) and int(t.max()) <= limits[1]
+
+
+def _check_whole(t: NDArray[Any]) -> None:
+    """Raise :class:`AmiwarpError` if times that are whole numbers are likely no microseconds."""
+    low, high = int(t.min()), int(t.max())
+    if _is_within(t, EPOCH_MS):
         raise AmiwarpError(
-            f"times from {int(t.min())} are those of nanoseconds since 1970, but this layout has {unit}; give the unit "
-            "with --time-unit ns, or us if that is right"
+            f"the unit of time is in doubt: times from {low} may be milliseconds since 1970, or microseconds; give it "
+            "with --time-unit ms or us"
         )
+    if _is_within(t, EPOCH_S) and t.size > MOST_PER_STEP * max(high - low, 1):
+        raise AmiwarpError(
+            f"the unit of time is in doubt: times from {low} may be seconds since 1970, or microseconds; give it with "
+            "--time-unit s or us"
+        )
+    if t.size > MOST_PER_US * max(high - low, 1) + 1000:
+        raise AmiwarpError(_whole_doubt(t))
+
+
+def _whole_doubt(t: NDArray[Any]) -> str:
+    """Return the message for times that are whole numbers in an unknown unit."""
+    return (
+        f"the unit of time is in doubt: times are whole numbers, and the first {t.size:,} events span "
+        f"{int(t.max()) - int(t.min()):,}; give it with --time-unit s, ms, us or ns"
+    )
 
 
 def _unit_of_fractions(t: NDArray[Any], hints: Hints) -> tuple[str, str | None]:
@@ -585,21 +709,13 @@ def _unit_of_fractions(t: NDArray[Any], hints: Hints) -> tuple[str, str | None]:
 
 def _unit_of_whole(t: NDArray[Any]) -> tuple[str, str]:
     """Return the unit of times that are whole numbers, and why."""
-    low, high = int(t.min()), int(t.max())
-    if EPOCH_MS[0] <= low and high <= EPOCH_MS[1]:
-        raise AmiwarpError(
-            f"the unit of time is in doubt: times from {low} may be milliseconds since 1970, or microseconds; give it "
-            "with --time-unit ms or us"
-        )
-    for unit, (first, last) in (("ns", EPOCH_NS), ("us", EPOCH_US)):
-        if first <= low and high <= last:
+    for unit, limits in (("ns", EPOCH_NS), ("us", EPOCH_US)):
+        if _is_within(t, limits):
             return unit, "times are whole numbers, as those since 1970"
-    span = high - low
-    if span > LONGEST_S * 10**6 or t.size > MOST_PER_US * max(span, 1) + 1000:
-        raise AmiwarpError(
-            f"the unit of time is in doubt: times are whole numbers, and the first {t.size:,} events span {span:,}; "
-            "give it with --time-unit s, ms, us or ns"
-        )
+    _check_whole(t)
+    span = int(t.max()) - int(t.min())
+    if span > LONGEST_S * 10**6:
+        raise AmiwarpError(_whole_doubt(t))
     return "us", f"times are whole numbers, and the first {t.size:,} events span {span * 1e-6:.3g} s then"
 
 

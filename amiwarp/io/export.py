@@ -69,12 +69,12 @@ def export(
     with contextlib.ExitStack() as files:  # both files appear at the end, or neither
         new = files.enter_context(NewFile(path, overwrite=overwrite))
         beside = None
-        if chosen is OutputFormat.TEXT:
+        if limits.text_unit is not None:
             beside = files.enter_context(NewFile(size_file(path), overwrite=overwrite))
         try:
             write(new.part, written, outline)
-            if beside is not None:
-                write_size(beside.part, new.part, outline)
+            if beside is not None and limits.text_unit is not None:
+                write_size(beside.part, new.part, outline, limits.text_unit)
         except BaseException as error:
             if error in foreign:
                 raise
@@ -258,7 +258,7 @@ def convert(
     text and csv hold the coordinates to 1e-6 px, and formats of whole pixels need ``rounding``. In a ROS 2 bag the
     times begin at 0 if the last is later than 28 h, as are times since 1970: only the stamps of its messages hold
     those. From a bag to a bag of the same version of ROS, the messages of all other topics are copied. The sensor size
-    of text is in a second file, ``OUT.txt.json``.
+    of text and csv is in a second file, such as ``OUT.txt.json``.
 
     Parameters
     ----------
@@ -398,7 +398,8 @@ def left_out(recording: Recording, chosen: OutputFormat) -> tuple[str, ...]:
     """Return what a recording has in addition to its events and a format does not hold."""
     if chosen is OutputFormat.NATIVE:
         return ("triggers",) if recording.metadata.get("triggers") and recording.encoder is None else ()
-    known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {}), "other_topics", "columns", "time_unit"}
+    known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {}), "other_topics", "columns"}
+    known |= {"time_unit", "time_zone"}
     known |= {name for name in recording.metadata if name.startswith(ASSUMED)}
     from_bag = str(recording.metadata.get("format")).startswith("rosbag")
     copied = bag_of(recording, chosen) is not None

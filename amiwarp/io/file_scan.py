@@ -6,6 +6,8 @@ it is moved to the largest time so far. An event outside the frame is dropped, u
 but steps back of at most a millisecond are always repaired.
 """
 
+from __future__ import annotations
+
 import contextlib
 import threading
 import time
@@ -28,13 +30,15 @@ from amiwarp.events.recording import (
     MetadataValue,
     as_coordinate,
     as_polarity,
+    check_slice,
+    check_window,
     regroup,
 )
 from amiwarp.events.truth import Instants
 from amiwarp.io.files import errors_name, open_input, register_reader
 from amiwarp.io.reading_process import packets
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
-from amiwarp.validation import rounded_times
+from amiwarp.validation import guarded, rounded_times
 
 Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
@@ -235,6 +239,7 @@ class PassCounts:
         return f"after {self.count} events (t = {self.t_last} us)" if self.count else "before the first event"
 
 
+@guarded
 class FileEvents(EventSource):
     """Events of a file that can be read only from its start. The constructor makes the first pass over the file.
 
@@ -364,6 +369,7 @@ class FileEvents(EventSource):
 
     def slice(self, start: int, stop: int) -> Events:
         """Return the events with ``start <= index < stop``."""
+        check_slice(start, stop)
         found: list[Events] = []
         seen = 0
         for block in self._all():
@@ -384,6 +390,7 @@ class FileEvents(EventSource):
 
     def between(self, t_start: int, t_end: int) -> Events:
         """Return the events with ``t_start <= t < t_end`` [us]."""
+        check_window(t_start, t_end)
         found: list[Events] = []
         for block in self._all():
             if block.t[0] >= t_end:

@@ -25,6 +25,7 @@ from amiwarp.io.file_scan import GivenSource, given_source
 from amiwarp.io.files import check_regular, errors_name, name_kind, note_folders, open_input
 from amiwarp.io.json_files import read_json
 from amiwarp.io.ros_bags import MCAP, ROS1, SQLITE, ZSTANDARD, packed_head
+from amiwarp.io.text_rows import HEAD_BYTES, looks_like_text, why_no_rows
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import choice, guarded, instance, shown, whole
 
@@ -169,14 +170,11 @@ def detect_format(path: Path) -> Format:
         return Format.DAT
     if head.startswith(ZSTANDARD) and packed_head(path).startswith((ROS1, SQLITE, MCAP)):
         return Format.ROSBAG
-    if kind := name_kind(head):
+    if kind := name_kind(head) or why_no_rows(head):
         raise AmiwarpError(f"{path}: {kind}")
     known = ", ".join(member.value for member in Format)
     raise AmiwarpError(f"{path}: content is of no known format; expected one of {known}")
 
-
-HEAD_BYTES = 4096
-"""Number of bytes from which a format is detected."""
 
 BIN_EVENT_BYTES = 5
 """Size of an event in the ``.bin`` files of N-MNIST [bytes]."""
@@ -208,89 +206,6 @@ def _is_evt(head: bytes) -> bool:
     """Return whether the first bytes of a Prophesee file are the header of a RAW (EVT) file."""
     lines = head.split(b"\n")
     return any(line.startswith((b"% evt ", b"% format EVT")) for line in lines)
-
-
-def holds_values(line: bytes) -> bool:
-    """Return whether a line of a text file is neither empty nor a comment."""
-    return line.lstrip()[:1] not in (b"", b"#", b"%")
-
-
-WORDS = {b"true": b"1", b"on": b"1", b"positive": b"1", b"false": b"0", b"off": b"0", b"negative": b"0"}
-"""Words for polarities in text, in lower case."""
-
-WORD_PATTERN = re.compile(rb"\b(?:" + b"|".join(WORDS) + rb")\b", re.I)
-"""Pattern of these words."""
-
-
-@dataclass(frozen=True, slots=True)
-class TextRow:
-    """Form of the lines of a text file."""
-
-    separator: bytes
-    """Character between two columns; a space stands for any number of spaces and tabs."""
-    decimal_comma: bool = False
-    """Whether numbers have commas in place of decimal points."""
-    has_words: bool = False
-    """Whether the polarity is a word."""
-    quoted: bool = False
-    """Whether values are in quotation marks."""
-
-    @classmethod
-    def of(cls, line: bytes) -> TextRow:
-        """Return the form of a line."""
-        separator = next((mark for mark in (b";", b",", b"\t") if mark in line), b" ")
-        separator = b" " if separator == b"\t" else separator
-        # With semicolons, commas can only be decimal ones, also if the first numbers have none.
-        return cls(separator, separator == b";", WORD_PATTERN.search(line) is not None, b'"' in line or b"'" in line)
-
-    def plain(self, text: bytes) -> bytes:
-        """Return text with numbers between spaces."""
-        if self.quoted:
-            text = text.replace(b'"', b"").replace(b"'", b"")
-        if self.separator != b" ":
-            text = text.replace(self.separator, b" ")
-        if self.decimal_comma:
-            text = text.replace(b",", b".")
-        if self.has_words:
-            text = WORD_PATTERN.sub(lambda match: WORDS[match[0].lower()], text)
-        return text
-
-    def words(self, line: bytes) -> list[bytes]:
-        """Return the values of a line."""
-        return self.plain(line.removeprefix(BOM)).split()
-
-    def names(self, line: bytes) -> tuple[str, ...]:
-        """Return the names of columns in a line; empty ones are those without a name."""
-        text = line.removeprefix(BOM).decode("utf-8", "replace").strip("\r\n")
-        if self.separator == b" ":
-            found = text.split("\t") if "\t" in text else text.split()
-        else:
-            found = text.split(self.separator.decode())
-        return tuple(name.strip().strip("\"'") for name in found)
-
-    def is_row(self, line: bytes) -> bool:
-        """Return whether a line consists of numbers."""
-        try:
-            return len([float(word) for word in self.words(line)]) > 0
-        except ValueError:
-            return False
-
-
-BOM = b"\xef\xbb\xbf"
-"""Mark at the beginning of some files in UTF-8."""
-
-
-def looks_like_text(head: bytes) -> bool:
-    """Return whether a file begins with rows of at least three numbers, or a line of names or a size before them."""
-    lines = list(filter(holds_values, head.removeprefix(BOM).splitlines()))[:3]
-    if not lines:  # a long comment
-        return len(head) >= HEAD_BYTES and head.startswith(b"#") and b"\0" not in head
-    first = TextRow.of(lines[0])
-    count = len(first.words(lines[0]))
-    if first.is_row(lines[0]):
-        return count >= 2
-    following = [line for line in lines[1:] if TextRow.of(line).is_row(line)]
-    return bool(following) and b"\0" not in head and all(len(TextRow.of(line).words(line)) >= 3 for line in following)
 
 
 @guarded
@@ -514,6 +429,8 @@ class Limits:
     """Longest time between the first and the last event [us]."""
     fractional: bool = False
     """Whether it holds the sub-pixel coordinates of compensated events."""
+    text_unit: str | None = None
+    """Unit of time in text, which is written beside it with the sensor size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -565,9 +482,9 @@ LIMITS = {
     OutputFormat.AEDAT4: Limits("AEDAT 4", side=2**15, t_first=0),
     OutputFormat.NPZ: Limits("npz", fractional=True),
     # Readers take the seconds as float64, which is exact to the microsecond up to these times, 71 years.
-    OutputFormat.TEXT: Limits("text", t_first=-(2**51), t_last=2**51, fractional=True),
+    OutputFormat.TEXT: Limits("text", t_first=-(2**51), t_last=2**51, fractional=True, text_unit="s"),
     # Readers may take the microseconds as float64, too.
-    OutputFormat.CSV: Limits("csv", t_first=-(2**53), t_last=2**53, fractional=True),
+    OutputFormat.CSV: Limits("csv", t_first=-(2**53), t_last=2**53, fractional=True, text_unit="us"),
     # A time in ROS has 32 bits for the seconds: without a sign in ROS 1, with a sign in ROS 2.
     OutputFormat.ROS1: Limits("a ROS 1 bag", t_first=0, t_last=2**32 * 10**6 - 1),
     OutputFormat.ROS2: Limits("a ROS 2 bag", side=2048, t_first=0, t_last=2**31 * 10**6 - 1, span=LONGEST_US),

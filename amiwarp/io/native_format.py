@@ -37,7 +37,7 @@ from amiwarp.events.truth import (
     check_truth,
 )
 from amiwarp.io import column_files, hdf5_files
-from amiwarp.io.columns import GivenLayout, is_plain_polarity
+from amiwarp.io.columns import SAMPLE, GivenLayout, are_microseconds, is_plain_polarity
 from amiwarp.io.file_scan import ASSUMED_SIZE, assumed_size, given_size, head_limit, smallest_sensor
 from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place, register_reader
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
@@ -180,7 +180,7 @@ def open_hdf5(path: Path, topic: str | None, given: GivenLayout) -> Recording:
             ours = file.attributes.get("/", {}).get("format") == FORMAT
             if ours and given != GivenLayout():
                 raise AmiwarpError(f"{path}: is amiwarp's own format, whose layout is fixed; leave out {given.options}")
-            if file.layout == "columns" or given != GivenLayout() or _has_other_polarity(file):
+            if file.layout == "columns" or given != GivenLayout() or _has_other_values(file):
                 file.close()
                 return column_files.open_hdf5_columns(path, given)
             if file.layout in ("mvsec", "ecf"):
@@ -194,12 +194,20 @@ def open_hdf5(path: Path, topic: str | None, given: GivenLayout) -> Recording:
             raise
 
 
-def _has_other_polarity(file: Hdf5File) -> bool:
-    """Return whether the first polarities of a file of another program are not 1 for ON, 0 or -1 for OFF."""
-    column = file.columns.get("events/p")
-    if column is None or file.attributes.get("/", {}).get("format") == FORMAT or file.unfinished:
+def _has_other_values(file: Hdf5File) -> bool:
+    """Return whether a file of another program has other polarities or another unit of time than the native layout.
+
+    The first polarities are then not 1 for ON, 0 or -1 for OFF, or the first times can be no microseconds. With an
+    index of the milliseconds, as in DSEC's files, the unit is known.
+    """
+    if file.attributes.get("/", {}).get("format") == FORMAT or file.unfinished:
         return False
-    return not is_plain_polarity(column.read(0, min(len(column), CHUNK)))
+    p, t = file.columns.get("events/p"), file.columns.get("events/t")
+    if p is not None and not is_plain_polarity(p.read(0, min(len(p), CHUNK))):
+        return True
+    if t is None or "ms_to_idx" in file.columns or file.layout != "native":
+        return False
+    return not are_microseconds(t.read(0, min(len(t), SAMPLE)))
 
 
 def _read_recording(path: Path, file: Hdf5File) -> Recording:
@@ -288,6 +296,7 @@ DSEC_SIZE = (640, 480)
 """Size of DSEC's sensors [px], which its files do not store."""
 
 
+@guarded
 class NativeEvents(EventSource):
     """Events of an HDF5 recording, read on demand. Raises :class:`AmiwarpError` for a damaged file."""
 
@@ -362,7 +371,8 @@ class NativeEvents(EventSource):
 
     def slice(self, start: int, stop: int) -> Events:
         """Return the events with ``start <= index < stop``, and check them. Threads may call it in parallel."""
-        start, stop = max(start, 0), min(max(stop, start, 0), self._count)
+        checks.check_slice(start, stop)
+        stop = min(max(stop, start), self._count)
         with errors_name(self.path, lambda: f"events {start} .. {stop}"):
             x, y, p = (self._read(name, start, stop) for name in ("x", "y", "p"))
             t = self._read("t", start, stop)
@@ -404,6 +414,7 @@ class NativeEvents(EventSource):
 
     def between(self, t_start: int, t_end: int) -> Events:
         """Return the events with ``t_start <= t < t_end`` [us], found with the file's millisecond index."""
+        checks.check_window(t_start, t_end)
         with errors_name(self.path, lambda: f"events between {t_start} and {t_end} us"):
             return self.slice(self.find(t_start), self.find(t_end))
 

@@ -31,7 +31,7 @@ from amiwarp.io.formats import (
 from amiwarp.io.json_files import read_json
 from amiwarp.optics.camera import LARGEST_SIZE, Camera, RadialTangential
 from amiwarp.tasks import in_order
-from amiwarp.validation import whole
+from amiwarp.validation import one_of, whole
 
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
@@ -52,9 +52,8 @@ def read_calib(path: Path, width: int, height: int) -> Camera:
 #
 # x and y of compensated events have six decimals; ``nan`` marks those without coordinates.
 #
-# Both keep the sensor size where it disturbs no other reader. A table has it as a fifth name without values, which
-# pandas and others read as an empty column. The Event Camera Dataset has no place for it, and its readers take a
-# further line for an event. So the size is in a file of its own, with the number of bytes of the text it belongs to.
+# Other readers take a further line or column for events. So the sensor size and the unit of time are in a file beside
+# the text, with the number of bytes of the text that they belong to.
 
 LINES = 1 << 17
 """Number of events that are formatted at a time."""
@@ -73,10 +72,9 @@ def write_text(part: Path, blocks: Iterable[Events], about: Outline) -> None:
 
 
 def write_csv(part: Path, blocks: Iterable[Events], about: Outline) -> None:
-    """Write all events as a table between commas, with the sensor size among the names of the columns."""
-    names = f"t,x,y,p,geometry {about.width}x{about.height} (t in us)\n"
+    """Write all events as a table between commas. :func:`write_size` writes the sensor size."""
     with part.open("xb") as file:
-        file.write(names.encode())
+        file.write(b"t,x,y,p\n")
         _write_lines(file, blocks, format_rows)
 
 
@@ -131,18 +129,18 @@ def _fractional(values: NDArray[Any]) -> list[Digits]:
 
 
 def size_file(path: Path) -> Path:
-    """Return the file with the sensor size of a text file of the Event Camera Dataset's format."""
+    """Return the file with the sensor size of a text file."""
     return path.with_name(f"{path.name}.json")
 
 
-def write_size(part: Path, text: Path, about: Outline) -> None:
-    """Write the sensor size of the finished file ``text``."""
-    fields = {"width": about.width, "height": about.height, "bytes": text.stat().st_size}
+def write_size(part: Path, text: Path, about: Outline, unit: str) -> None:
+    """Write the sensor size and the unit of time of the finished file ``text``."""
+    fields = {"width": about.width, "height": about.height, "time_unit": unit, "bytes": text.stat().st_size}
     part.write_text(json.dumps(fields) + "\n", encoding="ascii", newline="\n")
 
 
-def read_size(path: Path) -> tuple[int, int] | None:
-    """Return the sensor size that :func:`write_size` wrote for a text file [px].
+def read_size(path: Path) -> tuple[tuple[int, int], str] | None:
+    """Return the sensor size [px] and the unit of time that :func:`write_size` wrote for a text file.
 
     None if there is no such file, or if it is about another text than this one.
     """
@@ -153,7 +151,7 @@ def read_size(path: Path) -> tuple[int, int] | None:
     if fields.get("bytes") != path.stat().st_size:
         return None
     width, height = (whole(fields.get(name), f"{beside}: {name}", 1, LARGEST_SIZE) for name in ("width", "height"))
-    return width, height
+    return (width, height), one_of(fields.get("time_unit"), ("s", "us"), f"{beside}: time_unit")
 
 
 def _mark(character: str, count: int) -> Digits:

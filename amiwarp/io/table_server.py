@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.columns import ROLES, SAMPLE, given_roles, is_wanted, names_roles, role_of, unit_of
+from amiwarp.io.columns import ROLES, SAMPLE, example_of_columns, given_roles, is_wanted, names_roles, roles_of, unit_of
 from amiwarp.io.reading_process import Reply
 
 PIECE = 1 << 17
@@ -83,19 +83,13 @@ def sources_of(arrays: Mapping[str, Any], columns: str | None) -> list[Source]:
             listed = ", ".join(name or "the root" for name in list(kinds)[:20])
             raise AmiwarpError(
                 f"holds several sets of columns with events: {listed}; choose with --columns, such as "
-                f"{_example(next(iter(kinds)), found)}"
+                + example_of_columns(str(source.name) for source in found.get(next(iter(kinds)), []))
             )
     listed = ", ".join(list(arrays)[:20]) or "none"
     raise AmiwarpError(
         f"no arrays are named as t, x, y and p; its arrays are {listed}; choose with --columns, such as "
-        "t=ts,x=xs,y=ys,p=ps"
+        + example_of_columns(arrays)
     )
-
-
-def _example(group: str, found: Mapping[str, list[Source]]) -> str:
-    """Return an example of the option ``--columns`` for a group of columns."""
-    roles = {role_of(str(source.name))[0]: source.name for source in found.get(group, [])}
-    return ",".join(f"{role}={roles.get(role, 'NAME')}" for role in ROLES)
 
 
 def _vectors(name: str, array: Any) -> list[Source]:
@@ -137,7 +131,8 @@ def head_of(path: str, kind: str, columns: str | None) -> Reply:
 
 def _check_alike(sources: list[Source]) -> None:
     """Raise :class:`AmiwarpError` if columns that are named as events differ in length."""
-    counts = {source.name: source.count for source in sources if source.name is None or role_of(source.name)[0]}
+    named = {at for places in roles_of([source.name or "" for source in sources]).values() for at in places}
+    counts = {source.name: source.count for at, source in enumerate(sources) if source.name is None or at in named}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise AmiwarpError(f"columns of events differ in length: {listed}; the file is incomplete")

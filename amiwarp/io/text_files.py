@@ -39,11 +39,21 @@ from amiwarp.io.columns import (
     Layout,
     find_layout,
     names_roles,
+    roles_of,
 )
 from amiwarp.io.file_scan import FileEvents, Packet
-from amiwarp.io.files import LONGEST_LINE, errors_name, open_input
-from amiwarp.io.formats import BOM, TextRow, holds_values
+from amiwarp.io.files import LONGEST_LINE, errors_name
 from amiwarp.io.plain_files import read_calib, read_size
+from amiwarp.io.text_rows import (
+    BOM,
+    TextRow,
+    doubtful_comma,
+    holds_values,
+    text_head,
+    text_pieces,
+    text_tail,
+    why_no_rows,
+)
 from amiwarp.optics.camera import LARGEST_SIZE
 
 READ_BYTES = 1 << 22
@@ -57,9 +67,6 @@ SECONDS = re.compile(rb"-?\d+\.\d{6,}")
 
 SIZE = re.compile(r"geometry\W{1,3}(\d+)\s*[,x ]\s*(\d+)|width\W{1,3}(\d+).*?height\W{1,3}(\d+)", re.I | re.S)
 """Pattern of the sensor size in comments."""
-
-NOTE = re.compile(r"geometry (\d{1,5})x(\d{1,5}) \(t in us\)")
-"""Pattern of the last name in the tables that amiwarp writes, below which there is no column."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,20 +85,22 @@ class TextForm:
     """Names of the columns, or None."""
     size: tuple[int, int] | None
     """Sensor size that the file states [px], or None."""
+    stamped: tuple[int, ...]
+    """Indices of the columns that are dates with times of day."""
     unit: str | None = None
     """Unit of time in the text that amiwarp writes, or None."""
 
 
 def open_text(path: Path, given: GivenLayout) -> Recording:
     """Open a text recording, with the camera of ``calib.txt`` in the same folder if that file exists."""
-    with errors_name(path, lambda: "line 1"), open_input(path) as file:
-        head = file.read(max(HEAD_BYTES, 2 * LONGEST_LINE))
+    with errors_name(path, lambda: "line 1"):
+        head, is_cut = text_head(path, max(HEAD_BYTES, 2 * LONGEST_LINE))
         form = _find_form(path, head)
     beside = read_size(path)
-    if beside is not None:  # amiwarp has written the text, with seconds
-        form = replace(form, size=beside, unit="s")
+    if beside is not None:  # amiwarp has written the text
+        form = replace(form, size=beside[0], unit=beside[1])
     with errors_name(path, lambda: "finding the columns"):
-        layout = _find_text_layout(head, form, given)
+        layout = _find_text_layout(head, is_cut, form, given)
     events = FileEvents(
         path,
         partial(_text_packets, path, form, layout),
@@ -102,10 +111,15 @@ def open_text(path: Path, given: GivenLayout) -> Recording:
     calib = path.with_name("calib.txt")
     camera = read_calib(calib, *events.size) if calib.exists() and calib != path else None
     metadata = {"format": "text", **layout.metadata, **events.metadata}
+    if form.row.has_stamps:
+        metadata["time_zone"] = "UTC, unless a time states another zone"
     return Recording(events=events, camera=camera, metadata=metadata, name=path.stem)
 
 
 # The form of a file, from its first lines.
+
+ROWS_OF_FORM = 100
+"""Number of rows from which the form of a file is found: a first number may be whole where others have a comma."""
 
 
 def _find_form(path: Path, head: bytes) -> TextForm:
@@ -113,7 +127,6 @@ def _find_form(path: Path, head: bytes) -> TextForm:
     comments: list[str] = []
     names: tuple[str, ...] | None = None
     size: tuple[int, int] | None = None
-    unit: str | None = None
     position, number = len(BOM) * head.startswith(BOM), 0
     for line in io.BytesIO(head[position:]):  # which only a newline ends, as in the reader of all lines
         if b"\r" in line.rstrip(b"\r\n"):
@@ -132,30 +145,55 @@ def _find_form(path: Path, head: bytes) -> TextForm:
                 raise AmiwarpError(
                     f"{path}: line {number + 1} '{shown}' is not a size in pixels; expected 'width height' or 't x y p'"
                 )
-            row = TextRow.of(line)
-            return TextForm(position, number, row, len(words), names or _commented(comments, row, len(words)),
-                            size or _commented_size(comments), unit)  # fmt: skip
+            row = _form_of_rows(path, number + 1, head[position:].split(b"\n", ROWS_OF_FORM)[:ROWS_OF_FORM])
+            width = len(row.words(line))
+            return TextForm(
+                start=position,
+                lines=number,
+                row=row,
+                width=width,
+                names=_without_empty_end(names, width) or _commented(comments, row, width),
+                size=size or _commented_size(comments),
+                stamped=row.stamped(line),
+            )
         elif names is None:
             names = TextRow.of(line).names(line)
-            note = NOTE.fullmatch(names[-1])
-            if note is not None:
-                names = names[:-1]
-                size = int(note[1]), int(note[2])
-                unit = "us"
         else:
             break
         position, number = position + len(line), number + 1
-    raise AmiwarpError(
-        f"{path}: line {number + 1} holds no numbers; expected 't x y p', or names of columns before them"
+    why = (
+        why_no_rows(head) or f"line {number + 1} holds no numbers; expected 't x y p', or names of columns before them"
     )
+    raise AmiwarpError(f"{path}: {why}")
+
+
+def _form_of_rows(path: Path, number: int, lines: Sequence[bytes]) -> TextRow:
+    """Return the form of the first rows of a file. ``number`` is the line number of the first one."""
+    comma = doubtful_comma(filter(holds_values, lines))
+    if comma is not None:
+        raise AmiwarpError(
+            f"{path}: line {number} or one after it holds '{comma.decode('ascii', 'replace')}', whose comma can be a "
+            "decimal one or separate thousands; write numbers with decimal points and without thousands separators"
+        )
+    first = TextRow.of(lines[0])
+    forms = (TextRow.of(line) for line in lines if holds_values(line))
+    return next((form for form in forms if form.separator == first.separator and form.decimal_comma), first)
+
+
+def _without_empty_end(names: tuple[str, ...] | None, width: int) -> tuple[str, ...] | None:
+    """Return the names of columns without empty ones beyond the ``width`` of the rows, which a last separator makes."""
+    if names is None or any(names[width:]):
+        return names
+    return names[:width]
 
 
 def _commented(comments: Sequence[str], row: TextRow, width: int) -> tuple[str, ...] | None:
-    """Return the names of columns in the last comment before the values, or None."""
-    last = next((comment for comment in reversed(comments) if comment), "")
-    for names in (row.names(last.encode()), tuple(last.split())):
-        if len(names) == width and names_roles(names):
-            return names
+    """Return the names of columns in the last comment before the values that holds them, or None."""
+    for comment in reversed(comments):
+        for text in (comment, comment.rpartition(":")[2]):
+            for names in (row.names(text.encode()), tuple(re.split(r"[\s,;]+", text.strip()))):
+                if len(names) == width and names_roles(names):
+                    return names
     return None
 
 
@@ -167,17 +205,11 @@ def _commented_size(comments: Sequence[str]) -> tuple[int, int] | None:
     return int(match[1] or match[3]), int(match[2] or match[4])
 
 
-def _find_text_layout(head: bytes, form: TextForm, given: GivenLayout) -> Layout:
-    """Return the layout of the columns of a file that begins with ``head``."""
-    if form.names is not None and len(form.names) != form.width and given.columns is None:
-        raise AmiwarpError(
-            f"names {len(form.names)} columns ({', '.join(form.names)[:200]}), and its rows have {form.width}; give "
-            "the order with --columns, such as t,x,y,p"
-        )
+def _find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLayout) -> Layout:
+    """Return the layout of the columns of a file that begins with ``head``, whose last line may go on."""
     rows: list[list[bytes]] = []
     values: list[list[float]] = []
     lines = head[form.start :].split(b"\n")
-    is_cut = len(head) >= HEAD_BYTES  # the last line may go on
     for line in lines[:-1] if is_cut else lines:
         words = form.row.words(line) if holds_values(line) else []
         if len(words) == form.width:
@@ -185,14 +217,24 @@ def _find_text_layout(head: bytes, form: TextForm, given: GivenLayout) -> Layout
                 values.append([float(word) for word in words])
                 rows.append(words)
     numbers = np.array(values).reshape(-1, form.width)
+    if form.names is not None and len(form.names) != form.width and given.columns is None:
+        raise AmiwarpError(
+            f"names {len(form.names)} columns ({', '.join(form.names)[:200]}), and its rows have {form.width}; give "
+            f"the order with --columns, such as {_order_for(form.names, numbers)}"
+        )
     names = form.names if form.names is not None and len(form.names) == form.width else None
-    columns = [Column(names[at] if names else None, _whole_if_possible(values)) for at, values in enumerate(numbers.T)]
+    columns = [
+        Column(names[at] if names else None, _whole_if_possible(values), "us" if at in form.stamped else None)
+        for at, values in enumerate(numbers.T)
+    ]
     if names is not None and not any(names):
         columns = [replace(column, name=None) for column in columns]
     hints = Hints(is_text=True, unit=form.unit)
     if names is None:
         hints = replace(hints, order=ROLES, fractions="s")
     layout = find_layout(columns, given, hints)
+    if layout.columns["t"] in form.stamped and given.time_unit is not None:
+        raise AmiwarpError(f"times are dates, but --time-unit is {given.time_unit}; leave it out")
     t_words = [words[layout.columns["t"]] for words in rows]
     in_decimals = all(SECONDS.fullmatch(word) for word in t_words) and _can_be_seconds(numbers[:, layout.columns["t"]])
     if given.time_unit is None and names is None and in_decimals:
@@ -206,6 +248,17 @@ def _find_text_layout(head: bytes, form: TextForm, given: GivenLayout) -> Layout
     places = numbers[:, [layout.columns["x"], layout.columns["y"]]]
     fractional = bool((places != np.floor(places)).any(axis=1).mean() > 0.5)
     return replace(layout, compensated=fractional)
+
+
+def _order_for(names: Sequence[str], numbers: NDArray[np.float64]) -> str:
+    """Return an example of the option ``--columns`` for rows with more or fewer columns than names."""
+    found = roles_of(names)
+    roles = {places[0]: role for role, places in found.items() if places}
+    order = [roles.get(at, "-") for at in range(len(names))]
+    if len(numbers) > 1 and (np.diff(numbers[:, 0]) == 1).all():  # the number of the row, whose column has no name
+        order = ["-", *order]
+    kept = order[: max(at for at, role in enumerate(order) if role != "-") + 1] if roles else []
+    return ",".join(kept) if len(roles) == len(ROLES) else "t,x,y,p (- for a column without use)"
 
 
 def _can_be_seconds(t: NDArray[np.float64]) -> bool:
@@ -228,9 +281,7 @@ def _whole_if_possible(values: NDArray[np.float64]) -> NDArray[Any]:
 
 def _last_time(path: Path, form: TextForm, layout: Layout, estimate: int) -> int | None:
     """Return the time of the last line [us], or None if it holds none."""
-    with open_input(path) as file:
-        file.seek(max(path.stat().st_size - 2 * LONGEST_LINE, 0))
-        lines = list(filter(holds_values, file.read().split(b"\n")[1:]))
+    lines = list(filter(holds_values, text_tail(path, 2 * LONGEST_LINE).split(b"\n")[1:]))
     with contextlib.suppress(ValueError, IndexError, OverflowError):
         word = form.row.words(lines[-1])[layout.columns["t"]]
         return round(float(word) * TIME_UNITS[layout.unit])
@@ -239,21 +290,37 @@ def _last_time(path: Path, form: TextForm, layout: Layout, estimate: int) -> int
 
 def _text_packets(path: Path, form: TextForm, layout: Layout, notes: dict[str, int]) -> Iterator[Packet]:
     parse = partial(_parse, path, form, layout)
-    with open_input(path) as file:
-        file.seek(form.start)
-        line_number = form.lines
-        rest = b""
-        notes["total"] = path.stat().st_size
-        while data := file.read(READ_BYTES):
-            notes["read"] = file.tell()
-            whole, newline, rest = (rest + data).rpartition(b"\n")
-            if len(rest) > LONGEST_LINE:
-                raise AmiwarpError(f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters")
-            if newline:
-                yield parse(whole, line_number)
-                line_number += whole.count(b"\n") + 1
-        if rest.strip():
-            yield parse(rest, line_number)
+    line_number = form.lines
+    rest = before = b""
+    for data in text_pieces(path, form.start, READ_BYTES, notes):
+        whole, newline, rest = (rest + data).rpartition(b"\n")
+        if len(rest) > LONGEST_LINE:
+            raise AmiwarpError(f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters")
+        if newline:
+            yield parse(whole, line_number)
+            line_number += whole.count(b"\n") + 1
+            before = whole.rpartition(b"\n")[2]
+    if not rest.strip():
+        return
+    if before and _is_cut_off(rest, before, form, layout):
+        notes["truncated_bytes"] = len(rest)
+    else:
+        yield parse(rest, line_number)
+
+
+def _is_cut_off(line: bytes, before: bytes, form: TextForm, layout: Layout) -> bool:
+    """Return whether a last line without a newline is the beginning of one. ``before`` is the line before it.
+
+    Of a time in the last column that lost digits, what is left is earlier than the time before.
+    """
+    try:
+        row = np.array([[float(word) for word in form.row.words(line)]])
+        last = np.array([[float(word) for word in form.row.words(before)]])
+    except ValueError:
+        return True
+    if row.shape != (1, form.width) or not _plausible(_chosen(row, layout), layout).all():
+        return True
+    return layout.columns["t"] == form.width - 1 and last.shape == row.shape and bool(row[0, -1] < last[0, -1])
 
 
 def _parse(path: Path, form: TextForm, layout: Layout, text: bytes, line_number: int) -> Packet:
@@ -307,7 +374,7 @@ def _plain_table(text: bytes, form: TextForm) -> NDArray[np.float64] | None:
     row = form.row
     if len(text) < KERNEL_LINES * 2 * form.width or row.has_words or row.quoted:
         return None
-    if row.decimal_comma and b"," in text:
+    if (row.decimal_comma and b"," in text) or row.has_stamps or row.has_gaps(text):
         return None
     characters = np.frombuffer(text, np.uint8)
     ends = np.append(np.flatnonzero(characters == ord("\n")), len(text)).astype(np.int32)

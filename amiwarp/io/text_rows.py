@@ -1,0 +1,284 @@
+"""Lines of text files of events: separators, decimal commas, words for polarities, dates as times, and UTF-16.
+
+:class:`TextRow` makes plain numbers between spaces of a line. :func:`looks_like_text` decides whether a file is a
+table, and :func:`why_no_rows` says what keeps text from being one.
+"""
+
+from __future__ import annotations
+
+import codecs
+import datetime
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+from amiwarp.io.files import open_input
+
+HEAD_BYTES = 4096
+"""Number of bytes from which a format is detected."""
+
+# Text in UTF-8 and UTF-16.
+
+BOM = b"\xef\xbb\xbf"
+"""Mark at the beginning of some files in UTF-8."""
+
+UTF16 = {b"\xff\xfe": "utf-16-le", b"\xfe\xff": "utf-16-be"}
+"""Encodings by their marks at the beginning of a file, as Excel and PowerShell write them."""
+
+
+def as_utf8(data: bytes, mark: bytes) -> bytes:
+    """Return bytes of a file that begins with ``mark`` as UTF-8. They begin at a character."""
+    encoding = UTF16.get(mark[:2])
+    return data if encoding is None else data.decode(encoding, "replace").encode()
+
+
+def text_head(path: Path, size: int) -> tuple[bytes, bool]:
+    """Return the text in the first ``size`` bytes of a file, and whether the file goes on."""
+    with open_input(path) as file:
+        data = file.read(size)
+        return as_utf8(data, data), bool(file.read(1))
+
+
+def text_tail(path: Path, size: int) -> bytes:
+    """Return the text in about the last ``size`` bytes of a file; it may begin within a line."""
+    with open_input(path) as file:
+        mark = file.read(2)
+        file.seek(max(path.stat().st_size - size, 0) // 2 * 2)  # a character of UTF-16 has an even place
+        return as_utf8(file.read(), mark)
+
+
+def text_pieces(path: Path, start: int, size: int, notes: dict[str, int]) -> Iterator[bytes]:
+    """Yield the text of a file in pieces, from the byte ``start`` of the text on, and note how much was read."""
+    notes["total"] = path.stat().st_size
+    with open_input(path) as file:
+        encoding = UTF16.get(file.read(2))
+        file.seek(start if encoding is None else 0)
+        decoder = None if encoding is None else codecs.getincrementaldecoder(encoding)("replace")
+        left_out = 0 if encoding is None else start
+        while data := file.read(size):
+            notes["read"] = file.tell()
+            text = data if decoder is None else decoder.decode(data).encode()
+            yield text[left_out:]
+            left_out = max(left_out - len(text), 0)
+
+
+# Lines.
+
+
+def holds_values(line: bytes) -> bool:
+    """Return whether a line of a text file is neither empty nor a comment."""
+    return line.lstrip()[:1] not in (b"", b"#", b"%")
+
+
+ON_WORDS = (b"true", b"on", b"positive", b"pos", b"yes", b"y", b"t", b"p", b"+")
+OFF_WORDS = (b"false", b"off", b"negative", b"neg", b"no", b"n", b"f", b"-")
+WORDS = {**dict.fromkeys(ON_WORDS, b"1"), **dict.fromkeys(OFF_WORDS, b"0")}
+"""Words for polarities in text, in lower case."""
+
+WORD_PATTERN = re.compile(rb"(?<!\S)(?:" + b"|".join(map(re.escape, WORDS)) + rb")(?!\S)", re.I)
+"""Pattern of these words between spaces."""
+
+STAMP = re.compile(
+    rb"(?<!\S)(\d{4}-\d\d-\d\d)[T ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?(Z|[ ]?UTC|[+-]\d\d:?\d\d)?(?!\S)"
+)
+"""Pattern of a date and a time of day between spaces, as of ISO 8601."""
+
+QUOTED = re.compile(rb"\"[^\"\n]*\"|'[^'\n]*'")
+"""Pattern of a value in quotation marks."""
+QUOTED_DECIMAL = re.compile(rb"([\"'][+-]?\d*),(\d+(?:[eE][+-]?\d+)?[\"'])")
+"""Pattern of a number with one comma in quotation marks."""
+DECIMAL = re.compile(rb"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+"""Pattern of a number with one comma."""
+THOUSANDS = re.compile(rb"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
+"""Pattern of a number whose commas may separate thousands."""
+
+
+@dataclass(frozen=True, slots=True)
+class TextRow:
+    """Form of the lines of a text file."""
+
+    separator: bytes
+    """Character between two columns; a space stands for any number of spaces and tabs."""
+    decimal_comma: bool = False
+    """Whether numbers have commas in place of decimal points; between commas, only numbers in quotation marks."""
+    has_words: bool = False
+    """Whether the polarity is a word."""
+    quoted: bool = False
+    """Whether values are in quotation marks."""
+    has_stamps: bool = False
+    """Whether times are dates with times of day."""
+
+    @classmethod
+    def of(cls, line: bytes) -> TextRow:
+        """Return the form of a line."""
+        line = line.removeprefix(BOM)
+        quoted = b'"' in line or b"'" in line
+        outside = QUOTED.sub(b"0", line) if quoted else line
+        if b";" in outside:
+            row = cls(b";", True, quoted=quoted)  # commas can only be decimal ones, also if the first numbers have none
+        elif b"," in outside and not _decimals_between_spaces(outside):
+            row = cls(b",", QUOTED_DECIMAL.search(line) is not None, quoted=quoted)
+        else:
+            row = cls(b" ", b"," in line, quoted=quoted)
+        plain = row.plain(line)
+        return replace(
+            row, has_words=WORD_PATTERN.search(plain) is not None, has_stamps=STAMP.search(plain) is not None
+        )
+
+    def plain(self, text: bytes) -> bytes:
+        """Return text with numbers between spaces, and ``nan`` for an empty value before others."""
+        if self.quoted:
+            if self.decimal_comma and self.separator == b",":
+                text = QUOTED_DECIMAL.sub(rb"\1.\2", text)
+            text = text.replace(b'"', b"").replace(b"'", b"")
+        if self.separator != b" ":
+            if self.has_gaps(text):
+                text = _filled(text, self.separator)
+            text = text.replace(self.separator, b" ")
+        if self.decimal_comma and self.separator != b",":
+            text = text.replace(b",", b".")
+        if self.has_stamps:
+            text = STAMP.sub(_microseconds_since_1970, text)
+        if self.has_words:
+            text = WORD_PATTERN.sub(lambda match: WORDS[match[0].lower()], text)
+        return text
+
+    def has_gaps(self, text: bytes) -> bool:
+        """Return whether values may be empty in lines of this form."""
+        mark = self.separator
+        gaps = mark + mark, mark + b" " + mark, b"\n" + mark, b"\n " + mark
+        return mark != b" " and (text.startswith((mark, b" " + mark)) or any(gap in text for gap in gaps))
+
+    def words(self, line: bytes) -> list[bytes]:
+        """Return the values of a line without empty ones at its end."""
+        return self.plain(line.removeprefix(BOM)).split()
+
+    def stamped(self, line: bytes) -> tuple[int, ...]:
+        """Return the indices of the columns of a line that are dates."""
+        marked = STAMP.sub(b"date", replace(self, has_stamps=False, has_words=False).plain(line.removeprefix(BOM)))
+        return tuple(at for at, word in enumerate(marked.split()) if word == b"date")
+
+    def names(self, line: bytes) -> tuple[str, ...]:
+        """Return the names of columns in a line; empty ones are those without a name."""
+        text = line.removeprefix(BOM).decode("utf-8", "replace").strip("\r\n")
+        if self.separator == b" ":
+            found = text.split("\t") if "\t" in text else re.sub(r"\s+(?=[\[({])", "", text).split()
+        else:
+            found = text.split(self.separator.decode())
+        return tuple(name.strip().strip("\"'") for name in found)
+
+    def is_row(self, line: bytes) -> bool:
+        """Return whether a line consists of numbers."""
+        words = self.words(line)
+        return bool(words) and all(map(_is_number, words))
+
+
+def doubtful_comma(lines: Iterable[bytes]) -> bytes | None:
+    """Return a number of lines whose commas are decimal ones or separate thousands; None if that is clear.
+
+    Between semicolons, commas are decimal ones. A number such as 0,001 has no thousands.
+    """
+    numbers: list[bytes] = []
+    for line in lines:
+        row = TextRow.of(line)
+        if row.decimal_comma and row.separator != b";":
+            values = QUOTED.findall(line) if row.separator == b"," else line.split()
+            numbers += [value.strip(b"\"'") for value in values if b"," in value]
+    return numbers[0] if numbers and all(map(THOUSANDS.fullmatch, numbers)) else None
+
+
+def _decimals_between_spaces(line: bytes) -> bool:
+    """Return whether the commas of a line are decimal ones in columns between spaces or tabs."""
+    fields = line.split()
+    return len(fields) >= 4 and all(b"," not in each or DECIMAL.fullmatch(each) for each in fields)
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _filled(text: bytes, separator: bytes) -> bytes:
+    """Return lines with ``nan`` for each empty value that others follow, and without the empty ones at their ends."""
+    mark = re.escape(separator)
+    text = re.sub(rb"(?m)(?:[ \t]*" + mark + rb")+[ \t]*(?=\r?$)", b"", text)
+    return re.sub(rb"(?m)(?:^|(?<=" + mark + rb"))[ \t]*(?=" + mark + rb")", b"nan", text)
+
+
+@cache
+def _days_since_1970(date: bytes) -> int | None:
+    """Return the days from 1970 to a date; None for a day that no month has."""
+    try:
+        return datetime.date.fromisoformat(date.decode()).toordinal() - datetime.date(1970, 1, 1).toordinal()
+    except ValueError:
+        return None
+
+
+def _microseconds_since_1970(match: re.Match[bytes]) -> bytes:
+    """Return the time of a date as a number [us], or the date if it is none. Without a zone, it is in UTC."""
+    date, hours, minutes, seconds, fraction, zone = match.groups()
+    days = _days_since_1970(date)
+    if days is None or int(hours) > 23 or int(minutes) > 59 or int(seconds) > 59:
+        return match[0]
+    total = ((days * 24 + int(hours)) * 60 + int(minutes)) * 60 + int(seconds)
+    if zone is not None and zone[:1] in b"+-":
+        east = int(zone[1:3]) * 3600 + int(zone[-2:]) * 60
+        total -= -east if zone[:1] == b"-" else east
+    nanoseconds = int((fraction or b"0").ljust(9, b"0"))
+    return b"%d" % (total * 1_000_000 + (nanoseconds + 500) // 1000)
+
+
+# Whether a file is a table, and why it is none.
+
+
+def looks_like_text(head: bytes) -> bool:
+    """Return whether a file begins with rows of at least three numbers, or a line of names or a size before them."""
+    text = as_utf8(head, head)
+    lines = list(filter(holds_values, text.removeprefix(BOM).splitlines()))[:3]
+    if not lines:  # a long comment
+        return len(head) >= HEAD_BYTES and text.removeprefix(BOM).startswith(b"#") and b"\0" not in text
+    first = TextRow.of(lines[0])
+    count = len(first.words(lines[0]))
+    if first.is_row(lines[0]):
+        return count >= 2
+    following = [line for line in lines[1:] if TextRow.of(line).is_row(line)]
+    return bool(following) and b"\0" not in text and all(len(TextRow.of(line).words(line)) >= 3 for line in following)
+
+
+CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+"""Characters that are part of no text."""
+
+
+def why_no_rows(head: bytes) -> str | None:
+    """Return what keeps text from being a table of events; None if a file that begins with ``head`` is no text."""
+    if head[1::2].count(0) * 3 > len(head) and not CONTROL.search(head[::2]):
+        return "is text in UTF-16 without a mark at its beginning; save it in UTF-8"
+    text = as_utf8(head, head)
+    try:
+        codecs.getincrementaldecoder("utf-8")("strict").decode(text)  # the last character may be cut off
+    except UnicodeDecodeError:
+        return None
+    if CONTROL.search(text):
+        return None
+    lines = [(n, line) for n, line in enumerate(text.removeprefix(BOM).splitlines(), 1) if holds_values(line)][:3]
+    if not lines:
+        return None
+    counts = [sum(map(_is_number, replace(TextRow.of(line), has_words=False).words(line))) for _, line in lines]
+    at = counts.index(max(counts))
+    number, line = lines[at]
+    shown = line[:80].decode("utf-8", "replace").strip()
+    if not counts[at]:
+        return f"is text, but line {number} '{shown}' holds no numbers; expected rows of t, x, y and p"
+    wrong = next((word for word in TextRow.of(line).words(line) if not _is_number(word)), None)
+    if wrong is None:
+        return f"is text, but line {number} '{shown}' is no row of t, x, y and p"
+    return (
+        f"is text, but line {number} '{shown}' holds '{wrong[:40].decode('utf-8', 'replace')}', which is no number; "
+        "amiwarp reads numbers, polarities such as true and false, on and off, y and n, + and -, and times such as "
+        "2024-05-01T12:00:00.000123; leave out other columns, or change them to numbers"
+    )
