@@ -37,11 +37,11 @@ EPOCH = 1_700_000_000_000_000
 Maker = Callable[[Path], None]
 
 
-def lines(rows: Any, *, separator: str = " ", head: str = "", end: str = "\n") -> Maker:
+def lines(rows: Any, *, separator: str = " ", head: str = "", end: str = "\n", encoding: str = "utf-8") -> Maker:
     """Return a function that writes rows of text below a head."""
 
     def write(path: Path) -> None:
-        path.write_bytes((head + "".join(separator.join(map(str, row)) + end for row in rows)).encode())
+        path.write_bytes((head + "".join(separator.join(map(str, row)) + end for row in rows)).encode(encoding))
 
     return write
 
@@ -207,6 +207,10 @@ LAYOUTS: dict[str, tuple[Maker, dict[str, Any]]] = {
         lines(np.c_[Y, X, T, P], head="# columns: y x t_us p\n# 1000 events\n"), {},
     ),
     "text: names between commas in a comment of MATLAB": (lines(np.c_[Y, X, T, P], head="% y,x,t_us,p\n"), {}),
+    "text: names and units between commas in a comment": (
+        lines(np.c_[Y, X, T, P], head="# Format: y [px], x [px], time [us], p\n"), {},
+    ),
+    "csv of Windows": (lines(ROWS, separator=";", head="time [µs];x;y;p\n", end="\r\n", encoding="latin-1"), {}),
     "text: names with units apart": (lines(np.c_[Y, X, T, P], head="y x time [us] p\n"), {}),
     "csv of pandas, read and written again": (
         lines(zip(range(N), *ROWS.T, strict=True), separator=",", head="Unnamed: 0,t,x,y,p\n"), {},
@@ -449,7 +453,7 @@ REFUSED: dict[str, tuple[Maker, str]] = {
         r"holds '2024-05-32T12:00:00', which is no number",
     ),
     "prose": (
-        lambda path: path.write_text("hello world\nthis is no table\n") and None,
+        lines([], head="hello world\nthis is no table\n"),
         r"is text, but line 1 'hello world' holds no numbers; expected rows of t, x, y and p",
     ),
     "polarity 1 and 2": (archive(x=X, y=Y, t=T, p=2 - P), r"values 1, 2, of which .* --polarity, such as 1=on,2=off"),
@@ -807,6 +811,9 @@ def test_a_rate_that_no_camera_has(tmp_path: Path) -> None:
         with pytest.raises(AmiwarpError, match=r"the first 60,000 events span 1; give it with --time-unit"):
             open_recording(path)
         assert open_recording(path, time_unit="ms").events.t_last == 1000
+    with h5py.File(path, "r+") as file:  # as in DSEC's files, whose times are known to be microseconds
+        file["ms_to_idx"] = np.zeros(1, np.uint64)
+    assert open_recording(path).events.t_last == 1
 
 
 def test_times_of_own_files_are_believed(tmp_path: Path) -> None:
@@ -864,6 +871,16 @@ def test_a_time_that_lost_digits_is_cut_off(tmp_path: Path) -> None:
     path.write_text(text[:-1])
     recording = open_recording(path)
     assert (len(recording.events), recording.metadata["truncated_bytes"]) == (N - 1, len(text.split("\n")[-1]) - 1)
+    path.write_text(text + "\n" + text.split("\n")[-1])
+    recording = open_recording(path)
+    assert (len(recording.events), "truncated_bytes" in recording.metadata) == (N + 1, False)
+
+
+def test_a_long_head_in_utf16(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("amiwarp.io.text_files.READ_BYTES", 64)
+    text = lines(ROWS, head="# a story\n" * 30 + "t_us\tx\ty\tp\n", separator="\t")
+    recording = open_recording(made(tmp_path, in_utf16(text, "utf-16-le", b"\xff\xfe")))
+    assert_same(recording)
 
 
 def test_an_empty_value_does_not_shift_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,8 @@ The size may also be in a file beside it, as amiwarp writes it.
 
 Other tables have columns between commas, semicolons, tabs or spaces, and may begin with a line of names. Empty lines
 and lines that start with ``#`` or ``%`` are comments. A comment may give the names, or the size as ``geometry``.
-:mod:`amiwarp.io.columns` decides what the columns are.
+:mod:`amiwarp.io.text_rows` makes numbers of the lines, :mod:`amiwarp.io.columns` decides what the columns are. A last
+line that is cut off is dropped, and its length counted as ``truncated_bytes``.
 """
 
 from __future__ import annotations
@@ -191,7 +192,8 @@ def _commented(comments: Sequence[str], row: TextRow, width: int) -> tuple[str, 
     """Return the names of columns in the last comment before the values that holds them, or None."""
     for comment in reversed(comments):
         for text in (comment, comment.rpartition(":")[2]):
-            for names in (row.names(text.encode()), tuple(re.split(r"[\s,;]+", text.strip()))):
+            between_any = re.split(r"[\s,;]+", re.sub(r"\s+(?=[\[({])", "", text.strip()))
+            for names in (row.names(text.encode()), tuple(between_any)):
                 if len(names) == width and names_roles(names):
                     return names
     return None

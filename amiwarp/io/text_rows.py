@@ -162,7 +162,10 @@ class TextRow:
 
     def names(self, line: bytes) -> tuple[str, ...]:
         """Return the names of columns in a line; empty ones are those without a name."""
-        text = line.removeprefix(BOM).decode("utf-8", "replace").strip("\r\n")
+        try:
+            text = line.removeprefix(BOM).decode("utf-8").strip("\r\n")
+        except UnicodeDecodeError:  # such as the µ of a unit, as Windows writes it
+            text = line.decode("latin-1").strip("\r\n")
         if self.separator == b" ":
             found = text.split("\t") if "\t" in text else re.sub(r"\s+(?=[\[({])", "", text).split()
         else:
