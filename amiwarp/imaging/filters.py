@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
-from amiwarp.events.recording import Events, EventSource, ImageStore, ImuSamples, Recording, check_events
+from amiwarp.events.recording import Events, EventSource, ImuSamples, Recording, check_events
 from amiwarp.events.truth import EventTruth, StoredInstants
 from amiwarp.io import formats
 from amiwarp.io.export import convert
@@ -417,7 +417,8 @@ def _write_kept(
     running = RunningFilter(chosen, source.size)
     truth = recording.truth
     about = {name: value for name, value in recording.metadata.items() if name != "format"}
-    imu, frames = recording.imu, recording.frames
+    imu: ImuSamples | None = recording.imu
+    frames: StoredInstants[NDArray[Any]] | None = recording.frames
     removed_records: dict[str, int] = {}
     lost: tuple[str, ...] = ()
     if chosen.window is not None:
@@ -485,7 +486,9 @@ def _imu_within(imu: ImuSamples | None, window: tuple[int, int]) -> ImuSamples |
     return ImuSamples(imu.t[start:stop], imu.angular_velocity[start:stop], imu.acceleration[start:stop])
 
 
-def _frames_within(frames: ImageStore | None, window: tuple[int, int]) -> StoredInstants[NDArray[Any]] | None:
+def _frames_within(
+    frames: StoredInstants[NDArray[Any]] | None, window: tuple[int, int]
+) -> StoredInstants[NDArray[Any]] | None:
     """Return the frames within a time window [us], whose end is exclusive; None if there are none."""
     if frames is None:
         return None

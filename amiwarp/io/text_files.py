@@ -372,12 +372,13 @@ THREAD_LINES = 1 << 12
 
 
 def _plain_table(text: bytes, form: TextForm) -> NDArray[np.float64] | None:
-    """Return the numbers in lines of plain decimal numbers by a kernel; None for few lines, and for any others."""
+    """Return the numbers in lines of decimal numbers by a kernel; None for few lines, and for any others."""
     row = form.row
-    if len(text) < KERNEL_LINES * 2 * form.width or row.has_words or row.quoted:
+    if len(text) < KERNEL_LINES * 2 * form.width:
         return None
-    if (row.decimal_comma and b"," in text) or row.has_stamps or row.has_gaps(text):
-        return None
+    separator = row.separator
+    if not row.is_plain(text):
+        text, separator = row.plain(text), b" "
     characters = np.frombuffer(text, np.uint8)
     ends = np.append(np.flatnonzero(characters == ord("\n")), len(text)).astype(np.int32)
     if len(ends) < KERNEL_LINES:
@@ -394,7 +395,7 @@ def _plain_table(text: bytes, form: TextForm) -> NDArray[np.float64] | None:
     faults = wp.empty(blocks, dtype=int, device="cpu")
     powers = wp.array(10.0 ** np.arange(MOST_DIGITS + 1), dtype=wp.float64, device="cpu")
     given = [wp.array(each, device="cpu", copy=False) for each in (characters, ends)]
-    inputs = [*given, ord(row.separator), powers, THREAD_LINES]
+    inputs = [*given, ord(separator), powers, THREAD_LINES]
     launch(read_numbers, blocks, inputs, [values, faults], device="cpu", smallest=1)
     table: NDArray[np.float64] = values.numpy().T
     return None if faults.numpy().any() else table

@@ -145,6 +145,11 @@ class TextRow:
             text = WORD_PATTERN.sub(lambda match: WORDS[match[0].lower()], text)
         return text
 
+    def is_plain(self, text: bytes) -> bool:
+        """Return whether lines of this form consist of decimal numbers between separators."""
+        changes = self.has_words or self.has_stamps or self.quoted or self.has_gaps(text)
+        return not (changes or (self.decimal_comma and b"," in text))
+
     def has_gaps(self, text: bytes) -> bool:
         """Return whether values may be empty in lines of this form."""
         mark = self.separator
