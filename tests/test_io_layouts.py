@@ -816,6 +816,18 @@ def test_a_rate_that_no_camera_has(tmp_path: Path) -> None:
     assert open_recording(path).events.t_last == 1
 
 
+@pytest.mark.parametrize("unit", ["us", "ns"])
+def test_options_keep_the_offset_of_times(tmp_path: Path, unit: str) -> None:
+    """Files of DSEC's layout count from ``t_offset``, also where an option or the polarity has another reader."""
+    factor = {"us": 1, "ns": 1000}[unit]
+    path = made(tmp_path, hdf5(events__x=X, events__y=Y, events__t=(T * factor).astype("u4"), events__p=P,
+                               t_offset=np.int64(EPOCH * factor)))  # fmt: skip
+    assert_same(open_recording(path, time_unit=unit), EPOCH)
+    if unit == "us":
+        assert_same(open_recording(path), EPOCH)
+        assert_same(open_recording(path, polarity="1=on,0=off"), EPOCH)
+
+
 def test_times_of_own_files_are_believed(tmp_path: Path) -> None:
     """A camera that has run for weeks has times that could be milliseconds since 1970, too."""
     t = T + 1_700_000_000_000

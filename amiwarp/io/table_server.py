@@ -177,10 +177,25 @@ def _opened(path: str, kind: str) -> Iterator[tuple[Mapping[str, Any], dict[str,
                 ]
                 about["units"][name] = next(filter(None, map(unit_of, stated)), None)
             about["size"] = _hdf5_size(file, server)
+            offset = server.member(file, "t_offset")
+            if "events/t" in arrays and getattr(offset, "size", 0) == 1 and offset.dtype.kind in "iuf":
+                arrays["events/t"] = _LaterTimes(arrays["events/t"], np.ravel(offset[()])[0])
             yield arrays, about
 
 
 # HDF5.
+
+
+class _LaterTimes:
+    """Times of DSEC's layout, which count from the file's ``t_offset`` in the same unit."""
+
+    def __init__(self, times: Any, offset: Any) -> None:
+        self._times, self._offset = times, offset
+        whole = times.dtype.kind in "iub" and float(offset).is_integer()
+        self.shape, self.dtype = times.shape, np.dtype(np.int64 if whole else np.float64)
+
+    def __getitem__(self, rows: Any) -> NDArray[Any]:
+        return np.asarray(self._times[rows]).astype(self.dtype) + self._offset.astype(self.dtype)
 
 
 def _datasets(file: Any, server: Any) -> Iterator[tuple[str, Any]]:
