@@ -854,6 +854,15 @@ def test_times_may_be_dates(tmp_path: Path, head: str, separator: str, zone: str
         open_recording(tmp_path / "events", time_unit="ms")
 
 
+def test_dates_beside_the_times(tmp_path: Path) -> None:
+    rows = [(stamp, t, *rest) for (stamp, *rest), t in zip(dates(), T.tolist(), strict=True)]
+    recording = open_recording(made(tmp_path, lines(rows, separator=",", head="datetime,t_us,x,y,p\n")))
+    assert_same(recording)
+    assert "time_zone" not in recording.metadata
+    recording = open_recording(tmp_path / "events", columns="t=datetime,x=x,y=y,p=p")
+    assert_same(recording, START_US)
+
+
 def test_dates_in_nanoseconds_are_rounded(tmp_path: Path) -> None:
     rows = [(f"{stamp}{rest}", *others) for (stamp, *others), rest in zip(dates(), ["499", "500"] * N, strict=False)]
     found = of(open_recording(made(tmp_path, lines(rows, separator=";", head="time_ns;x;y;p\n"))))

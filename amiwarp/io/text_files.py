@@ -112,7 +112,7 @@ def open_text(path: Path, given: GivenLayout) -> Recording:
     calib = path.with_name("calib.txt")
     camera = read_calib(calib, *events.size) if calib.exists() and calib != path else None
     metadata = {"format": "text", **layout.metadata, **events.metadata}
-    if form.row.has_stamps:
+    if layout.columns["t"] in form.stamped:
         metadata["time_zone"] = "UTC, unless a time states another zone"
     return Recording(events=events, camera=camera, metadata=metadata, name=path.stem)
 
