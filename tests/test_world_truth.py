@@ -169,7 +169,7 @@ def test_the_file_holds_what_the_memory_holds(recording: amiwarp.Recording, stor
     same_truth(recording, amiwarp.open_recording(tmp_path / "converted.h5"))
 
 
-@pytest.mark.parametrize(("start", "stop"), [(0, 5), (100, 140), (-3, 4), (10, 10), (20, 10), (900, 10**6)])
+@pytest.mark.parametrize(("start", "stop"), [(0, 5), (100, 140), (10, 10), (20, 10), (900, 10**6)])
 def test_slices_of_events_and_truth_stay_aligned(
     recording: amiwarp.Recording, stored: Path, start: int, stop: int
 ) -> None:

@@ -128,7 +128,7 @@ class EvtFile:
 
 def open_evt(path: Path) -> Recording:
     """Open a RAW file."""
-    about = _read_evt_header(path)
+    about = read_evt_header(path)
     last = None if about.word == 2 else partial(_last_evt_time, about)
     events = FileEvents(path, partial(_evt_events, about), size=_evt_size(about.fields), last_time=last)
     truncated = (path.stat().st_size - about.offset) % about.word
@@ -138,7 +138,7 @@ def open_evt(path: Path) -> Recording:
     )
 
 
-def _read_evt_header(path: Path) -> EvtFile:
+def read_evt_header(path: Path) -> EvtFile:
     fields, offset = _read_header(path)
     version = fields.get("evt") or fields.get("format", "").removeprefix("EVT").partition(";")[0]
     word = {"2.0": 4, "2": 4, "2.1": 8, "21": 8, "3.0": 2, "3": 2}.get(version)
@@ -170,7 +170,7 @@ def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
 
 def trigger_packets(path: Path) -> Iterator[Packet]:
     """Yield the edges of the external triggers of a RAW file."""
-    about = _read_evt_header(path)
+    about = read_evt_header(path)
     for _, edges in _decoded(about, {}):
         yield edges.channel, np.zeros_like(edges.channel), edges.t + about.origin, edges.rising
 
