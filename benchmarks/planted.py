@@ -93,6 +93,11 @@ def score(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
     return {f"round {k}": dict(Counter(row["outcome"] for row in rows if row["round"] == k)) for k in rounds}
 
 
+def first_scores(earlier: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
+    """Return the first score of each round: a round of an earlier run keeps its score, a new one has today's."""
+    return found | earlier
+
+
 def main() -> None:
     """Read the command line, judge the defects and print the outcomes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -103,10 +108,12 @@ def main() -> None:
     given = parser.parse_args()
     chosen = [defect for defect in load() if given.only is None or defect.area in given.only]
     rows: list[dict[str, Any]] = []
-    first: dict[str, Any] | None = None
+    first: dict[str, Any] = {}
+    judged: set[tuple[str, str, str]] = set()
     if given.again:
         earlier = json.loads(given.again.read_text())
         first = earlier["first_run"]
+        judged = {(row["file"], row["before"], row["after"]) for row in earlier["defects"]}
         rows = [row for row in earlier["defects"] if row["outcome"] == "killed"]
         settled = {(row["file"], row["before"], row["after"]) for row in rows}
         chosen = [defect for defect in chosen if defect.name not in settled]
@@ -131,7 +138,7 @@ def main() -> None:
             copy = copies.get()
             outcome, reason = judge(defect, copy, seconds[defect.tests], kernels)
             copies.put(copy)
-            rows.append(asdict(defect) | {"outcome": outcome, "reason": reason, "again": bool(given.again)})
+            rows.append(asdict(defect) | {"outcome": outcome, "reason": reason, "again": defect.name in judged})
             print(f"{outcome:8} {defect.area}: {defect.wrong}  [{reason}]", flush=True)
 
         files = sorted({defect.tests for defect in chosen})
@@ -141,7 +148,7 @@ def main() -> None:
     rows.sort(key=lambda row: order.get((row["file"], row["before"], row["after"]), len(order)))
     print(found := score(rows))
     if given.out:
-        result = {"first_run": first or found, "now": found, "defects": rows}
+        result = {"first_run": first_scores(first, found), "now": found, "defects": rows}
         given.out.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     sys.exit(any(row["outcome"] != "killed" for row in rows))
 

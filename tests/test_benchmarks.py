@@ -349,6 +349,14 @@ def test_a_planted_defect_is_killed_or_survives_or_is_stale(tmp_path: Path, monk
         assert path.read_text() == code
 
 
+def test_each_round_of_planted_defects_keeps_its_first_score() -> None:
+    rows = [{"round": 2, "outcome": "killed"}, {"round": 3, "outcome": "survived"}]
+    earlier = {"round 2": {"survived": 1}}
+    now = planted.score(rows)
+    assert planted.first_scores({}, now) == now
+    assert planted.first_scores(earlier, now) == {"round 2": {"survived": 1}, "round 3": {"survived": 1}}
+
+
 def test_mutants_replace_functions_that_are_hidden_from_the_collector(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
