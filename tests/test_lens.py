@@ -156,6 +156,8 @@ def test_a_board_is_found_and_its_absence_explained() -> None:
     assert squares == "a board of 6 x 5 inner corners is seen, not of 7 x 6; count the inner corners, not the squares"
     other = amiwarp.Board(12, 4, 0.03)
     assert other.missing(picture) == "a board of 6 x 5 inner corners is seen, not of 12 x 4"
+    upright = amiwarp.Board(6, 7, 0.03).missing(picture)
+    assert upright == "a board of 5 x 6 inner corners is seen, not of 6 x 7; count the inner corners, not the squares"
     noise = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8), (0, 0), 3.0)
     assert other.missing(np.asarray(noise)) == "a board of 12 x 4 inner corners is not seen"
 
@@ -479,6 +481,18 @@ def test_an_index_far_off_is_asked_for_with_the_lens_that_is_seen_through_it(
     assert len(notes) == bool(said)
 
 
+def test_a_pose_that_better_pictures_show_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    corners = seen(1, CAMERA, noise=0.01)
+    work = calibration.LensWork(BOARD, CAMERA, [], "cpu", lambda *_: None)
+    pictures = {str(k): np.full((240, 320), k, np.uint8) for k in range(len(corners))}
+    for blurred, left_out in ((2, {"2": BOARD.missing(pictures["2"])}), (None, {})):
+        shown = {k: None if k == blurred else each for k, each in enumerate(corners)}
+        monkeypatch.setattr(amiwarp.Board, "find", lambda _, picture, shown=shown: shown[int(picture[0, 0])])
+        work.left_out["unlit"] = "has no events"
+        assert len(work._lens(pictures, matched=False).corners) == len(corners) - len(left_out)
+        assert work.left_out == {"unlit": "has no events", **left_out}
+
+
 @pytest.mark.parametrize("rpm", [720.0, -720.0])
 def test_pictures_start_at_evenly_spread_angles(rpm: float) -> None:
     turn_us = 60e6 / 720.0
@@ -590,7 +604,8 @@ def test_still_spans_of_one_recording_are_found(moved: amiwarp.Recording) -> Non
     assert spans[0][1] < 0.36
     assert spans[1][0] > 0.64
     assert all(0.12 < stop - start < 0.26 for start, stop in spans)
-    assert "s" in poses[0].name
+    named = [f"{moved.name}, {start:.2f} to {stop:.2f} s" for start, stop in spans]
+    assert [pose.name for pose in poses] == named
 
 
 def test_a_still_span_has_all_turns_that_repeat_each_other() -> None:
@@ -635,8 +650,11 @@ def streamed(recording: amiwarp.Recording, late_us: int = 0) -> list[amiwarp.Rec
     return found
 
 
-@pytest.mark.parametrize("late_us", [0, 300_000])
-def test_a_stream_has_the_same_still_spans(moved: amiwarp.Recording, late_us: int) -> None:
+@pytest.mark.parametrize(("late_us", "way"), [(0, 1.0), (300_000, 1.0), (0, -1.0)])
+def test_a_stream_has_the_same_still_spans(moved: amiwarp.Recording, late_us: int, way: float) -> None:
+    """``way``: 1 for angles that grow, -1 for those of a prism that turns backwards."""
+    assert moved.encoder is not None
+    moved = replace(moved, encoder=replace(moved.encoder, angle=way * moved.encoder.angle))
     found = streamed(moved, late_us)
     times = [(r.events.t_first * 1e-6, r.events.t_last * 1e-6) for r in found]
     assert len(found) == 2
