@@ -10,8 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 import amiwarp
-from amiwarp.brightness.depths import SMALLEST_PX, contrast, find_depths, orbit_px
+from amiwarp.brightness.depths import SMALLEST_PX, contrast, find_depths, lowest, orbit_px
 from amiwarp.brightness.pixel_costs import SCALE, PixelCosts
+from amiwarp.calib import plate as plate_phase
 from amiwarp.cli.app import app
 from reference import optics as reference
 
@@ -61,6 +62,19 @@ def test_a_position_between_pixels_has_the_depth_of_the_nearest_one(device: str)
     expected = model.compensate_at(xy, theta, depths[row, column])
     found = model.with_depths(depths).compensate_points(xy, theta)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)  # px
+
+
+def test_a_camera_of_two_focal_lengths_sees_each_axis_by_its_own() -> None:
+    """Events of a camera without distortion have a formula of their own."""
+    camera = amiwarp.Camera(64, 48, 60.0, 75.0, 30.0, 25.0)
+    rng = np.random.default_rng(4)
+    x, y, t = rng.integers(0, 64, 2000), rng.integers(0, 48, 2000), np.sort(rng.integers(0, 80_000, 2000))
+    depths = rng.uniform(0.5, 3.0, (48, 64)).astype(np.float32)
+    model, encoder = amiwarp.PlateModel(camera, PLATE, PHASE), amiwarp.Encoder.constant_speed(720.0, -1000, 90_000)
+    events = amiwarp.Events.from_arrays(x, y, t, x % 2)
+    found = amiwarp.compensate_events(events, model.with_depths(depths), encoder)
+    expected = model.compensate_at(np.stack([x, y], axis=1).astype(np.float64), encoder.angle_at(t), depths[y, x])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3)  # px
 
 
 def test_on_the_axis_the_orbit_is_the_shift_times_the_inverse_depth() -> None:
@@ -154,6 +168,28 @@ def test_files_hold_the_plate(seen: amiwarp.Recording, tmp_path: Path) -> None:
     assert amiwarp.open_recording(tmp_path / "r.h5").prism == PLATE
 
 
+def test_all_turns_but_the_first_determine_depths(seen: amiwarp.Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of very many events, one turn is used, or what the largest number of events holds if that is longer."""
+    assert seen.encoder is not None
+    turn_us, model = 60e6 / 720.0, amiwarp.PlateModel(CAMERA, PLATE, PHASE)
+    t, spans = seen.events.slice(0, len(seen.events)).t, []
+    whole = plate_phase.read_between
+
+    def noted(source: amiwarp.EventSource, start: int, stop: int) -> object:
+        spans.append((start, stop))
+        return whole(source, start, stop)
+
+    monkeypatch.setattr(plate_phase, "read_between", noted)
+    after = int(np.count_nonzero(t < t[0] + turn_us))
+    two_turns = int(np.count_nonzero((t >= t[0] + turn_us) & (t < t[0] + 3 * turn_us)))
+    for most in (plate_phase.MOST_EVENTS, two_turns, 10):
+        monkeypatch.setattr(plate_phase, "MOST_EVENTS", most)
+        plate_phase.costs_at_rest(seen, model, seen.encoder, 4.0, "cpu")
+    np.testing.assert_allclose([start for start, _ in spans], t[after], rtol=0, atol=100)
+    expected = [t[-1], t[0] + 3 * turn_us, t[0] + 2 * turn_us]
+    np.testing.assert_allclose([stop for _, stop in spans], expected, rtol=0, atol=100)
+
+
 @pytest.fixture(scope="module")
 def calibration(seen: amiwarp.Recording) -> amiwarp.Calibration:
     """Calibration of the recording."""
@@ -194,6 +230,15 @@ class KnownCosts:
     def gradient(self, model: amiwarp.PlateModel, plus: object, minus: object, width: float) -> np.ndarray:
         assert model.depths is not None
         return self.count * (model.depths - self.truth)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.25, 0.45, -0.2])
+def test_the_best_depth_lies_between_those_that_were_tried(share: float) -> None:
+    """Of a parabola of the inverse depth, three costs give the lowest point. ``share``: its place between two tries."""
+    tried = np.linspace(0.5, 2.5, 9)
+    truth = tried[4] + share * (tried[1] - tried[0])
+    windows = ((tried - truth) ** 2)[:, None, None] * np.ones((1, 3, 2))
+    np.testing.assert_allclose(lowest(tried, windows.astype(np.float32)), truth, rtol=0, atol=1e-5)  # 1/m
 
 
 def test_depths_beyond_both_ends_of_what_is_tried_are_unknown() -> None:
