@@ -252,6 +252,14 @@ def test_a_file_keeps_it(calibrated: amiwarp.Calibration, recording: amiwarp.Rec
     assert np.std(away) < 0.03  # px
 
 
+@pytest.mark.parametrize("resting", [("second_amplitude",), ("amplitude",), ("amplitude", "second_amplitude")])
+def test_only_a_mirror_without_any_tilt_is_at_rest(calibrated: amiwarp.Calibration, resting: tuple[str, ...]) -> None:
+    parameters = {**calibrated.parameters, **dict.fromkeys(resting, 0.0)}
+    encoder = replace(calibrated, parameters=parameters).encoder_for(TWO, 0, 100_000)
+    turned = np.ptp(encoder.angles_at([0, 50_000]), axis=0)
+    assert turned.tolist() == ([0.0, 0.0] if len(resting) == 2 else np.ptp(TWO.angles_at([0, 50_000]), axis=0).tolist())
+
+
 ONE = amiwarp.Encoder.constant_speed(720.0, 0, 100_000)
 TWO = ONE.with_second(0.7)
 

@@ -119,6 +119,12 @@ def test_a_pair_of_parameter_values_keeps_the_glass_of_each_prism() -> None:
     assert RisleyModel.from_values(CAMERA, PAIR, values) == RisleyModel(CAMERA, expected, *PHASES, ratio=-0.5)
 
 
+def test_a_search_starts_with_the_apex_of_each_prism() -> None:
+    start = RisleyModel.start_values(PAIR)
+    assert (start["apex"], start["second_apex"]) == (FIRST.apex, SECOND.apex)
+    assert RisleyModel.start_values(FIRST)["second_apex"] == FIRST.apex  # nothing else is known
+
+
 def test_pairs_of_events_have_both_angles_of_the_time_before_the_latency(device: str) -> None:
     encoder, rng = encoder_of_pair(), np.random.default_rng(4)
     t = np.sort(rng.integers(5_000, 390_000, 4000))

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -124,6 +125,15 @@ def test_simulated_events_know_their_point_at_rest(shaken: amiwarp.Recording) ->
     assert np.abs(np.median(away, axis=0)).max() < 0.01  # px
     assert np.std(away) < 0.1  # px; latency jitter of 30 us at up to 2000 px/s
     assert np.std(xy - points) > 1.5
+
+
+def test_a_table_gives_the_frequency_over_time() -> None:
+    t = np.arange(0.0, 1e6, 1e4)
+    constant = amiwarp.Vibration(90.0, 0.01, 0.7).motion.angle(t)
+    table = amiwarp.Vibration([[0.0, 90.0], [1.0, 90.0]], 0.01, 0.7).motion.angle(t)
+    np.testing.assert_allclose(table, constant, rtol=0, atol=1e-6)
+    rising = amiwarp.Vibration([[0.0, 80.0], [1.0, 100.0]], 0.01).motion.angle([0.0, 1e6])
+    assert rising[1] - rising[0] == pytest.approx(math.tau * 90.0)
 
 
 def test_simulated_steps_resolve_the_vibration() -> None:
@@ -254,8 +264,11 @@ def test_programs(tmp_path: Path, texture: np.ndarray) -> None:
     file = tmp_path / "c.json"
     found = runner.invoke(app, ["calibrate", str(out), str(file), "--stages", "sharpness"])  # of the file's optic
     assert found.exit_code == 0, found.output
-    assert "\nfrequency: " in found.stdout
-    assert json.loads(file.read_text())["parameters"]["rpm"]["hz"] == pytest.approx(80.0, rel=1e-3)
+    said = re.search(r"^frequency: ([\d.]+) ± (\S+) Hz$", found.stdout, re.MULTILINE)
+    assert said is not None
+    rpm = json.loads(file.read_text())["parameters"]["rpm"]
+    assert float(said[1]) == pytest.approx(rpm["hz"], rel=1e-6) == pytest.approx(80.0, rel=1e-3)
+    assert float(said[2]) == pytest.approx(rpm["std"] / 60.0, rel=0.05)
     for command in (
         ["compensate", str(out), str(tmp_path / "o.h5")],
         ["reconstruct", str(out), str(tmp_path / "o.png")],
