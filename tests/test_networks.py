@@ -651,6 +651,20 @@ def test_own_network_shows_the_scene(quarter: Any, device: str) -> None:
         Network.quarter_turn(device=device)(events, 160, 120, **window)
 
 
+def test_own_network_takes_a_prism_that_turns_backwards(quarter: Any) -> None:
+    """A prism that turns forwards, seen in a mirror image: its sums along y have the opposite sign."""
+    pytest.importorskip("torch")
+    _, events, optic, window = quarter
+    model, encoder = optic["model"], optic["encoder"]
+    flipped = DeviceEvents.from_arrays(events.x, 119 - events.y, events.t, events.p)
+    back = {"model": replace(model, phase=-model.phase), "encoder": replace(encoder, angle=-encoder.angle)}
+    found = networks.quarter_turn_sums(flipped, 160, 120, **window, **back).numpy()
+    here = DeviceEvents.from_arrays(events.x, events.y, events.t, events.p)
+    expected = networks.quarter_turn_sums(here, 160, 120, **window, **optic).numpy()[:, ::-1]
+    signs = np.array([1, -1, 1, -1, 1, 1, -1, 1])[:, None, None]  # of the gradient, its change, and the counts
+    np.testing.assert_allclose(found, signs * expected, rtol=0, atol=5e-3)
+
+
 def test_own_network_makes_several_pictures_at_a_time(quarter: Any, device: str, monkeypatch: Any) -> None:
     """They are those of single calls, also of windows that do not follow one another."""
     torch = pytest.importorskip("torch")

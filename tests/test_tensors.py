@@ -716,6 +716,13 @@ def test_transform_of_structured_arrays(names: str) -> None:
         transform(array[["t", "x", "y"]])
 
 
+def test_an_option_of_a_call_replaces_that_of_the_transform() -> None:
+    events = some_events(200)
+    transform = amiwarp.ToTensor(amiwarp.voxel_grid, width=WIDTH, height=HEIGHT, bins=BINS)
+    assert np.array_equal(transform(events, bins=3), amiwarp.voxel_grid(events, WIDTH, HEIGHT, 3))
+    assert transform(events).shape == (BINS, HEIGHT, WIDTH)
+
+
 def test_transform_on_a_device(device: str) -> None:
     events = some_events()
     cut = partial(amiwarp.windows, count=4_000)
@@ -778,17 +785,19 @@ def test_other_kinds_of_events_are_refused_with_the_remedy() -> None:
 # Refusals.
 
 
-def test_falling_times_are_refused(device: str) -> None:
+@pytest.mark.parametrize("at", [200, 192])
+def test_falling_times_are_refused(at: int, device: str) -> None:
+    """Also at the beginning of a block of 64 events, which kernels take together."""
     t = np.arange(300)
-    t[200] = 5
+    t[at] = 5
     events = Events(np.zeros(300, np.uint16), np.zeros(300, np.uint16), t, np.ones(300, np.uint8))
     given = DeviceEvents(*(wp.array(v, device=device) for v in (events.x, events.y, events.t, events.p)))
     for function in (amiwarp.event_count, amiwarp.latest_times, partial(amiwarp.voxel_grid, bins=3)):
         for one in (events, given):
-            with pytest.raises(AmiwarpError, match=r"event 200 .* is earlier than the one before"):
+            with pytest.raises(AmiwarpError, match=rf"event {at} .* is earlier than the one before"):
                 function(one, 4, 3)
-    cut = amiwarp.Windows(*(np.array(v, np.int64) for v in ([0, 200], [200, 300], [0, 5], [199, 299])))
-    assert host(amiwarp.event_count(given, 4, 3, windows=cut))[:, 0, 0].tolist() == [200, 100]
+    cut = amiwarp.Windows(*(np.array(v, np.int64) for v in ([0, at], [at, 300], [0, 5], [at - 1, 299])))
+    assert host(amiwarp.event_count(given, 4, 3, windows=cut))[:, 0, 0].tolist() == [at, 300 - at]
 
 
 def test_refusals() -> None:
