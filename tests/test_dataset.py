@@ -320,6 +320,18 @@ def test_a_finished_recording_that_cannot_be_read_is_made_again(place: Path, mon
     assert checksums(place) == before
 
 
+def test_the_manifest_of_an_interrupted_run_says_that_recordings_are_missing(place: Path) -> None:
+    def stop_at_third(step: str, _share: float) -> None:
+        if step.startswith("3 of 12"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make(place, progress=stop_at_third)
+    found = manifest(place)
+    assert (found["complete"], found["recordings"], len(found["items"]), found["failed"]) == (False, 12, 3, [])
+    assert (make(place).kept, manifest(place)["complete"]) == (3, True)
+
+
 def test_a_killed_run_is_continued(place: Path) -> None:
     (place / "spec.toml").write_text("seeds = 4\n" + BASE + PICTURES)
     journal = place / "out" / JOURNAL

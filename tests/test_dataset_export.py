@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import io
 import json
+import re
 import tarfile
 from pathlib import Path
 from typing import Any
@@ -119,6 +120,12 @@ def test_parquet_holds_every_event_and_label(made: Path, tmp_path: Path) -> None
         check(made, row["label_k"], row)
         entry = columns_of(made, row["label_k"])[1]
         assert (row["label_class"], row["split"], row["width"]) == (entry["labels"]["class"], entry["split"], 9)
+    named = re.findall(
+        r"^  - split: (\S+)\n    path: (\S+)$", (tmp_path / "out" / "README.md").read_text(), re.MULTILINE
+    )
+    assert {split for split, _ in named} == {"train", "val_1", "test"}
+    globbed = [path for _, pattern in named for path in (tmp_path / "out").glob(pattern)]
+    assert sorted(globbed) == sorted(tmp_path / "out" / name for name in done.files)
     types = pyarrow.parquet.read_schema(tmp_path / "out" / train[0])
     assert [str(types.field(name).type.value_type) for name in "xytp"] == ["uint16", "uint16", "int64", "uint8"]
 

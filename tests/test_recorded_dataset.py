@@ -147,6 +147,15 @@ def test_structured_items_are_those_of_tonic(folder: Path) -> None:
         RecordedDataset(folder, target_transform=len)
 
 
+def test_structured_items_keep_places_between_pixels(tmp_path: Path) -> None:
+    moved = Events.from_arrays(np.float32([1.5, -0.25]), np.float32([2.0, 3.75]), [10, 20], [1, 0])
+    save_recording(tmp_path / "a.h5", Recording(MemoryEvents(moved, 8, 6)))
+    write_manifest(tmp_path, items=[{**GOOD, "events": 2}])
+    events, _ = RecordedDataset(tmp_path, structured=True)[0]
+    assert events.dtype == np.dtype([("x", np.float32), ("y", np.float32), ("t", np.int64), ("p", np.int8)])
+    assert events.tolist() == [(1.5, 2.0, 10, 1), (-0.25, 3.75, 20, 0)]
+
+
 def test_tonic_s_transforms_and_caches_take_structured_items(tmp_path: Path) -> None:
     """tonic needs librosa and Numba, so it is not among the packages of the tests."""
     tonic = pytest.importorskip("tonic")
