@@ -210,6 +210,14 @@ def test_the_event_rate_comes_before_coverage() -> None:
     assert (speeds[300:] == speeds[-1]).all()
 
 
+def test_above_the_largest_event_rate_the_speed_is_lowered_well_below_it() -> None:
+    """From 600 rpm, where the rate is reached at 400 rpm, to nine tenths of it: a rate at the limit would swing."""
+    controller = SpeedController(circle(2.0), 600.0, most_mev_s=2.0)
+    speeds = follow(controller, [scene()] * 400)
+    assert 0.8 * 400.0 <= speeds[-1] <= 0.91 * 400.0
+    assert (np.diff(speeds) <= 0.0).all()
+
+
 def test_what_makes_no_sense_is_said() -> None:
     orbit = circle(4.0)
     with pytest.raises(AmiwarpError, match=r"100 rpm to start with is not in 120 \.\. 1440 rpm"):

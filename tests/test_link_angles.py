@@ -56,6 +56,8 @@ def test_a_missed_index_is_told_once_and_changes_nothing() -> None:
     assert found[0].counts == pytest.approx(1.5 * PER_TURN, abs=11)
     assert turned(angles, 6500, 9000) == []
     assert angles.count(0, 9000)[0] == pytest.approx(math.tau * 9)
+    found = turned(angles, 9000, 13_000, index=False)
+    assert [r.fault for r in found] == [EncoderFault.MISSED_INDEX]  # again, after one that came
 
 
 def test_a_reversal_is_told_and_the_angle_follows() -> None:

@@ -74,6 +74,13 @@ def test_it_does_not_matter_how_the_bytes_are_cut(messages: list[Message], cuts:
     assert decoder.received.lost == decoder.received.damaged == 0
 
 
+def test_the_largest_number_of_samples_comes_back() -> None:
+    message = Samples(tuple(range(MOST_SAMPLES)), tuple(range(-MOST_SAMPLES, 0)))
+    decoder = FrameDecoder()
+    assert decoder.feed(encode(message, 3)) == [(3, message)]
+    assert decoder.received.unknown == 0
+
+
 def test_layout_is_as_documented() -> None:
     """Computed by hand from the documentation: version 1, type 2, sequence 0x0102, t 0x04030201, count -1, CRC-32."""
     packet = bytes([1, 2, 0x02, 0x01, 1, 2, 3, 4, 255, 255, 255, 255])

@@ -563,14 +563,14 @@ def test_a_source_that_does_not_let_go_is_left_behind() -> None:
     free.set()
 
 
-@pytest.mark.parametrize("offset", [0.0, 700.0])
-def test_the_clock_offset_of_a_file_is_applied_once(tmp_path: Path, offset: float) -> None:
-    """The calibration's offset applies once, live and offline, to the file and to its live recording."""
+@pytest.mark.parametrize(("offset", "calibrated"), [(0.0, True), (700.0, True), (700.0, False)])
+def test_the_clock_offset_of_a_file_is_applied_once(tmp_path: Path, offset: float, *, calibrated: bool) -> None:
+    """The calibration's offset, or else the file's, applies once, live and offline, to file and live recording."""
     recording = points(20_000, 0.5)
     assert recording.encoder is not None
     late = Encoder(recording.encoder.t + 700, recording.encoder.angle, offset)
     save_recording(tmp_path / "file.h5", replace(recording, encoder=late))
-    known = replace(KNOWN, parameters={**KNOWN.parameters, "clock_offset": 700.0})
+    known = replace(KNOWN, parameters={**KNOWN.parameters, **({"clock_offset": 700.0} if calibrated else {})})
     source = open_source(str(tmp_path / "file.h5"), pace=None)
     out: list[Compensated] = []
     with LiveWriter(tmp_path / "raw.h5", width=64, height=48, clock_offset_us=offset) as raw:

@@ -220,7 +220,11 @@ def test_a_camera_returns_in_a_recording_and_in_a_view(tmp_path: Path, monkeypat
     assert said["returns"] >= 1
     assert said["events"] == 100_000
     recording = open_recording(tmp_path / "o.h5")
-    assert (np.diff(recording.events.slice(0, 100_000).t) >= 0).all()
+    t = recording.events.slice(0, 100_000).t
+    assert (np.diff(t) >= 0).all()
+    assert recording.encoder is not None
+    shift = int(t[50_000] - t[0])
+    assert np.isin(np.concatenate([at + 9, at + 9 + shift]).astype(np.int64), recording.encoder.t).all()
     with connected(camera := StubCamera(serial="1")):
         source = reopen_source("camera:1", threading.Event())
         assert source is not None

@@ -123,12 +123,17 @@ def test_without_pulses_arrivals_tell_within_what_they_say() -> None:
     assert found.offset_std_us > 1000
 
 
-def test_without_pulses_a_controller_that_runs_fast_is_followed() -> None:
-    """The controller's clock gains 0.2 ms per second on the host's, the camera's none; packets need 2 ms."""
+@pytest.mark.parametrize("ahead_us", [0, 3_600_000_000])
+def test_without_pulses_a_controller_that_runs_fast_is_followed(ahead_us: int) -> None:
+    """The controller's clock gains 0.2 ms per second on the host's, the camera's none; packets need 2 ms.
+
+    ``ahead_us``: by how much the host's clock is ahead of both, as it runs since the computer was started.
+    """
     sent, clock = np.arange(20) * 50_000, CameraClock()
-    host = fit_to_round_trips(sent, np.rint((sent + 150) * 1.0002).astype(np.int64), sent + 300)
+    answered = np.rint((sent + 150) * 1.0002).astype(np.int64)
+    host = fit_to_round_trips(sent + ahead_us, answered, sent + ahead_us + 300)
     for t in sent.tolist():
-        clock.packet(t - 2000, t)
+        clock.packet(t - 2000, t + ahead_us)
     found = clock.clock(host)
     assert found is not None
     for seconds in (0, 10, 20):
