@@ -654,6 +654,8 @@ def test_a_log_intensity_of_a_large_image_uses_a_part_of_its_pixels(
     assert "25 % of the pixels" in found.note
     assert "ms in the middle" in found.note
     assert np.corrcoef(found.after.ravel(), whole.ravel())[0, 1] > 0.5
+    inspector.set(replace(inspector.knobs, focal_length=inspector.camera.fx))  # as calibrated, and the same
+    np.testing.assert_allclose(make_images(inspector, ImageKind.LOG_INTENSITY).after, found.after, rtol=0, atol=1e-4)
 
 
 def test_a_scale_gives_colours_and_marks() -> None:
@@ -982,9 +984,10 @@ def test_the_events_of_the_window_are_downloaded(
         write_events(inspector, path, compensated=compensated)
 
 
-def test_events_of_two_prisms_are_downloaded_with_both_encoders(tmp_path: Path) -> None:
-    events, first = MemoryEvents(random_events(2000, 40, 30), 40, 30), Encoder.constant_speed(720.0, 0, 100_000)
-    second = Encoder.constant_speed(-500.0, 0, 100_000)
+@pytest.mark.parametrize("offset", [0.0, 50_000.0])
+def test_events_of_two_prisms_are_downloaded_with_both_encoders(tmp_path: Path, offset: float) -> None:
+    events = MemoryEvents(random_events(2000, 40, 30), 40, 30)
+    first, second = (Encoder.constant_speed(rpm, 0, 200_000).with_clock_offset(offset) for rpm in (720.0, -500.0))
     inspector = Inspector(Recording(events, Camera.from_fov(40, 30, 1.0), first.with_second(second)))
     inspector.open(40_000, 20_000, Selection())
     write_events(inspector, tmp_path / "events.h5", compensated=False)

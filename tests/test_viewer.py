@@ -144,6 +144,16 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
         assert np.abs(ours - plain).max() < 0.05 * plain.max()
 
 
+def test_the_angles_of_drawn_events_follow_the_clock_offset(inspector: Inspector) -> None:
+    inspector.open(*inspector.first_window())
+    for offset in (0.0, 2500.0):
+        inspector.set(replace(inspector.knobs, clock_offset=offset))
+        shown = inspector.show()
+        expected = inspector.encoder_of(inspector.knobs).angle_at(shown.events.t)
+        away = np.abs(np.exp(1j * shown.theta) - np.exp(1j * expected))
+        assert away.max() < 0.01  # rad; of 0.19, as the offset is applied linearly and the speed varies
+
+
 def test_points_are_thinned_evenly(recording: Recording) -> None:
     shown = Inspector(recording, most_points=1000).show()
     assert len(shown.events) == len(shown.after) == 1000
