@@ -121,6 +121,17 @@ def test_each_part_keeps_what_plain_python_keeps_in_blocks_of_any_length(name: s
         assert len(running.removed) == (7 if name == "all" else 1)
 
 
+def test_removed_events_of_hot_pixels_are_counted_one_by_one() -> None:
+    events = some_events()
+    running = RunningFilter(EventFilter(hot_pixels=HOT), (WIDTH, HEIGHT))
+    for a, b in ((0, 1400), (1400, len(events))):
+        running.keep(events[a:b])
+    counted = [(x, y, int(np.count_nonzero((events.x == x) & (events.y == y)))) for x, y in ((5, 3), (13, 8))]
+    assert running.hot_counts() == tuple(sorted(counted, key=lambda each: -each[2]))
+    assert min(count for *_, count in counted) > 2
+    assert sum(count for *_, count in counted) == running.removed["hot_pixels"]
+
+
 def test_a_limited_rate_is_even_and_allows_a_short_burst() -> None:
     t = np.concatenate([np.arange(0, 100_000, 10), [300_000] * 30])
     zeros = np.zeros(len(t), np.uint16)

@@ -570,6 +570,13 @@ def test_prophesee_hdf5_without_its_codec(tmp_path, mode):
     assert_equal(open_recording(tmp_path / "b.hdf5").events.slice(0, 9999), events)
 
 
+@pytest.mark.parametrize("mode", ["packed", "rows", "masks"])
+def test_chunks_of_ecf_hold_coordinates_of_eleven_bits(mode):
+    x, y = [0, 1023, 1024, 1279, 2047, 1500], [2047, 719, 1024, 0, 1023, 5]
+    events = Events.from_arrays(x, y, [10, 10, 12, 30, 400, 401], [0, 1, 1, 0, 1, 0])
+    assert_equal(Events(*ecf.decode_chunk(ecf_chunk(events, mode))), events)
+
+
 def test_prophesee_hdf5_that_is_damaged(tmp_path):
     events = ecf_events(800)
     path = tmp_path / "a.hdf5"
