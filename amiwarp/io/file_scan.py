@@ -402,7 +402,10 @@ class FileEvents(EventSource):
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
         """Return all events in blocks, as :meth:`amiwarp.EventSource.blocks`."""
-        return regroup((_copied([block]) for block in self._all()), count=count, duration_us=duration_us)
+        blocks = self._all()
+        if self._kept is not None:
+            blocks = (_copied([block]) for block in blocks)
+        return regroup(blocks, count=count, duration_us=duration_us)
 
     def _all(self) -> Iterator[Events]:
         return iter(self._kept) if self._kept is not None else self._pass(PassCounts())

@@ -66,8 +66,8 @@ def halves_of(words: NDArray[np.uint64]) -> Halves | None:
 
 # Readers of Prophesee's files: RAW with the decoder in Warp, DAT with NumPy.
 
-EVT_BYTES = 1 << 21
-"""Number of bytes of EVT words that are decoded at once. They hold at most 13 million events."""
+EVT_BYTES = 1 << 22
+"""Number of bytes of EVT words that are decoded at once. They hold at most 26 million events."""
 
 VERSION_OF = {2: "3.0", 4: "2.0", 8: "2.1"}
 """Version of EVT by the size of its words [bytes]."""
