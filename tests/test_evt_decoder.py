@@ -105,6 +105,25 @@ def test_data_that_are_no_words_are_refused() -> None:
         EvtDecoder("4")
 
 
+@pytest.mark.parametrize("rare", [0.003, 0.03])
+def test_words_that_are_rare_are_found_anywhere_in_a_block(rare: float, device: str) -> None:
+    """Rows, bases and times are searched for in strides of 64 words."""
+    rng = np.random.default_rng(int(1000 * rare))
+    for _ in range(6):
+        count = int(rng.integers(2000, 3000))
+        words = random_words("3.0", count, rng)
+        events = (rng.choice([2, 4, 5], count) << 12 | rng.integers(0, 1 << 12, count)).astype("<u2")
+        words = np.where(rng.random(count) < rare, words, events)
+        (x, y, t, p), known_edges = Evt3Decoder().decode(words)
+        decoder = EvtDecoder("3.0", device=device)
+        cut = int(rng.integers(0, count))
+        parts = [decoder.decode(part) for part in (words[:cut], words[cut:])]
+        found = [events.to_host() for events, _ in parts]
+        for name, known in (("x", np.minimum(x, 65535)), ("y", y), ("t", t), ("p", p)):
+            np.testing.assert_array_equal(np.concatenate([getattr(each, name) for each in found]), known)
+        np.testing.assert_array_equal(np.concatenate([edges.t for _, edges in parts]), known_edges[2])
+
+
 def test_a_single_event_between_vectors_moves_no_vector() -> None:
     words = [0x8000, 0x6001, 0x0000, 0x300A, 0x2805, 0x4001]
     assert decoded("3.0", words)[0] == [[5, 0, 1, 1], [10, 0, 0, 1]]

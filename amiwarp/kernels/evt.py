@@ -284,43 +284,110 @@ for _word in (wp.uint32, wp.uint64):
 # EVT 3.0. A vector has one bit for each of 12 or 8 pixels, and moves the base behind them.
 
 
+@wp.func_native("""
+    const uint16_t* word = (const uint16_t*)words.data;
+    int count = 0;
+    for (int i = start; i < stop; ++i) {
+        const uint16_t type = word[i] >> 12;
+        const uint16_t pixels = type == 4 ? word[i] & 0xFFF : type == 5 ? word[i] & 0xFF : type == 2;
+        const uint16_t pairs = pixels - ((pixels >> 1) & 0x5555);
+        const uint16_t fours = (pairs & 0x3333) + ((pairs >> 2) & 0x3333);
+        count += (fours & 0xF) + (fours >> 4 & 0xF) + (fours >> 8);
+    }
+    return count;
+""")
+def count_events(words: wp.array(dtype=wp.uint16), start: int, stop: int) -> int:
+    """Return the number of events in the words from ``start`` to before ``stop``. CPU compilers vectorise it."""
+
+
+@wp.func_native("""
+    const uint16_t* word = (const uint16_t*)words.data;
+    int count = 0;
+    for (int i = start; i < stop; ++i) count += word[i] >> 12 == kind;
+    return count;
+""")
+def count_words(words: wp.array(dtype=wp.uint16), kind: int, start: int, stop: int) -> int:
+    """Return the number of words of a kind from ``start`` to before ``stop``. CPU compilers vectorise it."""
+
+
+@wp.func_native("""
+    const uint16_t* word = (const uint16_t*)words.data;
+    int i = start;
+    for (; i + 64 <= stop; i += 64) {
+        int found = 0;
+        for (int k = 0; k < 64; ++k) found |= word[i + k] >> 12 == kind;
+        if (found) break;
+    }
+    while (i < stop && word[i] >> 12 != kind) ++i;
+    return i;
+""")
+def next_of(words: wp.array(dtype=wp.uint16), kind: int, start: int, stop: int) -> int:
+    """Return the index of the first word of a kind from ``start`` on, or ``stop``. CPU compilers vectorise it."""
+
+
+@wp.func_native("""
+    const uint16_t* word = (const uint16_t*)words.data;
+    int i = stop;
+    for (; i - 64 >= start; i -= 64) {
+        int found = 0;
+        for (int k = 1; k <= 64; ++k) found |= word[i - k] >> 12 == kind;
+        if (found) break;
+    }
+    for (--i; i >= start && word[i] >> 12 != kind; --i) {}
+    return i < start ? -1 : i;
+""")
+def last_of(words: wp.array(dtype=wp.uint16), kind: int, start: int, stop: int) -> int:
+    """Return the index of the last word of a kind from ``start`` to before ``stop``, or :data:`NONE`."""
+
+
 @wp.kernel
 def survey_evt3(words: wp.array(dtype=wp.uint16), length: int, start: int, changes: wp.array(dtype=Change)):
     """Note what each block of ``length`` words changes."""
     block = wp.tid() + start
+    begin = block * length
+    end = wp.min(begin + length, words.shape[0])
     change = unchanged()
-    last = int(NONE)
-    low = int(NONE)
-    for i in range(block * length, wp.min((block + 1) * length, words.shape[0])):
-        word = int(load_uint16(words, i))
-        kind = word >> 12
-        load = word & 0xFFF
-        # Selections instead of branches: which type of word follows cannot be predicted.
-        pixels = wp.where(kind == VECTOR_12, load, wp.where(kind == VECTOR_8, load & 0xFF, 0))
-        change.events += set_bits(wp.uint32(pixels)) + wp.where(kind == SINGLE, 1, 0)
-        width = wp.where(kind == VECTOR_12, 12, wp.where(kind == VECTOR_8, 8, 0))
-        change.moved = wp.where(kind == VECTOR_BASE, 0, change.moved + width)
-        change.base = wp.where(kind == VECTOR_BASE, load & 0x7FF, change.base)
-        change.polarity = wp.where(kind == VECTOR_BASE, load >> 11, change.polarity)
-        change.row = wp.where(kind == ROW, load & 0x7FF, change.row)
-        low = wp.where(kind == TIME_LOW, load, low)
-        if kind == TIME_HIGH:
-            if last == NONE:
-                change.first_high = load
-                change.early_events = change.events
-                change.early_triggers = change.triggers
-                change.low_before = low
-                low = int(NONE)
-            elif load != last:
-                change.rise += wp.int64(step_of(load, last, 12))
-                low = int(0)
-            last = load
-        elif kind == TRIGGER:
-            change.triggers += 1
-    if last == NONE:
-        change.low_before = low
-    else:
-        change.low_after = low
+
+    # The time's upper bits, of which there are few words.
+    first = int(end)
+    latest = int(NONE)
+    changed = int(end)
+    i = next_of(words, TIME_HIGH, begin, end)
+    while i < end:
+        high = int(load_uint16(words, i)) & 0xFFF
+        if latest == NONE:
+            first = i
+            changed = i
+            change.first_high = high
+        elif high != latest:
+            change.rise += wp.int64(step_of(high, latest, 12))
+            changed = i
+        latest = high
+        i = next_of(words, TIME_HIGH, i + 1, end)
+
+    change.events = count_events(words, begin, end)
+    change.triggers = count_words(words, TRIGGER, begin, end)
+    low = last_of(words, TIME_LOW, begin, first)
+    if low != NONE:
+        change.low_before = int(load_uint16(words, low)) & 0xFFF
+    if first < end:
+        change.early_events = count_events(words, begin, first)
+        change.early_triggers = count_words(words, TRIGGER, begin, first)
+        if changed > first:
+            change.low_after = 0
+        low = last_of(words, TIME_LOW, changed, end)
+        if low != NONE:
+            change.low_after = int(load_uint16(words, low)) & 0xFFF
+    at = last_of(words, ROW, begin, end)
+    if at != NONE:
+        change.row = int(load_uint16(words, at)) & 0x7FF
+    at = last_of(words, VECTOR_BASE, begin, end)
+    if at != NONE:
+        word = int(load_uint16(words, at))
+        change.base = word & 0x7FF
+        change.polarity = (word >> 11) & 1
+    at = wp.max(at, begin)
+    change.moved = 12 * count_words(words, VECTOR_12, at, end) + 8 * count_words(words, VECTOR_8, at, end)
     changes[block] = change
 
 
