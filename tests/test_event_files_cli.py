@@ -33,10 +33,13 @@ def large(monkeypatch: pytest.MonkeyPatch) -> None:
     """Treat files from 1 kB on as large, and their first 600 events as the part that is read, in blocks of 500."""
     monkeypatch.setattr("amiwarp.cli.recordings.LARGE_BYTES", 1000)
     monkeypatch.setattr("amiwarp.cli.recordings.HEAD_EVENTS", 600)
-    for module in ("prophesee", "aedat", "text_files"):
-        name, value = ("READ_BYTES", 4000) if module == "text_files" else ("DEFAULT_BLOCK", 500)
-        monkeypatch.setattr(f"amiwarp.io.{module}.{name}", value)
-    monkeypatch.setattr("amiwarp.io.prophesee.EVT_BYTES", 4000)
+    for name, value in (
+        ("aedat.DEFAULT_BLOCK", 500),
+        ("dat.PIECE_EVENTS", 500),
+        ("prophesee.EVT_BYTES", 4000),
+        ("text_files.READ_BYTES", 4000),
+    ):
+        monkeypatch.setattr(f"amiwarp.io.{name}", value)
 
 
 def write_later_start(path: Path, events: Events) -> None:

@@ -329,16 +329,41 @@ def test_pixels_that_no_sensor_has_are_named_without_a_size(tmp_path):
         open_recording(path)
 
 
-def test_dat_times_run_on_past_32_bits(tmp_path, monkeypatch):
-    monkeypatch.setattr("amiwarp.io.prophesee.DEFAULT_BLOCK", 7)
-    t = 3_000_000_000 + np.arange(0, 600) * 15_000_000
+@pytest.mark.parametrize("start", [3_000_000_000, 2**32 - 200 * 15_000_000])
+@pytest.mark.parametrize("back", [False, True], ids=["rising", "one step back over the end"])
+@pytest.mark.parametrize("piece", [1, 7])
+def test_dat_times_run_on_past_32_bits(tmp_path, monkeypatch, start, back, piece):
+    monkeypatch.setattr("amiwarp.io.dat.PIECE_EVENTS", piece)
+    monkeypatch.setattr("amiwarp.io.dat.BLOCK_EVENTS", 3)
+    t = start + np.arange(0, 600) * 15_000_000
+    if back:
+        after = int(np.searchsorted(t, 2**32))
+        t[after + 1 :] = np.maximum(t[after + 1 :], 2**32 + 100)
+        t[after : after + 2] = 2**32 + 50, 2**32 - 50
     events = Events(EVENTS.x, EVENTS.y, t, EVENTS.p)
     path = write_unsound(tmp_path / "long.dat", "dat", events[:0])
     words = np.stack([t % 2**32, EVENTS.x | (EVENTS.y.astype(np.int64) << 14)], axis=1).astype("<u4")
     path.write_bytes(path.read_bytes() + words.tobytes() + b"\1\2\3")
     recording = open_recording(path)
-    np.testing.assert_array_equal(recording.events.slice(0, 600).t, t)
+    np.testing.assert_array_equal(recording.events.slice(0, 600).t, np.maximum.accumulate(t))
     assert recording.metadata["truncated_bytes"] == 3
+    assert recording.metadata.get("repaired_time_events", 0) == back
+
+
+@pytest.mark.parametrize(("version", "y_at", "p_at"), [("1", 9, 17), ("2", 14, 28)])
+def test_dat_of_both_versions(tmp_path, version, y_at, p_at):
+    """Bits above the polarity are of no meaning."""
+    rng = np.random.default_rng(4)
+    t = np.cumsum(rng.integers(0, 9, 50))
+    x, y, p = rng.integers(0, 304, 50), rng.integers(0, 240, 50), rng.integers(0, 2, 50)
+    rest = x | y << y_at | p << p_at | rng.integers(0, 8, 50) << p_at + 1
+    path = tmp_path / "a.dat"
+    path.write_bytes(
+        f"% Version {version}\n".encode() + b"\x00\x08" + np.stack([t, rest], axis=1).astype("<u4").tobytes()
+    )
+    found = open_recording(path).events.slice(0, 50)
+    for name, known in (("x", x), ("y", y), ("t", t), ("p", p)):
+        np.testing.assert_array_equal(getattr(found, name), known)
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ FOLDERS = (("metadata.yaml", Format.ROSBAG), ("dataset_events_t.npy", Format.EVI
 OPENERS = {
     Format.HDF5: "native_format:open_hdf5",
     Format.EVT: "prophesee:open_evt",
-    Format.DAT: "prophesee:open_dat",
+    Format.DAT: "dat:open_dat",
     Format.AEDAT4: "aedat4:open_aedat4",
     Format.AEDAT3: "aedat:open_aedat3",
     Format.AEDAT2: "aedat:open_aedat2",
@@ -495,7 +495,7 @@ WRITERS = {
     OutputFormat.DSEC: "native_format:write_dsec",
     OutputFormat.EVT3: "prophesee:write_evt3",
     OutputFormat.EVT21: "prophesee:write_evt21",
-    OutputFormat.DAT: "prophesee:write_dat",
+    OutputFormat.DAT: "dat:write_dat",
     OutputFormat.AEDAT4: "aedat4:write_aedat4",
     OutputFormat.NPZ: "plain_files:write_npz",
     OutputFormat.TEXT: "plain_files:write_text",

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.io.evt_decoder import WORD_TYPES, EvtDecoder, Triggers
-from amiwarp.io.file_scan import FileEvents, Packet, last_word, nearest, read_pieces, read_words, unwrapped
+from amiwarp.io.file_scan import FileEvents, Packet, nearest, read_pieces, unwrapped
 from amiwarp.io.files import errors_name, open_input
-from amiwarp.io.formats import LONGEST_DAT_US, LONGEST_EVT21_US, LONGEST_US, Outline
+from amiwarp.io.formats import LONGEST_EVT21_US, LONGEST_US, Outline
 from amiwarp.validation import TIME_LIMIT
 
 # Words of the encodings.
@@ -84,7 +84,7 @@ GENERATIONS = {
 """Sensor sizes (width, height) [px] by name of the sensor generation, for headers without a geometry."""
 
 
-def _read_header(path: Path) -> tuple[dict[str, str], int]:
+def read_header(path: Path) -> tuple[dict[str, str], int]:
     """Return the ``% key value`` lines with lower-case keys, and the offset of the first byte after them."""
     with errors_name(path, lambda: "reading the header"), open_input(path) as file:
         fields: dict[str, str] = {}
@@ -139,16 +139,16 @@ def open_evt(path: Path) -> Recording:
 
 
 def read_evt_header(path: Path) -> EvtFile:
-    fields, offset = _read_header(path)
+    fields, offset = read_header(path)
     version = fields.get("evt") or fields.get("format", "").removeprefix("EVT").partition(";")[0]
     word = {"2.0": 4, "2": 4, "2.1": 8, "21": 8, "3.0": 2, "3": 2}.get(version)
     if word is None:
         raise AmiwarpError(f"{path}: EVT version in the header is '{version[:40]}'; expected 2.0, 2.1 or 3.0")
     swapped = word == 8 and _is_swapped(path, offset, fields.get("format", ""))
-    return EvtFile(path, fields, "2.1" if word == 8 else version, offset, word, swapped, _origin(path, fields))
+    return EvtFile(path, fields, "2.1" if word == 8 else version, offset, word, swapped, stated_origin(path, fields))
 
 
-def _origin(path: Path, fields: dict[str, str]) -> int:
+def stated_origin(path: Path, fields: dict[str, str]) -> int:
     """Return the time that is added to all times of a file [us]: ``t0`` of the header, or 0."""
     origin = fields.get("t0", "0")
     if not re.fullmatch(r"[0-9]{1,19}", origin) or int(origin) > TIME_LIMIT:
@@ -211,53 +211,6 @@ def _is_swapped(path: Path, offset: int, layout: str) -> bool:
         file.seek(offset)
         found = halves_of(words_of(file.read(EVT_BYTES), "2.1"))
         return found is None or found.swapped
-
-
-def open_dat(path: Path) -> Recording:
-    """Open a DAT file of 2D or CD events, version 1 or 2.
-
-    Its 32-bit times, which wrap after 71 min, are unwrapped.
-    """
-    fields, offset = _read_header(path)
-    with errors_name(path, lambda: "reading the header"), open_input(path) as file:
-        file.seek(offset)
-        kind = file.read(2)
-    # 0x00: 2D events; 0x0c: CD events. Both have 8 bytes.
-    if len(kind) < 2 or kind[0] not in (0x00, 0x0C) or kind[1] != 8:
-        raise AmiwarpError(
-            f"{path}: byte {offset}: {kind.hex() or 'nothing'} is not a DAT event type; expected 0008 or 0c08"
-        )
-    version = fields.get("version", "2")
-    if version not in ("1", "2"):
-        raise AmiwarpError(f"{path}: DAT version is '{version[:40]}'; expected 1 or 2")
-    width, height = fields.get("width", ""), fields.get("height", "")
-    size = (int(width), int(height)) if width.isdecimal() and height.isdecimal() else None
-    origin = _origin(path, fields)
-    read = partial(_dat_packets, path, offset + 2, version, origin)
-    last = partial(_last_dat_time, path, offset + 2, origin)
-    events = FileEvents(path, read, size=size, last_time=last)
-    return Recording(events=events, metadata={"format": f"dat{version}", **events.metadata}, name=path.stem)
-
-
-def _last_dat_time(path: Path, offset: int, origin: int, estimate: int) -> int | None:
-    """Return the time of the last event [us]."""
-    last = last_word(path, offset, "<u4", estimate - origin)
-    return None if last is None else last + origin
-
-
-def _dat_packets(path: Path, offset: int, version: str, origin: int, notes: dict[str, int]) -> Iterator[Packet]:
-    # Bits of the second word, according to Prophesee's documentation of the format.
-    bits, y_shift, p_shift = ((9, 8), 9, 17) if version == "1" else ((14, 14), 14, 28)
-    last: int | None = None
-    for words in read_words(path, offset, "<u4", DEFAULT_BLOCK, notes):
-        rest = words[:, 1]
-        if not rest.size:
-            return
-        t = unwrapped(words[:, 0].astype(np.int64), 32, last)
-        last = int(t[-1])
-        x = rest & ((1 << bits[0]) - 1)
-        y = (rest >> y_shift) & ((1 << bits[1]) - 1)
-        yield x, y, t + origin, (rest >> p_shift) & 1
 
 
 # Encoder of events in Prophesee's EVT 3.0, and writer of RAW files with them.
@@ -402,29 +355,3 @@ def write_evt21(part: Path, blocks: Iterable[Events], about: Outline) -> None:
         file.write(_raw_header(about, "2.1", "EVT21", origin, ";endianness=little"))
         for events in blocks:
             file.write(encoder.encode(events).astype("<u8").data)
-
-
-# Writer of DAT files, version 2, of CD events: a header, then 8 bytes for each event.
-
-DAT_KIND = bytes([0x0C, 8])
-"""Type of the events, CD, and their size [bytes], between the header and the events."""
-
-
-def write_dat(part: Path, blocks: Iterable[Events], about: Outline) -> None:
-    """Write all events into a DAT file."""
-    origin = origin_of(about, LONGEST_DAT_US)
-    header = [
-        "Data file containing CD events.",
-        "Version 2",
-        f"Height {about.height}",
-        f"Width {about.width}",
-        *([f"T0 {origin}"] if origin else []),
-    ]
-    with part.open("xb") as file:
-        file.write("".join(f"% {line}\n" for line in header).encode())
-        file.write(DAT_KIND)
-        for events in blocks:
-            words = np.empty((len(events), 2), "<u4")
-            words[:, 0] = events.t - origin
-            words[:, 1] = events.x | events.y.astype(np.uint32) << 14 | events.p.astype(np.uint32) << 28
-            file.write(words.data)
