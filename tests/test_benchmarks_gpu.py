@@ -26,6 +26,7 @@ def test_cells_are_compared_by_their_results() -> None:
     assert two_gpus.difference("files", {"0.h5": "x"}, {"0.h5": "y"}) == math.inf
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
 def test_two_workers_make_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two processes make the files of one worker, which is a thread of this process."""

@@ -346,6 +346,7 @@ def test_quick_chart_writes_everything(charted: tuple[Path, dict[str, Any]]) -> 
         assert preset["measured"][unit] == same[unit] == pytest.approx(data["answers"][kind][unit])
 
 
+@pytest.mark.slow
 def test_settings_that_fail_do_not_end_the_command(
     charted: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -69,6 +69,7 @@ def test_a_right_camera_is_left_alone(wide: Recording) -> None:
     assert abs(found.parameters["apex"] - PRISM.apex) < 3.0 * found.uncertainty["apex"]
 
 
+@pytest.mark.slow
 def test_a_distortion_that_was_not_given_is_found(texture: np.ndarray) -> None:
     camera = replace(CAMERA, distortion=RadialTangential(k1=-0.1))
     recording = simulate(texture, camera, PRISM, duration_s=0.17, seed=6)
@@ -82,6 +83,7 @@ def test_a_distortion_that_was_not_given_is_found(texture: np.ndarray) -> None:
     assert "k1" in found.photometric.uncertainty
 
 
+@pytest.mark.slow
 def test_the_flat_side_is_found(wide: Recording) -> None:
     found = calibrated(replace(wide, prism=replace(PRISM, flat_side=FlatSide.CAMERA)))
     assert found.prism.flat_side is FlatSide.SCENE
@@ -89,6 +91,7 @@ def test_the_flat_side_is_found(wide: Recording) -> None:
     assert any("flat face of the prism points to the scene" in w for w in found.warnings)
 
 
+@pytest.mark.slow
 def test_the_index_is_found(texture: np.ndarray) -> None:
     """Without it, a wobble, a focal length and a distortion would share the error."""
     prism = Prism(math.radians(4.0))
@@ -119,6 +122,7 @@ def bent(encoder: Encoder) -> Encoder:
     return replace(encoder, angle=encoder.angle + HARMONICS @ turns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["exact", "auto"])
 def test_an_encoder_that_is_off_centre_is_corrected(wide: Recording, model: str, tmp_path: Path) -> None:
     assert wide.encoder is not None
@@ -176,6 +180,7 @@ def test_an_accepted_delay_of_the_read_out_is_reported_and_no_error_of_the_encod
     assert found.parameters["apex"] == pytest.approx(PRISM.apex, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_very_wrong_camera_is_no_error_of_the_encoder(wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     """A false error of the angle is found first; the camera is corrected with it and without it."""
     errors = iter([np.array([0.004, 0.002, 0.0, 0.006, 0.0, 0.0])])
@@ -195,6 +200,7 @@ def test_a_wrong_ratio_of_the_focal_lengths_is_found(texture: np.ndarray) -> Non
     assert error_px(recording, found, camera) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "shape"), [("cylinder", (0.0, math.radians(0.1))), ("wobble", (math.radians(0.5), math.radians(3.0)))]
 )

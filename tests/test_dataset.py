@@ -966,6 +966,7 @@ def test_durations_read_well(seconds: float, text: str) -> None:
     assert duration_text(seconds) == text
 
 
+@pytest.mark.slow
 def test_the_tutorial_s_classifier_beats_chance(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

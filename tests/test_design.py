@@ -120,6 +120,7 @@ def test_tiles_see_what_their_part_of_the_image_sees() -> None:
     assert tiles(Camera.from_fov(40, 30, 1.0)) == [Camera.from_fov(40, 30, 1.0)]
 
 
+@pytest.mark.slow
 def test_the_law_predicts_whole_simulations(texture: np.ndarray) -> None:
     """For an apex and a speed that were not used in the fit."""
     camera = Camera.from_fov(240, 180, math.radians(30.0))

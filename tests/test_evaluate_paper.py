@@ -272,6 +272,7 @@ def test_a_saddle_is_not_convex() -> None:
     assert not shape.convex[2:-2, 2:-2].any()
 
 
+@pytest.mark.slow
 def test_the_cost_of_a_recording() -> None:
     """An ideal sensor before discs: contrast has one optimum, the true one, in a convex domain."""
     condition = Condition(DISCS, "still", math.radians(1.0), 1440.0, 1, 2.0, 100, 80, only=IDEAL)

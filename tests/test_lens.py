@@ -721,6 +721,7 @@ def stream(recordings: list[amiwarp.Recording], tmp_path_factory: pytest.TempPat
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_a_stream_gives_a_lens_once_its_poses_are_enough(
     stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

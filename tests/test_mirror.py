@@ -320,6 +320,7 @@ def test_motion_too_fast_for_the_sensor_is_refused(texture: np.ndarray) -> None:
         amiwarp.calibrate(shown, model="mirror", events=20_000, start=known, free=AMPLITUDES, photometric=coarse)
 
 
+@pytest.mark.slow
 def test_a_turning_camera_leaves_all_parameters_of_two_angles_free(texture: np.ndarray) -> None:
     camera, pair = amiwarp.Camera.from_fov(80, 60, math.radians(50.0)), amiwarp.Prism(0.03, second=amiwarp.Prism(0.025))
     motion = amiwarp.PrismMotion(1500.0, 0.3, second=amiwarp.PrismMotion(-2100.0, -0.7))

@@ -70,6 +70,7 @@ def rates_of(c: Calibration) -> NDArray[np.float64]:
     return np.array([c.parameters[n] for n in RATES])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axis", "speed"), [(1, 10.0), (2, 60.0)])
 def test_the_camera_turns(texture: NDArray[np.uint8], axis: int, speed: float) -> None:
     rate = np.eye(3)[axis] * math.radians(speed)
@@ -82,6 +83,7 @@ def test_the_camera_turns(texture: NDArray[np.uint8], axis: int, speed: float) -
     assert c.camera_rotation == CameraRotation(tuple(rates_of(c).tolist()), middle_us=c.middle_us or 0)
 
 
+@pytest.mark.slow
 def test_it_turns_ever_faster_and_the_picture_follows(texture: NDArray[np.uint8], tmp_path: Path) -> None:
     """Angular velocity linear in time: its change is found, stored in the file, and used by the reconstruction."""
     simulation = Simulation(
@@ -104,6 +106,7 @@ def test_it_turns_ever_faster_and_the_picture_follows(texture: NDArray[np.uint8]
     assert following.residual < 0.3 * still.residual
 
 
+@pytest.mark.slow
 def test_it_moves_forward_and_the_image_grows(texture: NDArray[np.uint8], device: str) -> None:
     """Towards a picture at 1 m, at 1.5 m/s: in the middle of the recording, the growth is speed over depth."""
     wall = Mesh(np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]), np.array([[0, 1, 2], [0, 2, 3]]),
@@ -129,6 +132,7 @@ def test_a_still_camera_is_found_to_be_still(recording: Recording) -> None:
     assert np.abs(rates).max() < math.radians(1.0)
 
 
+@pytest.mark.slow
 def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording) -> None:
     """At constant speed a clock offset equals a phase. This encoder has no counting steps that would separate them."""
     even = Encoder.constant_speed(720.0, recording.events.t_first, recording.events.t_last)
@@ -277,6 +281,7 @@ def test_blank_scene() -> None:
         calibrate(noisy)
 
 
+@pytest.mark.slow
 def test_a_hand_trembles(texture: NDArray[np.uint8]) -> None:
     # within two turns, the speed of a tremor is no linear function of time
     t = np.linspace(0.0, 0.2, 201)

@@ -123,6 +123,7 @@ def test_it_is_calibrated_stored_and_compensated(
     np.testing.assert_allclose(out, expected, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_programs_list_its_parameter(cylinder: Any, tmp_path: Path) -> None:
     assert units()["power"] == "1"
     assert "cylinder" not in rungs()

@@ -401,6 +401,7 @@ def test_no_letters_of_the_chart_overlap(compared: Comparison) -> None:
     assert outside == []
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_comparison(tmp_path: Path, texture: np.ndarray) -> None:
     app = typer.Typer()
     command(app, command_line.run_design, name="design", example="")

@@ -69,6 +69,7 @@ def test_free_of_the_bias(recording: Recording, device: str) -> None:
     assert [s.name for s in c.stages][-1] == "photometric"
 
 
+@pytest.mark.slow
 def test_unequal_thresholds(texture: np.ndarray) -> None:
     camera = Camera.from_fov(200, 150, math.radians(50.0))
     sensor = SensorModel(contrast_on=0.22, contrast_off=0.28, mismatch=0.05)
@@ -79,6 +80,7 @@ def test_unequal_thresholds(texture: np.ndarray) -> None:
     assert 1.05 < c.photometric.off_over_on < 1.35  # true value 1.27; noise pairs shift it towards 1
 
 
+@pytest.mark.slow
 def test_every_model_of_the_ladder_runs(recording: Recording) -> None:
     c = calibrate(recording, model="radial", photometric=KNOWN_COARSE)
     assert c.photometric is not None
@@ -86,6 +88,7 @@ def test_every_model_of_the_ladder_runs(recording: Recording) -> None:
     assert error_px(recording, c) < 0.1
 
 
+@pytest.mark.slow
 def test_clock_offset_is_found(texture: np.ndarray) -> None:
     camera = Camera.from_fov(140, 105, math.radians(50))
     ramp = np.array([[0.0, 300.0], [0.3, 1500.0]])
@@ -123,6 +126,7 @@ def test_too_few_pairs_are_refused(texture: np.ndarray) -> None:
     assert calibrate(recording, stages=("sharpness",)).photometric is None
 
 
+@pytest.mark.slow
 def test_missing_events_are_not_believed(texture: np.ndarray) -> None:
     """One event of seven is kept. The image is as sharp, but consecutive events are no longer one threshold apart."""
     recording = simulate(texture, Camera.from_fov(120, 90, math.radians(50)), TRUE_PRISM, duration_s=0.25, seed=3)
@@ -133,6 +137,7 @@ def test_missing_events_are_not_believed(texture: np.ndarray) -> None:
     assert error_px(recording, calibrate(thinned, stages=("sharpness",))) < 0.15
 
 
+@pytest.mark.slow
 def test_a_camera_that_turns_is_found_out(texture: np.ndarray) -> None:
     """An undeclared 40 deg/s: no brightness map explains the events of a still camera, so motion is estimated."""
     camera = Camera.from_fov(140, 105, math.radians(50))
@@ -156,6 +161,7 @@ def shaken(texture: np.ndarray, turning_s: float) -> Recording:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_calmest_turns_are_used(texture: np.ndarray) -> None:
     recording = shaken(texture, turning_s=0.06)
     c = calibrate(recording, events=100_000, photometric=COARSE, model="exact")
@@ -164,6 +170,7 @@ def test_the_calmest_turns_are_used(texture: np.ndarray) -> None:
     assert [0.19 < float(found[1]) < float(found[2]) < 0.41 for found in since if found] == [True]
 
 
+@pytest.mark.slow
 def test_a_camera_that_moves_too_fast_is_named(texture: np.ndarray) -> None:
     with pytest.raises(
         AmiwarpError, match=r"moves too fast for the prism.*hold the camera still.*or record such motion for"
@@ -171,6 +178,7 @@ def test_a_camera_that_moves_too_fast_is_named(texture: np.ndarray) -> None:
         calibrate(shaken(texture, turning_s=0.13), photometric=COARSE, model="exact", **SHORT)
 
 
+@pytest.mark.slow
 def test_a_tremor_that_hides_the_prism_is_refused(texture: np.ndarray) -> None:
     """A tremor of 0.5 px at 10.5 Hz beside a fast rotation: one map explains the events of two turns, by another orbit.
 
@@ -187,6 +195,7 @@ def test_a_tremor_that_hides_the_prism_is_refused(texture: np.ndarray) -> None:
         calibrate(recording, photometric=COARSE, model="exact", **SHORT)
 
 
+@pytest.mark.slow
 def test_a_camera_that_never_rests_is_calibrated_turn_by_turn(texture: np.ndarray, device: str) -> None:
     """It sways at 1.3 Hz, by up to 70 deg/s, and trembles at 9.7 Hz beside a prism of 12 turns per second."""
     t = np.arange(0.0, 1.7, 0.005)

@@ -25,6 +25,7 @@ def calibrated(condition: Condition) -> tuple[Calibration, float]:
     return found, model_error(found.model, truth).rms
 
 
+@pytest.mark.slow
 def test_slow_photoreceptors_are_found() -> None:
     """Without the correction the answer is refused; on a sensor of 160 × 120 px it is 0.07 px off."""
     found, error = calibrated(replace(SMALL, cutoff_hz=100.0, width=128, height=96))

@@ -283,6 +283,7 @@ def test_the_papers_method_on_sparse_edges() -> None:
     assert anywhere.stages[0].evaluations > found.stages[0].evaluations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ramp", [0.0, 0.5])
 def test_the_papers_method_without_an_encoder(ramp: float) -> None:
     """Its result gives the angle of the prism over the recording, in either sense of rotation."""

@@ -394,6 +394,7 @@ def relayed(server: socket.socket, camera: Path, go: threading.Event) -> None:
                 client.sendall(data)
 
 
+@pytest.mark.slow
 def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
     """Run ``emulate`` with its camera, ``live`` on its port, and ``record`` on the packets that ``live`` passes on."""
     rig = ["emulate", "--link", tmp_path / "prism", "--recording", folder / "recording.h5", "--counts-per-turn", 65536]
