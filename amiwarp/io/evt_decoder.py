@@ -111,7 +111,7 @@ class EvtDecoder:
         import warp as wp
 
         from amiwarp.events.device_events import DeviceEvents
-        from amiwarp.kernels import evt
+        from amiwarp.kernels import evt, evt2, evt3
         from amiwarp.kernels.launch import launch, load
 
         device = self._device
@@ -119,11 +119,11 @@ class EvtDecoder:
         length = BLOCK_WORDS[device.is_cpu]
         blocks = -(-words.shape[0] // length)
         if self._version == "3.0":
-            survey, decode = evt.survey_evt3, evt.decode_evt3
+            survey, decode = evt3.survey_evt3, evt3.decode_evt3
             layout = [words, length]
             bits = 12
         else:
-            survey, decode = evt.survey_evt2, evt.decode_evt2
+            survey, decode = evt2.survey_evt2, evt2.decode_evt2
             layout = [words, length, int(self._swapped)]
             bits = 28
 

@@ -1,19 +1,16 @@
-"""Decoders of Prophesee's EVT 2.0, 2.1 and 3.0: a first pass finds the state at the start of each block of words.
+"""What all decoders of Prophesee's EVT words share: the state that words change, and how blocks of words are linked.
 
-An EVT word changes the decoder's state (time, row, column of the next vector) or is an event. So that all blocks can be
-decoded at the same time, :func:`survey_evt2` and :func:`survey_evt3` note what each block changes, whatever the state
-before it. Then the changes are followed: :func:`merge_blocks` finds what groups of blocks change, :func:`link_groups`
-follows the groups with one thread, and :func:`link_blocks` the blocks of each group. :func:`decode_evt2` and
-:func:`decode_evt3` decode each block from the state at its start. One thread reads one block.
+An EVT word changes the decoder's state (time, row, column of the next vector) or is an event. So that all blocks of
+words can be decoded at the same time, a first pass notes what each block changes, whatever the state before it. Then
+the changes are followed: :func:`merge_blocks` finds what groups of blocks change, :func:`link_groups` follows the
+groups with one thread, and :func:`link_blocks` the blocks of each group. A second pass decodes each block from the
+state at its start. One thread reads one block. Both passes are in :mod:`amiwarp.kernels.evt2`, for EVT 2.0 and 2.1,
+and :mod:`amiwarp.kernels.evt3`.
 
 The words are described at https://docs.prophesee.ai/stable/data/encoding_formats/index.html.
 """
 
-from typing import Any
-
 import warp as wp
-
-from amiwarp.kernels.native_code import load_uint16
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,21 +19,11 @@ NONE = wp.constant(-1)
 LARGEST = wp.constant(65535)
 """Largest coordinate that can be stored [px]."""
 
-# Types of EVT 2.0 and 2.1 words, in their upper four bits.
-ON = wp.constant(0x1)
-"""Change detection ON. OFF is 0."""
+# Types of words in all versions, in their upper four bits.
 TIME_HIGH = wp.constant(0x8)
-"""Upper bits of the time, in all versions."""
+"""Upper bits of the time."""
 TRIGGER = wp.constant(0xA)
-"""Edge of an external trigger, in all versions."""
-
-# Types of EVT 3.0 words, in their upper four bits.
-ROW = wp.constant(0x0)
-SINGLE = wp.constant(0x2)
-VECTOR_BASE = wp.constant(0x3)
-VECTOR_12 = wp.constant(0x4)
-VECTOR_8 = wp.constant(0x5)
-TIME_LOW = wp.constant(0x6)
+"""Edge of an external trigger."""
 
 
 @wp.struct
@@ -133,15 +120,6 @@ def unchanged() -> Change:
     return change
 
 
-@wp.func
-def set_bits(mask: wp.uint32) -> int:
-    """Return the number of set bits."""
-    pairs = mask - ((mask >> wp.uint32(1)) & wp.uint32(0x55555555))
-    fours = (pairs & wp.uint32(0x33333333)) + ((pairs >> wp.uint32(2)) & wp.uint32(0x33333333))
-    bytes_ = (fours + (fours >> wp.uint32(4))) & wp.uint32(0x0F0F0F0F)
-    return int((bytes_ * wp.uint32(0x01010101)) >> wp.uint32(24))
-
-
 @wp.func_native("""
 #ifdef __CUDA_ARCH__
     return __ffs(mask) - 1;
@@ -173,291 +151,6 @@ def step_of(value: int, last: int, bits: int) -> int:
     elif step > half:
         step -= 2 * half
     return step
-
-
-# EVT 2.0 and 2.1. A word of EVT 2.1 has the same upper half, and one bit for each of 32 pixels in its lower half.
-
-
-@wp.func
-def head_of(word: wp.uint32, swapped: int) -> wp.uint32:
-    """Return type, time and place of a word."""
-    return word
-
-
-@wp.func
-def head_of(word: wp.uint64, swapped: int) -> wp.uint32:
-    """Return type, time and place of a word."""
-    if swapped != 0:
-        return wp.uint32(word)
-    return wp.uint32(word >> wp.uint64(32))
-
-
-@wp.func
-def pixels_of(word: wp.uint32, swapped: int) -> wp.uint32:
-    """Return which pixels from the word's place on have an event."""
-    return wp.uint32(1)
-
-
-@wp.func
-def pixels_of(word: wp.uint64, swapped: int) -> wp.uint32:
-    """Return which pixels from the word's place on have an event."""
-    if swapped != 0:
-        return wp.uint32(word >> wp.uint64(32))
-    return wp.uint32(word)
-
-
-@wp.kernel
-def survey_evt2(words: wp.array(dtype=Any), length: int, swapped: int, start: int, changes: wp.array(dtype=Change)):
-    """Note what each block of ``length`` words changes."""
-    block = wp.tid() + start
-    change = unchanged()
-    last = int(NONE)
-    for i in range(block * length, wp.min((block + 1) * length, words.shape[0])):
-        head = head_of(words[i], swapped)
-        kind = int(head >> wp.uint32(28))
-        if kind <= ON:
-            change.events += set_bits(pixels_of(words[i], swapped))
-        elif kind == TIME_HIGH:
-            high = int(head & wp.uint32(0xFFFFFFF))
-            if last == NONE:
-                change.first_high = high
-                change.early_events = change.events
-                change.early_triggers = change.triggers
-            else:
-                change.rise += wp.int64(step_of(high, last, 28))
-            last = high
-        elif kind == TRIGGER:
-            change.triggers += 1
-    changes[block] = change
-
-
-@wp.kernel
-def decode_evt2(
-    words: wp.array(dtype=Any),
-    length: int,
-    swapped: int,
-    states: wp.array(dtype=State),
-    places: wp.array(dtype=Place),
-    start: int,
-    events: EventArrays,
-    triggers: TriggerArrays,
-):
-    """Write the events and the edges of each block, from the state at its start."""
-    block = wp.tid() + start
-    timed = states[block].timed
-    high = states[block].high
-    event = places[block].event
-    trigger = places[block].trigger
-    for i in range(block * length, wp.min((block + 1) * length, words.shape[0])):
-        head = head_of(words[i], swapped)
-        kind = int(head >> wp.uint32(28))
-        if kind == TIME_HIGH:
-            value = int(head & wp.uint32(0xFFFFFFF))
-            if timed == 0:
-                high = wp.int64(value)
-                timed = int(1)
-            else:
-                high += wp.int64(step_of(value, int(high & wp.int64(0xFFFFFFF)), 28))
-        elif timed != 0:
-            now = (high << wp.int64(6)) | wp.int64((head >> wp.uint32(22)) & wp.uint32(0x3F))
-            if kind <= ON:
-                pixels = pixels_of(words[i], swapped)
-                column = int((head >> wp.uint32(11)) & wp.uint32(0x7FF))
-                row = wp.uint16(head & wp.uint32(0x7FF))
-                while pixels != wp.uint32(0):
-                    at = wp.uint16(column + lowest_bit(pixels))
-                    store_event(events, event, at, row, now, wp.uint8(kind))
-                    event += 1
-                    pixels = pixels & (pixels - wp.uint32(1))
-            elif kind == TRIGGER:
-                triggers.channel[trigger] = wp.uint8((head >> wp.uint32(8)) & wp.uint32(0x1F))
-                triggers.t[trigger] = now
-                triggers.rising[trigger] = wp.uint8(head & wp.uint32(1))
-                trigger += 1
-
-
-for _word in (wp.uint32, wp.uint64):
-    wp.overload(survey_evt2, {"words": wp.array(dtype=_word)})
-    wp.overload(decode_evt2, {"words": wp.array(dtype=_word)})
-
-
-# EVT 3.0. A vector has one bit for each of 12 or 8 pixels, and moves the base behind them.
-
-
-@wp.func_native("""
-    const uint16_t* word = (const uint16_t*)words.data;
-    int count = 0;
-    for (int i = start; i < stop; ++i) {
-        const uint16_t type = word[i] >> 12;
-        const uint16_t pixels = type == 4 ? word[i] & 0xFFF : type == 5 ? word[i] & 0xFF : type == 2;
-        const uint16_t pairs = pixels - ((pixels >> 1) & 0x5555);
-        const uint16_t fours = (pairs & 0x3333) + ((pairs >> 2) & 0x3333);
-        count += (fours & 0xF) + (fours >> 4 & 0xF) + (fours >> 8);
-    }
-    return count;
-""")
-def count_events(words: wp.array(dtype=wp.uint16), start: int, stop: int) -> int:
-    """Return the number of events in the words from ``start`` to before ``stop``. CPU compilers vectorise it."""
-
-
-@wp.func_native("""
-    const uint16_t* word = (const uint16_t*)words.data;
-    int count = 0;
-    for (int i = start; i < stop; ++i) count += word[i] >> 12 == kind;
-    return count;
-""")
-def count_words(words: wp.array(dtype=wp.uint16), kind: int, start: int, stop: int) -> int:
-    """Return the number of words of a kind from ``start`` to before ``stop``. CPU compilers vectorise it."""
-
-
-@wp.func_native("""
-    const uint16_t* word = (const uint16_t*)words.data;
-    int i = start;
-    for (; i + 64 <= stop; i += 64) {
-        int found = 0;
-        for (int k = 0; k < 64; ++k) found |= word[i + k] >> 12 == kind;
-        if (found) break;
-    }
-    while (i < stop && word[i] >> 12 != kind) ++i;
-    return i;
-""")
-def next_of(words: wp.array(dtype=wp.uint16), kind: int, start: int, stop: int) -> int:
-    """Return the index of the first word of a kind from ``start`` on, or ``stop``. CPU compilers vectorise it."""
-
-
-@wp.func_native("""
-    const uint16_t* word = (const uint16_t*)words.data;
-    int i = stop;
-    for (; i - 64 >= start; i -= 64) {
-        int found = 0;
-        for (int k = 1; k <= 64; ++k) found |= word[i - k] >> 12 == kind;
-        if (found) break;
-    }
-    for (--i; i >= start && word[i] >> 12 != kind; --i) {}
-    return i < start ? -1 : i;
-""")
-def last_of(words: wp.array(dtype=wp.uint16), kind: int, start: int, stop: int) -> int:
-    """Return the index of the last word of a kind from ``start`` to before ``stop``, or :data:`NONE`."""
-
-
-@wp.kernel
-def survey_evt3(words: wp.array(dtype=wp.uint16), length: int, start: int, changes: wp.array(dtype=Change)):
-    """Note what each block of ``length`` words changes."""
-    block = wp.tid() + start
-    begin = block * length
-    end = wp.min(begin + length, words.shape[0])
-    change = unchanged()
-
-    # The time's upper bits, of which there are few words.
-    first = int(end)
-    latest = int(NONE)
-    changed = int(end)
-    i = next_of(words, TIME_HIGH, begin, end)
-    while i < end:
-        high = int(load_uint16(words, i)) & 0xFFF
-        if latest == NONE:
-            first = i
-            changed = i
-            change.first_high = high
-        elif high != latest:
-            change.rise += wp.int64(step_of(high, latest, 12))
-            changed = i
-        latest = high
-        i = next_of(words, TIME_HIGH, i + 1, end)
-
-    change.events = count_events(words, begin, end)
-    change.triggers = count_words(words, TRIGGER, begin, end)
-    low = last_of(words, TIME_LOW, begin, first)
-    if low != NONE:
-        change.low_before = int(load_uint16(words, low)) & 0xFFF
-    if first < end:
-        change.early_events = count_events(words, begin, first)
-        change.early_triggers = count_words(words, TRIGGER, begin, first)
-        if changed > first:
-            change.low_after = 0
-        low = last_of(words, TIME_LOW, changed, end)
-        if low != NONE:
-            change.low_after = int(load_uint16(words, low)) & 0xFFF
-    at = last_of(words, ROW, begin, end)
-    if at != NONE:
-        change.row = int(load_uint16(words, at)) & 0x7FF
-    at = last_of(words, VECTOR_BASE, begin, end)
-    if at != NONE:
-        word = int(load_uint16(words, at))
-        change.base = word & 0x7FF
-        change.polarity = (word >> 11) & 1
-    at = wp.max(at, begin)
-    change.moved = 12 * count_words(words, VECTOR_12, at, end) + 8 * count_words(words, VECTOR_8, at, end)
-    changes[block] = change
-
-
-@wp.kernel
-def decode_evt3(
-    words: wp.array(dtype=wp.uint16),
-    length: int,
-    states: wp.array(dtype=State),
-    places: wp.array(dtype=Place),
-    start: int,
-    events: EventArrays,
-    triggers: TriggerArrays,
-):
-    """Write the events and the edges of each block, from the state at its start."""
-    block = wp.tid() + start
-    timed = states[block].timed
-    high = states[block].high
-    now = (high << wp.int64(12)) | wp.int64(states[block].low)
-    row = wp.uint16(states[block].row)
-    base = states[block].base
-    polarity = wp.uint8(states[block].polarity)
-    event = places[block].event
-    trigger = places[block].trigger
-    for i in range(block * length, wp.min((block + 1) * length, words.shape[0])):
-        word = int(load_uint16(words, i))
-        kind = word >> 12
-        load = word & 0xFFF
-        if kind == SINGLE:
-            if timed != 0:
-                store_event(events, event, wp.uint16(load & 0x7FF), row, now, wp.uint8(load >> 11))
-                event += 1
-        elif kind == ROW:
-            row = wp.uint16(load & 0x7FF)
-        elif kind == VECTOR_12 or kind == VECTOR_8:
-            pixels = wp.uint32(load)
-            width = int(12)
-            if kind == VECTOR_8:
-                pixels = wp.uint32(load & 0xFF)
-                width = int(8)
-            if timed != 0:
-                while pixels != wp.uint32(0):
-                    at = wp.uint16(wp.min(base + lowest_bit(pixels), LARGEST))
-                    store_event(events, event, at, row, now, polarity)
-                    event += 1
-                    pixels = pixels & (pixels - wp.uint32(1))
-            base += width
-        elif kind == VECTOR_BASE:
-            base = load & 0x7FF
-            polarity = wp.uint8(load >> 11)
-        elif kind == TIME_LOW:
-            now = (high << wp.int64(12)) | wp.int64(load)
-        elif kind == TIME_HIGH:
-            if timed == 0:
-                high = wp.int64(load)
-                now = (high << wp.int64(12)) | (now & wp.int64(0xFFF))
-                timed = int(1)
-            else:
-                step = step_of(load, int(high & wp.int64(0xFFF)), 12)
-                if step != 0:  # a new TIME_HIGH starts at its beginning, until the next TIME_LOW
-                    high += wp.int64(step)
-                    now = high << wp.int64(12)
-        elif kind == TRIGGER:
-            if timed != 0:
-                triggers.channel[trigger] = wp.uint8(load >> 8)
-                triggers.t[trigger] = now
-                triggers.rising[trigger] = wp.uint8(load & 1)
-                trigger += 1
-
-
-# All versions.
 
 
 @wp.func
