@@ -10,8 +10,10 @@ import zstandard
 from faery.extension import aedat
 
 from amiwarp import AmiwarpError, Events, MemoryEvents, Recording, convert, open_recording, save_recording
-from amiwarp.io import aedat4, read_encoder_triggers
-from amiwarp.io.aedat4 import Clock, Compression, _Decompressor
+from amiwarp.io import aedat4_compression, aedat4_packets, read_encoder_triggers
+from amiwarp.io.aedat4_clock import Clock
+from amiwarp.io.aedat4_compression import Compression, Decompressor
+from amiwarp.io.aedat4_writer import TABLE_POSITION
 from reference.aedat4_files import (
     COMPRESSIONS,
     DOUBLE,
@@ -207,7 +209,7 @@ def test_a_black_frame_that_zstandard_has_compressed_is_whole():
     black = bytes(640 * 480)
     packed = zstandard.ZstdCompressor().compress(black)
     assert len(packed) < 100
-    assert _Decompressor(Compression.ZSTD)(packed) == black
+    assert Decompressor(Compression.ZSTD)(packed) == black
 
 
 @pytest.mark.parametrize("at", [1, 250, 299])
@@ -232,7 +234,7 @@ def test_times_that_jump_all_the_time_are_refused(tmp_path):
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 @pytest.mark.parametrize("part", ["stream", "size", "small", "huge", "negative", "mark", "rest"])
 def test_damage_leaves_the_packets_around_it(tmp_path, monkeypatch, compression, part, window):
-    monkeypatch.setattr(aedat4, "WINDOW_BYTES", window)
+    monkeypatch.setattr(aedat4_packets, "WINDOW_BYTES", window)
     data, places = file_of([(0, events_packet(part_)) for part_ in parts_of(EVENTS)], compression=compression)
     damaged = bytearray(data)
     at = places[2]
@@ -268,7 +270,7 @@ def test_a_packet_is_found_wherever_a_window_ends(tmp_path, monkeypatch, compres
     damaged = bytearray(data)
     damaged[places[2] : places[3]] = b"\xff" * (places[3] - places[2])
     for window in range(30, 62):
-        monkeypatch.setattr(aedat4, "WINDOW_BYTES", window)
+        monkeypatch.setattr(aedat4_packets, "WINDOW_BYTES", window)
         recording = opened(tmp_path, bytes(damaged))
         assert recording.metadata == {"format": "aedat4", "dropped_damaged_bytes": places[3] - places[2]}
 
@@ -310,7 +312,7 @@ def test_events_outside_a_packet_and_impossible_ones(tmp_path):
 
 @pytest.mark.parametrize("compression", ["lz4", "lz4_high", "zstd", "zstd_high"])
 def test_packets_that_grow_without_measure_are_dropped(tmp_path, monkeypatch, compression):
-    monkeypatch.setattr(aedat4, "LARGEST_PACKET", 1 << 16)
+    monkeypatch.setattr(aedat4_compression, "LARGEST_PACKET", 1 << 16)
     packets = [events_packet(EVENTS[:300]), bytes(1 << 20), events_packet(EVENTS[300:])]
     data, places = file_of([(0, packet) for packet in packets], compression=compression)
     recording = opened(tmp_path, data)
@@ -335,9 +337,9 @@ def test_a_size_that_a_packet_only_states_takes_no_memory(tmp_path):
 def test_a_table_at_a_wrong_place_is_none(tmp_path):
     write_own(tmp_path / "whole.aedat4", make_events(20_000))
     data = bytearray((tmp_path / "whole.aedat4").read_bytes())
-    (place,) = DOUBLE.unpack_from(data, aedat4.TABLE_POSITION)
+    (place,) = DOUBLE.unpack_from(data, TABLE_POSITION)
     for wrong in (place - 1000, len(data) + 1, 0, -7):
-        DOUBLE.pack_into(data, aedat4.TABLE_POSITION, wrong)
+        DOUBLE.pack_into(data, TABLE_POSITION, wrong)
         recording = opened(tmp_path, bytes(data))
         assert_equal(all_of(recording), make_events(20_000))
         assert recording.metadata == {"format": "aedat4", "dropped_damaged_bytes": len(data) - place}

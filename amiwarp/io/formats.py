@@ -496,7 +496,7 @@ WRITERS = {
     OutputFormat.EVT3: "prophesee:write_evt3",
     OutputFormat.EVT21: "prophesee:write_evt21",
     OutputFormat.DAT: "dat:write_dat",
-    OutputFormat.AEDAT4: "aedat4:write_aedat4",
+    OutputFormat.AEDAT4: "aedat4_writer:write_aedat4",
     OutputFormat.NPZ: "plain_files:write_npz",
     OutputFormat.TEXT: "plain_files:write_text",
     OutputFormat.CSV: "plain_files:write_csv",

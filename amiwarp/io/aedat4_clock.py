@@ -1,0 +1,107 @@
+"""Times in AEDAT 4 files: where the clock of the camera starts again, they are made to go on."""
+
+import bisect
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.io.aedat4_packets import Content
+from amiwarp.io.aedat4_tables import Tables
+from amiwarp.validation import TIME_LIMIT
+
+RESTART_US = 100_000
+"""Least step back of the time that can be a restart of the camera's clock [us]."""
+RESTART_EVENTS = 64
+"""Number of events before and behind a restart whose times are compared."""
+LEAST_BEHIND = 3
+"""Fewest events behind a step back that decide whether the clock has started again."""
+MOST_RESTARTS = 100
+"""Largest number of restarts. With more steps back, the times are damaged, and are left as they are."""
+
+
+@dataclass(slots=True)
+class Clock:
+    """Times of the events as stored, which are made to go on where the clock of the camera starts again."""
+
+    restarts: list[tuple[int, int]] = field(default_factory=list)
+    """Positions of the packets in which the clock starts again, and what is added to the times from there on [us]."""
+    _last: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Latest times, as stored [us]."""
+    _is_open: bool = False
+    """Whether too few events follow the last step back to decide what it is."""
+
+    @property
+    def shift(self) -> int:
+        """What is added to the times now [us]."""
+        return self.restarts[-1][1] if self.restarts else 0
+
+    def shift_all(self, t: NDArray[np.int64], starts: list[int], places: list[int]) -> None:
+        """Shift the times of the next events, at least one, in place [us].
+
+        ``places`` are the positions of their packets, ``starts`` the index of the first event of each.
+        """
+        count = self._last.size
+        if self._is_open or bool((t[1:] < t[:-1]).any()) or (count and self._last[-1] > t[0]):
+            stored = np.concatenate([self._last, t])
+            back = np.flatnonzero(stored[1:] < stored[:-1] - RESTART_US) + 1
+        else:
+            stored = t
+            back = np.zeros(0, np.int64)
+        last = stored[-RESTART_EVENTS:].copy()
+        if self.shift:
+            t += self.shift
+        self._is_open = False
+        # A step just before the end of the last call was not decided then.
+        undecided = max(count - LEAST_BEHIND + 1, 0)
+        for at in back[back >= undecided].tolist() if back.size <= MOST_RESTARTS else ():
+            if stored.size - at < LEAST_BEHIND:
+                self._is_open = True
+                break
+            before = np.sort(stored[max(at - RESTART_EVENTS, 0) : at])
+            behind = np.sort(stored[at : at + RESTART_EVENTS])
+            shift = self.shift + int(stored[at - 1]) - int(stored[at])
+            # Times in the middle: a single wrong one changes them little.
+            step = int(behind[behind.size // 2]) - int(before[(before.size - 1) // 2])
+            if step < -RESTART_US and shift < TIME_LIMIT and len(self.restarts) < MOST_RESTARTS:
+                first = max(at - count, 0)
+                self.restarts.append((places[bisect.bisect_right(starts, first) - 1], shift))
+                t[first:] = stored[count + first :] + shift
+        self._last = last
+
+
+class OtherClock:
+    """Times of another stream than the events, which are shifted as these are."""
+
+    def __init__(self, restarts: list[tuple[int, int]]) -> None:
+        """Take the restarts of the clock, see :attr:`Clock.restarts`."""
+        self._places = [place for place, _ in restarts]
+        self._shifts = [0, *(shift for _, shift in restarts)]
+        self._part = 0
+        self._last: int | None = None
+
+    def shift(self, t: int, place: int) -> int:
+        """Return what to add to the times of the packet at ``place``, whose first time is ``t`` [us].
+
+        The streams are not stored in step: a packet may stand on the wrong side of a restart of the clock.
+        """
+        part = bisect.bisect_right(self._places, place)
+        if self._last is not None:
+            step = t - self._last
+            if part > self._part and 0 <= step < RESTART_US:
+                part = self._part
+            elif part == self._part and step < -RESTART_US and part + 1 < len(self._shifts):
+                part += 1
+        self._part = part
+        self._last = t
+        return self._shifts[part]
+
+    def shift_all(self, contents: list[Content], tables: Tables) -> NDArray[np.int64]:
+        """Return the times in field 0 of the tables of some packets, shifted [us]."""
+        t: NDArray[np.int64] = tables.values[0].astype(np.int64)
+        if len(self._shifts) > 1:
+            firsts = np.flatnonzero(np.diff(tables.packet, prepend=-1))
+            for start, stop in itertools.pairwise([*firsts.tolist(), t.size]):
+                t[start:stop] += self.shift(int(t[start]), contents[tables.packet[start]].at)
+        return t
