@@ -39,7 +39,8 @@ from amiwarp.io import file_scan as scan
 from amiwarp.io.evt_decoder import EvtDecoder
 from amiwarp.io.export import left_out
 from amiwarp.io.prophesee import Halves, halves_of, words_of
-from amiwarp.io.ros import _types_of, read_packets
+from amiwarp.io.ros import read_packets
+from amiwarp.io.ros_writer import _types_of
 from reference.evt_words import Evt2Decoder, Evt3Decoder
 from reference.io_samples import make_events, refusal, to_faery, write_aedat4
 from reference.io_samples_extra import (

@@ -500,8 +500,8 @@ WRITERS = {
     OutputFormat.NPZ: "plain_files:write_npz",
     OutputFormat.TEXT: "plain_files:write_text",
     OutputFormat.CSV: "plain_files:write_csv",
-    OutputFormat.ROS1: "ros:write_ros1",
-    OutputFormat.ROS2: "ros:write_ros2",
+    OutputFormat.ROS1: "ros_writer:write_ros1",
+    OutputFormat.ROS2: "ros_writer:write_ros2",
 }
 """Function that writes all events in each format other than the native one, see :func:`io_function`."""
 

@@ -33,7 +33,7 @@ from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
 from amiwarp.io.export import check_limits
 from amiwarp.io.files import NewFile, errors_name
 from amiwarp.io.formats import LIMITS, Codec, Limits, Outline, OutputFormat
-from amiwarp.io.ros import MESSAGE, TOPIC, PacketEncoder
+from amiwarp.io.ros_writer import MESSAGE, TOPIC, PacketEncoder
 from amiwarp.live.queues import BackgroundLoop
 from amiwarp.tasks import Progress
 
