@@ -20,7 +20,7 @@ from scipy.io import loadmat, savemat
 from amiwarp import AmiwarpError, Camera, Events, MemoryEvents, Recording, convert, open_recording, save_recording
 from amiwarp.calib.checks import size_warnings
 from amiwarp.io import table_server, text_files
-from amiwarp.io.columns import role_of, roles_of, unit_in
+from amiwarp.io.column_names import role_of, roles_of, unit_in
 from amiwarp.io.file_scan import assumptions_of
 from reference.io_samples_extra import write_raw_of_a_sensor
 

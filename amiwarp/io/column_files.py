@@ -1,6 +1,7 @@
 """Files of plain columns other than text: NumPy arrays (.npy, .npz), HDF5, MATLAB and Parquet.
 
-Each reader finds the columns of its file, and :func:`open_table` decides what they mean, see :mod:`amiwarp.io.columns`.
+Each reader finds the columns of its file, and :func:`open_table` decides what they mean, see
+:mod:`amiwarp.io.column_search`.
 HDF5, MATLAB and Parquet files are read in the reading process.
 """
 
@@ -20,21 +21,11 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MetadataValue, Recording
-from amiwarp.io.columns import (
-    ROLES,
-    SAMPLE,
-    Column,
-    GivenLayout,
-    Hints,
-    Layout,
-    check_duration,
-    example_of_columns,
-    find_layout,
-    given_roles,
-    is_wanted,
-    names_roles,
-    role_of,
-)
+from amiwarp.io.column_names import ROLES, example_of_columns, is_wanted, names_roles, role_of
+from amiwarp.io.column_options import GivenLayout, given_roles
+from amiwarp.io.column_search import find_layout
+from amiwarp.io.column_units import check_duration
+from amiwarp.io.columns import SAMPLE, Column, Hints, Layout
 from amiwarp.io.file_scan import SENSORS, FileEvents, Packet
 from amiwarp.io.files import errors_name, input_path, open_input
 from amiwarp.io.plain_files import Array, array_header, is_of_kind, lengths, next_rows, open_any_array, open_array

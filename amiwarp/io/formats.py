@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from amiwarp.choices import Option
 from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.recording import Recording
-from amiwarp.io.columns import GivenLayout
+from amiwarp.io.column_options import GivenLayout
 from amiwarp.io.file_scan import GivenSource, given_source
 from amiwarp.io.files import check_regular, errors_name, name_kind, note_folders, open_input
 from amiwarp.io.json_files import read_json
@@ -122,7 +122,7 @@ TOPICS = (Format.HDF5, Format.ROSBAG)
 """Formats whose files may hold several streams of events."""
 
 LAYOUTS = (Format.HDF5, Format.TEXT, Format.NPZ, Format.NPY, Format.MAT, Format.PARQUET)
-"""Formats whose columns may have any layout. Their openers take a :class:`~amiwarp.io.columns.GivenLayout`."""
+"""Formats whose columns may have any layout. Their openers take a :class:`~amiwarp.io.column_options.GivenLayout`."""
 
 CHIPS = (Format.AEDAT2,)
 """Formats whose openers take the name of the camera's chip, if it is given."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS
 from amiwarp.io import ecf
-from amiwarp.io.columns import ROLES, names_roles
+from amiwarp.io.column_names import ROLES, names_roles
 from amiwarp.io.file_scan import Columns, microseconds, whole_pixels
 from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32
 from amiwarp.io.native_format import FORMAT

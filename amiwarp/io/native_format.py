@@ -37,7 +37,9 @@ from amiwarp.events.truth import (
     check_truth,
 )
 from amiwarp.io import column_files, hdf5_files
-from amiwarp.io.columns import SAMPLE, GivenLayout, are_microseconds, is_plain_polarity
+from amiwarp.io.column_options import GivenLayout
+from amiwarp.io.column_units import are_microseconds
+from amiwarp.io.columns import SAMPLE, is_plain_polarity
 from amiwarp.io.file_scan import ASSUMED_SIZE, assumed_size, given_size, head_limit, smallest_sensor
 from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place, register_reader
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native

@@ -1,6 +1,6 @@
 """Part of the reader of HDF5, MATLAB and Parquet files of any layout that runs in the reading process.
 
-It finds the arrays that hold events, and sends their values. :mod:`amiwarp.io.columns` decides what they mean.
+It finds the arrays that hold events, and sends their values. :mod:`amiwarp.io.column_search` decides what they mean.
 """
 
 import contextlib
@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.columns import ROLES, SAMPLE, example_of_columns, given_roles, is_wanted, names_roles, roles_of, unit_of
+from amiwarp.io.column_names import ROLES, example_of_columns, is_wanted, names_roles, roles_of, unit_of
+from amiwarp.io.column_options import given_roles
+from amiwarp.io.columns import SAMPLE
 from amiwarp.io.reading_process import Reply
 
 PIECE = 1 << 17

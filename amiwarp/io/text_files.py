@@ -9,8 +9,8 @@ The size may also be in a file beside it, as amiwarp writes it.
 
 Other tables have columns between commas, semicolons, tabs or spaces, and may begin with a line of names. Empty lines
 and lines that start with ``#`` or ``%`` are comments. A comment may give the names, or the size as ``geometry``.
-:mod:`amiwarp.io.text_rows` makes numbers of the lines, :mod:`amiwarp.io.columns` decides what the columns are. A last
-line that is cut off is dropped, and its length counted as ``truncated_bytes``.
+:mod:`amiwarp.io.text_rows` makes numbers of the lines, :mod:`amiwarp.io.column_search` decides what the columns are.
+A last line that is cut off is dropped, and its length counted as ``truncated_bytes``.
 """
 
 from __future__ import annotations
@@ -30,18 +30,11 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, Recording
 from amiwarp.io.column_files import check_table
-from amiwarp.io.columns import (
-    LONGEST_S,
-    ROLES,
-    TIME_UNITS,
-    Column,
-    GivenLayout,
-    Hints,
-    Layout,
-    find_layout,
-    names_roles,
-    roles_of,
-)
+from amiwarp.io.column_names import ROLES, names_roles, roles_of
+from amiwarp.io.column_options import TIME_UNITS, GivenLayout
+from amiwarp.io.column_search import find_layout
+from amiwarp.io.column_units import LONGEST_S
+from amiwarp.io.columns import Column, Hints, Layout
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.files import LONGEST_LINE, errors_name
 from amiwarp.io.plain_files import read_calib, read_size

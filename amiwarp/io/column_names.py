@@ -1,0 +1,140 @@
+"""Names of columns in files of plain columns: which of them mean t, x, y and p, and the units of time in them.
+
+Names that nearly always mean the same decide first, then those that only stand for a role where no other does.
+"""
+
+import re
+from collections.abc import Collection, Iterable, Sequence
+
+ROLES = ("t", "x", "y", "p")
+"""Columns of an event: time, column and row of the pixel, polarity."""
+
+NAMES = {
+    "t": ("t", "ts", "time", "times", "timestamp", "timestamps", "time_stamp", "time_stamps", "tstamp"),
+    "x": ("x", "xs", "col", "cols", "column", "columns", "x_coord", "x_coordinate", "x_pos"),
+    "y": ("y", "ys", "row", "rows", "y_coord", "y_coordinate", "y_pos"),
+    "p": ("p", "ps", "pol", "pols", "polarity", "polarities", "on", "is_on"),
+}
+"""Names of each role, in lower case."""
+
+UNIT_NAMES = {
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "ms": ("ms", "msec", "millisecond", "milliseconds"),
+    "us": ("us", "µs", "μs", "usec", "usecs", "microsecond", "microseconds"),
+    "ns": ("ns", "nsec", "nsecs", "nanosecond", "nanoseconds"),
+}
+"""Names of the units of time, in lower case."""
+
+
+def unit_of(text: str) -> str | None:
+    """Return the unit of time of this name, or None."""
+    return next((unit for unit, names in UNIT_NAMES.items() if text.strip().lower() in names), None)
+
+
+def role_of(name: str) -> tuple[str | None, str | None]:
+    """Return the role of a column of this name, and the unit of time in the name; None for what is unknown."""
+    plain = re.split(r"[/.]", name.strip().strip("\"'").lower())[-1].strip()
+    plain = re.sub(r"^(?:events?|evts?|ev|dvs)[_\s-]+", "", plain)
+    for role, names in NAMES.items():
+        if plain in names:
+            return role, None
+    # A name and a unit: in brackets, behind a separator, or, of a time, immediately behind it.
+    match = re.fullmatch(r"(.+?)[\s_-]*[(\[{]([^)\]}]*)[)\]}]|(.+?)[_\s-]+(\S+)|(timestamps?|time)(\S+)", plain)
+    if match is None:
+        return None, None
+    stem = match[1] or match[3] or match[5]
+    suffix = match[2] or match[4] or match[6] or ""
+    found = next((role for role, names in NAMES.items() if stem in names), None)
+    unit = unit_of(suffix)
+    if found == "t":
+        return (found, unit) if unit else (None, None)
+    return (found, None) if found in ("x", "y") and suffix in ("px", "pixel", "pixels") else (None, None)
+
+
+RARE_NAMES = {
+    "x": ("u", "colindex", "colidx", "columnindex", "xaddr", "xaddress", "addrx", "addressx", "xpos",
+          "xposition", "posx", "positionx", "xcoord", "xcoords", "xcoordinate", "xcoordinates", "coordx",
+          "coordinatex", "xidx", "xindex", "xpx", "xpixel", "pixelx", "pxx", "xloc", "locx"),
+    "y": ("v", "rowindex", "rowidx", "yaddr", "yaddress", "addry", "addressy", "ypos", "yposition", "posy",
+          "positiony", "ycoord", "ycoords", "ycoordinate", "ycoordinates", "coordy", "coordinatey", "yidx",
+          "yindex", "ypx", "ypixel", "pixely", "pxy", "yloc", "locy"),
+    "p": ("onoff", "offon", "sign", "signs", "sgn", "polar", "positive", "ispositive", "isonevent",
+          "polaritybool", "polbool", "polaritybinary", "polaritysign", "polaritysigned", "polarityvalue",
+          "polarity01", "pol01", "polarityonoff", "onoffpolarity"),
+}  # fmt: skip
+"""Names that stand for a role where no column has one of :data:`NAMES`: in lower case, of letters and digits only."""
+
+_UNIT_PATTERN = "|".join(sorted((name for names in UNIT_NAMES.values() for name in names), key=len, reverse=True))
+RARE_TIME = re.compile(
+    r"(?P<stem>t|ts|times?|(?:time)?stamps?|timestamps?|tstamp|epochs?|unix|unixtime|unixtimestamp|utc|utctime|abstime|"
+    r"reltime|trel|elapsed|elapsedtime|timeelapsed|eventtimes?|datetimes?|dates?)?(?:in)?"
+    rf"(?P<unit>{_UNIT_PATTERN})?"
+)
+"""Pattern of such names of times, with or without a unit: a unit alone is the name of a time, too."""
+
+
+def _rare_role_of(name: str) -> tuple[str | None, str | None]:
+    """Return the role of a column with one of :data:`RARE_NAMES`, and the unit of time in it."""
+    plain = re.split(r"[/.]", name.lower())[-1]
+    plain = re.sub(r"^\W*(?:events?|evts?|ev|dvs)[_\s-]+", "", plain)
+    plain = re.sub(r"[\W_]+", "", plain)
+    for role, names in RARE_NAMES.items():
+        if plain in names:
+            return role, None
+    match = RARE_TIME.fullmatch(plain)
+    if match is None or plain in ("", "s", "in"):
+        return None, None
+    return "t", unit_of(match["unit"] or "")
+
+
+def unit_in(name: str) -> str | None:
+    """Return the unit of time in the name of a column, or None."""
+    role, unit = role_of(name)
+    return _rare_role_of(name)[1] if role is None else unit
+
+
+def roles_of(names: Sequence[str]) -> dict[str, list[int]]:
+    """Return for each role the indices of the columns that can have it by their names.
+
+    Columns with :data:`RARE_NAMES` count only for a role that no other column has, and for x and y only together: next
+    to x, v is a speed. But a time in whole seconds may have its fractions in another column.
+    """
+    common = [role_of(name) for name in names]
+    rare = [_rare_role_of(name) for name in names]
+    found = {role: [at for at, (known, _) in enumerate(common) if known == role] for role in ROLES}
+    others = {
+        role: [at for at, (known, _) in enumerate(rare) if known == role and common[at][0] is None] for role in ROLES
+    }
+    if [common[at][1] for at in found["t"]] == ["s"]:
+        found["t"] += [at for at in others["t"] if rare[at][1] not in (None, "s")]
+    found["t"] = found["t"] or others["t"]
+    found["p"] = found["p"] or others["p"]
+    if not found["x"] and not found["y"]:
+        found["x"] = others["x"]
+        found["y"] = others["y"]
+    return found
+
+
+def names_roles(names: Iterable[str]) -> bool:
+    """Return whether a file's columns of these names hold events."""
+    return all(roles_of(list(names)).values())
+
+
+def example_of_columns(names: Iterable[str]) -> str:
+    """Return an example of the option ``--columns`` with names of this file, and NAME for what none is named as.
+
+    Of names with groups, those of the group with the most roles are taken.
+    """
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(name.rpartition("/")[0], []).append(name)
+    best: dict[str, str] = {}
+    for members in groups.values():
+        found = {role: members[places[0]] for role, places in roles_of(members).items() if places}
+        best = found if len(found) > len(best) else best
+    return ",".join(f"{role}={best.get(role, 'NAME')}" for role in ROLES)
+
+
+def is_wanted(name: str, wanted: Collection[str]) -> bool:
+    """Return whether a column of this name, with or without its groups, is among the wanted names."""
+    return name in wanted or name.rpartition("/")[2] in wanted
