@@ -170,19 +170,24 @@ def test_every_restart_is_found(tmp_path):
     assert (recording.metadata["clock_restarts"], "repaired_time_events" in recording.metadata) == (2, False)
 
 
-def test_other_records_follow_the_clock(tmp_path):
-    """Packets of samples and edges stand on either side of the restart."""
+@pytest.mark.parametrize("impossible", [0, 40])
+def test_other_records_follow_the_clock(tmp_path, impossible):
+    """Packets of samples and edges stand on either side of the restart, also behind events with impossible times."""
     events = Events(EVENTS.x, EVENTS.y, again(EVENTS.t * 1000, [(300, 0)]), EVENTS.p)
     last = int(events.t[299])
     samples = [(2, lists("IMUS", [imu_row(t)])) for t in (last - 2000, last - 1000, last - 10, 990, 1990)]
     edges = [(3, lists("TRIG", [{0: DOUBLE.pack(t), 1: b"\1"}])) for t in (last - 5000, 0, 5000)]
-    early, late = ((0, events_packet(part)) for part in (events[:300], events[300:]))
+    early_t = events.t[:300].copy()
+    early_t[:impossible] = -(2**63)
+    early = (0, events_packet(events[:300], t=early_t))
+    late = (0, events_packet(events[300:]))
     for behind, first_edge in ((2, 1), (3, 2), (4, 1)):
         packets = [*samples[:behind], early, *edges[:first_edge], late, *samples[behind:], *edges[first_edge:]]
         recording = opened(tmp_path, file_of(packets)[0])
         assert recording.imu is not None
         assert (recording.imu.t - last).tolist() == [-2000, -1000, -10, 990, 1990]
         assert (read_encoder_triggers(tmp_path / "a.aedat4").t - last).tolist() == [-5000, 0, 5000]
+        assert recording.metadata.get("dropped_damaged_events", 0) == impossible
 
 
 @pytest.mark.parametrize("count", [1, 2])
