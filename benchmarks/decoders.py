@@ -269,9 +269,9 @@ def write_files(folder: Path, count: int) -> list[tuple[Path, Path]]:
 
 def measure(path: Path, known: Path, device: str) -> list[dict[str, Any]]:
     """Run all readers of a file in turns, and return a row for each."""
-    names = [name for name, (_, endings) in READERS.items() if path.suffix in endings]
-    if device != "cpu":
-        names = [*ON_GPU] if path.suffix == ".raw" else []
+    names = [*ON_GPU]
+    if device == "cpu":
+        names = [name for name, (_, endings) in READERS.items() if path.suffix in endings]
     results: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     missing: dict[str, str] = {}
     for _ in range(REPEATS):
@@ -321,6 +321,8 @@ def main() -> int:
             known = Path(folder) / f"recording{k}.npz"
             np.savez(known, **dict(zip("xytp", columns_of(by_amiwarp_file(path, "cpu")()), strict=True)))
             files.append((path, known))
+        if args.device != "cpu":
+            files = [(path, known) for path, known in files if path.suffix == ".raw"]
         for path, known in files:
             size = path.stat().st_size
             print(f"{path.name}: {size / 1e6:.1f} MB", flush=True)
