@@ -1,5 +1,6 @@
 """The decoder of EVT words: against the NumPy decoders, in pieces and blocks, and words that users' cameras send."""
 
+import array
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,9 @@ def test_words_may_be_bytes_or_arrays_of_any_library(version: str, word: type, d
     signed = wp.array(words.view(np.dtype(word).str.replace("u", "i")), device=device)
     plain = wp.array(words, dtype=wp.dtype_from_numpy(np.dtype(word)), device=device)
     strided = np.repeat(words, 2)[::2]
+    big_endian = words.astype(np.dtype(word).newbyteorder(">"))
+    plain_array = array.array("B", data)
+    gaps = memoryview(np.repeat(words, 2))[::2]
     for given in (
         data,
         bytearray(data),
@@ -86,6 +90,9 @@ def test_words_may_be_bytes_or_arrays_of_any_library(version: str, word: type, d
         signed,
         plain,
         strided,
+        big_endian,
+        plain_array,
+        gaps,
     ):
         found = EvtDecoder(version, device=device).decode(given)[0]
         assert str(found.device) == device
@@ -101,6 +108,14 @@ def test_data_that_are_no_words_are_refused() -> None:
     for wrong in (np.zeros(4, np.uint16), np.zeros(4, np.float32), np.zeros((2, 2), np.uint32)):
         with pytest.raises(AmiwarpError, match=r"expected bytes or uint32 of shape \(n,\) for EVT 2.0"):
             decoder.decode(wrong)
+    for wrong, kind in (([1, 2], r"\[1, 2\]"), (None, "None"), ("words", "'words'")):
+        with pytest.raises(AmiwarpError, match=f"EVT words are {kind}; expected bytes or an array"):
+            decoder.decode(wrong)
+    with pytest.raises(AmiwarpError, match="are a masked array"):
+        decoder.decode(np.ma.masked_array(np.zeros(2, np.uint32), [True, False]))
+    for view in (memoryview(np.zeros(4, np.float32)), memoryview(np.zeros(4, np.int64))):
+        with pytest.raises(AmiwarpError, match="expected bytes or uint32"):
+            decoder.decode(view)
     with pytest.raises(AmiwarpError, match="version of EVT is '4'; choose among"):
         EvtDecoder("4")
 

@@ -94,7 +94,10 @@ def test_a_frame_may_hold_more_or_less_than_the_time_between_frames(tmp_path: Pa
     events = made()
     for frame_us in (9_000, 700):
         pictures.clear()
-        render(recording(events), tmp_path / "a.mp4", fps=100.0, speed=0.2, frame_us=frame_us, overwrite=True, **PLAIN)
+        options = {"fps": 100.0, "speed": 0.2, "frame_us": frame_us, "overwrite": True, **PLAIN}
+        summary = render(recording(events), tmp_path / "a.mp4", **options)
+        shown = [between(events, (k + 1) * 2000 - frame_us, (k + 1) * 2000) for k in range(51)]
+        assert summary.events == (len(events) if frame_us > 2000 else sum(map(len, shown)))
         assert len(pictures) == 51
         for k, picture in enumerate(pictures):
             assert_shows(picture, between(events, (k + 1) * 2000 - frame_us, (k + 1) * 2000))
@@ -237,6 +240,18 @@ def test_the_film_is_that_of_the_pictures_enlarged_with_a_caption(tmp_path: Path
         assert picture[24 * HEIGHT :].max() > 150
 
 
+@pytest.mark.parametrize("count", [4000, 300])
+def test_the_rate_is_that_of_all_events_since_the_frame_before(count: int) -> None:
+    """Also if a frame shows only the last of them."""
+    events = made()
+    blocks = [events[k : k + count] for k in range(0, len(events), count)]
+    timing = film.Timing(FIRST, 10_000.0, 10)
+    for reach_us in (100, 10_000, 25_000):
+        for k, shown in enumerate(film.frames_of_time(blocks, timing, reach_us)):
+            assert shown.new == len(between(events, k * 10_000, (k + 1) * 10_000))
+            assert len(shown.events) == len(between(events, (k + 1) * 10_000 - reach_us, (k + 1) * 10_000))
+
+
 def test_the_caption_says_time_rate_colours_and_length() -> None:
     events = made()
     shown = film.Shown(events[:300], FIRST + 12_345, 250, 1000)
@@ -246,11 +261,17 @@ def test_the_caption_says_time_rate_colours_and_length() -> None:
     assert (wide.shape[1], narrow.shape[1]) == (960, 100)
     assert wide[:, 300:].any()
     assert narrow.any()
+    rates = ((3e5, "0.30 Mev/s"), (12_345.0, "12.35 kev/s"), (50.0, "50 ev/s"), (0.0, "0 ev/s"))
+    for per_s, text in rates:
+        slow = film.Shown(events[:3], FIRST, round(per_s * 100), 100_000_000)
+        assert film.Caption(960, FIRST, 4, "").parts(slow)[1][0] == text
     timing = film.Timing(FIRST, 333.3, 5)
     for given, note in (
-        ((timing, None, None, None), "0.3333 ms"), ((timing, None, 2000, None), "2 ms"),
-        ((timing, None, None, 1500.0), "decay 1.5 ms"), ((None, 20_000, None, None), "20,000 events"),
-    ):  # fmt: skip
+        ((timing, None, None), "0.3333 ms"),
+        ((timing, 2000, None), "2 ms"),
+        ((timing, None, 1500.0), "decay 1.5 ms"),
+        ((None, None, None), "300 events"),
+    ):
         assert film._caption(960, FIRST, *given).parts(shown)[-1][0] == note
 
 
@@ -275,6 +296,32 @@ def test_what_cannot_be_shown_is_refused(tmp_path: Path, options: dict[str, Any]
     with pytest.raises(AmiwarpError, match=message.replace("(", r"\(")):
         render(recording(), tmp_path / "a.mp4", **options)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_tall_sensor_is_not_enlarged_beyond_what_programs_show(tmp_path: Path) -> None:
+    events = Events.from_arrays([0, 9], [0, 3999], [0, 50_000], [1, 0])
+    tall = Recording(MemoryEvents(events, 10, 4000))
+    summary = render(tall, tmp_path / "a.mp4", caption=False)
+    assert (summary.width, summary.height) == (10, 4000)
+    with pytest.raises(AmiwarpError, match=r"b\.mp4: cannot be written as a film"):
+        render(tall, tmp_path / "b.mp4", scale=64)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_a_gif_has_frames_that_programs_show_at_their_speed(tmp_path: Path) -> None:
+    with pytest.raises(AmiwarpError, match=r"a GIF has at most 50 frames/s .*, not 60; give fewer, or write \.mp4"):
+        render(recording(), tmp_path / "a.gif", fps=60.0)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_what_was_assumed_of_the_recording_is_printed(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{k % 40},{k % 30},{k % 2}\n" for k in range(0, 90_000, 30))
+    (tmp_path / "a.csv").write_text(rows)
+    for command, *rest in (("render", "a.mp4"), ("filter", "b.h5", "--every", "2")):
+        rest[0] = str(tmp_path / rest[0])
+        done = CliRunner().invoke(app, [command, str(tmp_path / "a.csv"), *rest])
+        assert done.exit_code == 0, done.stderr
+        assert "note: assumed size 128x128 (--size)" in done.stdout
 
 
 def test_too_many_frames_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

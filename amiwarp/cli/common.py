@@ -621,6 +621,11 @@ def table(rows: Iterable[tuple[str, ...]], *headings: str) -> Table:
     return grid
 
 
+def assumption_lines(texts: Iterable[str]) -> list[str]:
+    """Return the lines that say what was assumed of an input, :func:`amiwarp.io.file_scan.assumed_texts`."""
+    return [f"note: assumed {text}" for text in texts]
+
+
 def format_notes(d: dict[str, Any]) -> list[str]:
     """Return what the format of the output has changed and left out."""
     lines = []

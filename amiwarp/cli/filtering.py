@@ -12,6 +12,7 @@ import typer
 from amiwarp.cli import common as cli
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
+from amiwarp.io.file_scan import assumed_texts
 from amiwarp.io.formats import EXTENSION_HELP
 
 _in_filter = partial(typer.Option, rich_help_panel="Filter, in the order in which the parts are applied")
@@ -97,6 +98,7 @@ def run_filter(
         summary = filter_recording(recording, out, chosen, format=format, progress=advance)
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {"file": str(out), **asdict(summary), "seconds": seconds}
+    data["assumptions"] = assumed_texts(recording.metadata)
     cli.report(common, data, _lines(data))
 
 
@@ -126,6 +128,7 @@ def _lines(d: dict[str, Any]) -> Iterator[str]:
         listed = ", ".join(f"({x}, {y}) {count:,}" for x, y, count in d["hot_pixels"][:MOST_HOT])
         more = len(d["hot_pixels"]) - MOST_HOT
         yield f"hot pixels: {listed}" + (f" and {more} more" if more > 0 else "")
+    yield from cli.assumption_lines(d["assumptions"])
     if d["left_out"]:
         yield f"note: the format leaves out: {', '.join(d['left_out'])}"
 

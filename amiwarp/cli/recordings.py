@@ -484,7 +484,7 @@ def _convert_lines(d: dict[str, Any]) -> list[str]:
         f"{d['file']}: {d['events']:,} events, {d['width']} x {d['height']}, {d['seconds']:.2f} s, {rate:.3g} Mev/s"
     ]
     lines += [f"note: {name}: {count:,}" for name, count in d["repairs"].items()]
-    lines += [f"note: assumed {text}" for text in d["assumptions"]]
+    lines += cli.assumption_lines(d["assumptions"])
     if d["encoder_covers"] is False:
         lines.append("warning: the encoder samples do not cover all events")
     if d["encoder_gaps"]:

@@ -11,6 +11,7 @@ import typer
 from amiwarp.choices import FilmMode
 from amiwarp.cli import common as cli
 from amiwarp.io import open_recording
+from amiwarp.io.file_scan import assumed_texts
 
 _in_frames = partial(typer.Option, rich_help_panel="Frames")
 
@@ -108,7 +109,8 @@ def run_render(
         )
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {"file": str(out), **asdict(summary), "device": device, "seconds": seconds}
-    cli.report(common, data, [_line(data)])
+    data["assumptions"] = assumed_texts(recording.metadata)
+    cli.report(common, data, [_line(data), *cli.assumption_lines(data["assumptions"])])
 
 
 def _line(d: dict[str, Any]) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import array
+import mmap
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import guarded, one_of
+from amiwarp.validation import guarded, one_of, shown
 
 if TYPE_CHECKING:
     from amiwarp.events.device_events import DeviceEvents
@@ -171,13 +173,19 @@ class EvtDecoder:
 
         word = np.dtype(WORD_TYPES[self._version])
         dtype = wp.dtype_from_numpy(word)
-        if isinstance(data, (bytes, bytearray, memoryview)):
+        if isinstance(data, (bytes, bytearray)):
             data = np.frombuffer(data, np.uint8)
+        elif isinstance(data, (memoryview, array.array, mmap.mmap)):
+            data = np.asarray(data)
+        if isinstance(data, np.ma.MaskedArray):
+            raise AmiwarpError("EVT words are a masked array; give the words without a mask")
         if isinstance(data, np.ndarray):
-            given = np.ascontiguousarray(data)
-            self._check(given.shape, given.dtype, word)
+            self._check(data.shape, data.dtype, word)
+            given = np.ascontiguousarray(data, data.dtype.newbyteorder("<"))
             words = given.view(word)
             return wp.array(words, dtype=dtype, device=self._device, copy=not self._device.is_cpu)
+        if not hasattr(data, "__dlpack__") and not isinstance(data, wp.array):
+            raise AmiwarpError(f"EVT words are {shown(data)}; expected bytes or an array")
         given = import_array(data, "EVT words").to(self._device)
         self._check(given.shape, np.dtype(wp.dtype_to_numpy(given.dtype)), word)
         if given.size and given.ptr % word.itemsize:  # a GPU reads no word across its borders

@@ -22,7 +22,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import SENSOR_DTYPE, Events, EventSource, Recording, check_coordinates
 from amiwarp.events.truth import FrameStore, Poses, PoseStore
 from amiwarp.io import formats
-from amiwarp.io.file_scan import ASSUMED, ASSUMED_SIZE, RECORDS, FileEvents, assumptions_of
+from amiwarp.io.file_scan import ASSUMED, ASSUMED_SIZE, RECORDS, FileEvents, assumed_texts
 from amiwarp.io.files import NewFile, check_output, errors_name
 from amiwarp.io.formats import LIMITS, Bag, Codec, Outline, OutputFormat, Rounding, open_recording
 from amiwarp.io.native_format import write_recording
@@ -378,7 +378,7 @@ def _summary(
         left_out=left_out(recording, chosen),
         rounding=rounding,
         dropped=dropped,
-        assumptions=tuple(f"{each.what} {each.value} ({each.option})" for each in assumptions_of(recording.metadata)),
+        assumptions=tuple(assumed_texts(recording.metadata)),
     )
 
 

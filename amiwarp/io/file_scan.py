@@ -111,6 +111,11 @@ class Assumption:
         return ASSUMED + self.what.replace(" ", "_"), f"{self.value}: {self.why}; {self.option}"
 
 
+def assumed_texts(metadata: Mapping[str, MetadataValue]) -> list[str]:
+    """Return for each assumption in the metadata of a recording what is assumed, and the option that overrides it."""
+    return [f"{each.what} {each.value} ({each.option})" for each in assumptions_of(metadata)]
+
+
 def assumptions_of(metadata: Mapping[str, MetadataValue]) -> list[Assumption]:
     """Return the assumptions in the metadata of a recording."""
     found = []

@@ -84,7 +84,7 @@ def frames_of_time(blocks: Iterable[Events], timing: Timing, reach_us: int | Non
             if block is None:
                 break
             held = block if held is None or not len(held) else Events.concatenate([held, block])
-            held = held[int(np.searchsorted(held.t, low)) :]
+            held = held[int(np.searchsorted(held.t, min(low, before))) :]
             if len(held) > MOST_EVENTS:
                 raise AmiwarpError(
                     f"a frame holds more than {MOST_EVENTS:,} events; give a shorter --frame-ms or --decay-ms "
@@ -155,6 +155,10 @@ class SurfacePainter:
 LEAST_WIDTH = 960
 """Width below which a picture is enlarged by a whole number by default [px]. Videos store one colour for 2 x 2 pixels,
 in which single events of a small picture would fade."""
+MOST_ENLARGED = 64
+"""Largest number by which a picture is enlarged."""
+LARGEST_SIDE = 4096
+"""Side up to which a picture is enlarged by default [px]."""
 FONT_SHARE, FONT_SIZES = 1 / 50, (11, 28)
 """Height of the font as a share of the picture's width, and its limits [px]."""
 INK = (190, 190, 190)
@@ -164,8 +168,11 @@ INK = (190, 190, 190)
 class Caption:
     """Line of text: time, event rate, length of a frame, and the colours of OFF and ON."""
 
-    def __init__(self, width: int, first_us: int, decimals: int, note: str) -> None:
-        """Take the width of the film [px], the time that is 0, the decimals of a time [s], and a text about frames."""
+    def __init__(self, width: int, first_us: int, decimals: int, note: str | None) -> None:
+        """Take the width of the film [px], the time that is 0, the decimals of a time [s], and a text about frames.
+
+        Without a text, it is the number of events of each frame.
+        """
         from PIL import ImageFont
 
         low, high = FONT_SIZES
@@ -177,9 +184,10 @@ class Caption:
     def parts(self, shown: Shown) -> list[tuple[str, tuple[int, ...]]]:
         """Return the texts of the line with their colours."""
         time = f"{(shown.end_us - self._first_us) * 1e-6:.{self._decimals}f} s"
-        rate = f"{shown.new / max(shown.length_us, 1):.2f} Mev/s"
+        rate = _rate(1e6 * shown.new / max(shown.length_us, 1))
+        note = f"{len(shown.events):,} events" if self._note is None else self._note
         off, on = (tuple(round(255 * part) for part in colour) for colour in (OFF_ON_BLACK, ON_ON_BLACK))
-        return [(time, INK), (rate, INK), ("OFF", off), ("ON", on), (self._note, INK)]
+        return [(time, INK), (rate, INK), ("OFF", off), ("ON", on), (note, INK)]
 
     def __call__(self, shown: Shown) -> NDArray[np.uint8]:
         """Return the picture of the line, shape ``(height, width, 3)``. What does not fit is left out."""
@@ -196,6 +204,14 @@ class Caption:
             draw.text((left, height / 2), text, fill=colour, font=self._font, anchor="lm")
             left = right + self._space
         return np.asarray(image)
+
+
+def _rate(per_s: float) -> str:
+    """Return a rate of events in words, with a unit in which it is not 0."""
+    for unit, size in (("Mev/s", 1e6), ("kev/s", 1e3)):
+        if per_s >= 0.1 * size:
+            return f"{per_s / size:.2f} {unit}"
+    return f"{per_s:.0f} ev/s"
 
 
 # Films.
@@ -215,7 +231,7 @@ class FilmSummary:
     frames: int
     """Number of frames."""
     events: int
-    """Number of events that they show."""
+    """Number of events that they show, each counted once."""
     width: int
     """Width of the film [px]."""
     height: int
@@ -272,7 +288,8 @@ def render(
     window : tuple of int, optional
         First time, and time after the last, of the events that are shown [us]. By default all events.
     scale : int, optional
-        Number by which the picture is enlarged. By default the least with which the film is at least 960 px wide.
+        Number by which the picture is enlarged. By default the least with which the film is at least 960 px wide, but
+        no side longer than 4096 px for it.
     caption : bool, default True
         Whether a line below the picture shows the time since the recording's first event, the event rate, and the
         colours.
@@ -319,7 +336,9 @@ def render(
             f"{(source.t_last - source.t_first) * 1e-6:g} s from the first"
         )
     width, height = source.size
-    scale = -(-LEAST_WIDTH // width) if scale is None else whole(scale, "scale", 1, 64)
+    if scale is None:
+        scale = max(min(-(-LEAST_WIDTH // width), LARGEST_SIDE // max(width, height)), 1)
+    scale = whole(scale, "scale", 1, MOST_ENLARGED)
     total = 0
     if events is not None:
         events = whole(events, "events", 1, MOST_EVENTS, " events per frame")
@@ -333,7 +352,7 @@ def render(
     paint: CountPainter | SurfacePainter = CountPainter((width, height), device)
     if decay is not None:
         paint = SurfacePainter((width, height), decay, device)
-    write = _caption(width * scale, source.t_first, timing, events, frame_us, decay) if caption else None
+    write = _caption(width * scale, source.t_first, timing, frame_us, decay) if caption else None
     size = [0, 0]
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
@@ -342,7 +361,7 @@ def render(
             picture = paint(shown).repeat(scale, axis=0).repeat(scale, axis=1)
             if write is not None:
                 picture = np.concatenate([picture, write(shown)])
-            total += shown.new
+            total += min(shown.new, len(shown.events))  # a frame may show fewer, or some that the last one showed
             size[:] = picture.shape[:2]
             yield picture
             if progress is not None:
@@ -399,12 +418,10 @@ def _decay(mode: FilmMode, decay_us: float | None, timing: Timing) -> float | No
     return DECAY_FRAMES * timing.step_us if decay_us is None else real(decay_us, "decay_us", 1.0, 1e9, " us")
 
 
-def _caption(
-    width: int, first_us: int, timing: Timing | None, events: int | None, frame_us: int | None, decay: float | None
-) -> Caption:
+def _caption(width: int, first_us: int, timing: Timing | None, frame_us: int | None, decay: float | None) -> Caption:
     """Return the line of text for the frames of a film that is ``width`` px wide."""
     if timing is None:
-        return Caption(width, first_us, 6, f"{events:,} events")
+        return Caption(width, first_us, 6, None)
     decimals = min(max(math.ceil(-math.log10(timing.step_us * 1e-6)), 0), 6)
     if decay is not None:
         return Caption(width, first_us, decimals, f"decay {decay * 1e-3:.4g} ms")

@@ -7,6 +7,7 @@ of it. ``docs/explanation/reconstruction.md`` gives the method and its limits.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -720,6 +721,8 @@ GAMMA = 2.2
 """Gamma with which pictures are displayed."""
 LIMITS_UPDATE = 0.1
 """Weight of a new frame in the running average of a video's black and white levels. A small weight prevents flicker."""
+GIF_FPS = 50.0
+"""Most frames per second of a GIF. Programs show those with shorter frames more slowly."""
 STILL_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
 """File suffixes of single pictures."""
 MASK_SUFFIXES = (".png", ".tif", ".tiff")
@@ -873,7 +876,16 @@ def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float, ov
     """
     av = check_film(path, overwrite=overwrite)
     count, kind = 0, path.suffix.lower().removeprefix(".")
-    with NewFile(path, overwrite=overwrite) as new, av.open(str(new.part), "w", format=kind) as container:
+    if kind == "gif" and fps > GIF_FPS:
+        raise AmiwarpError(
+            f"{path}: a GIF has at most {GIF_FPS:g} frames/s that programs show at their speed, not {fps:g}; give "
+            "fewer, or write .mp4"
+        )
+    with (
+        _films_are_written(path),
+        NewFile(path, overwrite=overwrite) as new,
+        av.open(str(new.part), "w", format=kind) as container,
+    ):
         stream: Any = None
         for value in map(padded_to_even, frames):
             if stream is None:
@@ -885,6 +897,17 @@ def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float, ov
             raise AmiwarpError(f"{path}: no picture to write; give at least one frame")
         container.mux(stream.encode())
     return count
+
+
+@contextlib.contextmanager
+def _films_are_written(path: Path) -> Iterator[None]:
+    """Turn the errors of PyAV, such as for a picture that is too large, into :class:`AmiwarpError`."""
+    from av.error import FFmpegError
+
+    try:
+        yield
+    except FFmpegError as error:
+        raise AmiwarpError(f"{path}: cannot be written as a film: {error.strerror}; try smaller pictures") from error
 
 
 def _add_stream(container: Any, fps: float, shape: tuple[int, ...], kind: str) -> Any:
