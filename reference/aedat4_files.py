@@ -60,6 +60,7 @@ def events_packet(events: Events, **wrong: Any) -> bytes:
     rows = np.zeros(len(events), [("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("rest", "V3")])
     for name in "xytp":
         rows[name] = wrong.get(name, getattr(events, name))
+    rows["rest"] = b"\xff\xff\xff"  # bytes without a meaning
     return flat("EVTS", {}, {0: struct.pack("<I", len(rows)) + rows.tobytes()})
 
 

@@ -301,16 +301,18 @@ def test_events_outside_a_packet_and_impossible_ones(tmp_path):
     t[5], t[6] = -(2**63), 2**63 - 1
     x = EVENTS.x[300:400].astype(np.int16)
     x[9] = -3
+    y = EVENTS.y[300:400].astype(np.int16)
+    y[11] = -(2**15)
     packets = [events_packet(EVENTS[:100]), events_packet(EVENTS[100:200], t=t), bytes(beyond),
-               events_packet(EVENTS[300:400], x=x), events_packet(EVENTS[400:])]  # fmt: skip
+               events_packet(EVENTS[300:400], x=x, y=y), events_packet(EVENTS[400:])]  # fmt: skip
     data, places = file_of([(0, packet) for packet in packets])
     recording = opened(tmp_path, data)
     assert recording.metadata == {
-        "format": "aedat4", "dropped_outside_events": 1, "dropped_damaged_events": 2,
+        "format": "aedat4", "dropped_outside_events": 2, "dropped_damaged_events": 2,
         "dropped_damaged_bytes": places[3] - places[2],
     }  # fmt: skip
     keep = np.ones(len(EVENTS), np.bool_)
-    keep[[105, 106, 309]] = False
+    keep[[105, 106, 309, 311]] = False
     keep[200:300] = False
     assert_equal(all_of(recording), Events(*(getattr(EVENTS, name)[keep] for name in "xytp")))
 

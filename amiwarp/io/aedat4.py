@@ -29,6 +29,9 @@ from amiwarp.io.file_scan import FileEvents, Packet, sensors_of
 from amiwarp.io.files import errors_name
 from amiwarp.validation import TIME_LIMIT
 
+BLOCK_EVENTS = 1 << 15
+"""Number of events that one thread unpacks."""
+
 
 def open_aedat4(path: Path) -> Recording:
     """Open the first event stream of an AEDAT 4 file."""
@@ -81,26 +84,46 @@ def _event_packets(about: Aedat4File, restarts: list[tuple[int, int]], notes: di
             buffer = buffer if size <= len(buffer) else bytearray(size)
             rows, starts, places, lost = _event_rows(found, buffer)
             damaged["dropped_damaged_bytes"] += lost
-            t: NDArray[np.int64] = rows["t"].astype(np.int64)
+            events = _unpacked(rows)
+            t = events.t
             if t.size and not (t.min() > -TIME_LIMIT and t.max() < TIME_LIMIT):
                 sound = (t > -TIME_LIMIT) & (t < TIME_LIMIT)
                 damaged["dropped_damaged_events"] += int(t.size - np.count_nonzero(sound))
                 # Each packet begins earlier by the events before it that are dropped.
                 dropped_before = np.searchsorted(np.flatnonzero(~sound), starts)
                 starts = (np.array(starts) - dropped_before).tolist()
-                rows = rows[sound]
-                t = t[sound]
+                events = events[sound]
+                t = events.t
             for name in {*damaged, *batch.notes}:
                 notes[name] = damaged.get(name, 0) + batch.notes.get(name, 0)
             if t.size:
                 clock.shift_all(t, starts, places)
                 restarts[:] = clock.restarts
                 notes["clock_restarts"] = len(restarts)
-                # Negative coordinates become large ones, which lie outside the frame.
-                x = rows["x"].astype(np.uint16)
-                y = rows["y"].astype(np.uint16)
-                p = (rows["p"] != 0).view(np.uint8)
-                yield Events(x, y, t, p)
+                yield events
+
+
+def _unpacked(rows: NDArray[Any]) -> Events:
+    """Return the events of some rows of a file."""
+    import warp as wp
+
+    from amiwarp.kernels.aedat4 import unpack_events
+    from amiwarp.kernels.evt import EventArrays
+    from amiwarp.kernels.launch import launch, start_once
+
+    if not rows.size:
+        return Events.empty()
+    start_once()
+    arrays = EventArrays()
+    arrays.x = wp.empty(rows.size, dtype=wp.uint16, device="cpu")
+    arrays.y = wp.empty(rows.size, dtype=wp.uint16, device="cpu")
+    arrays.t = wp.empty(rows.size, dtype=wp.int64, device="cpu")
+    arrays.p = wp.empty(rows.size, dtype=wp.uint8, device="cpu")
+    words = wp.array(rows.view(np.uint64), dtype=wp.uint64, device="cpu", copy=False)
+    blocks = -(-rows.size // BLOCK_EVENTS)
+    launch(unpack_events, blocks, [words, BLOCK_EVENTS], [arrays], device="cpu", smallest=1)
+    columns: list[Any] = [getattr(arrays, name).numpy() for name in ("x", "y", "t", "p")]
+    return Events(*columns)
 
 
 def _event_rows(contents: list[Content], buffer: bytearray) -> tuple[NDArray[Any], list[int], list[int], int]:

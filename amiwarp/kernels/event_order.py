@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from amiwarp.kernels.native_code import load_int64, load_uint16, store_int64
+from amiwarp.kernels.native_code import load_int64, store_int64
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,6 +23,39 @@ class Survey:
     """Largest row [px]."""
 
 
+# Loops in native code, one for each result: so CPU compilers vectorise them.
+
+
+@wp.func_native("""
+    const uint16_t* value = (const uint16_t*)values.data;
+    uint16_t largest = 0;
+    for (int i = start; i < stop; ++i) largest = value[i] > largest ? value[i] : largest;
+    return largest;
+""")
+def largest_coordinate(values: wp.array(dtype=wp.uint16), start: int, stop: int) -> int:
+    """Return the largest value from ``start`` to before ``stop``."""
+
+
+@wp.func_native("""
+    const int64_t* time = (const int64_t*)t.data;
+    int64_t largest = time[start];
+    for (int i = start + 1; i < stop; ++i) largest = time[i] > largest ? time[i] : largest;
+    return largest;
+""")
+def latest_time(t: wp.array(dtype=wp.int64), start: int, stop: int) -> wp.int64:
+    """Return the largest time from ``start`` to before ``stop``, of which there is at least one."""
+
+
+@wp.func_native("""
+    const int64_t* time = (const int64_t*)t.data;
+    int64_t falls = 0;
+    for (int i = start + 1; i < stop; ++i) falls += time[i] < time[i - 1];
+    return (int)falls;
+""")
+def count_falls(t: wp.array(dtype=wp.int64), start: int, stop: int) -> int:
+    """Return how many times from ``start`` to before ``stop`` are earlier than the one before."""
+
+
 @wp.kernel
 def survey_events(
     x: wp.array(dtype=wp.uint16),
@@ -34,19 +67,14 @@ def survey_events(
 ):
     """Note what each block of ``length`` events holds. One thread reads one block."""
     block = wp.tid() + start
-    survey = Survey()
     first = block * length
+    stop = wp.min(first + length, t.shape[0])
+    survey = Survey()
     survey.first = load_int64(t, first)
-    before = survey.first
-    latest = before
-    for i in range(first, wp.min(first + length, t.shape[0])):
-        now = load_int64(t, i)
-        survey.falls += wp.where(now < before, 1, 0)
-        latest = wp.max(latest, now)
-        before = now
-        survey.right = wp.max(survey.right, int(load_uint16(x, i)))
-        survey.bottom = wp.max(survey.bottom, int(load_uint16(y, i)))
-    survey.latest = latest
+    survey.latest = latest_time(t, first, stop)
+    survey.falls = count_falls(t, first, stop)
+    survey.right = largest_coordinate(x, first, stop)
+    survey.bottom = largest_coordinate(y, first, stop)
     surveys[block] = survey
 
 
