@@ -441,7 +441,7 @@ def read_speed(path: Path) -> None:
     assert np.isfinite(_read_speed(path)).all()
 
 
-def read_recording(path: Path) -> None:
+def read_recording(path: Path) -> Recording:
     """Read a recording in every possible way, check the events, and describe it as ``amiwarp info`` does."""
     recording = open_recording(path)
     source = recording.events
@@ -468,6 +468,7 @@ def read_recording(path: Path) -> None:
         for index in range(len(recording.frames.t)):
             assert recording.frames[index].shape == recording.frames.size[::-1]
     json.dumps(describe(recording, str(path)), ensure_ascii=False, allow_nan=False).encode()
+    return recording
 
 
 def check_finite(recording: Recording) -> None:
@@ -717,13 +718,18 @@ EDITS = (_flip, _flip, _set, _number, _number, _digits, _cut, _remove, _duplicat
 
 
 def check(path: Path, name: str) -> str | None:
-    """Read a file of one of :data:`KINDS` in this process. Return the refusal, or None if the file was read.
+    """Read a file of one of :data:`KINDS` in this process, see :func:`checked`."""
+    return checked(path, KINDS[name][2])
+
+
+def checked(path: Path, read: Callable[[Path], object]) -> str | None:
+    """Read a file with a function. Return the refusal, or None if the file was read.
 
     Any other exception is a defect. So is a refusal of several lines or without the file's name.
     """
     Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here: other tests ran in this process before
     before = memory_kib("VmRSS")
-    said = refusal(KINDS[name][2], path)
+    said = refusal(read, path)
     if said is not None:
         assert str(path) in said, said
         assert all(character.isprintable() or unicodedata.category(character) == "Zs" for character in said), repr(said)
@@ -742,15 +748,19 @@ def memory_kib(field: str) -> int:
 class Checker:
     """Runs :func:`check` in a supervised process, so that a crash or a hang is a finding too.
 
-    ``cpu_seconds`` is the processor time after which the package's own reading process refuses a file.
+    ``cpu_seconds`` is the processor time after which the package's own reading process refuses a file. ``module`` is
+    the module whose ``check`` is run.
     """
 
-    def __init__(self, cpu_seconds: float = reading_process.CPU_SECONDS) -> None:
+    def __init__(
+        self, cpu_seconds: float = reading_process.CPU_SECONDS, module: str = "reference.mutation_files"
+    ) -> None:
         self._cpu_seconds = cpu_seconds
+        self._module = module
         self._start()
 
     def _start(self) -> None:
-        command = [sys.executable, "-P", "-m", "reference.mutation_files", "--serve", str(self._cpu_seconds)]
+        command = [sys.executable, "-P", "-m", self._module, "--serve", str(self._cpu_seconds)]
         modules = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}  # the amiwarp of this process
         self._process = subprocess.Popen(command, env=modules, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
@@ -781,7 +791,7 @@ class Checker:
         self._process.stdout.close()
 
 
-def serve(cpu_seconds: float) -> None:
+def serve(cpu_seconds: float, check: Callable[[Path, str], str | None]) -> None:
     """Check the files whose names arrive on standard input."""
     reading_process.CPU_SECONDS = cpu_seconds
     replies = sys.stdout
@@ -817,6 +827,6 @@ def main(count: int, names: list[str]) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--serve"]:
-        serve(float(sys.argv[2]))
+        serve(float(sys.argv[2]), check)
     else:
         main(int(sys.argv[1]), sys.argv[2:])

@@ -3,7 +3,6 @@
 import contextlib
 import gzip
 import io
-import itertools
 import json
 import lzma
 import os
@@ -41,6 +40,8 @@ from amiwarp.io.export import left_out
 from amiwarp.io.prophesee import Halves, halves_of, words_of
 from amiwarp.io.ros import read_packets
 from amiwarp.io.ros_writer import _types_of
+from reference.ecf_files import ecf_chunk, ecf_events, write_ecf
+from reference.es_files import ES_SIZE, es_bytes
 from reference.evt_words import Evt2Decoder, Evt3Decoder
 from reference.io_samples import make_events, refusal, to_faery, write_aedat4
 from reference.io_samples_extra import (
@@ -161,6 +162,21 @@ def test_evt21_in_both_byte_orders(tmp_path, legacy, header):
 
 
 ONLY_COUNTED = "only counted: amiwarp does not read them from this format"
+
+
+@pytest.mark.parametrize(
+    ("version", "name", "dtype", "unknown"),
+    [("2", "evt2.0", "<u4", 10), ("21", "evt2.1", "<u8", 10), ("3", "evt3.0", "<u2", 5)],
+)
+def test_words_of_unknown_types_are_counted(tmp_path, version, name, dtype, unknown):
+    """Words of all 16 types, more than a block has, below a header that names the version in short."""
+    shift = 8 * np.dtype(dtype).itemsize - 4
+    turns = 2100
+    words = [0x8 << shift, *[kind << shift | 1 for kind in range(16)] * turns]
+    head = f"% format EVT{version};endianness=little;width=2048;height=2048\n% end\n".encode()
+    (tmp_path / "a.raw").write_bytes(head + np.array(words, dtype).tobytes())
+    recording = open_recording(tmp_path / "a.raw")
+    assert (recording.metadata["format"], recording.metadata["unknown_words"]) == (name, unknown * turns)
 
 
 def test_evt21_vectors(tmp_path):
@@ -310,7 +326,8 @@ def test_aedat3_triggers_sources_and_overflow(tmp_path):
     recording = open_recording(tmp_path / "a.aedat")
     assert_equal(recording.events.slice(0, 999), EVENTS)
     assert recording.metadata == {
-        "format": "aedat3", "imu_samples": 5, "triggers": 3, "events_of_other_sources": 1, "imu_note": ONLY_COUNTED,
+        "format": "aedat3", "imu_samples": 5, "triggers": 3, "events_of_other_sources": 1, "invalid_events": 1,
+        "imu_note": ONLY_COUNTED,
     }  # fmt: skip
     assert np.diff(read_encoder_triggers(tmp_path / "a.aedat").t).tolist() == [500]
     later = Events(EVENTS.x, EVENTS.y, EVENTS.t + 2**31, EVENTS.p)
@@ -319,6 +336,21 @@ def test_aedat3_triggers_sources_and_overflow(tmp_path):
     (tmp_path / "b.aedat").write_bytes((tmp_path / "b.aedat").read_bytes().replace(b"Format: RAW", b"Format: PNG"))
     with pytest.raises(AmiwarpError, match=r"b\.aedat: .*the packets have the format 'PNG'"):
         open_recording(tmp_path / "b.aedat")
+
+
+def test_aedat3_events_that_are_invalid_and_packets_of_other_types_are_counted(tmp_path):
+    """One event without its valid bit, and a packet of 100 events whose type is that of a configuration."""
+    path = tmp_path / "a.aedat"
+    write_aedat3(path, EVENTS)
+    data = bytearray(path.read_bytes())
+    start = data.index(b"#!END-HEADER\r\n") + 14
+    data[start + 28 + 8 * 5] ^= 1
+    last = len(data) - 28 - 8 * 100
+    data[last] = 7
+    path.write_bytes(data)
+    recording = open_recording(path)
+    assert len(recording.events) == len(EVENTS) - 101
+    assert (recording.metadata["invalid_events"], recording.metadata["packets_of_other_types"]) == (1, 1)
 
 
 def test_bin_with_and_without_marks(tmp_path):
@@ -348,27 +380,6 @@ def test_bin_with_and_without_marks(tmp_path):
 
 
 # Event Stream.
-
-ES_SIZE = 300, 260
-
-
-def es_bytes(events: Events, kind: str, *, exposure: np.ndarray | None = None) -> bytes:
-    """A file by the specification of Event Stream, with a reset between any two events."""
-    shift, longest = (1, 127) if kind == "dvs" else (2, 63)
-    out = b"Event Stream\2\0\0" + bytes([1 if kind == "dvs" else 2]) + struct.pack("<HH", *ES_SIZE)
-    before = 0
-    for k in range(len(events)):
-        left = int(events.t[k]) - before
-        before = int(events.t[k])
-        while left >= longest:
-            times = 1 if kind == "dvs" else min(3, left // longest)
-            out += bytes([longest << shift | times])
-            left -= longest * times
-        on = int(events.p[k])
-        bits = on if kind == "dvs" else on << 1 | int(exposure is not None and exposure[k])
-        out += bytes([left << shift | bits])
-        out += struct.pack("<HH", events.x[k], ES_SIZE[1] - 1 - int(events.y[k])) + bytes([longest << shift])
-    return out
 
 
 @pytest.mark.parametrize("piece", [1, 4, 7, 1 << 20])
@@ -459,99 +470,6 @@ def test_triggers_in_prophesee_hdf5(tmp_path):
     write_prophesee_hdf5(tmp_path / "a.hdf5", EVENTS, compression="gzip")
     assert open_recording(tmp_path / "a.hdf5").metadata["triggers"] == 4
     assert read_encoder_triggers(tmp_path / "a.hdf5").rpm == pytest.approx(30_000)
-
-
-def ecf_runs(values: list[int], bits: int, words: str) -> bytes:
-    """Runs of equal values, with their lengths in the lowest bits, or behind them if they are long."""
-    out = b""
-    for value, group in itertools.groupby(values):
-        count = len(list(group))
-        longest = (1 << bits) - 1
-        if count >= longest:
-            out += struct.pack(f"<{words}", value << bits | longest) + struct.pack("<H", count)
-        else:
-            out += struct.pack(f"<{words}", value << bits | count)
-    return out
-
-
-def ecf_packed(values: list[int], bits: int) -> bytes:
-    """Groups of four values: their bits in the order v0, low bits of v1, rest of v1, ... as three words."""
-    part = bits // 3
-    out = b""
-    for at in range(0, len(values), 4):
-        v0, v1, v2, v3 = [*values[at : at + 4], 1, 2, 3][:4]  # the codec does not clear the last ones
-        first = v0 << part | v1 % 2**part
-        second = v1 >> part << 2 * part | v2 % 2 ** (2 * part)
-        third = v2 >> 2 * part << 3 * part | v3
-        out += struct.pack("<3H" if bits == 12 else "<3I", first, second, third)
-    return out
-
-
-def ecf_chunk(events: Events, mode: str) -> bytes:
-    """A chunk by the description of Prophesee's codec."""
-    x, y, t, p = (column.tolist() for column in (events.x, events.y, events.t, events.p))
-    out = struct.pack("<Iq", len(t) << 2 | {"packed": 2, "rows": 1, "masks": 0}[mode], t[0])
-    now = t[0]
-    for time, group in itertools.groupby(t):
-        count = len(list(group))
-        step = time - now
-        now = time
-        gap = step if step >= 15 else 0
-        step -= gap
-        while gap:
-            out += bytes([0xF0 | gap & 15])
-            gap >>= 4
-        if count >= 15:
-            out += bytes([step << 4 | 15]) + struct.pack("<H", count)
-        else:
-            out += bytes([step << 4 | count])
-    if mode == "packed":
-        return out + ecf_packed([row << 12 | column << 1 | on for column, row, on in zip(x, y, p, strict=True)], 24)
-    out += ecf_runs(y, 5, "H")
-    if mode == "rows":
-        return out + ecf_packed([column << 1 | on for column, on in zip(x, p, strict=True)], 12)
-    at = 0
-    while at < len(x):
-        first, mask = x[at], 0
-        at += 1
-        for bit in range(5):
-            if at < len(x) and x[at] == first + bit + 1:
-                mask |= 16 >> bit
-                at += 1
-        # What lies behind the last event is not cleared.
-        out += struct.pack("<H", first << 5 | (mask | 1 if at == len(x) and mask < 2 else mask))
-    return out + ecf_runs(p, 7, "B")
-
-
-def write_ecf(path: Path, chunks: list[bytes], count: int, length: int, *filters: int, mask: int = 0) -> None:
-    """A file as Metavision writes it: chunks of ``length`` events in the ECF codec."""
-    rows = np.dtype({"names": ["x", "y", "p", "t"], "formats": ["<u2", "<u2", "<i2", "<i8"],
-                     "offsets": [0, 2, 4, 8], "itemsize": 16})  # fmt: skip
-    creation = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    creation.set_chunk((length,))
-    for number in (*filters, 0x8ECF):
-        creation.set_filter(number, h5py.h5z.FLAG_OPTIONAL, ())
-    with h5py.File(path, "w") as file:
-        group = file.create_group("CD")
-        kind, space = h5py.h5t.py_create(rows), h5py.h5s.create_simple((count,))
-        dataset = h5py.h5d.create(group.id, b"events", kind, space, creation)
-        for k, chunk in enumerate(chunks):
-            dataset.write_direct_chunk((k * length,), chunk, mask if k == 0 else 0)
-        file.attrs["geometry"] = "320x240"
-
-
-def ecf_events(count: int) -> Events:
-    """Rows of events next to each other, long runs, gaps of time, and the largest coordinates."""
-    rng = np.random.default_rng(3)
-    t = 10**15 + np.cumsum(rng.choice([0, 0, 0, 0, 1, 14, 15, 16, 255, 300_000], count))
-    t[50:400] = t[50]
-    t[400:] += t[50] - t[399] + 350_000_000 if t[399] > t[50] else 0
-    t = np.maximum.accumulate(t)
-    x = (np.arange(count) * rng.choice([1, 1, 1, 2, 7], count)) % 320
-    y = np.repeat(rng.integers(0, 240, count), rng.integers(1, 70, count))[:count]
-    p = np.repeat(rng.integers(0, 2, count), rng.integers(1, 300, count))[:count]
-    x[1], y[1] = 319, 239
-    return Events.from_arrays(x, y, t, p)
 
 
 @pytest.mark.parametrize("mode", ["packed", "rows", "masks"])

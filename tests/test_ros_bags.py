@@ -330,6 +330,35 @@ def test_triggers_and_copies_follow_the_clock_of_the_events(tmp_path: Path) -> N
     assert stamps == pytest.approx([50.0, 90.0, 90.001], abs=1e-9)
 
 
+@pytest.mark.parametrize("encoding", ["evt3", "mono"])
+def test_messages_that_only_the_index_lists_are_counted(tmp_path: Path, encoding: str) -> None:
+    """The first message has become a record of another type, which readers of MCAP pass over."""
+    messages = packets(encoding, EVENTS)
+    path = write_ros2(tmp_path / "a", {"/events": messages}, storage="MCAP")
+    data = bytearray(path.read_bytes())
+    first = data.index(bytes(messages[0].events)[:40])
+    at = data.rindex(b"\x05", 0, first - 30)
+    while int.from_bytes(data[at + 1 : at + 9], "little") != 22 + len(
+        typestore(False).serialize_cdr(messages[0], "event_camera_msgs/msg/EventPacket")
+    ):
+        at = data.rindex(b"\x05", 0, at)
+    data[at] = 0x7F
+    path.write_bytes(data)
+    recording = open_recording(path)
+    assert len(recording.events) == len(EVENTS) - 200
+    assert recording.metadata["unread_messages"] == 1
+
+
+@pytest.mark.parametrize("encoding", ["evt3", "evt2"])
+def test_words_of_unknown_types_in_bags_are_counted(tmp_path: Path, encoding: str) -> None:
+    words = packets(encoding, EVENTS[:100])[0].events.view({"evt3": "<u2", "evt2": "<u4"}[encoding]).copy()
+    shift = 8 * words.itemsize - 4
+    more = [*words.tolist(), 0x9 << shift, 0xB << shift | 5, 0xE << shift]
+    recording = open_recording(bag(tmp_path, [message(more, 0, encoding=encoding)]))
+    assert len(recording.events) == 100
+    assert recording.metadata["unknown_words"] == 2
+
+
 # The order of the halves of EVT 2.1.
 
 

@@ -370,12 +370,16 @@ def _contents(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[
             if kind in COUNTED_TYPES:
                 notes[COUNTED_TYPES[kind]] = notes.get(COUNTED_TYPES[kind], 0) + count
             if kind not in (SPECIAL, POLARITY):
+                if kind not in COUNTED_TYPES:
+                    notes["packets_of_other_types"] = notes.get("packets_of_other_types", 0) + 1
                 file.seek(length, 1)
             elif width != 8:
                 raise AmiwarpError(f"{path}: byte {at}: events of {width} bytes in a packet of type {kind}; expected 8")
             else:
                 words = np.frombuffer(file.read(length), "<i4").reshape(-1, 2).astype(np.int64)
-                yield kind, source, words[words[:, 0] & 1 == 1], overflow << 31
+                valid = words[:, 0] & 1 == 1
+                notes["invalid_events"] = notes.get("invalid_events", 0) + int(np.count_nonzero(~valid))
+                yield kind, source, words[valid], overflow << 31
             notes["read"] = file.tell()
 
 

@@ -81,11 +81,17 @@ class EvtDecoder:
         self._device = wp.get_device("cpu" if device is None else device)
         self._state: wp.array | None = None
         self._untimed = 0
+        self._unknown = 0
 
     @property
     def untimed(self) -> int:
         """Number of events and edges so far that came before the first time word. They have no time and are dropped."""
         return self._untimed
+
+    @property
+    def unknown(self) -> int:
+        """Number of words so far whose type the format does not define, as of damaged data. They are passed over."""
+        return self._unknown
 
     def decode(self, data: Any) -> tuple[DeviceEvents, Triggers]:
         """Return the events and the edges of the words that follow those of the last call.
@@ -150,6 +156,7 @@ class EvtDecoder:
         total = group_places[groups:].numpy()[0]
         events, edges = int(total["event"]), int(total["trigger"])
         self._untimed += int(total["untimed"])
+        self._unknown += int(total["unknown"])
         event_arrays = evt.EventArrays()
         event_arrays.x = wp.empty(events, dtype=wp.uint16, device=device)
         event_arrays.y = wp.empty(events, dtype=wp.uint16, device=device)

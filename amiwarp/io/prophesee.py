@@ -107,7 +107,7 @@ class EvtFile:
     fields: dict[str, str]
     """Values by lower-case key."""
     version: str
-    """Version of EVT, as the header names it."""
+    """Version of EVT: "2.0", "2.1" or "3.0"."""
     offset: int
     """Position of the first word [bytes]."""
     word: int
@@ -145,7 +145,7 @@ def read_evt_header(path: Path) -> EvtFile:
     if word is None:
         raise AmiwarpError(f"{path}: EVT version in the header is '{version[:40]}'; expected 2.0, 2.1 or 3.0")
     swapped = word == 8 and _is_swapped(path, offset, fields.get("format", ""))
-    return EvtFile(path, fields, "2.1" if word == 8 else version, offset, word, swapped, stated_origin(path, fields))
+    return EvtFile(path, fields, VERSION_OF[word], offset, word, swapped, stated_origin(path, fields))
 
 
 def stated_origin(path: Path, fields: dict[str, str]) -> int:
@@ -182,6 +182,7 @@ def _decoded(about: EvtFile, notes: dict[str, int]) -> Iterator[tuple[Events, Tr
         events, edges = decoder.decode(about.words(data))
         notes["triggers"] = notes.get("triggers", 0) + len(edges.t)
         notes["dropped_untimed_events"] = decoder.untimed
+        notes["unknown_words"] = decoder.unknown
         yield events.to_host(), edges
 
 

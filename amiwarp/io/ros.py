@@ -30,6 +30,7 @@ from amiwarp.io.ros_bags import (
     deserialised,
     messages_of,
     note_largest_gap,
+    note_unread,
     number_of,
     opened_bag,
     typestore,
@@ -175,6 +176,7 @@ def read_packets(notes: dict[str, int], path: str, topic: str, triggers: bool) -
         notes["read"] = notes.get("read", 0) + 1
         notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
         yield edges if triggers else events
+    note_unread(notes)
 
 
 def _topic_messages(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[Message, bool]]:

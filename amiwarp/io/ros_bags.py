@@ -97,6 +97,11 @@ def messages_of(bag: Any, connections: list[Any], *, ros1: bool) -> Iterator[Mes
         yield Message(connection, recorded, raw)
 
 
+def note_unread(notes: dict[str, int]) -> None:
+    """Note how many messages of a topic the bag's index lists, but the bag does not hold, after all were read."""
+    notes["unread_messages"] = max(notes["total"] - notes.get("read", 0), 0)
+
+
 def choose(bag: Any, topic: str | None, version: int) -> Any:
     """Return the connection of the topic with events. Raises :class:`AmiwarpError` if there are several or none."""
     found = {one.topic: one for one in bag.connections if one.msgtype in (*ARRAYS, *PACKETS) and one.msgcount}

@@ -26,6 +26,7 @@ from amiwarp.io.ros_bags import (
     deserialised,
     messages_of,
     note_largest_gap,
+    note_unread,
     number_of,
     opened_bag,
 )
@@ -270,6 +271,7 @@ def read_words(
             notes["read"] = notes.get("read", 0) + 1
             numbers_of = (len(words), shift, missing, one.recorded, stamp)
             yield words, *(np.array([value], np.int64) for value in numbers_of)
+        note_unread(notes)
 
 
 def _with_next(values: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
@@ -345,6 +347,7 @@ def decoded(path: Path, topic: str, layout: Layout, notes: dict[str, int]) -> It
             if events.t.size:
                 latest = int(events.t[-1])
             notes["triggers"] = notes.get("triggers", 0) + len(edges.t)
+            notes["unknown_words"] = decoder.unknown
             yield Decoded(events, edges, part, lengths[start:stop], recorded[start:stop], stamps[start:stop])
 
 

@@ -70,15 +70,20 @@ class Change:
     """Number of events before the first TIME_HIGH."""
     early_triggers: int
     """Number of edges before the first TIME_HIGH."""
+    unknown: int
+    """Number of words of types that the format does not define."""
 
 
 @wp.struct
 class Place:
-    """Where the output of a block begins, and how many events and edges before it came before the first TIME_HIGH."""
+    """Where the output of a block begins, and what was passed over before it."""
 
     event: int
     trigger: int
     untimed: int
+    """Number of events and edges before the first TIME_HIGH."""
+    unknown: int
+    """Number of words of unknown types."""
 
 
 @wp.struct
@@ -193,6 +198,7 @@ def merged(first: Change, second: Change, bits: int) -> Change:
     both = first
     both.events += second.events
     both.triggers += second.triggers
+    both.unknown += second.unknown
     if first.first_high == NONE:
         both.first_high = second.first_high
         both.rise = second.rise
@@ -240,6 +246,7 @@ def after_block(place: Place, state: State, change: Change) -> Place:
     after.event = place.event + events
     after.trigger = place.trigger + triggers
     after.untimed = place.untimed + change.events - events + change.triggers - triggers
+    after.unknown = place.unknown + change.unknown
     return after
 
 

@@ -27,6 +27,8 @@ wp.set_module_options({"enable_backward": False})
 
 ON = wp.constant(0x1)
 """Type of a change detection ON. OFF is 0."""
+TYPES = wp.constant(0b1100_0101_0000_0011)
+"""Types that EVT 2.0 and 2.1 define, a bit for each: those above, and words for other uses (0xE, 0xF)."""
 
 
 @wp.func
@@ -88,6 +90,8 @@ def survey_evt2(words: wp.array(dtype=Any), length: int, swapped: int, start: in
             last = high
         elif kind == TRIGGER:
             change.triggers += 1
+        elif (TYPES >> kind) & 1 == 0:
+            change.unknown += 1
     changes[block] = change
 
 

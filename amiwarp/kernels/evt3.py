@@ -33,6 +33,8 @@ VECTOR_BASE = wp.constant(0x3)
 VECTOR_12 = wp.constant(0x4)
 VECTOR_8 = wp.constant(0x5)
 TIME_LOW = wp.constant(0x6)
+TYPES = wp.constant(0b1100_0101_1111_1101)
+"""Types that EVT 3.0 defines, a bit for each: those above, and words for other uses (0x7, 0xE, 0xF)."""
 
 
 @wp.func_native("""
@@ -59,6 +61,16 @@ def count_events(words: wp.array(dtype=wp.uint16), start: int, stop: int) -> int
 """)
 def count_words(words: wp.array(dtype=wp.uint16), kind: int, start: int, stop: int) -> int:
     """Return the number of words of a kind from ``start`` to before ``stop``. CPU compilers vectorise it."""
+
+
+@wp.func_native("""
+    const uint16_t* word = (const uint16_t*)words.data;
+    int count = 0;
+    for (int i = start; i < stop; ++i) count += !(types >> (word[i] >> 12) & 1);
+    return count;
+""")
+def count_others(words: wp.array(dtype=wp.uint16), types: int, start: int, stop: int) -> int:
+    """Return the number of words of other ``types``, a bit for each, from ``start`` to before ``stop``."""
 
 
 @wp.func_native("""
@@ -118,6 +130,7 @@ def survey_evt3(words: wp.array(dtype=wp.uint16), length: int, start: int, chang
 
     change.events = count_events(words, begin, end)
     change.triggers = count_words(words, TRIGGER, begin, end)
+    change.unknown = count_others(words, TYPES, begin, end)
     low = last_of(words, TIME_LOW, begin, first)
     if low != NONE:
         change.low_before = int(load_uint16(words, low)) & 0xFFF
