@@ -251,7 +251,8 @@ def assert_said(recording: Recording, rows: Rows, found: list[Said]) -> None:
             for name in {*said.counts, "dropped_outside_events", "repaired_time_events", "largest_time_repair_us"}
             if recording.metadata.get(name, 0) != counts.get(name, 0)
         ]
-        if stated is None and recording.events.size != smallest_sensor(*(int(v) for v in expected[:, :2].max(axis=0))):
+        right, bottom = expected[:, :2].max(axis=0, initial=0).tolist()
+        if stated is None and recording.events.size != smallest_sensor(right, bottom):
             wrong.append(f"size {recording.events.size}")
         if not np.array_equal(rows, expected):
             wrong.append(f"{len(rows)} events read, {len(expected)} expected, or other values")

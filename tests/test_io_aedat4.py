@@ -401,3 +401,19 @@ def test_real_files_as_faery_reads_them(data_dir):
             np.testing.assert_array_equal(recording.imu.angular_velocity[:, k], turning)
             pulling = samples[f"accelerometer_{axis}"].astype(np.float64) * G
             np.testing.assert_array_equal(recording.imu.acceleration[:, k], pulling)
+
+
+def test_real_files_as_dv_processing_reads_them(data_dir):
+    dv = pytest.importorskip("dv_processing")
+    for name in ("aedat4_dvxplorerlite_320x240", "aedat4_davis346_cars"):
+        path = data_dir / f"aedat/{name}.aedat4"
+        recording = open_recording(path)
+        reader = dv.io.MonoCameraRecording(str(path))
+        batches = []
+        while (batch := reader.getNextEventBatch()) is not None:
+            batches.append(batch.numpy())
+        expected = np.concatenate(batches)
+        found = all_of(recording)
+        for given, field in (("x", "x"), ("y", "y"), ("t", "timestamp"), ("p", "polarity")):
+            np.testing.assert_array_equal(getattr(found, given), expected[field])
+        assert reader.getEventResolution() == recording.events.size
