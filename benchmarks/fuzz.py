@@ -2,10 +2,12 @@
 
     python -m benchmarks.fuzz --seconds 60
     python -m benchmarks.fuzz --files 20000 --frames 100000 --out benchmarks/results/fuzz.json
+    python -m benchmarks.fuzz --events 4000 --out benchmarks/results/fuzz_events.json
     python -m benchmarks.fuzz --guided stream --seconds 60
 
 Files are mutated samples of every format, read completely in supervised processes. Frames are mutated packets of the
-event stream and mutated messages of the serial port. ``--seed`` selects another series. ``--guided`` uses Atheris
+event stream and mutated messages of the serial port. Of ``--events``, mutated event files of each decoder, the events
+that are read are compared with what the damaged bytes say. ``--seed`` selects another series. ``--guided`` uses Atheris
 (``pip install '.[fuzz]'``) to search for inputs that reach new code in one of the decoders written in Python. Findings
 are printed and saved in the folder ``--keep``; the exit status is then 1.
 """
@@ -75,6 +77,21 @@ def _files(numbers: range, until: float | None, seed: int, folder: Path, keep: P
                 keep.mkdir(parents=True, exist_ok=True)
                 (keep / path.name).write_bytes(path.read_bytes())
             path.unlink()
+    return outcomes
+
+
+def event_files(count: int, seed: int, keep: Path) -> dict[str, Counter[str]]:
+    """Check ``count`` mutated files of each decoder of events on all cores; return what became of their events."""
+    from reference.mutation_events import DECODERS, count_outcomes
+
+    workers = cpu_threads()
+    outcomes: dict[str, Counter[str]] = {}
+    with ThreadPoolExecutor(workers) as pool, tempfile.TemporaryDirectory() as folder:
+        for decoder in DECODERS:
+            numbers = [range((seed << 32) + k, (seed << 32) + count, workers) for k in range(workers)]
+            parts = [pool.submit(count_outcomes, decoder, each, Path(folder), keep) for each in numbers]
+            outcomes[decoder] = sum((part.result() for part in parts), Counter[str]())
+            print(json.dumps({decoder: dict(sorted(outcomes[decoder].items()))}), flush=True)
     return outcomes
 
 
@@ -178,6 +195,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, help="time limit: half for files, half for frames")
     parser.add_argument("--files", type=int)
     parser.add_argument("--frames", type=int)
+    parser.add_argument("--events", type=int, help="mutated event files of each decoder")
     parser.add_argument("--guided", choices=GUIDED)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, default=Path("fuzz-findings"))
@@ -193,6 +211,9 @@ def main() -> int:
         until = None if args.seconds is None else began + args.seconds / 2.0
         data[name] = summary(run(count, until, args.seed, args.keep), time.monotonic() - began)
         print(json.dumps({name: data[name]}), flush=True)
+    if args.events is not None:
+        began = time.monotonic()
+        data["events"] = summary(event_files(args.events, args.seed, args.keep), time.monotonic() - began)
     largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     data["most_memory_mib"] = largest / 1024.0
     if args.out is not None:

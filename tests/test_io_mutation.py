@@ -4,6 +4,7 @@ import gc
 import os
 import random
 from collections.abc import Iterator
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -11,12 +12,17 @@ import pytest
 
 from amiwarp import convert, open_recording
 from reference.io_samples import WRITERS, make_events, refusal, write_sample
+from reference.mutation_events import DECODERS, OUTCOMES, VARIANTS, assert_said, count_outcomes, rows_of, said_by_evt
+from reference.mutation_events import check as check_events
+from reference.mutation_events import sample as event_sample
 from reference.mutation_files import KINDS, Checker, check, mutated, sample
 
 MUTANTS = 20
 """Mutants per kind of input. ``benchmarks.fuzz``, which ``.ci/run`` runs too, checks as many others as time allows."""
 CONVERTED = 30, 60
 """Least and most mutants per format that are converted: of formats with checksums, few are read."""
+COMPARED = 60
+"""Mutants per decoder whose events are compared."""
 ENDLESS = {"native": (31,), "truth": (52,)}
 """More mutants, in which HDF5 searches without end."""
 
@@ -52,6 +58,41 @@ def test_mutants_are_read_or_refused(tmp_path, checker, name):
         path.unlink()
     # If none were refused, the mutants would test nothing. Nearly all mutants of kinds with checksums are refused.
     assert outcomes["refused"] > 0
+
+
+@pytest.mark.parametrize("decoder", DECODERS)
+def test_events_of_mutants_are_those_of_the_bytes_or_the_change_is_said(tmp_path, capfd, decoder):
+    """No event may be lost or changed unsaid: ``reference.mutation_events``. ``benchmarks.fuzz`` tries more mutants."""
+    outcomes = count_outcomes(decoder, range(COMPARED), tmp_path, tmp_path / "kept")
+    assert outcomes["defects"] == 0, capfd.readouterr().err
+    assert set(outcomes) <= {*OUTCOMES, "defects"}
+    assert outcomes.total() == COMPARED
+    assert 0 < outcomes["refused"] < COMPARED  # of all refused, nothing would be compared
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_samples_of_events_are_sound(tmp_path, name):
+    path = tmp_path / f"sample{VARIANTS[name][0]}"
+    path.write_bytes(event_sample(name))
+    assert check_events(path, name) == "same"
+
+
+def test_a_second_decoder_notices_lost_and_changed_events_and_counts(tmp_path):
+    path = tmp_path / "a.raw"
+    path.write_bytes(event_sample("evt3/vectors"))
+    recording = open_recording(path)
+    rows = rows_of(recording)
+    said = said_by_evt(recording, path.read_bytes())
+    assert_said(recording, rows, said)
+    changed = rows.copy()
+    changed[7, 3] ^= 1
+    for wrong in (rows[:-1], changed):
+        with pytest.raises(AssertionError, match="events read, 300 expected, or other values"):
+            assert_said(recording, wrong, said)
+    for name in ("unknown_words", "repaired_time_events", "dropped_outside_events", "truncated_bytes"):
+        uncounted = replace(recording, metadata={**recording.metadata, name: 1})
+        with pytest.raises(AssertionError, match=f"{name}: 1 stated, 0 found"):
+            assert_said(uncounted, rows, said)
 
 
 MEANINGS = {

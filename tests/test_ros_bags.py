@@ -4,6 +4,7 @@ import errno
 import gc
 import os
 import re
+import struct
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,12 +19,14 @@ from rosbags.rosbag2 import Writer as Writer2
 from amiwarp import AmiwarpError, Events, convert, open_recording
 from amiwarp.io import read_encoder_triggers, ros_bags
 from amiwarp.io.prophesee import Halves, halves_of, words_of
+from amiwarp.io.ros import decode_array
 from amiwarp.io.ros_bags import RESTART, MessageNumbers, number_of
 from amiwarp.io.ros_words import Layout, Unknown
 from reference.evt_words import Evt2Decoder, Evt3Decoder, swap_halves
 from reference.io_samples import make_events, refusal
 from reference.io_samples_extra import (
     SIZE,
+    array_message,
     arrays,
     evt2_words,
     packet_message,
@@ -347,6 +350,21 @@ def test_messages_that_only_the_index_lists_are_counted(tmp_path: Path, encoding
     recording = open_recording(path)
     assert len(recording.events) == len(EVENTS) - 200
     assert recording.metadata["unread_messages"] == 1
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+@pytest.mark.parametrize("stated", [0, 99, 101])
+def test_an_array_with_another_number_of_events_than_it_states_is_refused(ros1: bool, stated: int) -> None:
+    """Events behind the stated number would be lost unsaid."""
+    store = typestore(ros1)
+    made = array_message(store, EVENTS[:100], ros1=ros1)
+    raw = bytearray((store.serialize_ros1 if ros1 else store.serialize_cdr)(made, made.__msgtype__))
+    at = raw.index(struct.pack("<III", SIZE[1], SIZE[0], 100)) + 8
+    assert len(decode_array(bytes(raw), ros1=ros1)[2][2]) == 100
+    assert ros1 or len(decode_array(bytes(raw) + bytes(3), ros1=ros1)[2][2]) == 100
+    raw[at : at + 4] = struct.pack("<I", stated)
+    with pytest.raises(AmiwarpError, match=f"declares {stated} events, but has .* bytes instead of"):
+        decode_array(bytes(raw), ros1=ros1)
 
 
 @pytest.mark.parametrize("encoding", ["evt3", "evt2"])

@@ -127,9 +127,20 @@ ALIGNED = np.dtype(
 """Event of ROS 2 that begins 2 bytes after a multiple of 4, as all do except a first one at a multiple of 4."""
 
 
+ALIGNMENT = 4
+"""Number of bytes to a multiple of which a message of ROS 2 may be padded."""
+
+
+def _check_length(raw: bytes | memoryview, end: int, count: int, padding: int) -> None:
+    """Raise :class:`AmiwarpError` if a message does not end behind its events, or up to ``padding`` bytes later."""
+    if not end <= len(raw) <= end + padding:
+        raise AmiwarpError(
+            f"has a message that declares {count} events, but has {len(raw)} bytes instead of {end}; the bag is damaged"
+        )
+
+
 def _packed(raw: bytes | memoryview, start: int, count: int) -> Columns:
-    if start + count * PACKED.itemsize > len(raw):
-        raise AmiwarpError(f"has a message that declares {count} events, which it does not hold; the bag is damaged")
+    _check_length(raw, start + count * PACKED.itemsize, count, 0)
     return _columns(np.frombuffer(raw, PACKED, count, start))
 
 
@@ -137,8 +148,7 @@ def _aligned(raw: bytes | memoryview, start: int, count: int) -> Columns:
     """Return the events of a ROS 2 message, whose times lie at multiples of 4 bytes."""
     # The first event begins at a multiple of 4: 13 bytes, and one for the alignment of the next event to 2.
     size = 0 if count == 0 else 13 + max(count - 1, 0) * 16
-    if start + size > len(raw):
-        raise AmiwarpError(f"has a message that declares {count} events, which it does not hold; the bag is damaged")
+    _check_length(raw, start + size, count, ALIGNMENT - 1)
     if not count:
         return NOTHING
     first = np.frombuffer(raw, PACKED, 1, start)
