@@ -213,14 +213,14 @@ ONLY_COUNTED = "only counted: amiwarp does not read them from this format"
     [("2", "evt2.0", "<u4", 10), ("21", "evt2.1", "<u8", 10), ("3", "evt3.0", "<u2", 5)],
 )
 def test_words_of_unknown_types_are_counted(tmp_path, version, name, dtype, unknown):
-    """Words of all 16 types, more than a block has, below a header that names the version in short."""
+    """Words of all 16 types, more than a block has, below a header that names the version in short; one comes first."""
     shift = 8 * np.dtype(dtype).itemsize - 4
     turns = 2100
-    words = [0x8 << shift, *[kind << shift | 1 for kind in range(16)] * turns]
+    words = [0x9 << shift, 0x8 << shift, *[kind << shift | 1 for kind in range(16)] * turns]
     head = f"% format EVT{version};endianness=little;width=2048;height=2048\n% end\n".encode()
     (tmp_path / "a.raw").write_bytes(head + np.array(words, dtype).tobytes())
     recording = open_recording(tmp_path / "a.raw")
-    assert (recording.metadata["format"], recording.metadata["unknown_words"]) == (name, unknown * turns)
+    assert (recording.metadata["format"], recording.metadata["unknown_words"]) == (name, 1 + unknown * turns)
 
 
 def test_evt21_vectors(tmp_path):

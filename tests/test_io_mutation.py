@@ -62,12 +62,12 @@ def test_mutants_are_read_or_refused(tmp_path, checker, name):
 
 @pytest.mark.parametrize("decoder", DECODERS)
 def test_events_of_mutants_are_those_of_the_bytes_or_the_change_is_said(tmp_path, capfd, decoder):
-    """No event may be lost or changed unsaid: ``reference.mutation_events``. ``benchmarks.fuzz`` tries more mutants."""
+    """No event may be lost or changed unsaid: see ``reference.mutation_events``. ``benchmarks.fuzz`` tries more."""
     outcomes = count_outcomes(decoder, range(COMPARED), tmp_path, tmp_path / "kept")
     assert outcomes["defects"] == 0, capfd.readouterr().err
     assert set(outcomes) <= {*OUTCOMES, "defects"}
     assert outcomes.total() == COMPARED
-    assert 0 < outcomes["refused"] < COMPARED  # of all refused, nothing would be compared
+    assert 0 < outcomes["refused"] < COMPARED  # if all were refused, nothing would be compared
 
 
 @pytest.mark.parametrize("name", VARIANTS)
