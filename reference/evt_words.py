@@ -15,6 +15,16 @@ TIME_HIGH, TRIGGER = 0x8, 0xA
 """Types of words that all versions share."""
 
 
+UNKNOWN_TYPES = {2: (1, 9, 0xB, 0xC, 0xD), **dict.fromkeys((4, 8), (2, 3, 4, 5, 6, 7, 9, 0xB, 0xC, 0xD))}
+"""Types of words that are not in Prophesee's documentation, by the size of a word [bytes]."""
+
+
+def unknown_words(words: NDArray[Any]) -> int:
+    """Return the number of words of unknown types. The first half of words of EVT 2.1 is the upper one."""
+    size = words.dtype.itemsize
+    return int(np.isin(words >> words.dtype.type(8 * size - 4), UNKNOWN_TYPES[size]).sum())
+
+
 def swap_halves(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Swap the 32-bit halves of EVT 2.1 words, as the IMX636 sends them (``endianness=legacy``)."""
     return (words >> np.uint64(32)) | (words << np.uint64(32))

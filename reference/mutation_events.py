@@ -32,7 +32,7 @@ from amiwarp.io.file_scan import smallest_sensor
 from reference.aedat4_files import whole_file
 from reference.ecf_files import ecf_chunk, write_ecf
 from reference.es_files import ES_SIZE, es_bytes
-from reference.evt_words import Evt2Decoder, Evt3Decoder, swap_halves
+from reference.evt_words import Evt2Decoder, Evt3Decoder, swap_halves, unknown_words
 from reference.io_samples import SIZE, make_events, write_aedat4, write_dat, write_es, write_evt
 from reference.io_samples_extra import (
     arrays,
@@ -83,10 +83,6 @@ def evt_header(data: bytes) -> tuple[dict[str, str], int]:
     return fields, at
 
 
-UNKNOWN_TYPES = {2: (1, 9, 0xB, 0xC, 0xD), **dict.fromkeys((4, 8), (2, 3, 4, 5, 6, 7, 9, 0xB, 0xC, 0xD))}
-"""Types of words that are not in Prophesee's documentation, by the size of a word [bytes]."""
-
-
 def said_by_evt(recording: Recording, data: bytes) -> list[Said]:
     """Decode the words of a RAW file with NumPy; EVT 2.1 in each order of halves that the header allows."""
     version = str(recording.metadata["format"]).removeprefix("evt")
@@ -112,10 +108,7 @@ def _evt_words(words: NDArray[Any], origin: int, counts: dict[str, int]) -> Said
     all_events, all_edges = decoder(0).decode(words)
     untimed = all_events[0].size - x.size + all_edges[0].size - edges[0].size
     rows = np.stack([np.minimum(x, 65535), y, t + origin, p], axis=1).astype(np.int64)
-    heads = words if words.dtype.itemsize < 8 else words >> np.uint64(32)
-    kinds = heads >> (12 if words.dtype.itemsize == 2 else 28)
-    unknown = np.isin(kinds, UNKNOWN_TYPES[words.dtype.itemsize]).sum()
-    counts |= {"dropped_untimed_events": untimed, "triggers": edges[0].size, "unknown_words": int(unknown)}
+    counts |= {"dropped_untimed_events": untimed, "triggers": edges[0].size, "unknown_words": unknown_words(words)}
     return Said(rows, counts)
 
 

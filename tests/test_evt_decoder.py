@@ -13,7 +13,7 @@ from amiwarp.events.recording import Events
 from amiwarp.io import evt_decoder, file_scan
 from amiwarp.io.evt_decoder import EvtDecoder
 from amiwarp.io.file_scan import FileEvents
-from reference.evt_words import Evt2Decoder, Evt3Decoder, swap_halves
+from reference.evt_words import Evt2Decoder, Evt3Decoder, swap_halves, unknown_words
 
 TIME_HIGH_2, TIME_HIGH_3, TIME_LOW_3 = 0x8 << 28, 0x8000, 0x6000
 
@@ -47,6 +47,7 @@ def test_blocks_and_pieces_are_decoded_as_numpy_does(
         swapped = version == "2.1" and trial % 2 == 1
         decoder = EvtDecoder(version, swapped=swapped, device=device)
         cuts = np.sort(rng.integers(0, len(words) + 1, 2))
+        unknown = 0
         for piece in np.split(words, cuts):
             (x, y, t, p), edges = expected.decode(piece)
             on_device, triggers = decoder.decode(swap_halves(piece) if swapped else piece)
@@ -57,6 +58,9 @@ def test_blocks_and_pieces_are_decoded_as_numpy_does(
             np.testing.assert_array_equal(triggers.channel, edges[0])
             np.testing.assert_array_equal(triggers.t, edges[2])
             np.testing.assert_array_equal(triggers.rising, edges[3])
+            unknown += unknown_words(piece)
+            assert decoder.unknown == unknown
+        assert unknown > 0 or len(words) < 50
 
 
 def decoded(version: str, words: list[int], **options: Any) -> tuple[list[list[int]], EvtDecoder]:

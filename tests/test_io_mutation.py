@@ -21,7 +21,7 @@ MUTANTS = 20
 """Mutants per kind of input. ``benchmarks.fuzz``, which ``.ci/run`` runs too, checks as many others as time allows."""
 CONVERTED = 30, 60
 """Least and most mutants per format that are converted: of formats with checksums, few are read."""
-COMPARED = 60
+COMPARED = 40
 """Mutants per decoder whose events are compared."""
 ENDLESS = {"native": (31,), "truth": (52,)}
 """More mutants, in which HDF5 searches without end."""
