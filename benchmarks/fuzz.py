@@ -82,17 +82,22 @@ def _files(numbers: range, until: float | None, seed: int, folder: Path, keep: P
 
 def event_files(count: int, seed: int, keep: Path) -> dict[str, Counter[str]]:
     """Check ``count`` mutated files of each decoder of events on all cores; return what became of their events."""
-    from reference.mutation_events import DECODERS, count_outcomes
-
-    workers = cpu_threads()
+    workers = min(cpu_threads(), count)
     outcomes: dict[str, Counter[str]] = {}
     with ThreadPoolExecutor(workers) as pool, tempfile.TemporaryDirectory() as folder:
-        for decoder in DECODERS:
-            numbers = [range((seed << 32) + k, (seed << 32) + count, workers) for k in range(workers)]
-            parts = [pool.submit(count_outcomes, decoder, each, Path(folder), keep) for each in numbers]
-            outcomes[decoder] = sum((part.result() for part in parts), Counter[str]())
-            print(json.dumps({decoder: dict(sorted(outcomes[decoder].items()))}), flush=True)
+        numbers = [range((seed << 32) + k, (seed << 32) + count, workers) for k in range(workers)]
+        for part in pool.map(lambda each: _event_files(each, Path(folder), keep), numbers):
+            for decoder, found in part.items():
+                outcomes[decoder] = outcomes.get(decoder, Counter[str]()) + found
     return outcomes
+
+
+def _event_files(numbers: range, folder: Path, keep: Path) -> dict[str, Counter[str]]:
+    """Check the mutated files with these numbers in one supervised process."""
+    from reference.mutation_events import DECODERS, count_outcomes, event_checker
+
+    with contextlib.closing(event_checker()) as checker:
+        return {decoder: count_outcomes(checker, decoder, numbers, folder, keep) for decoder in DECODERS}
 
 
 def frames(count: int | None, until: float | None, seed: int, keep: Path) -> dict[str, Counter[str]]:

@@ -10,7 +10,6 @@ documented and with the counts that :func:`amiwarp.open_recording` states, must 
 
 from __future__ import annotations
 
-import contextlib
 import random
 import struct
 import sys
@@ -468,27 +467,31 @@ def check(path: Path, name: str) -> str:
     return "silent: all times" if shifted else "silent: values"
 
 
-def count_outcomes(decoder: str, numbers: range, folder: Path, keep: Path) -> Counter[str]:
-    """Check mutants of a decoder's samples in one supervised process; return what became of their events.
+def count_outcomes(checker: Checker, decoder: str, numbers: range, folder: Path, keep: Path) -> Counter[str]:
+    """Check mutants of a decoder's samples with a checker of this module; return what became of their events.
 
     Files with findings are saved in ``keep``.
     """
     names = [f"{decoder}/{name}" for name in DECODERS[decoder]]
     outcomes: Counter[str] = Counter()
-    with contextlib.closing(Checker(module="reference.mutation_events")) as checker:
-        for number in numbers:
-            name = names[number % len(names)]
-            path = folder / f"{name.replace('/', '-')}-{number}{VARIANTS[name][0]}"
-            path.write_bytes(mutated(sample(name), random.Random(f"{name} {number}")))
-            try:
-                outcomes[str(checker.check(path, name))] += 1
-            except AssertionError as finding:
-                outcomes["defects"] += 1
-                print(finding, file=sys.stderr, flush=True)
-                keep.mkdir(parents=True, exist_ok=True)
-                (keep / path.name).write_bytes(path.read_bytes())
-            path.unlink()
+    for number in numbers:
+        name = names[number % len(names)]
+        path = folder / f"{name.replace('/', '-')}-{number}{VARIANTS[name][0]}"
+        path.write_bytes(mutated(sample(name), random.Random(f"{name} {number}")))
+        try:
+            outcomes[str(checker.check(path, name))] += 1
+        except AssertionError as finding:
+            outcomes["defects"] += 1
+            print(finding, file=sys.stderr, flush=True)
+            keep.mkdir(parents=True, exist_ok=True)
+            (keep / path.name).write_bytes(path.read_bytes())
+        path.unlink()
     return outcomes
+
+
+def event_checker() -> Checker:
+    """Start a process that compares the events of mutants."""
+    return Checker(module="reference.mutation_events")
 
 
 if __name__ == "__main__":

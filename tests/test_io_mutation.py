@@ -12,7 +12,16 @@ import pytest
 
 from amiwarp import convert, open_recording
 from reference.io_samples import WRITERS, make_events, refusal, write_sample
-from reference.mutation_events import DECODERS, OUTCOMES, VARIANTS, assert_said, count_outcomes, rows_of, said_by_evt
+from reference.mutation_events import (
+    DECODERS,
+    OUTCOMES,
+    VARIANTS,
+    assert_said,
+    count_outcomes,
+    event_checker,
+    rows_of,
+    said_by_evt,
+)
 from reference.mutation_events import check as check_events
 from reference.mutation_events import sample as event_sample
 from reference.mutation_files import KINDS, Checker, check, mutated, sample
@@ -60,10 +69,17 @@ def test_mutants_are_read_or_refused(tmp_path, checker, name):
     assert outcomes["refused"] > 0
 
 
+@pytest.fixture(scope="module")
+def comparer() -> Iterator[Checker]:
+    found = event_checker()
+    yield found
+    found.close()
+
+
 @pytest.mark.parametrize("decoder", DECODERS)
-def test_events_of_mutants_are_those_of_the_bytes_or_the_change_is_said(tmp_path, capfd, decoder):
+def test_events_of_mutants_are_those_of_the_bytes_or_the_change_is_said(tmp_path, capfd, comparer, decoder):
     """No event may be lost or changed unsaid: see ``reference.mutation_events``. ``benchmarks.fuzz`` tries more."""
-    outcomes = count_outcomes(decoder, range(COMPARED), tmp_path, tmp_path / "kept")
+    outcomes = count_outcomes(comparer, decoder, range(COMPARED), tmp_path, tmp_path / "kept")
     assert outcomes["defects"] == 0, capfd.readouterr().err
     assert set(outcomes) <= {*OUTCOMES, "defects"}
     assert outcomes.total() == COMPARED
