@@ -240,21 +240,32 @@ def test_a_page_that_cannot_be_served_is_reported_in_one_line(files: Path, args:
 
 
 def test_a_notebook_shows_the_page_below_its_cell(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fake IPython display collects the page's address."""
-    pages: list[bytes] = []
-    shown = types.ModuleType("IPython.display")
-    vars(shown).update(IFrame=lambda url, width, height: url, display=pages.append)
+    """A fake IPython display collects the page's address, which is there when the call returns."""
+    pages: list[str] = []
+    fake = types.ModuleType("IPython.display")
+    vars(fake).update(IFrame=lambda url, width, height: url, display=pages.append)
     monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
-    monkeypatch.setitem(sys.modules, "IPython.display", shown)
+    monkeypatch.setitem(sys.modules, "IPython.display", fake)
 
     async def cell() -> bytes:
         shown = amiwarp.view(open_recording(files / "recording.h5"))
-        while not pages:
-            await asyncio.sleep(0.01)
-        page = await asyncio.to_thread(lambda: urllib.request.urlopen(str(pages[0])).read())
+        [url] = pages  # nothing has waited: programs that run notebooks keep only what a cell shows before it ends
+        page = await asyncio.to_thread(lambda: urllib.request.urlopen(url).read())
         assert shown._ipython_display_() is None  # the cell shows the page and nothing else
         shown.close()
         await asyncio.wait([shown._serving])
+        with pytest.raises(OSError, match="refused"):
+            urllib.request.urlopen(url)
         return bytes(page)
 
+    async def closed_at_once() -> None:
+        """A page that is closed before the server starts frees its port."""
+        shown = amiwarp.view(open_recording(files / "recording.h5"))
+        shown.close()
+        await asyncio.wait([shown._serving])
+        await asyncio.sleep(0.0)
+        with pytest.raises(OSError, match="refused"):
+            urllib.request.urlopen(pages[-1])
+
     assert b"<html" in asyncio.run(cell()).lower()
+    asyncio.run(closed_at_once())

@@ -7,6 +7,7 @@ import contextlib
 import logging
 import math
 import secrets
+import socket
 import tempfile
 import traceback
 import weakref
@@ -35,7 +36,7 @@ from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
 from amiwarp.viewer.inspector import WINDOW_POINTS, DisplayedWindow, Inspector, Knobs, Library, Selection
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
-from amiwarp.viewer.serve import finite, serve, use_page
+from amiwarp.viewer.serve import address, finite, serve, use_page
 
 BINS = 400
 """Number of points of the drawn event rates."""
@@ -812,12 +813,15 @@ def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progre
 
 # Ways to show the page, in a browser or in a notebook.
 
+LOCAL_HOST = "127.0.0.1"
+"""Address of this machine that only this machine can reach."""
+
 
 def serve_panel(
     make_inspector: Callable[[], Inspector],
     library: Library | None = None,
     *,
-    host: str = "127.0.0.1",
+    host: str = LOCAL_HOST,
     port: int = 0,
     ready: Callable[[str], None],
 ) -> None:
@@ -828,14 +832,15 @@ def serve_panel(
     Raises :class:`AmiwarpError` if the host or the port cannot be used.
     """
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(_serve(make_inspector, library, host=host, port=port, ready=ready))
+        token = secrets.token_urlsafe(16)
+        asyncio.run(_serve(make_inspector, library, host=host, port=port, token=token, ready=ready))
 
 
 async def _serve(make_inspector: Callable[[], Inspector], library: Library | None = None, **options: Any) -> None:
     def build(server: Any) -> Callable[[], None]:
         return Panel(server, make_inspector(), library).close
 
-    await serve(build, settable=layout.SETTABLE, token=secrets.token_urlsafe(16), **options)
+    await serve(build, settable=layout.SETTABLE, **options)
 
 
 @guarded
@@ -880,6 +885,9 @@ def view(
     height: int = 700,
 ) -> NotebookPage:
     """Show the inspector below a notebook cell. Warp's messages are switched off, so that the cell shows only the page.
+
+    The page is in the cell's output before this returns, so that tools that run notebooks, such as nbclient and
+    papermill, keep it.
 
     Parameters
     ----------
@@ -932,5 +940,11 @@ def view(
         return made
 
     make_inspector()  # raises errors in the cell, before the page is served
-    serving = _serve(make_inspector, ready=lambda url: display(IFrame(url, "100%", height)))
-    return NotebookPage(loop.create_task(serving))
+    # The port is opened here, because programs that run notebooks keep only what a cell shows before it ends, and the
+    # server starts after that. A browser that is faster waits until the server answers.
+    listening = socket.create_server((LOCAL_HOST, 0))
+    token = secrets.token_urlsafe(16)
+    serving = loop.create_task(_serve(make_inspector, host=LOCAL_HOST, token=token, listening=listening))
+    serving.add_done_callback(lambda _: listening.close())  # also if it ends before the server takes the socket
+    display(IFrame(address(LOCAL_HOST, listening.getsockname()[1], token), "100%", height))
+    return NotebookPage(serving)

@@ -289,12 +289,14 @@ async def serve(
     port: int = 0,
     token: str,
     ready: Callable[[str], None] | None = None,
+    listening: socket.socket | None = None,
 ) -> None:
     """Serve until cancelled; then close every tab.
 
     ``build`` is called each time a page is loaded; if it raises an error, the page shows the error's text. ``settable``
     maps the state variables that a page may set to the checks of their values. ``port`` 0 selects a free port.
-    ``ready`` is called with the URL once the server listens. Raises :class:`AmiwarpError` if the token is empty, or if
+    ``ready`` is called with the URL once the server listens. ``listening``: socket that listens on ``host`` already;
+    ``port`` is then not used. Raises :class:`AmiwarpError` if the token is empty, or if
     the host or the port cannot be used.
     """
     from aiohttp import web
@@ -311,7 +313,10 @@ async def serve(
     closing = asyncio.create_task(_close_silent(runner.server, heard))
     try:
         try:
-            await web.TCPSite(runner, normalised(host), port).start()
+            if listening is None:
+                await web.TCPSite(runner, normalised(host), port).start()
+            else:
+                await web.SockSite(runner, listening).start()
         except OSError as error:
             raise cannot_serve(error, host, port) from error
         bound, number = runner.addresses[0][:2]
