@@ -250,7 +250,7 @@ def test_a_notebook_shows_the_page_below_its_cell(files: Path, monkeypatch: pyte
     async def cell() -> bytes:
         shown = amiwarp.view(open_recording(files / "recording.h5"))
         [url] = pages  # nothing has waited: programs that run notebooks keep only what a cell shows before it ends
-        page = await asyncio.to_thread(lambda: urllib.request.urlopen(url).read())
+        page = await asyncio.to_thread(lambda: urllib.request.urlopen(url, timeout=30.0).read())
         assert shown._ipython_display_() is None  # the cell shows the page and nothing else
         shown.close()
         await asyncio.wait([shown._serving])
