@@ -21,7 +21,7 @@ from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.metrics import PictureQuality
-from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
+from amiwarp.imaging.palette import BLACK, BLUE, ORANGE, VERMILION
 from amiwarp.imaging.regions import best_box
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import write_text
@@ -46,8 +46,10 @@ GREYS, FAINT = 128, 8
 [levels]."""
 MOST_NUMBERS = 9
 """Largest number of numbers on a logarithmic axis."""
-FOUND, TRUTH, LOCAL = VERMILION, BLACK, ORANGE
-"""Colours of the calibrated parameters, of the true parameters, and of the local search."""
+FOUND, TRUTH, LOCAL, SHARPEST = VERMILION, BLACK, ORANGE, BLUE
+"""Colours of the calibrated parameters, of the true parameters, of the local search, and of the sharpest parameters."""
+HATCHES = "#999999"
+"""Colour of the hatches where nothing was sampled."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,8 @@ def show(ax: Any, image: NDArray[np.float32], top: float, title: str) -> None:
 def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float, float] | None = None) -> None:
     """Draw the global search's cost over (size cos phase, size sin phase), all samples, and the result.
 
-    ``truth`` is the true size and phase [rad]. Without a global search only the samples are drawn.
+    If the photometric stage has moved the result, the sharpest parameters are marked too. Where nothing was sampled,
+    the map is hatched. ``truth`` is the true size and phase [rad]. Without a global search only the samples are drawn.
     """
     calibration = calibration.exact
     size = MODELS[calibration.model_name].SIZE
@@ -109,19 +112,41 @@ def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float
     coarse = np.array([stage.name == "global" for stage in calibration.stages], bool)[samples[:, 3].astype(int)]
     if coarse.sum() >= 10 and np.ptp(x[coarse]) > 0 and np.ptp(y[coarse]) > 0:
         surface = ax.tricontourf(x[coarse], y[coarse], samples[coarse, 2], levels=24, cmap="cividis")
-        ax.set_facecolor(surface.cmap(0.0))
         figure.colorbar(surface, ax=ax, label=f"sharpness ({calibration.sharpness_name}, coarse image)", shrink=0.85)
-        ax.plot(x[coarse], y[coarse], ".", color="white", markersize=2.2, label="global search")
+        dots = {"color": "white", "markersize": 3.0, "markeredgecolor": "black", "markeredgewidth": 0.3}
+        ax.plot(x[coarse], y[coarse], ".", label="global search", **dots)
+        _hatch_the_unsampled(ax)
     ax.plot(x[~coarse], y[~coarse], "+", color=LOCAL, markersize=5, label="local search")
     found = _polar(calibration.parameters[size], calibration.parameters["phase"])
+    moved = _draw_sharpest(ax, calibration, size)
     ax.plot(*found, "o", markersize=13, fillstyle="none", color=FOUND, markeredgewidth=2.2, label="found")
     if truth is not None:
         ax.plot(*_polar(*truth), "x", color=TRUTH, markersize=9, markeredgewidth=1.8, label="true")
     reach = 1.05 * max(np.abs([*x, *y, *found]))
     ax.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1.0)
     ax.set(xlabel=f"{size} · cos phase [deg]", ylabel=f"{size} · sin phase [deg]")
-    ax.set_title("cost surface and its samples")
+    ax.set_title(f"cost surface and its samples{moved}")
     ax.legend(loc="lower left", fontsize=8, framealpha=1.0, facecolor="#9a9a9a", markerscale=0.7)
+
+
+def _hatch_the_unsampled(ax: Any) -> None:
+    """Hatch the background of a map, which shows where nothing was sampled, and name it in the legend."""
+    how = {"facecolor": "white", "edgecolor": HATCHES, "hatch": "////", "linewidth": 0.0}
+    ax.patch.set(**how)
+    ax.fill((), (), label="not sampled", **how)  # draws nothing but the legend's entry
+
+
+def _draw_sharpest(ax: Any, calibration: Calibration, size: str) -> str:
+    """Mark the sharpest parameters if the photometric stage has moved the result from them.
+
+    Returns a line of the title that says so; empty if nothing moved it.
+    """
+    stage = calibration.photometric
+    if stage is None or not stage.accepted or not {size, "phase"} <= stage.sharpness_parameters.keys():
+        return ""
+    sharpest = _polar(stage.sharpness_parameters[size], stage.sharpness_parameters["phase"])
+    ax.plot(*sharpest, "s", markersize=8, fillstyle="none", color=SHARPEST, markeredgewidth=1.6, label="sharpest")
+    return f"\nphotometric stage moved it by {stage.moved_px:.2g} px"
 
 
 def _polar(size: float, phase: float) -> tuple[float, float]:
