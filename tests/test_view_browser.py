@@ -1320,11 +1320,29 @@ def test_a_page_in_a_notebook_of_another_site_works_and_an_ended_server_is_said(
         notebook.shutdown()
 
 
-def test_a_slice_of_the_third_axis_is_drawn(page: Any) -> None:
+def test_curves_and_statistics_of_the_window_before_are_marked_while_it_is_played(page: Any) -> None:
+    title, words = page.locator("#curve-title"), "sharpness over apex angle"
+    statistics = page.locator("#statistics.stale h2")
+    assert title.inner_text() == words
+    page.locator("#field-start_ms").fill("1")
+    page.locator("#field-start_ms").press("Enter")
+    ready(page)
+    assert title.inner_text() == words
+    page.locator("#do-play").click()
+    title.filter(has_text="(of the former window)").wait_for()
+    statistics.filter(has_text="(of the former window)").wait_for()
+    page.locator("#do-play").click()
+    ready(page)
+    assert title.inner_text() == words
+    assert statistics.count() == 0
+
+
+def test_a_slice_of_the_third_axis_is_drawn(page: Any, kept: Any) -> None:
     page.locator("#view-x-θ").click()
     page.locator("#orbit").uncheck()
     ready(page)
     before = cloud(page)
+    words = page.locator("#events").inner_text()
     page.locator("#slice-from").fill("0.5")
     after = seen_change(page, ".clouds canvas", before)
     assert page.locator("label:has(#slice-from)").inner_text().split() == ["θ", "from", "180"]
@@ -1333,7 +1351,15 @@ def test_a_slice_of_the_third_axis_is_drawn(page: Any) -> None:
     lower = slice(int(0.55 * height), int(0.85 * height))
     assert coloured[0][lower].any()
     assert not coloured[1][lower].any()  # angles below 180 degrees
+    page.locator("#slice-to").fill("0.75")
+    theta = np.degrees(kept[1].shown.theta)
+    seen = np.count_nonzero((theta >= 180.0) & (theta <= 270.0))
+    chosen = words.removesuffix(", all of these drawn")
+    assert chosen != words
+    page.locator("#events").filter(has_text=re.compile(f"^{chosen}, {seen:,} of these drawn .slice.$")).wait_for()
     page.locator("#slice-from").fill("0")
+    page.locator("#slice-to").fill("1")
+    assert page.locator("#events").inner_text() == words
     assert np.array_equal(seen_change(page, ".clouds canvas", after), before)
 
 

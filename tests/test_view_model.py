@@ -943,6 +943,8 @@ def test_the_page_says_how_many_events_were_read_of_a_full_window(
     inspector.open(*window)
     total = inspector.loaded.span.count
     assert events_text(inspector.show()) == f"{total:,} events, all drawn"
+    third = len(inspector.show().every(3).events)
+    assert events_text(inspector.show(), 3) == f"{total:,} events, {third:,} of these drawn"
     monkeypatch.setattr(viewer, "MOST_EVENTS", 6400)
     thinned = Inspector(inspector.recording)
     thinned.open(*window, Selection(polarity=1))

@@ -14,9 +14,9 @@ import pytest
 from amiwarp import AmiwarpError, Camera, DepthMap, Encoder, Events, MemoryEvents, Plate, Prism, Recording, simulate
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
-from amiwarp.plotting.colours import depth_image
+from amiwarp.plotting.colours import GREY, depth_image
 from amiwarp.viewer import jobs, layout
-from amiwarp.viewer.drawing import RECORDED, Look, orbit_lines
+from amiwarp.viewer.drawing import BACKGROUND_AND_INK, RECORDED, Look, orbit_lines
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector
 from amiwarp.viewer.window import HELP_PAPER, MORE_KEYS, Window
 
@@ -324,9 +324,30 @@ def test_a_slow_renderer_draws_fewer_points_until_nothing_moves(
     window._coarse = 7
     drag(window, "apex", 0.8)
     assert len(points(window, 1)) == -(-everything // 7)
+    assert f", {-(-everything // 7):,} of these drawn" in window.scene._caption.input
     monkeypatch.setattr("amiwarp.viewer.window.REST_S", 0.0)
     assert window.turn()
     check(window)
+    assert ", all of these drawn" in window.scene._caption.input
+
+
+def test_curves_of_the_window_before_are_grey_until_the_new_ones_are_there(window: Window) -> None:
+    def shown() -> list[tuple[str, str]]:
+        lines = [window._plots[name][1][0] for name in window._curve_names()]
+        return [(line.label, line.color.hex_rgb) for line in lines]
+
+    new = [("sharpness", BACKGROUND_AND_INK[False][1])] * 2
+    old = [("of the former window", GREY)] * 2
+    assert sum(1 for _ in window._curves) > 0
+    assert shown() == new
+    window.whole()
+    window.update()
+    assert shown() == old
+    assert sum(1 for _ in window._curves) > 0
+    assert shown() == new
+    window.step(1)
+    window.update()
+    assert shown() == old
 
 
 def test_the_curves_have_their_top_at_the_true_parameters(window: Window, recording: Recording) -> None:

@@ -473,15 +473,18 @@ def cloud_titles(inspector: Inspector, against: str) -> tuple[str, ...]:
     return (RECORDED,)
 
 
-def caption(inspector: Inspector, shown: DisplayedWindow) -> str:
-    """Return what a picture of the clouds shows: recording, time, region, numbers of events and sharpness."""
+def caption(inspector: Inspector, shown: DisplayedWindow, stride: int = 1) -> str:
+    """Return what a picture of the clouds shows: recording, time, region, numbers of events and sharpness.
+
+    ``stride``: only every ``stride``-th point is drawn.
+    """
     left, top, right, bottom = shown.region
     end_ms = shown.span.start_ms + shown.span.length_us * 1e-3
     sharpness = sharpness_text(shown, compensated=math.isfinite(inspector.turn_us))
     beside = "" if shown.beside is None or inspector.beside is None else f"; left: {inspector.beside.recording.name}"
     return (
         f"{inspector.recording.name}: {shown.span.start_ms:.3f} to {end_ms:.3f} ms; x {left} to {right - 1}, "
-        f"y {top} to {bottom - 1} px; {events_text(shown)}; sharpness {sharpness}{beside}"
+        f"y {top} to {bottom - 1} px; {events_text(shown, stride)}; sharpness {sharpness}{beside}"
     )
 
 
@@ -504,14 +507,29 @@ def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
     return f"{before:.3f} → {after:.3f}{gain}"
 
 
-def events_text(shown: DisplayedWindow) -> str:
-    """Return the numbers of events of the window, of those that were read, of these selected, and of these drawn."""
-    total, read, drawn = shown.span.count, len(shown.span.events), len(shown.events)
+def events_text(shown: DisplayedWindow, stride: int = 1) -> str:
+    """Return the numbers of events of the window, of those that were read, of these selected, and of these drawn.
+
+    ``stride``: only every ``stride``-th point is drawn.
+    """
+    return f"{chosen_text(shown)}, {drawn_text(shown, stride)}"
+
+
+def chosen_text(shown: DisplayedWindow) -> str:
+    """Return the numbers of events of the window, of those that were read, and of these selected."""
+    total, read = shown.span.count, len(shown.span.events)
     parts = [f"{total:,} events"]
     parts += [] if read == total else [f"{read:,} of them read"]
     parts += [] if shown.selected == read else [f"{shown.selected:,} of these selected"]
-    whole = "all" if len(parts) == 1 else "all of these"
-    return ", ".join([*parts, f"{whole if drawn == shown.selected else f'{drawn:,} of these'} drawn"])
+    return ", ".join(parts)
+
+
+def drawn_text(shown: DisplayedWindow, stride: int = 1) -> str:
+    """Return how many of the selected events are drawn, if every ``stride``-th point is."""
+    drawn = len(range(0, len(shown.events), stride))
+    if drawn < shown.selected:
+        return f"{drawn:,} of these drawn"
+    return "all drawn" if shown.selected == shown.span.count else "all of these drawn"
 
 
 # VTK scene with the event clouds before and after compensation, drawn off screen without a user interface.

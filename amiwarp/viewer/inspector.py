@@ -638,6 +638,11 @@ class Inspector:
         self._window = self._load(start_us, max(1, length_us), chosen)
         self.selection, self.window = chosen, (start_us, length_us)
 
+    @property
+    def chosen(self) -> tuple[tuple[int, int] | None, Selection]:
+        """Time window and selection, by which is known whether something was computed for other ones."""
+        return self.window, self.selection
+
     def suggest_region(self) -> Region:
         """Return the region in which compensation gains most sharpness in the current time window."""
         loaded = self.loaded

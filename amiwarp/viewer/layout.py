@@ -349,16 +349,17 @@ SETTABLE: dict[str, Check] = {
 }  # fmt: skip
 """State variables that the page may set directly, with the check of their values. The page changes all others through
 :data:`CALLS`."""
-CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice")
+CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice", "sliced")
 """State variables that the browser keeps to itself."""
 EMPTY: tuple[tuple[Any, str], ...] = (
-    ("", "trame_error_report_msg stream_note hover measured address events sharpness message rate_note picked_text "
-         "image_note against_title b_text busy found"),
+    ("", "trame_error_report_msg stream_note hover measured address events drawn sharpness message rate_note "
+         "picked_text image_note against_title b_text busy found"),
     (b"", "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off orbit "
           "column"),
     (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
             "difference has_b calibrating"),
-    (None, "overview before after surface image_scale after_scale"), ((), "live_rows updating titles against_choices"),
+    (None, "overview before after surface image_scale after_scale"),
+    ((), "live_rows updating titles against_choices old"),
 )  # fmt: skip
 """Values of state variables before the first update, and their names."""
 
@@ -545,9 +546,9 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "kinds": [each.value for each in ImageKind if each is not ImageKind.DEPTH or inspector.depth is not None],
         "speed": 0.1, "polarity": "both", "noise_ms": 2.0, "region_kind": "whole", "region_wanted": [0, 0, *size],
         "region": [0, 0, *size], "knob": inspector.orbit_names[0], "point_size": 2, "opacity": 1.0, "orbit_shown": True,
-        "view": [View.FREE.value, 0], "tool": "region", "late": 0, "slice": [0.0, 1.0], "severity": "info",
-        "picked": -1, "against": "recorded", "progress": 0, "calibrate_on": ["", ""], "curve_mark": 0.0,
-        "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
+        "view": [View.FREE.value, 0], "tool": "region", "late": 0, "slice": [0.0, 1.0], "sliced": "",
+        "severity": "info", "picked": -1, "against": "recorded", "progress": 0, "calibrate_on": ["", ""],
+        "curve_mark": 0.0, "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
         "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
         "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
         "statistics": {"rows": [], "x": [], "y": [], "median": None},

@@ -85,6 +85,7 @@ class Panel(layout.Actions):
         self.plays = False
         """Whether the playback runs; after a stop it runs until it notices the stop."""
         self._picked, self._card = -1, False
+        self._made_for: dict[str, Any] = {}  # window and selection of which the slow parts of the page are, by name
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._rates: EventRates
         self._progress = JobProgress(self._show_progress)  # of the latest calibration or film
@@ -98,6 +99,7 @@ class Panel(layout.Actions):
         """Show an inspector from its first state."""
         self.inspector, self.shown, self.b, self.found, self._picked = inspector, None, None, None, -1
         self.history, self.steps = None, ()
+        self._made_for.clear()
         self.use_card(self._card)
         inspector.renew()  # a live stream may have gone on since the inspector was made
         files = [] if self._library is None else self._library.files()
@@ -698,12 +700,25 @@ class Panel(layout.Actions):
                 state.axis = (Axis.ANGLE if self.compensates else Axis.TIME).value
                 self.request("look")
             mark = layout.knob_values(self.inspector)[state.knob]
+            self._show_old()
             state.update({**values, "turn_ms": layout.turn_ms(self.inspector), "curve_mark": mark})
             if not state.playing:
                 self.remember("" if todo & {"suggestion", "state"} else self._change)
 
+    def _show_old(self) -> None:
+        """Show which slow parts of the page are still of another window or selection."""
+        chosen = self.inspector.chosen
+        self.state.old = sorted(name for name, made_for in self._made_for.items() if made_for != chosen)
+
     async def make_slow(self, name: str) -> None:
         """Make a slow update: "curve", "picture", "statistics", or "preparation" of the first picture."""
+        chosen = self.inspector.chosen
+        await self._make_slow(name)
+        if name != "preparation":
+            self._made_for[name] = chosen
+            self._show_old()
+
+    async def _make_slow(self, name: str) -> None:
         if name == "preparation":
             await self.in_thread(drawing.prepare, self.inspector)
         elif name == "statistics":
@@ -753,7 +768,8 @@ class Panel(layout.Actions):
         left = "recorded" if against is None else s.against
         titles = drawing.cloud_titles(self.inspector, left)
         return shown, {
-            **values, "titles": [list(each) for each in enumerate(titles)], "events": drawing.events_text(shown),
+            **values, "titles": [list(each) for each in enumerate(titles)], "events": drawing.chosen_text(shown),
+            "drawn": drawing.drawn_text(shown),
             "sharpness": drawing.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
             "picked_text": "" if self._picked < 0 else drawing.event_text(shown, self._picked),
             "against_title": drawing.against_title(self.inspector, left), "against_choices": self._against_choices(),

@@ -20,6 +20,7 @@ from amiwarp.imaging.export import save_png
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.live.stream.session import LiveSource
 from amiwarp.optics.models import alternatives
+from amiwarp.plotting.colours import GREY
 from amiwarp.tasks import interrupts_later, no_garbage_collection
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import Look, Scene
@@ -128,6 +129,7 @@ class Window(layout.Actions):
         self._plots: dict[str, tuple[Any, list[Any]]] = {}
         self.curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         """Values and sharpness of the curves by parameter, in the units of the sliders."""
+        self._curves_of: dict[str, Any] = {}  # window and selection of which the curves are
         self._stream: list[str] = []
         self._texts = [drawing.text_actor("", "black", (0.05, top)) for top in (0.985, 0.97, 0.26, 0.97)]
         self._listen()
@@ -449,7 +451,7 @@ class Window(layout.Actions):
                 plots[k].update(orbit[:, 2], moved[:, k])
             low, high = moved.min(), max(moved.max(), moved.min() + 1e-3)
             chart.x_range, chart.y_range = (0.0, 360.0), (1.1 * low, high + LEGEND_SHARE * (high - low))
-        self.scene.show(shown, look, lines, drawing.caption(self.inspector, shown))
+        self.scene.show(shown, look, lines, drawing.caption(self.inspector, shown, self.scene.stride))
         for name in self.curves:
             self._plot_curve(name)
 
@@ -562,21 +564,28 @@ class Window(layout.Actions):
             self._show_statistics()
             yield
         for name in self._curve_names() if self.compensates else ():
-            found = []
+            found, chosen = [], self.inspector.chosen
             for point in self.inspector.curve_points(name):
                 found.append(point)
                 yield
             values, sharpness = np.array(found).T
             self.curves[name] = values / layout.UNITS[name], sharpness
+            self._curves_of[name] = chosen
             self._plot_curve(name)
             self._dirty = True
 
     def _plot_curve(self, name: str) -> None:
-        """Plot a sharpness curve with the current value and the known true one."""
+        """Plot a sharpness curve with the current value and the known true one.
+
+        A curve of the window or selection before is grey, until the new one is computed.
+        """
         if name not in self._plots or name not in self.curves:
             return
         (chart, lines), (x, y) = self._plots[name], self.curves[name]
         lines[0].update(x, y)
+        old = self._curves_of[name] != self.inspector.chosen
+        lines[0].color = GREY if old else drawing.BACKGROUND_AND_INK[self.look.dark][1]
+        lines[0].label = "of the former window" if old else "sharpness"
         ends = np.array([y.min(), y.max()]) + max(np.ptp(y), 1e-6) * np.array([-0.05, LEGEND_SHARE])
         known = layout.truths(self.inspector)[name], layout.knob_values(self.inspector)[name]
         for line, value in zip(lines[1:], known, strict=True):

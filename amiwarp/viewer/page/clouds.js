@@ -20,7 +20,7 @@ export const EventClouds = {
     box: Array, axis: Object, titles: Array, view: Array, dot: Number, opacity: Number, overlaid: Boolean,
     dark: Boolean, picked: Number, slice: Array, beside: Boolean,
   },
-  emits: ['pick', 'card'],
+  emits: ['pick', 'card', 'sliced'],
   template: `<div class="clouds"><canvas ref="canvas" tabindex="0" role="img" :aria-label="label" @pointerdown="pressed"
     @contextmenu.prevent @keydown="typed" @wheel.prevent="wheeled"></canvas></div>`,
   setup(props, { emit }) {
@@ -57,6 +57,19 @@ export const EventClouds = {
       return `Event cloud${props.titles.length > 1 ? 's' : ''}, ${names}, over x, y and ${props.axis.title}. `
         + 'Drag or shift and arrow keys to turn, wheel or plus and minus to zoom.';
     });
+    const limits = computed(() => { // of the drawn slice of the third axis, in the box
+      const [from, to] = props.slice;
+      return [from > 0 ? from : -1e9, to < 1 ? to : 1e9].map((share) => frame.value.half[2] * (2 * share - 1));
+    });
+    const sliced = computed(() => { // how many events are in the slice; empty if it is everything
+      if (props.slice[0] <= 0 && props.slice[1] >= 1) return '';
+      const [points, [low, high]] = [places[1].value, limits.value];
+      let count = 0;
+      for (let k = 0; k < points.length; k += 3) {
+        if (points[k + 2] >= low && points[k + 2] <= high && points[k] === points[k]) count++; // NaN: not drawn
+      }
+      return `${count.toLocaleString('en')} of these drawn (slice)`;
+    });
     let waiting = false;
 
     function ask() {
@@ -82,8 +95,7 @@ export const EventClouds = {
 
     // Return the projection of a pane, with the slice of the third axis that is drawn.
     function projected(pane) {
-      const [from, to] = props.slice;
-      const [low, high] = [from > 0 ? from : -1e9, to < 1 ? to : 1e9].map((share) => frame.value.half[2] * (2 * share - 1));
+      const [low, high] = limits.value;
       return { ...camera.project(frame.value.half, pane.width, pane.height), low, high };
     }
 
@@ -225,6 +237,7 @@ export const EventClouds = {
       ask();
     });
     watch(props, () => setTimeout(ask)); // then the page has the colours of dark mode
+    watch(sliced, (text) => emit('sliced', text));
     watch(() => props.view, ([view]) => {
       camera.look(view);
       ask();

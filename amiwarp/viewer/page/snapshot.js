@@ -46,7 +46,9 @@ export function savePicture(name, words, state, download) {
   const canvas = document.querySelector('.clouds canvas');
   const ratio = canvas.width / canvas.clientWidth;
   const width = canvas.clientWidth;
-  const lines = wrapped(sheet(1, 1), words, width - 2 * GAP);
+  const seen = document.getElementById('events').textContent; // with a slice, fewer events than the server draws
+  const said = words.map((each) => (/^[\d,.]+ events/.test(each) ? seen : each));
+  const lines = wrapped(sheet(1, 1), said, width - 2 * GAP);
   const context = sheet(width, canvas.clientHeight + (lines.length + 1) * LINE + GAP, ratio);
   context.drawImage(canvas, 0, 0, width, canvas.clientHeight);
   let y = canvas.clientHeight + LINE;
