@@ -1117,6 +1117,8 @@ def test_labels_focus_and_contrast_meet_the_rules_of_axe(page: Any, dark: bool) 
 
 def test_without_encoder_there_is_one_cloud_until_the_speed_is_set(opened: Open, recording: Recording) -> None:
     page = opened(of=replace(recording, encoder=None, prism=None))
+    page.locator("#do-optic").click()
+    page.locator("#prism").wait_for()
     assert page.locator("#image-before, #curve, #slider-clock_offset").count() == 0
     assert "no encoder" in page.locator("#prism .missing").first.inner_text()
     assert page.locator("#axis").input_value() == "time"
@@ -1133,6 +1135,27 @@ def test_without_encoder_there_is_one_cloud_until_the_speed_is_set(opened: Open,
     page.locator("#name").click()
     page.keyboard.press("t")
     until(lambda: page.locator("#axis").input_value() == "time")
+
+
+def test_a_plain_recording_has_windows_by_time_and_count_and_no_controls_of_a_prism(
+    opened: Open, recording: Recording
+) -> None:
+    """Ground truth of a prism does not bring its controls back: nothing in the recording says that one moves."""
+    page = opened(of=replace(recording, encoder=None, prism=None))
+    optical = "#prism, #calibration, #do-truth, #field-turns, #do-calibration, #do-compensated, #do-suggested, #curve"
+    assert page.locator(optical).count() == 0
+    assert page.locator("#axis option").all_inner_texts() == ["time"]
+    page.locator("#statistics dd").filter(has_text="events/s").wait_for()
+    assert "→" not in page.locator("#sharpness").inner_text()
+    enter(page, "events", 1000)
+    events = recording.events.slice(0, len(recording.events))
+    first = np.searchsorted(events.t - events.t[0], 1e3 * field(page, "start_ms"))
+    expected = np.count_nonzero(events.t[first:] <= events.t[first + 999])  # with those of equal time
+    page.locator("#events").filter(has_text=f"{expected:,} events, all drawn").wait_for()
+    assert field(page, "events") == expected
+    page.locator("#do-optic").click()
+    page.locator("#slider-rpm").wait_for()
+    assert page.locator("#calibration, #do-truth, #field-turns").count() == 3
 
 
 def test_a_recording_without_a_prism_is_played_fills_its_pane_and_gets_camera_and_prism(
@@ -1157,6 +1180,7 @@ def test_a_recording_without_a_prism_is_played_fills_its_pane_and_gets_camera_an
     ready(page)
     page.keyboard.press(" ")
     message(page, "the window holds the whole recording")
+    page.locator("#do-optic").click()
     enter(page, "fov_deg", 50)
     enter(page, "prism_index", 1.6)
     until(lambda: "camera unknown" not in page.locator("#prism").inner_text())

@@ -936,6 +936,20 @@ def test_the_cost_surface_without_encoder_is_over_the_speed(recording: Recording
     assert sharpness.max() - at_truth < 0.05 * np.ptp(sharpness[:, 3])
 
 
+@pytest.mark.parametrize("count", [1, 7, 1000])
+def test_a_window_holds_the_wanted_number_of_events(count: int) -> None:
+    t = np.arange(1000) * 10 + 500
+    x = np.zeros(1000, np.uint16)
+    inspector = Inspector(Recording(MemoryEvents(Events(x, x, t, x.astype(np.uint8)), 4, 3)))
+    assert not inspector.has_optic
+    for start_us in (500, 505, 5000, 10_480):
+        start, length = inspector.window_of(start_us, count)
+        assert np.count_nonzero((t >= start) & (t < start + length)) == count
+        assert start == min(start_us, t[-count])
+    assert inspector.window_of(500, 5000) == (500, 9991)
+    assert inspector.window_of(520, 0) == (520, 1)
+
+
 def test_the_page_says_how_many_events_were_read_of_a_full_window(
     inspector: Inspector, monkeypatch: pytest.MonkeyPatch
 ) -> None:

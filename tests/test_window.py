@@ -581,6 +581,29 @@ def test_a_file_without_a_prism_has_one_large_cloud(recording: Recording) -> Non
     window.scene.close()
 
 
+def test_a_plain_recording_has_controls_of_a_prism_only_when_they_are_asked_for(recording: Recording) -> None:
+    window = Window(Inspector(replace(recording, encoder=None, prism=None)), size=SIZE, off_screen=True)
+    assert list(window.sliders) == ["start_ms", "length_ms"]
+    count, length_us = window.shown.span.count, window.shown.span.length_us
+    assert window._texts[0].input.startswith(f"{count / length_us * 1e6:,.0f} events/s ")
+    assert "encoder" not in window._texts[0].input
+    for key in ("Up", "Down", "Tab"):  # of the parameter moved last: there is none
+        window.key(key)
+        window.turn()
+    window.key("comma")
+    window.turn()
+    half = window.shown.span.count
+    assert half == pytest.approx(count / 2, abs=20)
+    window.key("period")
+    window.turn()
+    assert window.shown.span.count == pytest.approx(2 * half, abs=20)
+    window.key("x")
+    window.turn()
+    assert list(window.sliders)[:3] == ["apex", "phase", "rpm"]
+    assert "no encoder" in window._texts[0].input
+    window.scene.close()
+
+
 def test_the_calibration_and_a_picture_are_saved_under_new_names(
     window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -437,6 +437,12 @@ class Inspector:
         return self.recording.encoder is not None
 
     @property
+    def has_optic(self) -> bool:
+        """Whether anything says that the camera looks through an optic that moves: else it is a plain recording."""
+        known = any(source is not Source.ASSUMED for name, source in self.sources.items() if name != "camera")
+        return known or self.has_encoder or self.recording.prism is not None
+
+    @property
     def turn_us(self) -> float:
         """Duration of one turn of the prism in the time window [us]; infinite if the prism does not rotate."""
         if not self.has_encoder:
@@ -526,6 +532,20 @@ class Inspector:
         still = min(WINDOW_US, max(1, whole // 5))
         length = min(round(self.turn_us) if math.isfinite(self.turn_us) else still, whole)
         return source.t_first + (whole - length) // 2, length
+
+    def window_of(self, start_us: int, count: int) -> tuple[int, int]:
+        """Return start and length of the time window [us] from a start on that holds a number of events.
+
+        It starts earlier if too few events follow. Events of equal time stay together, so it may hold a few more.
+        """
+        source = self.recording.events
+        count = min(max(1, count), len(source))
+        first = source.find(start_us)
+        if first > len(source) - count:
+            first = len(source) - count
+            start_us = int(source.slice(first, first + 1).t[0])
+        last = int(source.slice(first + count - 1, first + count).t[0])
+        return start_us, last - start_us + 1
 
     def renew(self) -> None:
         """Take the current events of a live stream; call :meth:`open` afterwards.

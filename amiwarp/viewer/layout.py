@@ -331,6 +331,8 @@ EXPORTS = {
 """Downloads by name: text of the button, and suffix."""
 FILMS = ("turntable", "film")
 """Downloads that take long."""
+OF_OPTICS = ("compensated", "calibration")
+"""Downloads that only a recording with an optic has."""
 CALLS = (
     "key", "released", "choose", "slide", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline", "undo", "redo",
@@ -344,7 +346,7 @@ SETTABLE: dict[str, Check] = {
     "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
     "message": one_of(""),
     **dict.fromkeys(("hide_hot", "noise_filter", "dark", "overlaid", "orbit_shown", "help_shown", "open_shown", "loop",
-                     "difference"),
+                     "difference", "optic"),
                     flag),
 }  # fmt: skip
 """State variables that the page may set directly, with the check of their values. The page changes all others through
@@ -535,10 +537,10 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
     return {
         **source_state(inspector), **knob_state(inspector), "turn_ms": turn_ms(inspector),
         "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "truth": truth_text(recording.truth),
-        "size": list(size), "live": inspector.latest is not None,
+        "size": list(size), "optic": inspector.has_optic, "count": 0, "live": inspector.latest is not None,
         "models": list(alternatives(inspector.knobs.model)),
         "has_truth": inspector.truth is not None, "beside": inspector.beside is not None,
-        "exports": [[name, text, name in FILMS] for name, (text, _) in EXPORTS.items()],
+        "exports": [[name, text, name in FILMS, name in OF_OPTICS] for name, (text, _) in EXPORTS.items()],
         "keys": [[key, words] for key, _, words in KEYS], "scope": SCOPES[0], "scopes": list(SCOPES),
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],

@@ -288,7 +288,7 @@ class Panel(layout.Actions):
 
     def typed(self, name: str, text: str) -> None:
         """Set the value that a user typed into a number field."""
-        if name not in (*layout.FIELD_LIMITS, "start_ms", "length_ms", "turns", "noise_ms"):
+        if name not in (*layout.FIELD_LIMITS, "start_ms", "length_ms", "turns", "events", "noise_ms"):
             return
         try:
             value = finite(text)
@@ -297,11 +297,21 @@ class Panel(layout.Actions):
             return
         if name in layout.FIELD_LIMITS:
             self.slide(name, value)
+        elif name == "events":
+            self.start_job(self._take_events(round(value)))
+            return
         else:
             length = name == "turns"
             self.state["length_ms" if length else name] = round(value * float(self.state.turn_ms if length else 1.0), 4)
             self.request("window")
         self.released()
+
+    async def _take_events(self, count: int) -> None:
+        """Show a time window with a number of events."""
+        with self.errors_shown("window"):
+            self.time_window = await self.in_thread(self.inspector.window_of, self.time_window[0], count)
+            self.request("window")
+            self.released()
 
     def slide(self, name: str, value: float) -> None:
         """Set a parameter of the prism or the camera, in the unit of its slider or field."""
@@ -701,6 +711,7 @@ class Panel(layout.Actions):
                 self.request("look")
             mark = layout.knob_values(self.inspector)[state.knob]
             self._show_old()
+            state.optic = bool(state.optic or self.inspector.has_optic)  # a live stream may have got its encoder
             state.update({**values, "turn_ms": layout.turn_ms(self.inspector), "curve_mark": mark})
             if not state.playing:
                 self.remember("" if todo & {"suggestion", "state"} else self._change)
@@ -769,7 +780,7 @@ class Panel(layout.Actions):
         titles = drawing.cloud_titles(self.inspector, left)
         return shown, {
             **values, "titles": [list(each) for each in enumerate(titles)], "events": drawing.chosen_text(shown),
-            "drawn": drawing.drawn_text(shown),
+            "drawn": drawing.drawn_text(shown), "count": shown.span.count,
             "sharpness": drawing.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
             "picked_text": "" if self._picked < 0 else drawing.event_text(shown, self._picked),
             "against_title": drawing.against_title(self.inspector, left), "against_choices": self._against_choices(),

@@ -66,7 +66,7 @@ FINE = ("start_ms", "length_ms")
 """Sliders of the time window."""
 X_KEYS = {
     "Right": "ArrowRight", "Left": "ArrowLeft", "space": " ", "question": "?", "h": "?", "plus": "+", "equal": "+",
-    "minus": "-",
+    "minus": "-", "comma": ",", "period": ".",
 }  # fmt: skip
 """Keys by their names in VTK, where these differ."""
 MORE_KEYS = (
@@ -78,6 +78,9 @@ MORE_KEYS = (
     ("k", ("choose_next", "colour"), "next quantity shown by colour"),
     ("n", ("choose_next", "polarity"), "ON, OFF or both"),
     ("i", ("toggle", "statistics_shown"), "statistics of the selected events of the region: show or hide"),
+    (",", ("scale_count", 0.5), "a time window with half as many events"),
+    (".", ("scale_count", 2.0), "a time window with twice as many events"),
+    ("x", ("toggle", "optic_shown"), "controls of a prism, for a recording that does not say that there is one"),
     ("v", ("take_truth",), "take the known true parameters of a simulation"),
     ("+", ("resize_points", 1.0), "larger points"),
     ("-", ("resize_points", -1.0), "smaller points"),
@@ -110,6 +113,8 @@ class Window(layout.Actions):
         self.shown: DisplayedWindow
         """What the window shows."""
         self.help_shown = self.statistics_shown = self.depth_shown = self.plays = self.loop = self.closed = False
+        self.optic_shown = False
+        """Whether a recording shows the controls of a prism though nothing says that there is one."""
         self.knob, self.message = inspector.orbit_names[0], ""
         self.sliders: dict[str, Any] = {}
         """Slider widgets by the name of their value."""
@@ -233,6 +238,8 @@ class Window(layout.Actions):
 
     def nudge(self, steps: int) -> None:
         """Move the chosen parameter by steps of its slider."""
+        if self.knob not in self.sliders:
+            return
         step = layout.SLIDERS[self.knob][2][2]
         self.slide(self.knob, layout.knob_values(self.inspector)[self.knob] + steps * step)
 
@@ -240,7 +247,7 @@ class Window(layout.Actions):
         """Choose the next parameter for the keys and the curve, or the next model, colour or polarity that is shown."""
         inspector, knobs = self.inspector, self.inspector.knobs
         if what == "knob":
-            self.knob = _following([name for name in self.sliders if name not in FINE], self.knob)
+            self.knob = _following([name for name in self.sliders if name not in FINE] or [self.knob], self.knob)
             self.request("look")
         elif what == "model":
             inspector.set(replace(knobs, model=_following(list(alternatives(knobs.model)), knobs.model)))
@@ -250,12 +257,19 @@ class Window(layout.Actions):
         else:
             self._select(polarity=_following([None, 1, 0], inspector.selection.polarity))
 
+    def scale_count(self, factor: float) -> None:
+        """Show a time window with so many times as many events."""
+        count = round(self.shown.span.count * factor)
+        with self.errors_shown("window"):
+            self.time_window = self.inspector.window_of(self.time_window[0], count)
+            self.request("window")
+
     def resize_points(self, px: float) -> None:
         """Make the points larger."""
         self.restyle(point_size=min(max(self.look.point_size + px, 1.0), 20.0))
 
     def toggle(self, name: str) -> None:
-        """Invert "overlaid", "dark", "loop", "help_shown" or "statistics_shown"."""
+        """Invert "overlaid", "dark", "loop", "help_shown", "statistics_shown", "depth_shown" or "optic_shown"."""
         if name in ("overlaid", "dark"):
             self.restyle(**{name: not getattr(self.look, name)})
             return
@@ -464,7 +478,8 @@ class Window(layout.Actions):
 
         dark, fields = self.look.dark, self._fields()
         names = tuple(fields)
-        self.knob = self.knob if self.knob in names else names[0]
+        parameters = [name for name in names if name not in FINE]
+        self.knob = self.knob if self.knob in parameters or not parameters else parameters[0]
         built, self._built = self._built, (names, dark, self.compensates, self.knob)
         if built[:1] != self._built[:1]:
             self._make_sliders(names)
@@ -486,7 +501,7 @@ class Window(layout.Actions):
     def _fields(self) -> dict[str, tuple[float, float, float, str]]:
         """Return value, ends and title of the sliders: of the parameters that matter, and of the time window."""
         out, always = {}, (*self.inspector.orbit_names, "clock_offset", "rpm")
-        for slider in layout.sliders(self.inspector):
+        for slider in layout.sliders(self.inspector) if self._has_controls else ():
             name, value = slider["name"], slider["value"]
             if value or name in always or name.startswith("tilt"):
                 title = f"{slider['label']} {layout.with_unit(name, value, 6)} ({slider['note']})"
@@ -496,6 +511,11 @@ class Window(layout.Actions):
         out["start_ms"] = start_ms, 0.0, whole_ms, f"window from {start_ms:.3f} ms"
         out["length_ms"] = length_ms, min(0.1, 0.5 * whole_ms), whole_ms, f"length {length_ms:.3f} ms"
         return out
+
+    @property
+    def _has_controls(self) -> bool:
+        """Whether there are controls of a prism."""
+        return self.optic_shown or self.inspector.has_optic
 
     def _make_sliders(self, names: tuple[str, ...]) -> None:
         import pyvista
@@ -608,7 +628,12 @@ class Window(layout.Actions):
     def _show_texts(self) -> None:
         """Show what is missing, messages, and the help."""
         paper, ink = drawing.BACKGROUND_AND_INK[self.look.dark]
-        notes = [f"model {self.inspector.knobs.model}      h: help", "", self.message, *layout.notes(self.inspector)]
+        if self._has_controls:
+            about, notes = f"model {self.inspector.knobs.model}", layout.notes(self.inspector)
+        else:
+            span = self.shown.span
+            about, notes = f"{span.count / span.length_us * 1e6:,.0f} events/s", ["x: set a prism"]
+        notes = [f"{about}      h: help", "", self.message, *notes]
         notes, stream = ([line for text in texts for line in textwrap.wrap(text, COLUMN_LETTERS)]
                          for texts in (notes, self._stream))  # fmt: skip
         rows = [f"{KEY_NAMES.get(key, key):>6}   {words}" for key, _, words in self.keys]
