@@ -95,6 +95,35 @@ def test_window_model_and_axis(files: Path, tmp_path: Path) -> None:
     assert one.read_bytes() != two.read_bytes()
 
 
+@pytest.mark.parametrize(("given", "region"), [("whole", [0, 0, 120, 90]), ("20,30,70,60", [20, 30, 70, 60])])
+def test_a_picture_shows_the_wanted_region(files: Path, tmp_path: Path, given: str, region: list[int]) -> None:
+    data = json.loads(view(files / "recording.h5", "--screenshot", tmp_path / "o.png", "--region", given, "--json")[1])
+    left, top, right, bottom = data["region"]
+    assert data["region"] == region
+    start, length = Inspector(open_recording(files / "recording.h5")).first_window()
+    e = open_recording(files / "recording.h5").events.between(start, start + length)
+    inside = (e.x >= left) & (e.x < right) & (e.y >= top) & (e.y < bottom)
+    assert data["drawn"] == np.count_nonzero(inside)
+
+
+def test_a_picture_of_an_image_that_gains_little_shows_the_suggested_region(files: Path, tmp_path: Path) -> None:
+    """The prism is set to one that moves almost nothing; with the right one, the whole image is shown."""
+    calibration = json.loads((files / "c.json").read_text())
+    calibration["parameters"]["apex"]["value"] *= 0.01
+    (tmp_path / "weak.json").write_text(json.dumps(calibration))
+    shown = {}
+    for name, calibrated in (("weak", tmp_path / "weak.json"), ("right", files / "c.json")):
+        options = ["--calibration", calibrated, "--screenshot", tmp_path / f"{name}.png", "--json"]
+        shown[name] = json.loads(view(files / "recording.h5", *options)[1])
+        asked = ["--calibration", calibrated, "--screenshot", tmp_path / f"{name}2.png", "--region", "suggested"]
+        shown[f"{name} asked"] = json.loads(view(files / "recording.h5", *asked, "--json")[1])
+    assert shown["weak"]["region"] == shown["weak asked"]["region"] != [0, 0, 120, 90]
+    assert "--region whole" in " ".join(shown["weak"]["notes"])
+    assert "--region whole" not in " ".join(shown["weak asked"]["notes"])
+    assert shown["right"]["region"] == [0, 0, 120, 90] != shown["right asked"]["region"]
+    assert "--region whole" not in " ".join(shown["right"]["notes"])
+
+
 def test_a_picture_without_a_rotating_prism_shows_one_cloud(files: Path, tmp_path: Path) -> None:
     recording, out = open_recording(files / "recording.h5"), tmp_path / "out.png"
     events = MemoryEvents(recording.events.slice(0, 5_000), *recording.events.size)
@@ -115,6 +144,13 @@ def test_a_picture_without_a_rotating_prism_shows_one_cloud(files: Path, tmp_pat
         (["--screenshot", "out.png", "--window", "50:60"], "take another window"),
         (["--screenshot", "out.png", "--model", "sphere"], "choose among circle, exact, radial, ellipse"),
         (["--screenshot", "out.png", "--size", "9x9"], "--size"),
+        (
+            ["--screenshot", "out.png", "--region", "0,0,121,90"],
+            "--region 0,0,121,90: is no part of the image of 120x90",
+        ),
+        (["--screenshot", "out.png", "--region", "9,0,9,90"], "is no part of the image"),
+        (["--screenshot", "out.png", "--region", "all"], "--region"),
+        (["--region", "whole"], "give --screenshot too"),
         (["--calibration", "none.json"], "none.json"),
         (["--screenshot", "out.png", "--web"], "give one of them"),
         (["--screenshot", "out.png", "--host", "0.0.0.0"], "give --web too"),

@@ -430,6 +430,15 @@ def parse_size(text: str, name: str = "--size", example: str = "640x480") -> tup
     return int(width), int(height)
 
 
+def parse_region(text: str) -> tuple[int, int, int, int]:
+    """Return the edges of a region [px]."""
+    values = numbers(text, 4, "--region")
+    if any(value != int(value) for value in values):
+        raise AmiwarpError(f"--region: {text!r} has fractions; give whole pixels: LEFT,TOP,RIGHT,BOTTOM")
+    left, top, right, bottom = (int(value) for value in values)
+    return left, top, right, bottom
+
+
 def microseconds(value: float, unit: str, name: str) -> int:
     """Convert the time that the option ``name`` gives in the unit ``s`` or ``ms`` to whole microseconds.
 

@@ -86,7 +86,7 @@ def run_filter(
         background_us = cli.microseconds(parts.background_ms, "ms", "--background-ms")
     chosen = EventFilter(
         window=None if parts.window is None else cli.span(parts.window, events.t_first, events.t_last),
-        region=None if parts.region is None else _region(parts.region),
+        region=None if parts.region is None else cli.parse_region(parts.region),
         polarity=None if parts.only is None else int(parts.only == "on"),
         hot_pixels=find_hot_pixels(events, events.size) if parts.hot_pixels else None,
         refractory_us=parts.refractory_us,
@@ -100,15 +100,6 @@ def run_filter(
     data: dict[str, Any] = {"file": str(out), **asdict(summary), "seconds": seconds}
     data["assumptions"] = assumed_texts(recording.metadata)
     cli.report(common, data, _lines(data))
-
-
-def _region(text: str) -> tuple[int, int, int, int]:
-    """Return the edges of a region [px]."""
-    values = cli.numbers(text, 4, "--region")
-    if any(value != int(value) for value in values):
-        raise AmiwarpError(f"--region: {text!r} has fractions; give whole pixels: LEFT,TOP,RIGHT,BOTTOM")
-    left, top, right, bottom = (int(value) for value in values)
-    return left, top, right, bottom
 
 
 def _lines(d: dict[str, Any]) -> Iterator[str]:

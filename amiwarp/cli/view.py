@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from ctypes import CDLL, c_void_p
 from ctypes.util import find_library
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,6 +35,8 @@ LEAST_PX, MOST_PX = 100, 8000
 """Smallest and largest width or height of a window or a screenshot [px]."""
 PICTURE_PX = 1400, 620
 """Width and height of a screenshot [px]."""
+LEAST_GAIN = 1.1
+"""Ratio of the sharpness compensated to that as recorded from which a screenshot shows the whole image."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,16 @@ class LookOptions:
         Path | None,
         typer.Option(help="Write a picture of both event clouds (.png) and exit.", rich_help_panel=_LOOK),
         cli.OUTPUT,
+    ] = None
+    region: Annotated[
+        str | None,
+        typer.Option(
+            help="Region of a screenshot (px; right and bottom exclusive), 'whole' for the whole image, or 'suggested' "
+            "for the one in which compensation gains most. Default: whole, or suggested if the whole image gains "
+            "little.",
+            metavar="LEFT,TOP,RIGHT,BOTTOM",
+            rich_help_panel=_LOOK,
+        ),
     ] = None
     view: Annotated[View, typer.Option(help="Viewpoint.", rich_help_panel=_LOOK)] = View.FREE
     colour: Annotated[
@@ -99,14 +111,45 @@ class LookOptions:
         check_ending(path, "pictures are written", [".png"])
         size = self.pixels(PICTURE_PX)
         estimate_phase(inspector)
+        chosen = self._choose_region(inspector)
         save_screenshot(inspector, path, view=self.view, look=self.look(inspector), size=size)
         shown = inspector.show()
         return {
             "file": str(path), "events": shown.span.count, "drawn": len(shown.events),
             "sharpness_before": shown.sharpness_before,
             "sharpness_after": shown.sharpness_after if math.isfinite(inspector.turn_us) else None,
-            "notes": notes(inspector),
+            "region": list(shown.region), "notes": [*notes(inspector), *chosen],
         }  # fmt: skip
+
+    def _choose_region(self, inspector: Inspector) -> list[str]:
+        """Show the wanted region; return a note if it was chosen because the whole image gains little.
+
+        Raises :class:`AmiwarpError` for a region that is not one of the image.
+        """
+        width, height = inspector.recording.events.size
+        region, notes = None, []
+        if self.region == "suggested":
+            region = inspector.suggest_region()
+        elif self.region is None:
+            shown, alone = inspector.show(), inspector.beside is None and inspector.depth is None
+            gains = shown.sharpness_after >= LEAST_GAIN * shown.sharpness_before
+            if alone and math.isfinite(inspector.turn_us) and not gains:
+                region = inspector.suggest_region()
+                notes = [
+                    f"the whole image gains little ({shown.sharpness_before:.3f} as recorded, "
+                    f"{shown.sharpness_after:.3f} compensated): the suggested region is shown; --region whole shows all"
+                ]
+        elif self.region != "whole":
+            region = left, top, right, bottom = cli.parse_region(self.region)
+            if not (0 <= left < right <= width and 0 <= top < bottom <= height):
+                raise AmiwarpError(
+                    f"--region {self.region}: is no part of the image of {width}x{height} px; give "
+                    f"LEFT,TOP,RIGHT,BOTTOM within 0,0,{width},{height}"
+                )
+        if region is not None:
+            loaded = inspector.loaded.span
+            inspector.open(loaded.start_us, loaded.length_us, replace(inspector.selection, region=region))
+        return notes
 
 
 @dataclass(frozen=True)
@@ -267,6 +310,8 @@ def run_view(
 
     if look.screenshot is not None and page.web:
         raise AmiwarpError("--screenshot and --web are both given; give one of them")
+    if look.screenshot is None and look.region is not None:
+        raise AmiwarpError("--region applies to a picture; give --screenshot too, or draw the region in the window")
     if not page.web and page != PageOptions():
         raise AmiwarpError("--host and --port apply to the page; give --web too")
     if stream.live and layout.given():
