@@ -52,7 +52,7 @@ def view(*args: str | Path) -> tuple[int, str, str]:
 
 def test_a_picture_without_a_window(files: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.png"
-    options = ["--view", "x-y", "--colour", "density", "--dark", "--size", "400x200", "--json"]
+    options = ["--view", "x-y", "--colour", "density", "--dark", "--size", "400x200", "--region", "whole", "--json"]
     code, said, _ = view(files / "recording.h5", "--calibration", files / "c.json", "--screenshot", out, *options)
     assert code == 0
     data = json.loads(said)
@@ -106,13 +106,13 @@ def test_a_picture_shows_the_wanted_region(files: Path, tmp_path: Path, given: s
     assert data["drawn"] == np.count_nonzero(inside)
 
 
-def test_a_picture_of_an_image_that_gains_little_shows_the_suggested_region(files: Path, tmp_path: Path) -> None:
-    """The prism is set to one that moves almost nothing; with the right one, the whole image is shown."""
+def test_a_picture_in_which_the_motion_is_too_small_shows_the_suggested_region(files: Path, tmp_path: Path) -> None:
+    """An apex of 1° moves the image of 120 px by 1.2 px to each side, one of 3° by 3.5 px."""
     calibration = json.loads((files / "c.json").read_text())
-    calibration["parameters"]["apex"]["value"] *= 0.01
-    (tmp_path / "weak.json").write_text(json.dumps(calibration))
+    calibration["parameters"]["apex"]["value"] *= 3.0
+    (tmp_path / "strong.json").write_text(json.dumps(calibration))
     shown = {}
-    for name, calibrated in (("weak", tmp_path / "weak.json"), ("right", files / "c.json")):
+    for name, calibrated in (("weak", files / "c.json"), ("strong", tmp_path / "strong.json")):
         options = ["--calibration", calibrated, "--screenshot", tmp_path / f"{name}.png", "--json"]
         shown[name] = json.loads(view(files / "recording.h5", *options)[1])
         asked = ["--calibration", calibrated, "--screenshot", tmp_path / f"{name}2.png", "--region", "suggested"]
@@ -120,8 +120,8 @@ def test_a_picture_of_an_image_that_gains_little_shows_the_suggested_region(file
     assert shown["weak"]["region"] == shown["weak asked"]["region"] != [0, 0, 120, 90]
     assert "--region whole" in " ".join(shown["weak"]["notes"])
     assert "--region whole" not in " ".join(shown["weak asked"]["notes"])
-    assert shown["right"]["region"] == [0, 0, 120, 90] != shown["right asked"]["region"]
-    assert "--region whole" not in " ".join(shown["right"]["notes"])
+    assert shown["strong"]["region"] == [0, 0, 120, 90] != shown["strong asked"]["region"]
+    assert "--region whole" not in " ".join(shown["strong"]["notes"])
 
 
 def test_a_picture_without_a_rotating_prism_shows_one_cloud(files: Path, tmp_path: Path) -> None:

@@ -35,8 +35,9 @@ LEAST_PX, MOST_PX = 100, 8000
 """Smallest and largest width or height of a window or a screenshot [px]."""
 PICTURE_PX = 1400, 620
 """Width and height of a screenshot [px]."""
-LEAST_GAIN = 1.1
-"""Ratio of the sharpness compensated to that as recorded from which a screenshot shows the whole image."""
+LEAST_MOTION = 0.05
+"""Diameter of the orbit of a scene point, as a share of the image's width, from which a screenshot shows the whole
+image. The clouds of a smaller one look alike before and after compensation."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ class LookOptions:
         str | None,
         typer.Option(
             help="Region of a screenshot (px; right and bottom exclusive), 'whole' for the whole image, or 'suggested' "
-            "for the one in which compensation gains most. Default: whole, or suggested if the whole image gains "
-            "little.",
+            "for the one in which compensation gains most. Default: whole, or suggested if the prism's motion is "
+            "too small to be seen in the whole image.",
             metavar="LEFT,TOP,RIGHT,BOTTOM",
             rich_help_panel=_LOOK,
         ),
@@ -122,7 +123,7 @@ class LookOptions:
         }  # fmt: skip
 
     def _choose_region(self, inspector: Inspector) -> list[str]:
-        """Show the wanted region; return a note if it was chosen because the whole image gains little.
+        """Show the wanted region; return a note if it was chosen because the motion is small.
 
         Raises :class:`AmiwarpError` for a region that is not one of the image.
         """
@@ -131,13 +132,12 @@ class LookOptions:
         if self.region == "suggested":
             region = inspector.suggest_region()
         elif self.region is None:
-            shown, alone = inspector.show(), inspector.beside is None and inspector.depth is None
-            gains = shown.sharpness_after >= LEAST_GAIN * shown.sharpness_before
-            if alone and math.isfinite(inspector.turn_us) and not gains:
+            alone, orbit_px = inspector.beside is None and inspector.depth is None, inspector.orbit_px
+            if alone and math.isfinite(inspector.turn_us) and 2.0 * orbit_px < LEAST_MOTION * width:
                 region = inspector.suggest_region()
                 notes = [
-                    f"the whole image gains little ({shown.sharpness_before:.3f} as recorded, "
-                    f"{shown.sharpness_after:.3f} compensated): the suggested region is shown; --region whole shows all"
+                    f"the prism moves the image by only ±{orbit_px:.1f} px of {width}: the suggested region is shown; "
+                    "--region whole shows all"
                 ]
         elif self.region != "whole":
             region = left, top, right, bottom = cli.parse_region(self.region)

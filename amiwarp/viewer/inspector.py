@@ -669,8 +669,12 @@ class Inspector:
         if self.selection.region is not None:
             loaded = self._load(loaded.span.start_us, loaded.span.length_us, replace(self.selection, region=None))
         (before, _), (after, _) = self._measured(loaded, None), self._measured(loaded, self.knobs)
-        orbit_px = np.abs(border_displacements(self.model)).max(initial=0.0)
-        return suggest_region(before, after, margin=math.ceil(orbit_px))
+        return suggest_region(before, after, margin=math.ceil(self.orbit_px))
+
+    @property
+    def orbit_px(self) -> float:
+        """Largest displacement of a scene point by the optic, in x or in y, at the image's border [px]."""
+        return float(np.abs(border_displacements(self.model)).max(initial=0.0))
 
     def put_beside(self, recording: Recording) -> None:
         """Show another recording beside this one: its events, as recorded, at the same time after its first event.
