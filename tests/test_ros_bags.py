@@ -19,8 +19,9 @@ from rosbags.rosbag2 import Writer as Writer2
 from amiwarp import AmiwarpError, Events, convert, open_recording
 from amiwarp.io import read_encoder_triggers, ros_bags
 from amiwarp.io.prophesee import Halves, halves_of, words_of
-from amiwarp.io.ros import decode_array
-from amiwarp.io.ros_bags import RESTART, MessageNumbers, number_of
+from amiwarp.io.ros_bags import Message
+from amiwarp.io.ros_messages import decode_array
+from amiwarp.io.ros_order import AHEAD, FIRST_NUMBERS, LATE, RESTART, MessageNumbers, Numbered, number_of
 from amiwarp.io.ros_words import Layout, Unknown
 from reference.evt_words import Evt2Decoder, Evt3Decoder, swap_halves
 from reference.io_samples import make_events, refusal
@@ -143,13 +144,178 @@ def test_numbers_that_start_again_or_stand_still_are_no_lost_packets(tmp_path: P
     found, about = rows(bag(tmp_path, messages))
     assert [t for _, _, t in found] == [1000, 2000, 3000]
     assert not {"missing_packets", "packet_gaps", "largest_packet_gap"} & set(about)
+    found, notes = placed([0, 1, 3, 3, 2**63, 2**63 + 1, 4])
+    assert found == [0, 0, 1, 0, RESTART, 0, RESTART]
+    assert notes == {"missing_packets": 1, "packet_gaps": 1}
+
+
+def numbered_message(number: int, stamp: int = 0, raw: bytes = b"", publisher: int = 0) -> Numbered:
+    """Return a message with a number. ``stamp`` [ns]."""
+    return Numbered(Message(SimpleNamespace(id=publisher), 0, raw), None, number, stamp)
+
+
+def placed(given: list[int], stamps: list[float] | None = None) -> tuple[list[int], dict[str, int]]:
+    """Return what the numbers of messages tell, each on its own, and the counts. ``stamps`` [s]."""
     notes: dict[str, int] = {}
     numbers = MessageNumbers(notes)
-    given = [0, 1, 3, 3, 2**63, 2**63 + 1, 4]
-    assert [numbers.missing(0, number) for number in given] == [0, 0, 1, 0, RESTART, 0, RESTART]
-    assert numbers.missing(1, 900) == 0  # another publisher
-    assert numbers.missing(0, 5) == 0
+    times = [0.0] * len(given) if stamps is None else stamps
+    messages = [
+        numbered_message(number, round(time * SECOND), bytes([at]))
+        for at, (number, time) in enumerate(zip(given, times, strict=True))
+    ]
+    return [each.missing for message_ in messages for each in numbers.place(message_)], notes
+
+
+def test_each_publisher_counts_for_itself() -> None:
+    notes: dict[str, int] = {}
+    numbers = MessageNumbers(notes)
+    given = [numbered_message(number, raw=bytes([number]), publisher=of) for number, of in ((4, 0), (90, 1), (6, 0))]
+    assert [each.missing for message_ in given for each in numbers.place(message_)] == [0, 0, 1]
     assert notes == {"missing_packets": 1, "packet_gaps": 1}
+
+
+# Late and repeated packets.
+
+
+def counted(count: int, *, ros1: bool = False) -> list[Any]:
+    """Return packets of one event each, 10 ms apart, numbered from 100 on, with right stamps."""
+    return [message(one_event(10_000 * k + 5000), 100 + k, 50 + k / 100, ros1=ros1) for k in range(count)]
+
+
+ORDERS = {
+    "swapped": ([0, 1, 2, 4, 3, 5, 6, 7], 1, 0),
+    "all pairs swapped": ([1, 0, 3, 2, 5, 4, 7, 6], 4, 0),
+    "late by three": ([0, 1, 2, 4, 5, 6, 3, 7], 1, 0),
+    "two late": ([0, 1, 4, 5, 3, 2, 6, 7], 2, 0),
+    "two late in their order": ([0, 1, 4, 5, 2, 3, 6, 7], 2, 0),
+    "repeated at once": ([0, 0, 1, 2, 3, 4, 4, 5, 6, 7], 0, 2),
+    "repeated later": ([0, 1, 2, 3, 4, 5, 2, 6, 7, 0], 0, 2),
+    "late and repeated": ([0, 1, 3, 2, 2, 4, 5, 6, 7], 1, 1),
+    "as they were sent": ([0, 1, 2, 3, 4, 5, 6, 7], 0, 0),
+}
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+@pytest.mark.parametrize("name", ORDERS)
+def test_late_packets_are_put_in_their_place_and_repeated_ones_dropped(tmp_path: Path, name: str, ros1: bool) -> None:
+    order, late, repeated = ORDERS[name]
+    given = counted(8, ros1=ros1)
+    found, about = rows(bag(tmp_path, [given[k] for k in order], ros1=ros1))
+    assert [row[2] for row in found] == [10_000 * k + 5000 for k in range(8)]
+    assert (about.get("late_packets", 0), about.get("repeated_packets", 0)) == (late, repeated)
+    assert not {"clock_restarts", "missing_packets", "packet_gaps", "repaired_time_events"} & set(about)
+
+
+def test_words_of_late_packets_are_decoded_in_their_place(tmp_path: Path) -> None:
+    """Their time, row and column are those of the packet before."""
+    given = [
+        message([HIGH, LOW | 9, ROW | 3, ON | 1, 0xA001], 7, 50.0),
+        message([ON | 2, BASE | 40], 8, 50.001),
+        message([0x4003, ROW | 4, LOW | 12, 0xA001], 9, 50.002),
+        message([ON | 5], 10, 50.003),
+    ]
+    path = bag(tmp_path, [given[k] for k in (0, 3, 2, 1)])
+    found, about = rows(path)
+    assert found == [[1, 3, 9], [2, 3, 9], [40, 3, 9], [41, 3, 9], [5, 4, 12]]
+    assert (about["late_packets"], "dropped_unplaced_events" in about) == (2, False)
+    assert read_encoder_triggers(path, 0).t.tolist() == [9, 12]
+
+
+@pytest.mark.parametrize("late", [AHEAD, AHEAD + 1])
+def test_a_packet_that_is_too_late_keeps_its_place_and_time(tmp_path: Path, late: int) -> None:
+    """The events behind it are not moved."""
+    count = 3 * AHEAD
+    given = [message(one_event(40 * k + 5000, y=k), 100 + k, 50 + k / 25_000) for k in range(count)]
+    order = [0, *range(2, late + 2), 1, *range(late + 2, count)]
+    found, about = rows(bag(tmp_path, [given[k] for k in order]))
+    assert (about["late_packets"], "clock_restarts" in about) == (1, False)
+    assert [row[2] for row in found[-5:]] == [40 * k + 5000 for k in range(count - 5, count)]
+    if late == AHEAD:
+        assert "missing_packets" not in about
+        assert [row[1] for row in found[:3]] == [0, 1, 2]
+        assert "repaired_time_events" not in about
+    else:
+        assert about["missing_packets"] == 1
+        assert [row[1] for row in found[:3]] == [0, 2, 3]
+        at = [row[1] for row in found].index(1)
+        assert found[at - 1][2] == found[at][2]  # its time, repaired and counted
+        assert about["repaired_time_events"] == 1
+
+
+def test_words_behind_a_packet_that_is_too_late_do_not_follow_it(tmp_path: Path) -> None:
+    count = AHEAD + 5
+    given = [message(one_event(10 * k + 5000, y=k), k, 50 + k / 100_000) for k in range(count)]
+    given[-1] = message([ON | 1, *one_event(6000)], count - 1, 51.0)
+    order = [0, *range(2, count - 1), 1, count - 1]
+    found, about = rows(bag(tmp_path, [given[k] for k in order]))
+    assert found[-1] == [5, 7, 6000]
+    assert [1, 1, 5010] not in found
+    assert about["dropped_unplaced_events"] == 1
+
+
+@pytest.mark.parametrize("encoding", ["mono", "array"])
+def test_late_and_repeated_messages_of_other_encodings(tmp_path: Path, encoding: str) -> None:
+    messages = arrays(EVENTS, ros1=True) if encoding == "array" else packets("mono", EVENTS, ros1=True)
+    for number, each in enumerate(messages):
+        if encoding == "array":
+            each.header.seq = number
+        else:
+            each.seq = number
+    path = bag(tmp_path, [messages[0], messages[2], messages[1], messages[2], *messages[3:]], ros1=True)
+    recording = open_recording(path)
+    assert_equal(recording.events.slice(0, 999), EVENTS)
+    known = {"late_packets": 1, "repeated_packets": 1}
+    assert {name: recording.metadata[name] for name in known} == known
+    assert not {"missing_packets", "repaired_time_events"} & set(recording.metadata)
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_copies_of_bags_with_late_packets_are_in_order(tmp_path: Path, ros1: bool) -> None:
+    given = counted(8, ros1=ros1)
+    path = bag(tmp_path, [given[k] for k in (1, 0, 4, 3, 2, 5, 7, 6)], ros1=ros1)
+    copy = tmp_path / ("copy.bag" if ros1 else "copy.mcap")
+    convert(path, copy)
+    assert [row[2] for row in rows(copy)[0]] == [10_000 * k + 5000 for k in range(8)]
+    assert "late_packets" not in rows(copy)[1]
+
+
+def test_a_driver_that_starts_again_soon_is_told_from_late_packets_by_the_stamps(tmp_path: Path) -> None:
+    """Its numbers fall by a little only, but the stamps go on, and the clock of the sensor does not."""
+    first = [message(one_event(2_000_000 + 1000 * k), k, 50 + k / 1000) for k in range(20)]
+    second = [message(one_event(1000 * k), k, 53 + k / 1000) for k in range(20)]
+    found, about = rows(bag(tmp_path, [*first, *second]))
+    times = [row[2] for row in found]
+    assert times[:20] == [2_000_000 + 1000 * k for k in range(20)]
+    assert times[20] == pytest.approx(5_000_000, abs=4096)
+    assert np.diff(times[20:]).tolist() == [1000] * 19
+    assert about["clock_restarts"] == 1
+    assert not {"late_packets", "repeated_packets", "missing_packets", "repaired_time_events"} & set(about)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "stamps", "known"),
+    [
+        pytest.param([500, 501, 480, 502], [5.00, 5.01, 4.80, 5.02], LATE, id="earlier stamp"),
+        pytest.param([500, 501, 7, 502], [5.00, 5.01, 0.07, 5.02], LATE, id="earlier stamp, one of the first"),
+        pytest.param([500, 501, 480, 502], [0.0] * 4, LATE, id="no stamps"),
+        pytest.param([900, 901, 480, 902], [0.0] * 4, LATE, id="no stamps, a large fall to a large number"),
+        pytest.param([500, 501, 7, 8], [0.0] * 4, RESTART, id="no stamps, a large fall to one of the first"),
+        pytest.param([500, 501, 7, 8], [5e3, 5001, 10, 11], RESTART, id="stamps set back"),
+        pytest.param([500, 501, 480, 481], [5.00, 5.01, 5.51, 5.52], RESTART, id="stamps go on"),
+        pytest.param([500, 501, 480, 502], [5.00, 5.01, 5.50, 5.02], LATE, id="too early for a new start"),
+    ],
+)
+def test_falls_of_numbers(numbers: list[int], stamps: list[float], known: int) -> None:
+    found, notes = placed(numbers, stamps)
+    assert found == [0, 0, known, 0]
+    assert notes == ({"late_packets": 1} if known == LATE else {})
+
+
+def test_a_wrong_number_does_not_make_all_later_packets_late() -> None:
+    count = FIRST_NUMBERS + 5
+    found, notes = placed([2000, 2**30, *range(2001, 2001 + count)])
+    assert found[2:] == [LATE] * FIRST_NUMBERS + [RESTART, 0, 0, 0, 0]
+    assert notes["late_packets"] == FIRST_NUMBERS
 
 
 def test_messages_without_a_number_have_that_of_their_header() -> None:

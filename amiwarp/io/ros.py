@@ -24,19 +24,16 @@ from amiwarp.io.files import errors_name
 from amiwarp.io.reading_process import Reply, packets, run
 from amiwarp.io.ros_bags import (
     ARRAYS,
-    Message,
-    MessageNumbers,
     choose,
     deserialised,
     messages_of,
-    note_largest_gap,
     note_unread,
-    number_of,
     opened_bag,
     typestore,
     unpacked,
 )
 from amiwarp.io.ros_messages import Columns, decode_array, decode_packet
+from amiwarp.io.ros_order import Placed, in_order, note_largest_gap, numbered
 from amiwarp.io.ros_words import EVT, Layout, edge_packets, event_packets, layout_of, stamp_packets
 
 SENSORS = "amiwarp.io.ros_sensors"
@@ -165,50 +162,47 @@ def read_head(path: str, topic: str | None) -> Reply:
 
 def read_packets(notes: dict[str, int], path: str, topic: str, triggers: bool) -> Iterator[Columns]:
     """Yield the events, or the triggers, of each message of a topic without EVT words. Runs in the reading process."""
-    numbers = MessageNumbers(notes)
     latest = 0
-    for one, ros1 in _topic_messages(notes, path, topic):
-        number, events, edges = _decoded(one, ros1=ros1)
-        if number is not None:
-            note_largest_gap(notes, numbers.missing(one.connection.id, number), latest)
+    for each, ros1 in _topic_messages(notes, path, topic):
+        events, edges = _decoded(each, ros1=ros1)
+        note_largest_gap(notes, each.missing, latest)
         if len(events[2]):
-            latest = int(events[2][-1])
+            latest = max(latest, int(events[2][-1]))  # those of a late message are earlier
         notes["read"] = notes.get("read", 0) + 1
         notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
         yield edges if triggers else events
     note_unread(notes)
 
 
-def _topic_messages(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[Message, bool]]:
+def _topic_messages(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[Placed, bool]]:
     """Yield the messages of a topic, and whether the bag is of ROS 1. Note their number."""
     with opened_bag(path) as (bag, ros1):
         connections = [found for found in bag.connections if found.topic == topic]
         notes["total"] = max(sum(found.msgcount for found in connections), 1)
-        for one in messages_of(bag, connections, ros1=ros1):
-            yield one, ros1
+        read = (numbered(one, ros1=ros1) for one in messages_of(bag, connections, ros1=ros1))
+        for each in in_order(read, notes):
+            yield each, ros1
 
 
-def _decoded(one: Message, *, ros1: bool) -> tuple[int | None, Columns, Columns]:
-    """Return the number of a message, or None in arrays of ROS 2, which have none; its events; and its triggers."""
-    if one.connection.msgtype not in ARRAYS:
-        message = deserialised(one.connection, one.raw, ros1=ros1)
-        return number_of(message), *decode_packet(message)
-    typestore(one.connection, ros1=ros1)
-    x, y, t, p = decode_array(one.raw, ros1=ros1)[2]
-    number = struct.unpack_from("<I", one.raw)[0] if ros1 else None
-    return number, (x, y, t, p), (x[:0], y[:0], t[:0], p[:0])
+def _decoded(each: Placed, *, ros1: bool) -> tuple[Columns, Columns]:
+    """Return the events of a message, and its triggers."""
+    if each.message is not None:
+        return decode_packet(each.message)
+    typestore(each.one.connection, ros1=ros1)
+    x, y, t, p = decode_array(each.one.raw, ros1=ros1)[2]
+    return (x, y, t, p), (x[:0], y[:0], t[:0], p[:0])
 
 
 def read_stamps(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[Any, ...]]:
     """Yield for each message of a topic that holds events, but no EVT words: the times of its first event [us], of its
     recording and of its header [ns]. Runs in the reading process.
     """
-    for one, ros1 in _topic_messages(notes, path, topic):
-        t = _decoded(one, ros1=ros1)[1][2]
+    for each, ros1 in _topic_messages(notes, path, topic):
+        t = _decoded(each, ros1=ros1)[0][2]
         if len(t):
             # All types of messages with events begin so, in ROS 1 after a number, in ROS 2 after the encapsulation.
-            seconds, rest = struct.unpack_from("<II" if ros1 else "<iI", one.raw, 4)
-            yield tuple(np.array([value], np.int64) for value in (t[0], one.recorded, seconds * 10**9 + rest))
+            seconds, rest = struct.unpack_from("<II" if ros1 else "<iI", each.one.raw, 4)
+            yield tuple(np.array([value], np.int64) for value in (t[0], each.one.recorded, seconds * 10**9 + rest))
 
 
 def read_topics(path: str, topic: str) -> Reply:

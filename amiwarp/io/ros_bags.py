@@ -99,7 +99,8 @@ def messages_of(bag: Any, connections: list[Any], *, ros1: bool) -> Iterator[Mes
 
 def note_unread(notes: dict[str, int]) -> None:
     """Note how many messages of a topic the bag's index lists, but the bag does not hold, after all were read."""
-    notes["unread_messages"] = max(notes["total"] - notes.get("read", 0), 0)
+    found = notes.get("read", 0) + notes.get("repeated_packets", 0)
+    notes["unread_messages"] = max(notes["total"] - found, 0)
 
 
 def choose(bag: Any, topic: str | None, version: int) -> Any:
@@ -159,52 +160,6 @@ def _check_order(types: Any, name: str) -> None:
         if given != expected:
             shown = ", ".join(given) or "nothing"
             raise AmiwarpError(f"defines {name} with the fields {shown}; expected {', '.join(expected)}")
-
-
-# Numbers of messages, which tell how many were lost.
-
-RESTART = -1
-"""Stands for a number that does not continue the one before, as after a new start of the driver."""
-
-LARGEST_GAP = 1 << 32
-"""Largest number of missing messages. A larger step is another count."""
-
-
-class MessageNumbers:
-    """Numbers of the messages of a topic, which its publishers count."""
-
-    def __init__(self, notes: dict[str, int]) -> None:
-        """Take the dictionary of counts, which gets the messages that are missing."""
-        self._notes = notes
-        self._last: dict[int, int] = {}  # by publisher
-
-    def missing(self, publisher: int, number: int) -> int:
-        """Return how many messages are missing before that with this number, or :data:`RESTART`.
-
-        Publishers that do not count give all messages the same number.
-        """
-        step = number - self._last.get(publisher, number)
-        self._last[publisher] = number
-        if step in (0, 1):
-            return 0
-        if not 0 < step <= LARGEST_GAP:
-            return RESTART
-        self._notes["missing_packets"] = self._notes.get("missing_packets", 0) + step - 1
-        self._notes["packet_gaps"] = self._notes.get("packet_gaps", 0) + 1
-        return step - 1
-
-
-def number_of(message: Any) -> int:
-    """Return the number of a message, or that of its header, which only ROS 1 counts; 0 if it has none."""
-    number = getattr(message, "seq", None)
-    return int(getattr(message.header, "seq", 0) if number is None else number)
-
-
-def note_largest_gap(notes: dict[str, int], missing: int, t: int) -> None:
-    """Note a gap if it is the largest so far, with the time of the last event before it [us]."""
-    if missing > notes.get("largest_packet_gap", 0):
-        notes["largest_packet_gap"] = missing
-        notes["largest_packet_gap_us"] = t
 
 
 # Compressed bags: a file that the Zstandard program or rosbag2 has compressed, or the folder of such files. rosbag2 can

@@ -20,16 +20,8 @@ from amiwarp.io.evt_decoder import EvtDecoder, Triggers
 from amiwarp.io.file_scan import Packet, unwrapped
 from amiwarp.io.prophesee import halves_of, words_of
 from amiwarp.io.reading_process import packets
-from amiwarp.io.ros_bags import (
-    RESTART,
-    MessageNumbers,
-    deserialised,
-    messages_of,
-    note_largest_gap,
-    note_unread,
-    number_of,
-    opened_bag,
-)
+from amiwarp.io.ros_bags import messages_of, note_unread, opened_bag
+from amiwarp.io.ros_order import RESTART, in_order, note_largest_gap, numbered
 
 EVT = {"evt3": "3.0", "evt2": "2.0", "evt21": "2.1"}
 """Encodings with Prophesee's words, and their versions."""
@@ -247,29 +239,31 @@ def read_words(
     notes: dict[str, int], path: str, topic: str, encoding: str, swapped: bool
 ) -> Iterator[tuple[NDArray[Any], ...]]:
     """Yield for each message of a topic: its words, their number, what is added to the times from there on [us], how
-    many messages are missing before it (or RESTART), and the times of its recording and of its header [ns].
+    many messages are missing before it (or RESTART or LATE), and the times of its recording and of its header [ns].
     """
     layout = Layout(encoding, swapped)
-    numbers, clock, unknown = MessageNumbers(notes), SensorClock(layout, notes), Unknown(layout)
+    clock, unknown = SensorClock(layout, notes), Unknown(layout)
     unknown.start()
+    whole = True
     with opened_bag(path) as (bag, ros1):
         connections = [found for found in bag.connections if found.topic == topic]
         notes["total"] = max(sum(found.msgcount for found in connections), 1)
-        found = messages_of(bag, connections, ros1=ros1)
-        read = ((one, deserialised(one.connection, one.raw, ros1=ros1)) for one in found)
-        for (one, message), following in _with_next(read):
-            words = checked_words(message, encoding)
-            missing = numbers.missing(one.connection.id, number_of(message))
-            stamp = _stamp(message)
-            after = stamp if following is None else _stamp(following[1])
-            shift = clock.shift(words, stamp, after, restarted=missing == RESTART)
-            if missing:
+        read = (numbered(one, ros1=ros1) for one in messages_of(bag, connections, ros1=ros1))
+        for each, following in _with_next(in_order(read, notes)):
+            words = checked_words(each.message, encoding)
+            after = each.stamp if following is None else following.stamp
+            shift = clock.shift(words, each.stamp, after, restarted=each.missing == RESTART)
+            if not (each.follows and whole):
                 unknown.start()
+            rest = len(each.message.events) % words.itemsize
+            whole = not rest
+            if rest:
+                notes["truncated_bytes"] = notes.get("truncated_bytes", 0) + rest
             if unknown.kinds:
                 words, dropped = unknown.without_events(words)
                 notes["dropped_unplaced_events"] = notes.get("dropped_unplaced_events", 0) + dropped
             notes["read"] = notes.get("read", 0) + 1
-            numbers_of = (len(words), shift, missing, one.recorded, stamp)
+            numbers_of = (len(words), shift, each.missing, each.one.recorded, each.stamp)
             yield words, *(np.array([value], np.int64) for value in numbers_of)
         note_unread(notes)
 
@@ -294,12 +288,6 @@ def check_byte_order(message: Any) -> None:
     """Raise :class:`AmiwarpError` if the words of a message are those of a big-endian machine."""
     if message.is_bigendian:
         raise AmiwarpError("has packets of big-endian words, which are not read; record on a little-endian machine")
-
-
-def _stamp(message: Any) -> int:
-    """Return the time in a message's header [ns]."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 # Decoding, in the program.
@@ -345,7 +333,7 @@ def decoded(path: Path, topic: str, layout: Layout, notes: dict[str, int]) -> It
                 np.add(events.t, offset, out=events.t)
                 np.add(edges.t, offset, out=edges.t)
             if events.t.size:
-                latest = int(events.t[-1])
+                latest = max(latest, int(events.t[-1]))  # those of a late message are earlier
             notes["triggers"] = notes.get("triggers", 0) + len(edges.t)
             notes["unknown_words"] = decoder.unknown
             yield Decoded(events, edges, part, lengths[start:stop], recorded[start:stop], stamps[start:stop])

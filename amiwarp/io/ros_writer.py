@@ -138,8 +138,10 @@ class _Clock:
         parts: list[tuple[NDArray[np.int64], ...]] = [(np.zeros(1, np.int64),) * 3]
         if bag is not None:
             parts = list(event_topic(bag.path, bag.topic)[0].stamps())
-        t, self._recorded, self._stamps = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        t, recorded, self._stamps = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         self._t = np.maximum.accumulate(t)
+        # A message that came late was recorded after those behind it. Packets are written in order.
+        self._recorded = np.minimum.accumulate(recorded[::-1])[::-1]
 
     def packets(self, block: Events) -> Iterator[Events]:
         """Divide a block into packets, none longer than :data:`PACKET_US` or from several messages."""
