@@ -16,7 +16,7 @@ import zstandard
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from amiwarp import AmiwarpError, Events, convert, open_recording
+from amiwarp import AmiwarpError, Events, MemoryEvents, Recording, convert, open_recording, save_recording
 from amiwarp.io import read_encoder_triggers, ros_bags
 from amiwarp.io.prophesee import Halves, halves_of, words_of
 from amiwarp.io.ros_bags import Message
@@ -607,6 +607,75 @@ def test_arrays_of_inivation(tmp_path: Path, package: str, ros1: bool) -> None:
     assert_equal(recording.events.slice(0, 999), EVENTS)
 
 
+# Damaged and empty bags.
+
+
+@pytest.mark.parametrize("encoding", ["evt3", "mono"])
+def test_bytes_that_are_no_whole_word_are_counted(tmp_path: Path, encoding: str) -> None:
+    messages = packets(encoding, EVENTS)
+    for number, each in enumerate(messages):
+        each.seq = number
+    cut = messages[1].events[:-1]
+    messages[1].events = cut
+    recording = open_recording(bag(tmp_path, messages))
+    rest = len(cut) % (2 if encoding == "evt3" else 8)
+    assert recording.metadata["truncated_bytes"] == rest > 0
+
+
+def test_words_behind_a_packet_that_is_cut_off_do_not_follow_it(tmp_path: Path) -> None:
+    """The lost word may be that of the row."""
+    broken = message([*one_event(6000), ROW | 9], 1)
+    broken.events = broken.events[:-1]
+    given = [message(one_event(5000), 0), broken, message([ON | 1, *one_event(7000), ON | 2], 2), message([ON | 3], 3)]
+    found, about = rows(bag(tmp_path, given))
+    assert found == [[5, 7, 5000], [5, 7, 6000], [5, 7, 7000], [2, 7, 7000], [3, 7, 7000]]
+    assert (about["truncated_bytes"], about["dropped_unplaced_events"]) == (1, 1)
+
+
+def test_ros1_bags_that_are_cut_off_or_not_ended_are_named(tmp_path: Path) -> None:
+    whole = bag(tmp_path, packets("evt3", EVENTS, ros1=True), ros1=True).read_bytes()
+    (place,) = re.findall(rb"index_pos=(.{8})", whole[:4096], re.DOTALL)
+    index = int.from_bytes(place, "little")
+    path = tmp_path / "cut.bag"
+    reindex = "copy the whole file again, or run rosbag reindex"
+    known = {
+        index: f"is cut off: it ends after {index:,} bytes, and its index is at byte {index:,}; {reindex}",
+        5000: f"is cut off: it ends after 5,000 bytes, and its index is at byte {index:,}; {reindex}",
+        index + 20: f"is cut off within its index, or the index is damaged; {reindex}",
+        len(whole) - 3: f"is cut off within its index, or the index is damaged; {reindex}",
+        30: "is cut off within its header; copy the whole file again",
+    }
+    for length, text in known.items():
+        path.write_bytes(whole[:length])
+        assert str(refusal(open_recording, path)).endswith(f": {text}")
+    path.write_bytes(whole.replace(b"index_pos=" + place, b"index_pos=" + bytes(8)))
+    text = str(refusal(open_recording, path))
+    assert text.endswith("has no index, because its recording was not ended; run rosbag reindex")
+
+
+@pytest.mark.parametrize("end", [".db3", ".mcap", ".db3.zstd"])
+def test_the_folder_of_a_bag_without_its_metadata_is_named(tmp_path: Path, end: str) -> None:
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("x")
+    assert "is a folder; give a regular file" in str(refusal(open_recording, folder))
+    (folder / f"bag_0{end}").write_bytes(b"x")
+    text = str(refusal(open_recording, folder))
+    assert "is the folder of a ROS 2 bag without its metadata.yaml; run ros2 bag reindex" in text
+
+
+@pytest.mark.parametrize("end", [".bag", ".mcap", ".db3"])
+def test_empty_bags_hold_no_events(tmp_path: Path, end: str) -> None:
+    save_recording(tmp_path / "a.h5", Recording(MemoryEvents(Events.empty(), *SIZE)))
+    path = tmp_path / f"a{end}"
+    convert(tmp_path / "a.h5", path)
+    topic = "/dvs/events" if end == ".bag" else "/event_camera/events"
+    text = str(refusal(open_recording, path))
+    assert f"holds no events: its topic {topic} has no messages; give another recording" in text
+    text = str(refusal(lambda: open_recording(path, topic="/other")))
+    assert "without event topics; its topics are" in text
+
+
 # Compressed bags.
 
 
@@ -718,6 +787,10 @@ def test_damaged_compressed_bags_are_named_and_leave_no_copy(
     cut = tmp_path / "cut.db3.zstd"
     cut.write_bytes(whole[:-200])
     assert re.search(r"cut\.db3\.zstd.* ends after [\d,]+ of [\d,]+ bytes", str(refusal(open_recording, cut)))
+    for length in (len(whole) // 100, 40):
+        cut.write_bytes(whole[:length])
+        text = str(refusal(open_recording, cut))
+        assert text == f"{cut}: is a Zstandard archive that is cut off; copy the whole file again"
     bad = tmp_path / "bad.db3.zstd"
     bad.write_bytes(whole[: len(whole) // 2] + bytes(50) + whole[len(whole) // 2 + 50 :])
     message_ = str(refusal(open_recording, bad))

@@ -89,6 +89,9 @@ FOLDERS = (("metadata.yaml", Format.ROSBAG), ("dataset_events_t.npy", Format.EVI
 """Pairs of the name of a file in a folder and the format that the file identifies."""
 
 
+BAG_ENDS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+"""Ends of the names of the files in the folder of a ROS 2 bag."""
+
 OPENERS = {
     Format.HDF5: "native_format:open_hdf5",
     Format.EVT: "prophesee:open_evt",
@@ -149,6 +152,11 @@ def detect_format(path: Path) -> Format:
     folder = _folder_format(path)
     if folder is not None:
         return folder
+    if path.is_dir() and any(each.name.endswith(BAG_ENDS) for each in path.iterdir()):
+        raise AmiwarpError(
+            f"{path}: is the folder of a ROS 2 bag without its metadata.yaml; "
+            "run ros2 bag reindex, or give one of its files"
+        )
     with errors_name(path, lambda: "opening"), open_input(path) as file:
         head = file.read(HEAD_BYTES)
         file_bytes = os.fstat(file.fileno()).st_size

@@ -32,7 +32,7 @@ from amiwarp.io.ros_bags import (
     typestore,
     unpacked,
 )
-from amiwarp.io.ros_messages import Columns, decode_array, decode_packet
+from amiwarp.io.ros_messages import Columns, decode_array, decode_packet, truncated_bytes
 from amiwarp.io.ros_order import Placed, in_order, note_largest_gap, numbered
 from amiwarp.io.ros_words import EVT, Layout, edge_packets, event_packets, layout_of, stamp_packets
 
@@ -166,6 +166,8 @@ def read_packets(notes: dict[str, int], path: str, topic: str, triggers: bool) -
     for each, ros1 in _topic_messages(notes, path, topic):
         events, edges = _decoded(each, ros1=ros1)
         note_largest_gap(notes, each.missing, latest)
+        if each.message is not None:
+            notes["truncated_bytes"] = notes.get("truncated_bytes", 0) + truncated_bytes(each.message)
         if len(events[2]):
             latest = max(latest, int(events[2][-1]))  # those of a late message are earlier
         notes["read"] = notes.get("read", 0) + 1

@@ -67,11 +67,39 @@ def opened_bag(path: str) -> Iterator[tuple[Any, bool]]:
     readers: dict[bytes, Any] = {ROS1: Reader1, SQLITE: Sqlite3Reader, MCAP: McapReader}
     kind = next((reader for magic, reader in readers.items() if head.startswith(magic)), DirectoryReader)
     bag = kind(Path(path))
-    bag.open()
+    if ros1:
+        _open_ros1(bag, path)
+    else:
+        bag.open()
     try:
         yield bag, ros1
     finally:
         bag.close()
+
+
+def _open_ros1(bag: Any, path: str) -> None:
+    """Open a ROS 1 bag. Raises :class:`AmiwarpError` if it is cut off, or lacks the index at its end."""
+    from rosbags.rosbag1.reader import Header, ReaderError
+
+    try:
+        bag.open()
+    except ReaderError as error:
+        remedy = "copy the whole file again, or run rosbag reindex"
+        if str(error).startswith("Header could not be read"):
+            raise AmiwarpError("is cut off within its header; copy the whole file again") from error
+        if str(error).startswith("Bag is not indexed"):
+            raise AmiwarpError("has no index, because its recording was not ended; run rosbag reindex") from error
+        if not str(error).startswith("Bag index looks damaged"):
+            raise
+        with open(path, "rb") as file:
+            file.readline()
+            place = Header.read(file).get_uint64("index_pos")
+        size = os.path.getsize(path)
+        if place >= size:
+            raise AmiwarpError(
+                f"is cut off: it ends after {size:,} bytes, and its index is at byte {place:,}; {remedy}"
+            ) from error
+        raise AmiwarpError(f"is cut off within its index, or the index is damaged; {remedy}") from error
 
 
 class Message(NamedTuple):
@@ -118,6 +146,9 @@ def choose(bag: Any, topic: str | None, version: int) -> Any:
         return found[topic]
     if found:
         raise AmiwarpError(f"has no events in the topic '{topic}'; the topics with events are {listed}")
+    empty = [one.topic for one in bag.connections if one.msgtype in (*ARRAYS, *PACKETS) and topic in (None, one.topic)]
+    if empty:
+        raise AmiwarpError(f"holds no events: its topic {empty[0]} has no messages; give another recording")
     others = sorted({f"{one.topic} ({one.msgtype.replace('/msg/', '/')})" for one in bag.connections})
     shown = ", ".join(others[:20]) or "none"
     raise AmiwarpError(f"is a ROS {version} bag without event topics; its topics are {shown}; give a bag with events")
@@ -196,14 +227,23 @@ def _unpacked_message(raw: bytes) -> bytes:
 
 
 def packed_head(path: Path) -> bytes:
-    """Return the first bytes of what a Zstandard archive holds, or nothing if it is damaged."""
+    """Return the first bytes of what a Zstandard archive holds, or nothing if it is damaged.
+
+    Raises :class:`AmiwarpError` if the archive ends before them.
+    """
     import zstandard
 
     try:
         with open_input(path) as file, zstandard.ZstdDecompressor().stream_reader(file) as reader:
-            return reader.read(16)
+            if head := reader.read(16):
+                return head
+            file.seek(0)
+            holds_something = zstandard.frame_content_size(file.read(32)) != 0
     except zstandard.ZstdError:
         return b""
+    if holds_something:
+        raise AmiwarpError(f"{path}: is a Zstandard archive that is cut off; copy the whole file again")
+    return b""
 
 
 def is_packed(path: Path) -> bool:

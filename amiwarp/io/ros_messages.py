@@ -17,6 +17,9 @@ from amiwarp.io.ros_words import EVT, check_byte_order
 Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
 
+WORD_BYTES = {"mono": 8, "trigger": 8, "libcaer": 8, "libcaer_cmp": 2}
+"""Encodings without EVT words, and the bytes of an event, or of a word of the compressed one."""
+
 NOTHING: Columns = (np.zeros(0, np.int64),) * 4
 """No events."""
 
@@ -35,10 +38,15 @@ def decode_packet(message: Any) -> tuple[Columns, Columns]:
         return _libcaer(base, data), NOTHING
     if message.encoding == "libcaer_cmp":
         return _libcaer_cmp(base, data), NOTHING
-    known = ", ".join((*EVT, "mono", "trigger", "libcaer", "libcaer_cmp"))
+    known = ", ".join((*EVT, *WORD_BYTES))
     raise AmiwarpError(
         f"has packets with the encoding '{message.encoding[:40]}'; expected one of {known}, in the whole topic"
     )
+
+
+def truncated_bytes(message: Any) -> int:
+    """Return the number of bytes at the end of a message that are no whole word."""
+    return len(message.events) % WORD_BYTES[message.encoding]
 
 
 def _mono(base: int, data: NDArray[np.uint8]) -> Columns:

@@ -256,9 +256,8 @@ def read_words(
             if not (each.follows and whole):
                 unknown.start()
             rest = len(each.message.events) % words.itemsize
-            whole = not rest
-            if rest:
-                notes["truncated_bytes"] = notes.get("truncated_bytes", 0) + rest
+            whole = rest == 0  # otherwise words are lost, which those of the next message may follow
+            notes["truncated_bytes"] = notes.get("truncated_bytes", 0) + rest
             if unknown.kinds:
                 words, dropped = unknown.without_events(words)
                 notes["dropped_unplaced_events"] = notes.get("dropped_unplaced_events", 0) + dropped
