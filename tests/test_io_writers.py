@@ -553,18 +553,26 @@ def test_a_size_that_no_event_shows_comes_back(tmp_path, name):
 def test_the_size_beside_a_text_belongs_to_this_text(tmp_path):
     path = exported(tmp_path, "text", MemoryEvents(make_events(50), *SIZE))
     beside = tmp_path / "out.txt.json"
-    stated = {"width": 320, "height": 240, "time_unit": "s", "bytes": path.stat().st_size}
+    stated = {"width": 320, "height": 240, "time_unit": "s", "compensated": False, "bytes": path.stat().st_size}
     assert json.loads(beside.read_text()) == stated
     path.write_text("0.000001 5 7 1\n")
     assert open_recording(path).events.size == (128, 128)
-    beside.write_text(json.dumps({"width": 0, "height": 240, "bytes": path.stat().st_size}))
-    with pytest.raises(AmiwarpError, match=r"out\.txt\.json: width = 0"):
-        open_recording(path)
+    stated["bytes"] = path.stat().st_size
+    for wrong in ({"width": 0}, {"compensated": 1}, {"time_unit": "ms"}):
+        beside.write_text(json.dumps({**stated, **wrong}))
+        with pytest.raises(AmiwarpError, match=rf"out\.txt\.json: {next(iter(wrong))}\b"):
+            open_recording(path)
     source = save(tmp_path / "source.h5", make_events(50))
-    path.unlink()
-    with pytest.raises(AmiwarpError, match=r"out\.txt\.json: exists; give another name"):
+    with pytest.raises(AmiwarpError, match=r"out\.txt: exists; give another name"):
         convert(source, path)
-    assert not path.exists()
+    path.unlink()
+    convert(source, path)  # replaces what is left over of the text that is gone
+    assert json.loads(beside.read_text())["bytes"] == path.stat().st_size
+    path.rename(tmp_path / "moved.txt")
+    beside.rename(tmp_path / "moved.txt.json")
+    del stated["compensated"]  # as earlier versions wrote it
+    (tmp_path / "moved.txt.json").write_text(json.dumps({**stated, "bytes": (tmp_path / "moved.txt").stat().st_size}))
+    assert open_recording(tmp_path / "moved.txt").events.size == SIZE
 
 
 @pytest.mark.parametrize("name", CLIENTS)
@@ -625,3 +633,98 @@ def test_the_earliest_times_are_written(tmp_path: Path) -> None:
     source = save(tmp_path / "a.h5", Events.from_arrays([1, 2], [3, 4], t, [0, 1]))
     convert(source, tmp_path / "a.npz")
     np.testing.assert_array_equal(open_recording(tmp_path / "a.npz").events.slice(0, 2).t, t)
+
+
+def partly_whole(count: int, whole: int) -> Events:
+    """Return compensated events, of which the first have whole coordinates; some lie outside the image."""
+    rng = np.random.default_rng(5)
+    x, y = (np.floor(rng.uniform(-9, side + 9, count)) for side in SIZE)
+    x[whole:] += 0.25
+    p = (np.arange(count) % 2).astype(np.uint8)
+    return Events(x.astype(np.float32), y.astype(np.float32), np.arange(count) * 10, p)
+
+
+@pytest.mark.parametrize("ending", [".txt", ".csv"])
+@pytest.mark.parametrize(("count", "whole"), [(2000, 1100), (8000, 7000), (2000, 2000), (1, 1)])
+def test_compensated_events_in_text_are_known_without_fractions(tmp_path, ending, count, whole):
+    events = partly_whole(count, whole)
+    path = tmp_path / f"out{ending}"
+    convert(save(tmp_path / "source.h5", events), path)
+    assert json.loads((tmp_path / f"out{ending}.json").read_text())["compensated"] is True
+    found = open_recording(path).events.slice(0, count + 1)
+    assert not found.whole_pixels
+    assert_columns(tuple(getattr(found, name) for name in "xytp"), events)
+    assert open_recording(path).metadata["format"] == "text"
+
+
+def test_whole_pixels_in_text_stay_whole(tmp_path):
+    """Also such as fixed-point numbers, and of more events than a camera sends: amiwarp says what they are."""
+    events = Events.from_arrays(np.full(5000, 2048), np.full(5000, 1024), np.arange(5000) // 2500, np.arange(5000) % 2)
+    save_recording(tmp_path / "source.h5", Recording(MemoryEvents(events, 4096, 2048)))
+    convert(tmp_path / "source.h5", tmp_path / "out.csv")
+    found = open_recording(tmp_path / "out.csv").events.slice(0, 5001)
+    assert found.whole_pixels
+    assert_columns(tuple(getattr(found, name) for name in "xytp"), events)
+
+
+def test_rounded_events_in_text_are_whole(tmp_path):
+    convert(save(tmp_path / "source.h5", moved()), tmp_path / "out.csv", rounding="nearest")
+    assert json.loads((tmp_path / "out.csv.json").read_text())["compensated"] is False
+
+
+FOREIGN = {
+    "list": b"[1, 2]",
+    "prose": b"my notes",
+    "empty": b"",
+    "object": b'{"width": 3, "height": 4, "bytes": 0}',
+    "long": b'{"a": "' + b"a" * 9000 + b'"}',
+    "not UTF-8": b"\xff\xfe\x00",
+}
+"""Files beside a text that amiwarp did not write."""
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_file_of_another_program_beside_a_text(tmp_path, name):
+    """It is ignored when the text is read, and never replaced."""
+    source = save(tmp_path / "source.h5", make_events(50))
+    path = tmp_path / "out.csv"
+    beside = tmp_path / "out.csv.json"
+    beside.write_bytes(FOREIGN[name])
+    path.write_text("t_us,x,y,p\n5,6,7,1\n")
+    assert open_recording(path).events.size == (128, 128)
+    for _ in range(2):  # with and without a text
+        with pytest.raises(AmiwarpError, match=r"out\.csv\.json: was not written by amiwarp, .* another name"):
+            convert(source, path, overwrite=True)
+        assert beside.read_bytes() == FOREIGN[name]
+        path.unlink(missing_ok=True)
+    assert sorted(os.listdir(tmp_path)) == ["out.csv.json", "source.h5"]
+
+
+@pytest.mark.parametrize(
+    ("ending", "message"), [(".csv", "only names of columns in line 1"), (".txt", "another recording")]
+)
+def test_texts_without_events_say_so(tmp_path, ending, message):
+    path = tmp_path / f"out{ending}"
+    convert(save(tmp_path / "source.h5", Events.empty()), path)
+    with pytest.raises(AmiwarpError, match=rf"out{ending}: holds no events.*{message}"):
+        open_recording(path)
+    (tmp_path / "out.txt").write_bytes(b"")
+    (tmp_path / "out.txt.json").unlink(missing_ok=True)
+    with pytest.raises(AmiwarpError, match=r"out\.txt: is empty; give a recording"):
+        open_recording(tmp_path / "out.txt")
+
+
+def test_what_amiwarp_says_of_a_text_is_believed(tmp_path):
+    """Coordinates that could be polarities, and fractions in a text that is said to have none."""
+    x, y = np.full((2, 40), -5, np.float32)
+    events = Events(x, y, np.arange(40) * 10, (np.arange(40) % 2).astype(np.uint8))
+    path = exported(tmp_path, "text", MemoryEvents(events, *SIZE))
+    recording = open_recording(path)
+    assert recording.metadata == {"format": "text"}
+    assert_columns(tuple(getattr(recording.events.slice(0, 41), name) for name in "xytp"), events)
+    beside = tmp_path / "out.txt.json"
+    path.write_text(path.read_text().replace("-5.000000", "5.2500000"))
+    assert not open_recording(path).events.slice(0, 1).whole_pixels
+    beside.write_text(beside.read_text().replace("true", "false"))
+    with pytest.raises(AmiwarpError, match=r"line 1 is '0\.000000 5\.2500000 5\.2500000 0'"):
+        open_recording(path)

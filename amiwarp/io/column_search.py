@@ -44,7 +44,7 @@ def find_layout(columns: Sequence[Column], given: GivenLayout, hints: Hints) -> 
     assumptions += said
     compensated = hints.compensated and all(chosen[role].values.dtype.kind == "f" for role in "xy")
     scale = given.scale_xy or 1
-    if given.scale_xy is None and not compensated:
+    if given.scale_xy is None and not compensated and not hints.is_own:
         _check_scale(chosen["x"].values, chosen["y"].values)
     return Layout(
         columns=roles,

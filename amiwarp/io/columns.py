@@ -49,7 +49,8 @@ class Hints:
     is_text: bool = False
     """Whether the file is text, which OpenMV does not write."""
     is_own: bool = False
-    """Whether the layout is amiwarp's own in all details, so that its promised unit is believed for any rate."""
+    """Whether the layout is amiwarp's own in all details: its promised unit is believed for any rate, and x and y in
+    pixels."""
 
 
 Coding: TypeAlias = Mapping[int, bool]

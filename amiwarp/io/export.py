@@ -26,7 +26,8 @@ from amiwarp.io.file_scan import ASSUMED, ASSUMED_SIZE, RECORDS, FileEvents, ass
 from amiwarp.io.files import NewFile, check_output, errors_name
 from amiwarp.io.formats import LIMITS, Bag, Codec, Outline, OutputFormat, Rounding, open_recording
 from amiwarp.io.native_format import write_recording
-from amiwarp.io.plain_files import size_file, write_array, write_size
+from amiwarp.io.plain_files import write_array
+from amiwarp.io.text_size import TextSize, may_replace_size, size_file, write_size
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import NominalPrism
 from amiwarp.tasks import Progress
@@ -70,11 +71,11 @@ def export(
         new = files.enter_context(NewFile(path, overwrite=overwrite))
         beside = None
         if limits.text_unit is not None:
-            beside = files.enter_context(NewFile(size_file(path), overwrite=overwrite))
+            beside = files.enter_context(NewFile(size_file(path), overwrite=may_replace_size(path) or overwrite))
         try:
             write(new.part, written, outline)
             if beside is not None and limits.text_unit is not None:
-                write_size(beside.part, new.part, outline, limits.text_unit)
+                write_size(beside.part, new.part, TextSize(size, limits.text_unit, pixels.fractional))
         except BaseException as error:
             if error in foreign:
                 raise
@@ -144,6 +145,8 @@ class Pixels:
         self._limits, self._size, self._rounding = limits, size, rounding
         self._random = np.random.default_rng(whole(seed, "seed", 0, 2**63 - 1))
         self.dropped = 0
+        self.fractional = False
+        """Whether events with fractional pixels, which are compensated, were kept so far."""
 
     def __call__(self, events: Events) -> Events:
         """Return events as the format holds them. Raises :class:`AmiwarpError` if they need rounding, or must not."""
@@ -154,6 +157,7 @@ class Pixels:
         if self._rounding is not None:
             return self._rounded(events, self._rounding)
         if self._limits.fractional:
+            self.fractional = True
             return events
         names = " or ".join(Rounding)
         exact = [end for end, one in formats.EXTENSIONS.items() if one in LIMITS and LIMITS[one].fractional]

@@ -26,6 +26,7 @@ from amiwarp.io.files import check_regular, errors_name, name_kind, note_folders
 from amiwarp.io.json_files import read_json
 from amiwarp.io.ros_bags import MCAP, ROS1, SQLITE, ZSTANDARD, packed_head
 from amiwarp.io.text_rows import HEAD_BYTES, looks_like_text, why_no_rows
+from amiwarp.io.text_size import read_size
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import choice, guarded, instance, shown, whole
 
@@ -160,6 +161,8 @@ def detect_format(path: Path) -> Format:
     with errors_name(path, lambda: "opening"), open_input(path) as file:
         head = file.read(HEAD_BYTES)
         file_bytes = os.fstat(file.fileno()).st_size
+    if not head and read_size(path) is not None:
+        raise AmiwarpError(f"{path}: holds no events; give another recording")
     if not head:
         raise AmiwarpError(f"{path}: is empty; give a recording")
     for magic, found in SIGNATURES:

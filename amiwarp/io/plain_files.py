@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import zipfile
@@ -28,10 +27,8 @@ from amiwarp.io.formats import (
     check_ending,
     looks_like_bin,
 )
-from amiwarp.io.json_files import read_json
 from amiwarp.optics.camera import LARGEST_SIZE, Camera, RadialTangential
 from amiwarp.tasks import in_order
-from amiwarp.validation import one_of, whole
 
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
@@ -53,7 +50,7 @@ def read_calib(path: Path, width: int, height: int) -> Camera:
 # x and y of compensated events have six decimals; ``nan`` marks those without coordinates.
 #
 # Other readers take a further line or column for events. So the sensor size and the unit of time are in a file beside
-# the text, with the number of bytes of the text that they belong to.
+# the text, see :mod:`amiwarp.io.text_size`.
 
 LINES = 1 << 17
 """Number of events that are formatted at a time."""
@@ -66,13 +63,13 @@ Digits = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 
 
 def write_text(part: Path, blocks: Iterable[Events], about: Outline) -> None:
-    """Write all events as the Event Camera Dataset does. :func:`write_size` writes the sensor size."""
+    """Write all events as the Event Camera Dataset does. Their sensor size is in a file of its own."""
     with part.open("xb") as file:
         _write_lines(file, blocks, format_events)
 
 
 def write_csv(part: Path, blocks: Iterable[Events], about: Outline) -> None:
-    """Write all events as a table between commas. :func:`write_size` writes the sensor size."""
+    """Write all events as a table between commas. Their sensor size is in a file of its own."""
     with part.open("xb") as file:
         file.write(b"t,x,y,p\n")
         _write_lines(file, blocks, format_rows)
@@ -126,32 +123,6 @@ def _fractional(values: NDArray[Any]) -> list[Digits]:
             kept[:, unknown] = False
         columns += [(np.full((1, len(values)), ord(letter), np.uint8), unknown[None]) for letter in "nan"]
     return columns
-
-
-def size_file(path: Path) -> Path:
-    """Return the file with the sensor size of a text file."""
-    return path.with_name(f"{path.name}.json")
-
-
-def write_size(part: Path, text: Path, about: Outline, unit: str) -> None:
-    """Write the sensor size and the unit of time of the finished file ``text``."""
-    fields = {"width": about.width, "height": about.height, "time_unit": unit, "bytes": text.stat().st_size}
-    part.write_text(json.dumps(fields) + "\n", encoding="ascii", newline="\n")
-
-
-def read_size(path: Path) -> tuple[tuple[int, int], str] | None:
-    """Return the sensor size [px] and the unit of time that :func:`write_size` wrote for a text file.
-
-    None if there is no such file, or if it is about another text than this one.
-    """
-    beside = size_file(path)
-    if not beside.is_file():
-        return None
-    fields = read_json(beside, "the sensor size of a text file")
-    if fields.get("bytes") != path.stat().st_size:
-        return None
-    width, height = (whole(fields.get(name), f"{beside}: {name}", 1, LARGEST_SIZE) for name in ("width", "height"))
-    return (width, height), one_of(fields.get("time_unit"), ("s", "us"), f"{beside}: time_unit")
 
 
 def _mark(character: str, count: int) -> Digits:

@@ -5,7 +5,7 @@ which some exporters write, gives the sensor size. A ``calib.txt`` in the same f
 ``fx fy cx cy k1 k2 p1 p2 k3``. If most of the first events have fractional x or y, all are compensated, and ``nan``
 marks events without coordinates.
 
-The size may also be in a file beside it, as amiwarp writes it.
+The size may also be in a file beside it, as amiwarp writes it, see :mod:`amiwarp.io.text_size`.
 
 Other tables have columns between commas, semicolons, tabs or spaces, and may begin with a line of names. Empty lines
 and lines that start with ``#`` or ``%`` are comments. A comment may give the names, or the size as ``geometry``.
@@ -37,7 +37,7 @@ from amiwarp.io.column_units import LONGEST_S
 from amiwarp.io.columns import Column, Hints, Layout
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.files import LONGEST_LINE, errors_name
-from amiwarp.io.plain_files import read_calib, read_size
+from amiwarp.io.plain_files import read_calib
 from amiwarp.io.text_rows import (
     BOM,
     TextRow,
@@ -48,6 +48,7 @@ from amiwarp.io.text_rows import (
     text_tail,
     why_no_rows,
 )
+from amiwarp.io.text_size import TextSize, read_size
 from amiwarp.optics.camera import LARGEST_SIZE
 
 READ_BYTES = 1 << 22
@@ -81,8 +82,8 @@ class TextForm:
     """Sensor size that the file states [px], or None."""
     stamped: tuple[int, ...]
     """Indices of the columns that are dates with times of day."""
-    unit: str | None = None
-    """Unit of time in the text that amiwarp writes, or None."""
+    own: TextSize | None = None
+    """What amiwarp wrote beside the text, or None."""
 
 
 def open_text(path: Path, given: GivenLayout) -> Recording:
@@ -90,9 +91,9 @@ def open_text(path: Path, given: GivenLayout) -> Recording:
     with errors_name(path, lambda: "line 1"):
         head, is_cut = text_head(path, max(HEAD_BYTES, 2 * LONGEST_LINE))
         form = _find_form(path, head)
-    beside = read_size(path)
-    if beside is not None:  # amiwarp has written the text
-        form = replace(form, size=beside[0], unit=beside[1])
+    own = read_size(path)
+    if own is not None:
+        form = replace(form, names=form.names or ROLES, size=own.size, own=own)
     with errors_name(path, lambda: "finding the columns"):
         layout = _find_text_layout(head, is_cut, form, given)
     events = FileEvents(
@@ -224,7 +225,9 @@ def _find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLay
     ]
     if names is not None and not any(names):
         columns = [replace(column, name=None) for column in columns]
-    hints = Hints(is_text=True, unit=form.unit)
+    hints = Hints(is_text=True)
+    if form.own is not None:
+        hints = replace(hints, unit=form.own.unit, is_own=True)
     if names is None:
         hints = replace(hints, order=ROLES, fractions="s")
     layout = find_layout(columns, given, hints)
@@ -240,6 +243,8 @@ def _find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLay
             assumptions=tuple(each for each in layout.assumptions if each.what != "time unit"),
         )
         layout = replace(layout, is_promised=given == GivenLayout() and not layout.assumptions)
+    if form.own is not None and form.own.compensated is not None:
+        return replace(layout, compensated=form.own.compensated)
     places = numbers[:, [layout.columns["x"], layout.columns["y"]]]
     fractional = bool((places != np.floor(places)).any(axis=1).mean() > 0.5)
     return replace(layout, compensated=fractional)

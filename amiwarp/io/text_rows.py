@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+from amiwarp.io.column_names import names_roles
 from amiwarp.io.files import open_input
 
 HEAD_BYTES = 4096
@@ -280,6 +281,8 @@ def why_no_rows(head: bytes) -> str | None:
     at = counts.index(max(counts))
     number, line = lines[at]
     shown = line[:80].decode("utf-8", "replace").strip()
+    if len(lines) == 1 and names_roles(TextRow.of(line).names(line)):
+        return f"holds no events, only names of columns in line {number}; give another recording"
     if not counts[at]:
         return f"is text, but line {number} '{shown}' holds no numbers; expected rows of t, x, y and p"
     wrong = next((word for word in TextRow.of(line).words(line) if not _is_number(word)), None)
