@@ -448,6 +448,64 @@ REFUSED: dict[str, tuple[Maker, str]] = {
         lines([(stamp[11:], *rest) for stamp, *rest in dates()], separator=",", head="t,x,y,p\n"),
         r"line 2 '12:00:00.000191,.*' holds '12:00:00.000191', which is no number; .* such as 2024-05-01T12:",
     ),
+    "a missing value in the first row": (
+        lines([(T[0], "NA", 5, 1), *ROWS.tolist()], separator=",", head="t,x,y,p\n"),
+        r"is text, but line 2 '191,NA,5,1' holds 'NA', which is no number",
+    ),
+    "a missing value in a later row": (
+        lines([*ROWS.tolist(), (T[-1], 5, "NA", 1)], separator=",", head="t,x,y,p\n"),
+        r"line 1002 is '\d+,5,NA,1' and holds 'NA', which is no number; expected 't x y p'",
+    ),
+    "an empty value": (
+        lines([*ROWS.tolist(), (T[-1], 5, "", 1)], separator=",", head="t,x,y,p\n"),
+        r"line 1002 is '\d+,5,,1', in which y has no value; expected",
+    ),
+    "a date in the first row": (
+        lines([("2024-05-01", 5, 6, 1), *dates()], separator=",", head="t,x,y,p\n"),
+        r"line 2 '2024-05-01,5,6,1' holds '2024-05-01', which is a date without a time of day, such as T00:00:00; ",
+    ),
+    "a date in a later row": (
+        lines([*dates(), ("2024-05-02", 5, 6, 1)], separator=",", head="t,x,y,p\n"),
+        r"line 1002 is '2024-05-02,5,6,1' and holds '2024-05-02', which is a date without a time of day",
+    ),
+    "fractions in some rows": (
+        lines([(t, x + 0.5 * (t % 4 == 1), y, p) for t, x, y, p in ROWS.tolist()], separator=","),
+        r"line \d+ is '\d+,\d+\.5,\d+,[01]', in which x has a fraction; expected",
+    ),
+    "a fraction of y": (
+        lines([*ROWS.tolist(), (T[-1], 5, 6.5, 1)], separator=","), r"line 1001 is '.*', in which y has a fraction; ",
+    ),
+    "underscores between thousands": (
+        lines([(f"{t:_}", *rest) for t, *rest in ROWS.tolist()], separator=",", head="t,x,y,p\n"),
+        r"line \d+ is '1_\d+,\d+,\d+,[01]' and holds '1_\d+', which is no number; expected",
+    ),
+    "underscores between thousands in the first row": (
+        lines([(f"{t + 1000:_}", *rest) for t, *rest in ROWS.tolist()], separator=",", head="t,x,y,p\n"),
+        r"is text, but line 2 '1_191,.*' holds '1_191', which is no number",
+    ),
+    "narrow spaces between thousands": (
+        lines([(f"{t:,}".replace(",", "\u202f"), *rest) for t, *rest in ROWS.tolist()], separator=";"),
+        r"and holds '1\\u202f\d+', which is no number",
+    ),
+    "a unit that is not the one in the name": (
+        lines(ROWS, separator=",", head="t_ms,x,y,p\nus,px,px,-\n"),
+        r"line 2 gives the unit us for column t_ms; change the name or the line",
+    ),
+    "a second line that holds more than units": (
+        lines(ROWS, separator=",", head="t,x,y,p\nus,left,px,-\n"),
+        r"is text, but line 2 'us,left,px,-' holds neither numbers nor only units; leave it out",
+    ),
+    "days since 1900": (
+        lines([(f"{45413.5 + t / 86400e6:.9f}", *rest) for t, *rest in ROWS.tolist()], separator=",", head="t,x,y,p\n"),
+        r"times from 45413\.5\d* may be days since 1900, as Excel counts them, or seconds; .* --time-unit s",
+    ),
+    "days since 1900 without names": (
+        lines([(f"{45413.5 + t / 86400e6:.9f}", *rest) for t, *rest in ROWS.tolist()]), r"may be days since 1900",
+    ),
+    "a rate that no camera has, with fractions": (
+        lines([(f"{5 + k % 2 * 5e-7!r}", k % 640, k % 7, k % 2) for k in range(2500)], separator=",", head="t,x,y,p\n"),
+        r"times have fractions, and the first 2,500 events span 5e-07, in which no camera sends .* --time-unit",
+    ),
     "a date that is none": (
         lines([("2024-05-32T12:00:00", *rest) for _, *rest in dates()], separator=","),
         r"holds '2024-05-32T12:00:00', which is no number",
@@ -914,6 +972,77 @@ def test_an_empty_value_does_not_shift_a_row(tmp_path: Path, monkeypatch: pytest
             path.write_text("t,x,y,p\n" + "\n".join([*rows[:500], wrong, *rows[500:]]) + "\n")
             with pytest.raises(AmiwarpError, match=rf"line 502 is '{wrong}'"):
                 open_recording(path)
+
+
+UNDER_NAMES = {
+    "units": ("t,x,y,p\nus,px,px,-\n", "us", True),
+    "units in brackets": ("t,x,y,p\n[ms],[px],[px],[-]\n", "ms", True),
+    "units and none": ("t,x,y,p\nns,,,\n", "ns", True),
+    "the unit in the name, too": ("t_us,x,y,p\nus,px,px,-\n", "us", True),
+    "Excel's separator": ("sep=,\nt,x,y,p\n", "us", False),
+    "Excel's separator, quoted": ('"sep=,"\nt_us,x,y,p\n', "us", True),
+    "both": ("\ufeffSEP=,\nt,x,y,p\nus,px,px,-\n", "us", True),
+}
+"""Lines above the rows, the unit of time, and whether they state it."""
+
+
+@pytest.mark.parametrize("name", UNDER_NAMES)
+def test_lines_of_units_and_separators(tmp_path: Path, name: str) -> None:
+    head, unit, is_stated = UNDER_NAMES[name]
+    recording = open_recording(made(tmp_path, lines(ROWS, separator=",", head=head)))
+    events = of(recording)
+    times = {"us": T, "ms": T * 1000, "ns": (T + 500) // 1000}[unit]
+    for found, expected in ((events.x, X), (events.y, Y), (events.t, times), (events.p, P)):
+        np.testing.assert_array_equal(found, expected)
+    assert recording.metadata["time_unit"] == unit
+    assert ("assumed_time_unit" in recording.metadata) is not is_stated
+
+
+@pytest.mark.parametrize(
+    ("form", "offset", "options", "note"),
+    [
+        ("{:.5E}", 123_456_000_000, {}, "to 6 significant digits: steps of 1,000,000 us; export them with all digits"),
+        ("{:.5g}", 5_000_000, {}, "to 5 significant digits: steps of 100 us; export them with all digits"),
+        ("{:.10e}", 123_456_000_000, {}, "to 11 significant digits: steps of 10 us; export them with all digits"),
+        ("{:.11e}", 123_456_000_000, {}, None),
+        ("{:.9e}", 1_234_560, {"time_unit": "ms"}, None),
+        ("{:.5e}", 123_456, {"time_unit": "ms"}, "to 6 significant digits: steps of 1 ms; export them with all digits"),
+        (
+            "{:.6e}",
+            123_456,
+            {"time_unit": "ms"},
+            "to 7 significant digits: steps of 0.1 ms; export them with all digits",
+        ),
+        ("{}", 123_000_000, {}, None),
+    ],
+)
+def test_rounded_times_are_said(
+    tmp_path: Path, form: str, offset: int, options: dict[str, Any], note: str | None
+) -> None:
+    rows = [(form.format(t + offset), *rest) for t, *rest in ROWS.tolist()]
+    recording = open_recording(made(tmp_path, lines(rows, separator=",", head="t,x,y,p\n")), **options)
+    assert recording.metadata.get("rounded_times") == note
+
+
+def test_one_time_with_an_exponent_is_not_rounded(tmp_path: Path) -> None:
+    """R writes 100000 as 1e+05 among times with all digits."""
+    rows = [("1e+05" if k == 500 else t + 99_000, *rest) for k, (t, *rest) in enumerate(ROWS.tolist())]
+    recording = open_recording(made(tmp_path, lines(rows, separator=",", head="t_us,x,y,p\n")))
+    assert "rounded_times" not in recording.metadata
+
+
+@pytest.mark.parametrize("read_bytes", [64, 1 << 22])
+def test_a_last_line_without_an_end_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read_bytes: int) -> None:
+    monkeypatch.setattr("amiwarp.io.text_files.READ_BYTES", read_bytes)
+    path = made(tmp_path, lines(ROWS))
+    assert "unended_last_lines" not in open_recording(path).metadata
+    path.write_text(path.read_text().rstrip("\n"))
+    recording = open_recording(path)
+    assert_same(recording)
+    assert recording.metadata["unended_last_lines"] == 1
+    assert convert(path, tmp_path / "a.h5").repairs == {"unended_last_lines": 1}
+    path.write_text("5 6 7 1")
+    assert "unended_last_lines" not in open_recording(path).metadata
 
 
 def test_rare_names_are_said(tmp_path: Path) -> None:

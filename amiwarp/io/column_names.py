@@ -6,6 +6,8 @@ Names that nearly always mean the same decide first, then those that only stand 
 import re
 from collections.abc import Collection, Iterable, Sequence
 
+from amiwarp.errors import AmiwarpError
+
 ROLES = ("t", "x", "y", "p")
 """Columns of an event: time, column and row of the pixel, polarity."""
 
@@ -91,6 +93,27 @@ def unit_in(name: str) -> str | None:
     """Return the unit of time in the name of a column, or None."""
     role, unit = role_of(name)
     return _rare_role_of(name)[1] if role is None else unit
+
+
+NO_TIME_UNITS = ("", "-", "1", "px", "pixel", "pixels", "bool")
+"""Units of columns that are no times, in a line of units."""
+
+
+def units_in(names: Sequence[str], row: Sequence[str], where: str) -> tuple[str | None, ...] | None:
+    """Return the units of time in a line of units below the names of columns; None if the line is none.
+
+    ``where`` names the line for messages. Raises :class:`AmiwarpError` if a name states another unit.
+    """
+    words = [word.strip().strip("[](){}").strip().lower() for word in row]
+    units = [unit_of(word) for word in words]
+    known = all(unit is not None or word in NO_TIME_UNITS for word, unit in zip(words, units, strict=True))
+    if not known or not any(units):
+        return None
+    for name, unit in zip(names, units, strict=False):
+        stated = unit_in(name)
+        if unit is not None and stated not in (None, unit):
+            raise AmiwarpError(f"{where} gives the unit {unit} for column {name}; change the name or the line")
+    return tuple(units)
 
 
 def roles_of(names: Sequence[str]) -> dict[str, list[int]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +11,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.column_names import unit_in
-from amiwarp.io.column_options import GivenLayout
+from amiwarp.io.column_options import TIME_UNITS, GivenLayout
 from amiwarp.io.columns import Column, Hints, Layout
 from amiwarp.validation import TIME_LIMIT
 
@@ -25,7 +27,10 @@ EPOCH_MS = 10**12, 4 * 10**12
 EPOCH_S = 10**9, 4 * 10**9
 """Range of times since 1970, from 2001 to 2096 [s]. As microseconds they are half an hour after the start."""
 MOST_PER_STEP = 20
-"""Number of events per step of time from which on times in :data:`EPOCH_S` may be whole seconds."""
+"""Number of events per step of time from which on times in :data:`EPOCH_S` may be whole seconds, and seconds in
+:data:`EXCEL_DAYS` may be days."""
+EXCEL_DAYS = 36_526, 73_051
+"""Range of times since 1900 as Excel counts them, from 2000 to 2099 [d]. As seconds they are half a day."""
 
 
 def find_unit(column: Column, given: GivenLayout, hints: Hints) -> tuple[str, str | None]:
@@ -103,9 +108,20 @@ def _whole_doubt(t: NDArray[Any]) -> str:
 
 def _unit_of_fractions(t: NDArray[Any], hints: Hints) -> tuple[str, str | None]:
     """Return the unit of times with fractions, and why it was assumed; None if the format promises it."""
+    span = float(t.max() - t.min())
+    in_days = EXCEL_DAYS[0] <= t.min() and t.max() < EXCEL_DAYS[1]
+    if in_days and t.size > MOST_PER_STEP * max(span * 1e6, 1.0):
+        raise AmiwarpError(
+            f"the unit of time is in doubt: times from {float(t.min()):.15g} may be days since 1900, as Excel counts "
+            "them, or seconds; change them to seconds, or give --time-unit s"
+        )
+    if t.size > MOST_PER_US * max(span * 1e6, 1.0) + 1000:
+        raise AmiwarpError(
+            f"the unit of time is in doubt: times have fractions, and the first {t.size:,} events span {span:.6g}, in "
+            "which no camera sends as many if these are seconds; give it with --time-unit s, ms, us or ns"
+        )
     if hints.fractions is not None:
         return hints.fractions, None
-    span = float(t.max() - t.min())
     if span > 10.0 and t.size / span < 1000.0:
         raise AmiwarpError(
             f"the unit of time is in doubt: times have fractions, and the first {t.size:,} events span {span:.6g}; "
@@ -124,6 +140,26 @@ def _unit_of_whole(t: NDArray[Any]) -> tuple[str, str]:
     if span > LONGEST_S * 10**6:
         raise AmiwarpError(_whole_doubt(t))
     return "us", f"times are whole numbers, and the first {t.size:,} events span {span * 1e-6:.3g} s then"
+
+
+EXPONENT = re.compile(rb"[+-]?(\d)(?:\.(\d*))?[eE]([+-]?\d+)")
+"""Pattern of a number with an exponent, of which the first digit, the decimals and the exponent are found."""
+
+
+def rounded_times_note(words: Sequence[bytes], unit: str) -> str | None:
+    """Return a note on times that a program has rounded to few digits, as 1.23457E+11; None for others.
+
+    Only numbers with exponents show it. Steps of a microsecond are no loss.
+    """
+    found = [match for match in map(EXPONENT.fullmatch, words) if match is not None]
+    if 2 * len(found) <= len(words):
+        return None
+    digits = 1 + max(len(match[2] or b"") for match in found)
+    step = 10.0 ** (max(int(match[3]) for match in found) + 1 - digits)
+    if step * TIME_UNITS[unit] < 2.0:  # the next step is 10 us
+        return None
+    shown = f"{step:,.0f}" if step > 0.5 else f"{step:g}"
+    return f"to {digits} significant digits: steps of {shown} {unit}; export them with all digits"
 
 
 def check_duration(layout: Layout, duration_us: int) -> None:

@@ -94,6 +94,8 @@ class Layout:
     """Whether the file has a documented layout, and nothing was assumed."""
     names: Mapping[str, str] = field(default_factory=dict)
     """Name or number of the column of each role, for the metadata."""
+    rounded_times: str | None = None
+    """What a program that wrote the text has rounded times to, or None."""
 
     @property
     def chosen(self) -> tuple[int, ...]:
@@ -103,10 +105,11 @@ class Layout:
     @property
     def metadata(self) -> dict[str, MetadataValue]:
         """Columns, unit and assumptions, for the metadata of a recording; empty for a layout that a format promises."""
+        rounded = {} if self.rounded_times is None else {"rounded_times": self.rounded_times}
         if self.is_promised:
-            return {}
+            return {**rounded}
         columns = ", ".join(f"{role} = {name}" for role, name in self.names.items())
-        return {"columns": columns, "time_unit": self.unit, **dict(each.entry for each in self.assumptions)}
+        return {"columns": columns, "time_unit": self.unit, **rounded, **dict(each.entry for each in self.assumptions)}
 
     def events(self, *columns: NDArray[Any], notes: dict[str, int]) -> Packet:
         """Return the events of the columns in the order of :attr:`chosen`. Counts go to ``notes``."""

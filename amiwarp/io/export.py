@@ -403,7 +403,7 @@ def left_out(recording: Recording, chosen: OutputFormat) -> tuple[str, ...]:
     if chosen is OutputFormat.NATIVE:
         return ("triggers",) if recording.metadata.get("triggers") and recording.encoder is None else ()
     known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {}), "other_topics", "columns"}
-    known |= {"time_unit", "time_zone"}
+    known |= {"time_unit", "time_zone", "rounded_times"}
     known |= {name for name in recording.metadata if name.startswith(ASSUMED)}
     from_bag = str(recording.metadata.get("format")).startswith("rosbag")
     copied = bag_of(recording, chosen) is not None

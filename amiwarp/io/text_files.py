@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, Recording
 from amiwarp.io.column_files import check_table
-from amiwarp.io.column_names import ROLES, names_roles, roles_of
+from amiwarp.io.column_names import ROLES, names_roles, roles_of, units_in
 from amiwarp.io.column_options import TIME_UNITS, GivenLayout
 from amiwarp.io.column_search import find_layout
-from amiwarp.io.column_units import LONGEST_S
+from amiwarp.io.column_units import LONGEST_S, rounded_times_note
 from amiwarp.io.columns import Column, Hints, Layout
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.files import LONGEST_LINE, errors_name
@@ -43,10 +43,12 @@ from amiwarp.io.text_rows import (
     TextRow,
     doubtful_comma,
     holds_values,
+    number_of,
     text_head,
     text_pieces,
     text_tail,
     why_no_rows,
+    wrong_word,
 )
 from amiwarp.io.text_size import TextSize, read_size
 from amiwarp.optics.camera import LARGEST_SIZE
@@ -82,6 +84,8 @@ class TextForm:
     """Sensor size that the file states [px], or None."""
     stamped: tuple[int, ...]
     """Indices of the columns that are dates with times of day."""
+    units: tuple[str | None, ...] | None = None
+    """Unit of time of each column in a line below the names, or None without such a line."""
     own: TextSize | None = None
     """What amiwarp wrote beside the text, or None."""
 
@@ -121,6 +125,7 @@ def _find_form(path: Path, head: bytes) -> TextForm:
     """Return the form of a file that begins with ``head``."""
     comments: list[str] = []
     names: tuple[str, ...] | None = None
+    units: tuple[str | None, ...] | None = None
     size: tuple[int, int] | None = None
     position, number = len(BOM) * head.startswith(BOM), 0
     for line in io.BytesIO(head[position:]):  # which only a newline ends, as in the reader of all lines
@@ -150,11 +155,14 @@ def _find_form(path: Path, head: bytes) -> TextForm:
                 names=_without_empty_end(names, width) or _commented(comments, row, width),
                 size=size or _commented_size(comments),
                 stamped=row.stamped(line),
+                units=units,
             )
         elif names is None:
             names = TextRow.of(line).names(line)
         else:
-            break
+            units = units_in(names, TextRow.of(line).names(line), f"{path}: line {number + 1}")
+            if units is None:
+                break
         position, number = position + len(line), number + 1
     why = (
         why_no_rows(head) or f"line {number + 1} holds no numbers; expected 't x y p', or names of columns before them"
@@ -210,7 +218,7 @@ def _find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLay
         words = form.row.words(line) if holds_values(line) else []
         if len(words) == form.width:
             with contextlib.suppress(ValueError):  # the reader names such a line
-                values.append([float(word) for word in words])
+                values.append([number_of(word) for word in words])
                 rows.append(words)
     numbers = np.array(values).reshape(-1, form.width)
     if form.names is not None and len(form.names) != form.width and given.columns is None:
@@ -219,8 +227,9 @@ def _find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLay
             f"the order with --columns, such as {_order_for(form.names, numbers)}"
         )
     names = form.names if form.names is not None and len(form.names) == form.width else None
+    units = form.units if form.units is not None and len(form.units) >= form.width else (None,) * form.width
     columns = [
-        Column(names[at] if names else None, _whole_if_possible(values), "us" if at in form.stamped else None)
+        Column(names[at] if names else None, _whole_if_possible(values), "us" if at in form.stamped else units[at])
         for at, values in enumerate(numbers.T)
     ]
     if names is not None and not any(names):
@@ -234,6 +243,7 @@ def _find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLay
     if layout.columns["t"] in form.stamped and given.time_unit is not None:
         raise AmiwarpError(f"times are dates, but --time-unit is {given.time_unit}; leave it out")
     t_words = [words[layout.columns["t"]] for words in rows]
+    layout = replace(layout, rounded_times=rounded_times_note(t_words, layout.unit))
     in_decimals = all(SECONDS.fullmatch(word) for word in t_words) and _can_be_seconds(numbers[:, layout.columns["t"]])
     if given.time_unit is None and names is None and in_decimals:
         layout = replace(
@@ -304,8 +314,10 @@ def _text_packets(path: Path, form: TextForm, layout: Layout, notes: dict[str, i
         return
     if before and _is_cut_off(rest, before, form, layout):
         notes["truncated_bytes"] = len(rest)
-    else:
-        yield parse(rest, line_number)
+        return
+    yield parse(rest, line_number)
+    if before:  # a last number may have lost digits
+        notes["unended_last_lines"] = 1
 
 
 def _is_cut_off(line: bytes, before: bytes, form: TextForm, layout: Layout) -> bool:
@@ -314,8 +326,8 @@ def _is_cut_off(line: bytes, before: bytes, form: TextForm, layout: Layout) -> b
     Of a time in the last column that lost digits, what is left is earlier than the time before.
     """
     try:
-        row = np.array([[float(word) for word in form.row.words(line)]])
-        last = np.array([[float(word) for word in form.row.words(before)]])
+        row = np.array([[number_of(word) for word in form.row.words(line)]])
+        last = np.array([[number_of(word) for word in form.row.words(before)]])
     except ValueError:
         return True
     if row.shape != (1, form.width) or not _plausible(_chosen(row, layout), layout).all():
@@ -431,14 +443,31 @@ def _plausible(columns: Sequence[NDArray[np.float64]], layout: Layout) -> NDArra
 
 
 def _first_bad_line(lines: list[bytes], line_number: int, form: TextForm, layout: Layout) -> str:
-    """Return a description of the first line that does not hold an event, for error messages."""
+    """Return a description of the first line that does not hold an event, and why, for error messages."""
     for number, line in enumerate(lines, line_number + 1):
         if not holds_values(line):
             continue
-        try:
-            row = np.array([[float(word) for word in form.row.words(line)]])
-        except ValueError:
-            row = np.zeros((1, 0))
-        if row.shape != (1, form.width) or not _plausible(_chosen(row, layout), layout).all():
-            return f"line {number} is '{line[:80].decode('ascii', 'replace').strip()}'"
+        words = form.row.words(line)
+        shown = f"line {number} is '{line[:80].decode('utf-8', 'replace').strip()}'"
+        wrong = wrong_word(words)
+        if wrong is not None:
+            return f"{shown} and holds {wrong}"
+        row = np.array([[number_of(word) for word in words]])
+        if row.shape != (1, form.width):
+            return shown
+        if not _plausible(_chosen(row, layout), layout).all():
+            _, x, y, _ = _chosen(row, layout)
+            return shown + _why_no_pixel(x.item(), y.item(), layout)
     return f"line {line_number + 1} or after it is malformed"
+
+
+def _why_no_pixel(x: float, y: float, layout: Layout) -> str:
+    """Return why x or y is no pixel, for messages; nothing if both can be, and for compensated events."""
+    if layout.compensated:
+        return ""
+    for name, value in (("x", x), ("y", y)):
+        if np.isnan(value):
+            return f", in which {name} has no value"
+        if value != np.floor(value):
+            return f", in which {name} has a fraction"
+    return ""

@@ -69,8 +69,9 @@ def text_pieces(path: Path, start: int, size: int, notes: dict[str, int]) -> Ite
 
 
 def holds_values(line: bytes) -> bool:
-    """Return whether a line of a text file is neither empty nor a comment."""
-    return line.lstrip()[:1] not in (b"", b"#", b"%")
+    """Return whether a line of a text file is neither empty, nor a comment, nor Excel's ``sep=,``."""
+    begin = line.lstrip()
+    return begin[:1] not in (b"", b"#", b"%") and not begin[:5].lstrip(b'"').lower().startswith(b"sep=")
 
 
 ON_WORDS = (b"true", b"on", b"positive", b"pos", b"yes", b"y", b"t", b"p", b"+")
@@ -204,9 +205,29 @@ def _decimals_between_spaces(line: bytes) -> bool:
     return len(fields) >= 4 and all(b"," not in each or DECIMAL.fullmatch(each) for each in fields)
 
 
+def number_of(word: bytes) -> float:
+    """Return the number that a word is. Raises ValueError for others, such as 1_229, which only Python reads."""
+    if b"_" in word:
+        raise ValueError
+    return float(word)
+
+
+DATE = re.compile(rb"\d{4}-\d\d-\d\d")
+"""Pattern of a date, as of ISO 8601."""
+
+
+def wrong_word(words: Iterable[bytes]) -> str | None:
+    """Return the first of the words that is no number, and what it is, for messages; None if all are numbers."""
+    for word in words:
+        if not _is_number(word):
+            what = "a date without a time of day, such as T00:00:00" if DATE.fullmatch(word) else "no number"
+            return f"'{word[:40].decode('utf-8', 'replace')}', which is {what}"
+    return None
+
+
 def _is_number(word: bytes) -> bool:
     try:
-        float(word)
+        number_of(word)
     except ValueError:
         return False
     return True
@@ -278,18 +299,24 @@ def why_no_rows(head: bytes) -> str | None:
     if not lines:
         return None
     counts = [sum(map(_is_number, replace(TextRow.of(line), has_words=False).words(line))) for _, line in lines]
-    at = counts.index(max(counts))
+    wrong_words = [wrong_word(TextRow.of(line).words(line)) for _, line in lines]
+    partly = (at for at, wrong in enumerate(wrong_words) if counts[at] and wrong is not None)
+    at = next(partly, counts.index(max(counts)))
     number, line = lines[at]
     shown = line[:80].decode("utf-8", "replace").strip()
     if len(lines) == 1 and names_roles(TextRow.of(line).names(line)):
         return f"holds no events, only names of columns in line {number}; give another recording"
     if not counts[at]:
         return f"is text, but line {number} '{shown}' holds no numbers; expected rows of t, x, y and p"
-    wrong = next((word for word in TextRow.of(line).words(line) if not _is_number(word)), None)
+    wrong = wrong_words[at]
+    if wrong is None and at > 1:  # two lines of words above it
+        number, line = lines[1]
+        shown = line[:80].decode("utf-8", "replace").strip()
+        return f"is text, but line {number} '{shown}' holds neither numbers nor only units; leave it out"
     if wrong is None:
         return f"is text, but line {number} '{shown}' is no row of t, x, y and p"
     return (
-        f"is text, but line {number} '{shown}' holds '{wrong[:40].decode('utf-8', 'replace')}', which is no number; "
+        f"is text, but line {number} '{shown}' holds {wrong}; "
         "amiwarp reads numbers, polarities such as true and false, on and off, y and n, + and -, and times such as "
         "2024-05-01T12:00:00.000123; leave out other columns, or change them to numbers"
     )
