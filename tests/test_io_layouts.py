@@ -977,6 +977,7 @@ def test_an_empty_value_does_not_shift_a_row(tmp_path: Path, monkeypatch: pytest
 UNDER_NAMES = {
     "units": ("t,x,y,p\nus,px,px,-\n", "us", True),
     "units in brackets": ("t,x,y,p\n[ms],[px],[px],[-]\n", "ms", True),
+    "a unit of the time only": ("t,x,y,p\nns\n", "ns", True),
     "units and none": ("t,x,y,p\nns,,,\n", "ns", True),
     "the unit in the name, too": ("t_us,x,y,p\nus,px,px,-\n", "us", True),
     "Excel's separator": ("sep=,\nt,x,y,p\n", "us", False),

@@ -99,8 +99,8 @@ NO_TIME_UNITS = ("", "-", "1", "px", "pixel", "pixels", "bool")
 """Units of columns that are no times, in a line of units."""
 
 
-def units_in(names: Sequence[str], row: Sequence[str], where: str) -> tuple[str | None, ...] | None:
-    """Return the units of time in a line of units below the names of columns; None if the line is none.
+def units_in(names: Sequence[str], row: Sequence[str], where: str) -> tuple[str | None, ...]:
+    """Return the units of time in a line of units below the names of columns; none if the line is no such line.
 
     ``where`` names the line for messages. Raises :class:`AmiwarpError` if a name states another unit.
     """
@@ -108,7 +108,7 @@ def units_in(names: Sequence[str], row: Sequence[str], where: str) -> tuple[str 
     units = [unit_of(word) for word in words]
     known = all(unit is not None or word in NO_TIME_UNITS for word, unit in zip(words, units, strict=True))
     if not known or not any(units):
-        return None
+        return ()
     for name, unit in zip(names, units, strict=False):
         stated = unit_in(name)
         if unit is not None and stated not in (None, unit):

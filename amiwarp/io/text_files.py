@@ -84,8 +84,8 @@ class TextForm:
     """Sensor size that the file states [px], or None."""
     stamped: tuple[int, ...]
     """Indices of the columns that are dates with times of day."""
-    units: tuple[str | None, ...] | None = None
-    """Unit of time of each column in a line below the names, or None without such a line."""
+    units: tuple[str | None, ...] = ()
+    """Unit of time of each column in a line below the names; empty without such a line."""
     own: TextSize | None = None
     """What amiwarp wrote beside the text, or None."""
 
@@ -125,7 +125,7 @@ def _find_form(path: Path, head: bytes) -> TextForm:
     """Return the form of a file that begins with ``head``."""
     comments: list[str] = []
     names: tuple[str, ...] | None = None
-    units: tuple[str | None, ...] | None = None
+    units: tuple[str | None, ...] = ()
     size: tuple[int, int] | None = None
     position, number = len(BOM) * head.startswith(BOM), 0
     for line in io.BytesIO(head[position:]):  # which only a newline ends, as in the reader of all lines
@@ -161,7 +161,7 @@ def _find_form(path: Path, head: bytes) -> TextForm:
             names = TextRow.of(line).names(line)
         else:
             units = units_in(names, TextRow.of(line).names(line), f"{path}: line {number + 1}")
-            if units is None:
+            if not units:
                 break
         position, number = position + len(line), number + 1
     why = (
@@ -227,7 +227,7 @@ def _find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLay
             f"the order with --columns, such as {_order_for(form.names, numbers)}"
         )
     names = form.names if form.names is not None and len(form.names) == form.width else None
-    units = form.units if form.units is not None and len(form.units) >= form.width else (None,) * form.width
+    units = [*form.units, *[None] * form.width]  # those of the last columns may be left out
     columns = [
         Column(names[at] if names else None, _whole_if_possible(values), "us" if at in form.stamped else units[at])
         for at, values in enumerate(numbers.T)
