@@ -338,7 +338,8 @@ def render(
     width, height = source.size
     if scale is None:
         scale = max(min(-(-LEAST_WIDTH // width), LARGEST_SIDE // max(width, height)), 1)
-    scale = whole(scale, "scale", 1, MOST_ENLARGED)
+    else:
+        scale = whole(scale, "scale", 1, MOST_ENLARGED)
     total = 0
     if events is not None:
         events = whole(events, "events", 1, MOST_EVENTS, " events per frame")
