@@ -528,6 +528,20 @@ def test_a_bag_is_compensated_and_keeps_its_other_topics(
     assert at == len(t)
 
 
+def test_compensate_says_what_it_subtracts_from_times_since_1970(exact: Calibration, tmp_path: Path) -> None:
+    first = 1_700_000_000_000_000
+    events = Events.from_arrays([20, 30], [40, 50], [first, first + 20], [1, 0])
+    save_recording(tmp_path / "a.h5", Recording(MemoryEvents(events, 200, 150)))
+    exact.save(tmp_path / "calibration.json")
+    (tmp_path / "encoder.csv").write_text(f"t_us,angle_deg\n{first - 100},0.0\n{first + 100},1.0\n")
+    line = ["compensate", "a.h5", "a.mcap", "--calibration", "calibration.json", "--encoder", "encoder.csv"]
+    with contextlib.chdir(tmp_path):
+        result = CliRunner().invoke(app, [*line, "--round", "nearest"])
+    assert result.exit_code == 0, result.stderr
+    assert f"note: the times begin at 0: {first:,} us are subtracted" in " ".join(result.stdout.split())
+    assert open_recording(tmp_path / "a.mcap").events.t_first == 0
+
+
 def test_a_real_bag_is_compensated(data_dir: Path, tmp_path: Path) -> None:
     """It has no prism: one without deflection leaves every event in place. Its triggers are the encoder."""
     source = data_dir / "rosbag/ros2_evt3_640x480_trig10Hz.db3"

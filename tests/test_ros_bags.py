@@ -676,6 +676,31 @@ def test_empty_bags_hold_no_events(tmp_path: Path, end: str) -> None:
     assert "without event topics; its topics are" in text
 
 
+# Times since 1970.
+
+
+@pytest.mark.parametrize("end", [".mcap", ".db3", ".bag", ".raw"])
+@pytest.mark.parametrize("command", ["convert", "filter"])
+def test_times_that_only_the_stamps_of_a_ros2_bag_hold_are_named(tmp_path: Path, end: str, command: str) -> None:
+    from typer.testing import CliRunner
+
+    from amiwarp.cli.app import app
+
+    longest = 100_000_000_000
+    for first, moved in ((1_700_000_000_000_000, True), (longest - 20, False), (longest - 19, True)):
+        events = Events.from_arrays([1, 2], [3, 4], [first, first + 20], [1, 0])
+        save_recording(tmp_path / "a.h5", Recording(MemoryEvents(events, *SIZE)), overwrite=True)
+        path = tmp_path / f"{first}{end}"
+        options = ["--region", "0,0,99,99"] if command == "filter" else []
+        result = CliRunner().invoke(app, [command, str(tmp_path / "a.h5"), str(path), *options])
+        assert result.exit_code == 0, result.output
+        text = " ".join(result.output.split())
+        moves = moved and end in (".mcap", ".db3")
+        note = f"note: the times begin at 0: {first:,} us are subtracted"
+        assert (note in text, "subtracted" in text) == (moves, moves)
+        assert open_recording(path).events.t_first == (0 if moves else first)
+
+
 # Compressed bags.
 
 

@@ -520,6 +520,7 @@ def run_compensate(
         "rounding": done.rounding,
         "dropped": done.dropped,
         "left_out": list(done.left_out),
+        "subtracted_us": done.subtracted_us,
         "seconds": done.seconds,
         "mev_per_s": done.mev_per_s,
         "device": device,

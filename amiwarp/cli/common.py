@@ -644,4 +644,14 @@ def format_notes(d: dict[str, Any]) -> list[str]:
         native = d["format"] is OutputFormat.NATIVE
         who = "the new file" if native else f"{LIMITS[d['format']].label} does not hold, and"
         lines.append(f"note: {who} leaves out: {', '.join(d['left_out'])}")
-    return lines
+    return [*lines, *time_notes(d)]
+
+
+def time_notes(d: dict[str, Any]) -> list[str]:
+    """Return what the format of the output has changed in the times."""
+    if not d["subtracted_us"]:
+        return []
+    return [
+        f"note: the times begin at 0: {d['subtracted_us']:,} us are subtracted, because packets in a ROS 2 bag hold "
+        "up to 28 h; only the stamps of its messages hold them"
+    ]

@@ -122,6 +122,7 @@ def _lines(d: dict[str, Any]) -> Iterator[str]:
     yield from cli.assumption_lines(d["assumptions"])
     if d["left_out"]:
         yield f"note: the format leaves out: {', '.join(d['left_out'])}"
+    yield from cli.time_notes(d)
 
 
 RECORD_NAMES = {"imu_samples": "IMU samples", "frames": "frames"}

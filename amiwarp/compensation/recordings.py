@@ -24,7 +24,7 @@ from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, EventSource, MetadataValue, Recording
 from amiwarp.io import RecordingWriter
 from amiwarp.io.depth_map import DepthMap
-from amiwarp.io.export import bag_of, export, left_out
+from amiwarp.io.export import bag_of, export, left_out, subtracted_us
 from amiwarp.io.files import check_output
 from amiwarp.io.formats import Codec, OutputFormat, Rounding, check_codec, check_rounding, output_format
 from amiwarp.io.hdf5_files import CHUNK, compile_checksums
@@ -149,6 +149,8 @@ class CompensationSummary:
     """Number of events that were not written, because after rounding they are outside the image."""
     left_out: tuple[str, ...] = ()
     """Parts of the recording that the new file does not hold, such as ``"encoder"`` in a format without."""
+    subtracted_us: int = 0
+    """Time that was subtracted from all events [us]: in a ROS 2 bag the first event, if the last is later than 28 h."""
 
     @property
     def mev_per_s(self) -> float:
@@ -382,7 +384,8 @@ def compensate(
             )  # fmt: skip
         missing = left_out(recording, chosen)
         seconds = time.perf_counter() - began
-        return CompensationSummary(done, outside, seconds, chosen, rounding, dropped, missing)
+        moved = subtracted_us(recording.events, chosen)
+        return CompensationSummary(done, outside, seconds, chosen, rounding, dropped, missing, moved)
     parameters, labels = (None, None) if truth is None else (truth.parameters, truth.labels)
     with RecordingWriter(
         out_path, width=width, height=height, camera=model.camera, prism=recording.prism, encoder=encoder,

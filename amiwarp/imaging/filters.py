@@ -348,6 +348,8 @@ class FilterSummary:
     """What the format of the output cannot hold."""
     removed_records: dict[str, int]
     """Number of IMU samples and frames outside the window, by name; empty without a window."""
+    subtracted_us: int = 0
+    """Time that was subtracted from all events [us]: in a ROS 2 bag the first event, if the last is later than 28 h."""
 
 
 @guarded
@@ -405,8 +407,9 @@ def filter_recording(
     # Other formats are converted from amiwarp's.
     with scratch_folder(out_path.parent) as folder:
         summary = _write_kept(recording, folder / "kept.h5", chosen, progress, False)
-        left_out = convert(folder / "kept.h5", out_path, format=output, progress=progress, overwrite=overwrite).left_out
-    return replace(summary, left_out=tuple(dict.fromkeys((*left_out, *summary.left_out))))
+        written = convert(folder / "kept.h5", out_path, format=output, progress=progress, overwrite=overwrite)
+    left_out = tuple(dict.fromkeys((*written.left_out, *summary.left_out)))
+    return replace(summary, left_out=left_out, subtracted_us=written.subtracted_us)
 
 
 def _write_kept(

@@ -14,8 +14,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, Recording
 from amiwarp.io.file_scan import FileEvents, Packet, last_word, read_words, unwrapped
 from amiwarp.io.files import errors_name, open_input
-from amiwarp.io.formats import LONGEST_DAT_US, Outline
-from amiwarp.io.prophesee import origin_of, read_header, stated_origin
+from amiwarp.io.formats import LONGEST_DAT_US, Outline, origin_of
+from amiwarp.io.prophesee import read_header, stated_origin
 
 if TYPE_CHECKING:
     from amiwarp.kernels.dat import Layout

@@ -230,6 +230,8 @@ class ConversionSummary:
     """Number of events that were not written, because after rounding they are outside the image."""
     assumptions: tuple[str, ...] = ()
     """What was assumed, because the input does not state it, with the option that overrides it."""
+    subtracted_us: int = 0
+    """Time that was subtracted from all events [us]: in a ROS 2 bag the first event, if the last is later than 28 h."""
 
 
 @guarded
@@ -261,8 +263,8 @@ def convert(
     the metadata. All formats keep x, y, t and p of every event exactly, with three exceptions. Of compensated events,
     text and csv hold the coordinates to 1e-6 px, and formats of whole pixels need ``rounding``. In a ROS 2 bag the
     times begin at 0 if the last is later than 28 h, as are times since 1970: only the stamps of its messages hold
-    those. From a bag to a bag of the same version of ROS, the messages of all other topics are copied. The sensor size
-    of text and csv is in a second file, such as ``OUT.txt.json``.
+    those, and the summary's ``subtracted_us``. From a bag to a bag of the same version of ROS, the messages of all
+    other topics are copied. The sensor size of text and csv is in a second file, such as ``OUT.txt.json``.
 
     Parameters
     ----------
@@ -382,6 +384,7 @@ def _summary(
         left_out=left_out(recording, chosen),
         rounding=rounding,
         dropped=dropped,
+        subtracted_us=subtracted_us(source, chosen),
         assumptions=tuple(assumed_texts(recording.metadata)),
     )
 
@@ -421,6 +424,11 @@ def left_out(recording: Recording, chosen: OutputFormat) -> tuple[str, ...]:
         "metadata": not set(recording.metadata) <= known,
     }
     return tuple(name for name, left in found.items() if left)
+
+
+def subtracted_us(source: EventSource, chosen: OutputFormat) -> int:
+    """Return what is subtracted from the times of all events [us], so that only the stamps of a ROS 2 bag hold them."""
+    return formats.origin_of(source) if chosen is OutputFormat.ROS2 and len(source) else 0
 
 
 def _gaps(encoder: Encoder) -> tuple[tuple[int, int], ...]:

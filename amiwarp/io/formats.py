@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import Option
 from amiwarp.errors import AmiwarpError, optional_module
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import EventSource, Recording
 from amiwarp.io.column_options import GivenLayout
 from amiwarp.io.file_scan import GivenSource, given_source
 from amiwarp.io.files import check_regular, errors_name, name_kind, note_folders, open_input
@@ -484,6 +484,12 @@ LONGEST_US = MAX_MS * 1000
 LONGEST_EVT21_US, LONGEST_DAT_US = 2**34 - 1, 2**32 - 1
 """Longest recording that is written in EVT 2.1 and as DAT [us], 4.8 h and 71 min: their clocks of 34 and 32 bits do not
 wrap, because not every reader notices that."""
+
+
+def origin_of(about: Outline | EventSource, longest_us: int = LONGEST_US) -> int:
+    """Return the time at which the clock of EVT words starts [us]: 0, or the first event if the last is very late."""
+    return 0 if about.t_last <= longest_us else about.t_first
+
 
 LIMITS = {
     OutputFormat.DSEC: Limits("the DSEC layout", span=2**32 - 1),

@@ -15,7 +15,7 @@ from amiwarp.events.recording import Events, Recording
 from amiwarp.io.evt_decoder import WORD_TYPES, EvtDecoder, Triggers
 from amiwarp.io.file_scan import FileEvents, Packet, nearest, read_pieces, unwrapped
 from amiwarp.io.files import errors_name, open_input
-from amiwarp.io.formats import LONGEST_EVT21_US, LONGEST_US, Outline
+from amiwarp.io.formats import LONGEST_EVT21_US, Outline, origin_of
 from amiwarp.validation import TIME_LIMIT
 
 # Words of the encodings.
@@ -229,11 +229,6 @@ LOW_BITS = 12
 
 STOPS = (0x000, 0x7FF, 0xFFF)
 """Values that the upper bits of the time never skip. Decoders take other large steps for a step back or for a wrap."""
-
-
-def origin_of(about: Outline, longest_us: int = LONGEST_US) -> int:
-    """Return the time at which the clock of EVT words starts [us]: 0, or the first event if the last is very late."""
-    return 0 if about.t_last <= longest_us else about.t_first
 
 
 class Evt3Encoder:
