@@ -18,6 +18,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import zstandard
 from faery.extension import aedat, dat, es, evt
 
 from amiwarp import (
@@ -774,7 +775,7 @@ FOREIGN = {
     "is a RIFF file of sound or pictures": b"RIFF" + bytes(4) + b"WAVEfmt " + bytes(99),
     "is a Matroska or WebM video; .*translate": b"\x1aE\xdf\xa3" + bytes(99),
     "is an xz archive; unpack": lzma.compress(b"1 2 3"),
-    "is a Zstandard archive; unpack": b"\x28\xb5\x2f\xfd" + bytes(99),
+    "is a Zstandard archive; unpack": zstandard.compress(b"1 2 3"),
     "is an LZ4 archive; unpack": b"\x04\x22\x4d\x18" + bytes(99),
     "is a 7-Zip archive; unpack": b"7z\xbc\xaf\x27\x1c" + bytes(99),
     "is a RAR archive; unpack": b"Rar!\x1a\x07\x01\0" + bytes(99),

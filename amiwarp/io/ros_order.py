@@ -149,11 +149,12 @@ class MessageNumbers:
         last = -1 if publisher is None else _number(publisher.latest)
         if head.number is None or head.number <= last:
             return 0
-        found = 0
+        found, lowest = 0, head.number
         for at, each in enumerate(waiting):
-            same = each.one.connection.id == head.one.connection.id
-            if same and last < _number(each) < _number(waiting[found]) and _is_late(each, head):
-                found = at
+            if each.number is None or not last < each.number < lowest:
+                continue  # at once, because it is so for nearly all
+            if each.one.connection.id == head.one.connection.id and _is_late(each, head):
+                found, lowest = at, each.number
         if found:
             self._count("late_packets")
         return found
