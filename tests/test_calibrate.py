@@ -249,6 +249,7 @@ def test_thinning_is_even_and_complete(recording: Recording) -> None:
     assert PARTS > 1
 
 
+@pytest.mark.slow
 def test_a_burst_at_the_first_time_stamp_is_left_out_and_said(recording: Recording) -> None:
     (width, height), events = recording.events.size, recording.events[:]
     y, x = np.divmod(np.arange(5000), width)

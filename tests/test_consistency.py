@@ -59,6 +59,7 @@ def error_px(recording: Recording, found: Calibration, camera: Camera = CAMERA) 
     return model_error(found.model, truth_model(camera, recording.truth, FlatSide.SCENE)).rms
 
 
+@pytest.mark.slow
 def test_a_right_camera_is_left_alone(wide: Recording) -> None:
     found = calibrated(wide)
     assert found.camera == CAMERA
@@ -223,6 +224,7 @@ def linear(truth: np.ndarray, noise: float, squares: int = 200) -> LinearFit:
     return LinearFit(("size", "phase", "other"), hessian, gradient, xy, float(np.sum(residual**2)))
 
 
+@pytest.mark.slow
 def test_a_slow_rotation_of_the_camera_is_noticed(texture: np.ndarray, wide: Recording) -> None:
     """The cost alone does not tell: it is below that from which on a rotation is tried anyway."""
     motion = CameraMotion(np.radians([1.5, 1.5, 0.0]))
@@ -235,6 +237,7 @@ def test_a_slow_rotation_of_the_camera_is_noticed(texture: np.ndarray, wide: Rec
     assert moved.cost < LARGEST_STILL_COST
 
 
+@pytest.mark.slow
 def test_a_camera_that_shakes_with_the_prism_is_refused(texture: np.ndarray) -> None:
     t = np.arange(0.0, 0.18, 1e-3)
     angle = 2.0 * math.pi * 12.0 * t

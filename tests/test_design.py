@@ -157,6 +157,7 @@ def curves(made: Design) -> tuple[list[float], list[float], list[float]]:
     return circle, [c.blur_px for c in made.choices], [c.events_per_s for c in made.choices]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fov", "index", "deflected"), [(60.0, 1.5168, False), (90.0, 1.55, True)], ids=["apex", "deflection"]
 )

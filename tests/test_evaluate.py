@@ -265,6 +265,7 @@ def test_a_still_camera_is_rendered_once() -> None:
     np.testing.assert_array_equal(first, last)
 
 
+@pytest.mark.slow
 def test_the_prism_is_calibrated_once_and_the_calibration_reused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Recordings of two seeds and lenses begin at other angles of one prism, which a third one is calibrated from."""
     monkeypatch.setattr(study, "SETUP_S", 0.2)

@@ -12,6 +12,12 @@ import pytest
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
+SLOW_EXAMPLES = ("train_from_files", "save_for_paraview", "event_sensors")
+"""Examples that take many seconds."""
+
+
+def marks_of(example: Path) -> list[pytest.MarkDecorator]:
+    return [pytest.mark.slow] if example.stem in SLOW_EXAMPLES else []
 
 
 def test_there_are_examples() -> None:
@@ -19,7 +25,10 @@ def test_there_are_examples() -> None:
     assert len(TUTORIALS) >= 5
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "example",
+    [pytest.param(path, id=path.stem, marks=marks_of(path)) for path in EXAMPLES],
+)
 def test_example_runs(
     example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -264,6 +264,7 @@ print(opened, absent)
 """
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_killed_while_it_is_created_is_absent_or_opens(tmp_path):
     """The process kills itself at each line of the code that creates the file."""
     done = subprocess.run(

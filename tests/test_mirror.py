@@ -389,6 +389,7 @@ def test_recorded_commands_compensate_as_the_angles_do(recording: amiwarp.Record
 # The command line.
 
 
+@pytest.mark.slow
 def test_programs(tmp_path: Path, texture: np.ndarray) -> None:
     from PIL import Image
 

@@ -145,6 +145,7 @@ def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording
     assert error_px(c, recording) < 0.02
 
 
+@pytest.mark.slow
 def test_index_and_focal_length(recording: Recording) -> None:
     """Index, focal length and apex make nearly the same motion."""
     c = calibrate(recording, free=("apex", "phase", "index", "focal_length"), photometric=KNOWN, events=40_000)
@@ -157,6 +158,7 @@ def test_index_and_focal_length(recording: Recording) -> None:
             assert c.parameters[name] == pytest.approx(true, abs=6.0 * c.uncertainty[name])
 
 
+@pytest.mark.slow
 def test_linear_unknowns(texture: NDArray[np.uint8]) -> None:
     """A strong leak is found. To free it or the ratio of the thresholds costs little accuracy."""
     sensor = SensorModel(contrast_on=0.22, contrast_off=0.28, leak_hz=20.0)
@@ -258,6 +260,7 @@ def test_flickering_light(texture: NDArray[np.uint8]) -> None:
     check_honest(recording, c)
 
 
+@pytest.mark.slow
 def test_an_object_moves_through(texture: NDArray[np.uint8]) -> None:
     """A third of the image moves independently at 400 px/s."""
 

@@ -62,6 +62,8 @@ from amiwarp.studies.optics_comparison import (
 )
 from reference import optics as reference
 
+pytestmark = pytest.mark.slow  # one comparison for all takes many seconds
+
 GLASS = Prism(0.0)
 CAMERA = Camera.from_fov(160, 120, math.radians(60.0))
 SMALL = Camera.from_fov(64, 48, math.radians(10.0))
@@ -401,7 +403,6 @@ def test_no_letters_of_the_chart_overlap(compared: Comparison) -> None:
     assert outside == []
 
 
-@pytest.mark.slow
 def test_the_command_writes_the_comparison(tmp_path: Path, texture: np.ndarray) -> None:
     app = typer.Typer()
     command(app, command_line.run_design, name="design", example="")

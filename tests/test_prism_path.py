@@ -155,6 +155,7 @@ def test_the_inspector_shows_the_path(spun_up: tuple[Recording, PrismMotion], ca
     assert inspector.as_calibration() is calibrated
 
 
+@pytest.mark.slow
 def test_ripple_is_found(texture: np.ndarray) -> None:
     recording, motion = simulated(texture, lambda t: 720.0 * (1.0 + 0.1 * np.cos(math.tau * 12.0 * t)))
     found = calibrate(recording, photometric=COARSE, model="exact")

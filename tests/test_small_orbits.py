@@ -37,6 +37,7 @@ def test_small_orbits_are_not_too_large(texture: np.ndarray) -> None:
     assert error_px(small_orbit(texture)) < 0.01
 
 
+@pytest.mark.slow
 def test_small_thresholds_do_not_change_the_orbit(texture: np.ndarray) -> None:
     """In units of a small threshold the map is large, so that the damping of ordinary maps would flatten it."""
     sensor = SensorModel(contrast_on=0.05, contrast_off=0.05)

@@ -230,6 +230,7 @@ def test_best_fit_of_each_model() -> None:
     assert best_fit(replace(SMALL, focal_error=0.3), "exact") == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

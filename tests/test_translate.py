@@ -157,6 +157,7 @@ def test_video_times_and_length(tmp_path: Path) -> None:
     assert events.t.max() < 450_000  # the last picture does not change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "fps"), [("nfs240fps_basketball_20x200x200.npy", 240.0), ("bikes_640x272_25fps.mp4", None)]
 )

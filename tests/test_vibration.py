@@ -195,6 +195,7 @@ def calibrated(shaken: amiwarp.Recording) -> amiwarp.Calibration:
     return amiwarp.calibrate(shaken, model="vibration", events=50_000, photometric=prompt)
 
 
+@pytest.mark.slow
 def test_an_unknown_refractory_period_is_refused_with_the_remedy(shaken: amiwarp.Recording) -> None:
     with pytest.raises(amiwarp.AmiwarpError, match=r"within 0\.0\d+ px only.*give the sensor's refractory period"):
         amiwarp.calibrate(shaken, model="vibration", events=25_000, photometric=replace(COARSE, pairs=10_000))
