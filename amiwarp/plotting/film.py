@@ -74,23 +74,27 @@ def frames_of_time(blocks: Iterable[Events], timing: Timing, reach_us: int | Non
     At most the events of a frame and one block are in memory.
     """
     waiting = iter(blocks)
-    held: Events | None = None
+    held = Events.empty()
     before = timing.start_us
     for frame in range(timing.count):
         end = timing.end(frame)
         low = before if reach_us is None else end - reach_us
-        while held is None or not len(held) or int(held.t[-1]) < end:
+        # Blocks are joined once a frame: a time surface holds the events of many.
+        held = held[int(np.searchsorted(held.t, min(low, before))) :]
+        parts = [held]
+        count = len(held)
+        while not len(parts[-1]) or int(parts[-1].t[-1]) < end:
             block = next(waiting, None)
             if block is None:
                 break
-            held = block if held is None or not len(held) else Events.concatenate([held, block])
-            held = held[int(np.searchsorted(held.t, min(low, before))) :]
-            if len(held) > MOST_EVENTS:
+            parts.append(block)
+            count += len(block)
+            if count > MOST_EVENTS:
                 raise AmiwarpError(
                     f"a frame holds more than {MOST_EVENTS:,} events; give a shorter --frame-ms or --decay-ms "
                     "(frame_us, decay_us in Python), or a lower --speed"
                 )
-        held = Events.empty() if held is None else held
+        held = Events.concatenate([part for part in parts if len(part)] or [Events.empty()])
         first, since, stop = np.searchsorted(held.t, (low, before, end)).tolist()
         yield Shown(held[first:stop], end, stop - since, end - before)
         held = held[min(first, since) :]
