@@ -33,7 +33,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp import Events, EvtDecoder, MemoryEvents, Recording, convert, open_recording, save_recording
-from amiwarp.io.prophesee import VERSION_OF, read_evt_header
+from amiwarp.io.prophesee import read_evt_header
 from amiwarp.studies.cluster import machine, versions
 from benchmarks.corners import moving_tiles
 
@@ -73,7 +73,7 @@ def words_in(path: Path) -> tuple[str, NDArray[Any]]:
     """Return the version of EVT of a RAW file, and its words."""
 
     about = read_evt_header(path)
-    return VERSION_OF[about.word], about.words(path.read_bytes()[about.offset :])
+    return about.version, about.words(path.read_bytes()[about.offset :])
 
 
 def by_amiwarp_words(path: Path, _: str) -> Callable[[], Columns]:

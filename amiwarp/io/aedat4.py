@@ -107,23 +107,19 @@ def _unpacked(rows: NDArray[Any]) -> Events:
     """Return the events of some rows of a file."""
     import warp as wp
 
+    from amiwarp.events.device_events import DeviceEvents
     from amiwarp.kernels.aedat4 import unpack_events
-    from amiwarp.kernels.evt import EventArrays
+    from amiwarp.kernels.evt import new_event_arrays
     from amiwarp.kernels.launch import launch, start_once
 
     if not rows.size:
         return Events.empty()
     start_once()
-    arrays = EventArrays()
-    arrays.x = wp.empty(rows.size, dtype=wp.uint16, device="cpu")
-    arrays.y = wp.empty(rows.size, dtype=wp.uint16, device="cpu")
-    arrays.t = wp.empty(rows.size, dtype=wp.int64, device="cpu")
-    arrays.p = wp.empty(rows.size, dtype=wp.uint8, device="cpu")
+    arrays = new_event_arrays(rows.size, "cpu")
     words = wp.array(rows.view(np.uint64), dtype=wp.uint64, device="cpu", copy=False)
     blocks = -(-rows.size // BLOCK_EVENTS)
     launch(unpack_events, blocks, [words, BLOCK_EVENTS], [arrays], device="cpu", smallest=1)
-    columns: list[Any] = [getattr(arrays, name).numpy() for name in ("x", "y", "t", "p")]
-    return Events(*columns)
+    return DeviceEvents(arrays.x, arrays.y, arrays.t, arrays.p).to_host()
 
 
 def _event_rows(contents: list[Content], buffer: bytearray) -> tuple[NDArray[Any], list[int], list[int], int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,24 +99,21 @@ def _decoded(words: NDArray[np.uint32], layout: Layout, last: int | None) -> tup
     """
     import warp as wp
 
+    from amiwarp.events.device_events import DeviceEvents
     from amiwarp.kernels.dat import decode_dat
-    from amiwarp.kernels.evt import EventArrays
+    from amiwarp.kernels.evt import new_event_arrays
     from amiwarp.kernels.launch import launch, start_once
 
     start_once()
     count = len(words)
-    arrays = EventArrays()
-    arrays.x = wp.empty(count, dtype=wp.uint16, device="cpu")
-    arrays.y = wp.empty(count, dtype=wp.uint16, device="cpu")
-    arrays.t = wp.empty(count, dtype=wp.int64, device="cpu")
-    arrays.p = wp.empty(count, dtype=wp.uint8, device="cpu")
+    arrays = new_event_arrays(count, "cpu")
     before = int(words[0, 0]) if last is None else last
     blocks = -(-count // BLOCK_EVENTS)
     wrapped = wp.empty(blocks, dtype=int, device="cpu")
     flat = wp.array(words.ravel(), dtype=wp.uint32, device="cpu", copy=False)
     launch(decode_dat, blocks, [flat, BLOCK_EVENTS, layout, before], [arrays, wrapped], device="cpu", smallest=1)
-    columns: list[Any] = [getattr(arrays, name).numpy() for name in ("x", "y", "t", "p")]
-    return Events(*columns), bool(wrapped.numpy().any())
+    events = DeviceEvents(arrays.x, arrays.y, arrays.t, arrays.p).to_host()
+    return events, bool(wrapped.numpy().any())
 
 
 # Writer of DAT files, version 2, of CD events: a header, then 8 bytes for each event.

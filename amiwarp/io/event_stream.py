@@ -42,7 +42,7 @@ def _packets(path: Path, atis: bool, height: int, notes: dict[str, int]) -> Iter
     import warp as wp
 
     from amiwarp.kernels.event_stream import EVENT_BYTES, Progress, decode_stream
-    from amiwarp.kernels.evt import EventArrays
+    from amiwarp.kernels.evt import new_event_arrays
     from amiwarp.kernels.launch import load, start_once
 
     start_once()
@@ -53,11 +53,7 @@ def _packets(path: Path, atis: bool, height: int, notes: dict[str, int]) -> Iter
     for piece in read_pieces(path, HEADER.size, PIECE_BYTES, notes):
         data = np.frombuffer(rest + piece, np.uint8)
         most = data.size // int(EVENT_BYTES)
-        arrays = EventArrays()
-        arrays.x = wp.empty(most, dtype=wp.uint16, device="cpu")
-        arrays.y = wp.empty(most, dtype=wp.uint16, device="cpu")
-        arrays.t = wp.empty(most, dtype=wp.int64, device="cpu")
-        arrays.p = wp.empty(most, dtype=wp.uint8, device="cpu")
+        arrays = new_event_arrays(most, "cpu")
         found = wp.empty(1, dtype=Progress, device="cpu")
         inputs = [wp.array(data, dtype=wp.uint8, device="cpu", copy=False), int(atis), height, now, arrays]
         wp.launch(decode_stream, 1, inputs, [found], device="cpu")

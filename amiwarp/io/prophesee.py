@@ -64,7 +64,7 @@ def halves_of(words: NDArray[np.uint64]) -> Halves | None:
     return Halves(best, certain=not others or (found[best][0] and not others[0][0]))
 
 
-# Readers of Prophesee's files: RAW with the decoder in Warp, DAT with NumPy.
+# Reader of RAW files.
 
 EVT_BYTES = 1 << 22
 """Number of bytes of EVT words that are decoded at once. They hold at most 26 million events."""
@@ -119,11 +119,11 @@ class EvtFile:
 
     def words(self, data: bytes) -> NDArray[Any]:
         """Return the whole words of some bytes of the file, with halves as they are stored."""
-        return words_of(data, VERSION_OF[self.word])
+        return words_of(data, self.version)
 
     def decoder(self) -> EvtDecoder:
         """Return a new decoder of the file's words."""
-        return EvtDecoder(VERSION_OF[self.word], swapped=self.swapped)
+        return EvtDecoder(self.version, swapped=self.swapped)
 
 
 def open_evt(path: Path) -> Recording:

@@ -10,6 +10,8 @@ and :mod:`amiwarp.kernels.evt3`.
 The words are described at https://docs.prophesee.ai/stable/data/encoding_formats/index.html.
 """
 
+from typing import Any
+
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
@@ -98,6 +100,16 @@ class EventArrays:
     """Times [us]."""
     p: wp.array(dtype=wp.uint8)
     """Polarities: 1 is ON."""
+
+
+def new_event_arrays(count: int, device: Any) -> Any:
+    """Return :class:`EventArrays` for a number of events, without values, on a device."""
+    arrays = EventArrays()
+    arrays.x = wp.empty(count, dtype=wp.uint16, device=device)
+    arrays.y = wp.empty(count, dtype=wp.uint16, device=device)
+    arrays.t = wp.empty(count, dtype=wp.int64, device=device)
+    arrays.p = wp.empty(count, dtype=wp.uint8, device=device)
+    return arrays
 
 
 @wp.struct
