@@ -45,7 +45,7 @@ from reference.io_samples_extra import (
     write_ros1,
     write_ros2,
 )
-from reference.mutation_files import Checker, checked, mutated, read_recording, serve
+from reference.mutation_files import Checker, checked, content_of, mutated, read_recording, serve
 
 EVENTS = make_events(300)
 
@@ -417,10 +417,7 @@ VARIANTS = {f"{decoder}/{name}": variant for decoder, found in DECODERS.items() 
 def sample(name: str) -> bytes:
     """Return the content of an undamaged file of one of :data:`VARIANTS`."""
     ending, write, _ = VARIANTS[name]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"sample{ending}"
-        write(path)
-        return path.read_bytes()
+    return content_of(ending, write)
 
 
 def rows_of(recording: Recording) -> Rows:

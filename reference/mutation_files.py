@@ -616,14 +616,19 @@ KINDS: dict[str, Kind] = {
 """Every kind of input that is read from a file."""
 
 
-@cache
-def sample(name: str) -> bytes:
-    """Return the content of an undamaged file of one of :data:`KINDS`."""
-    ending, write, _ = KINDS[name]
+def content_of(ending: str, write: Callable[[Path], object]) -> bytes:
+    """Return the content of a file that a function writes, with a name that ends in ``ending``."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"sample{ending}"
         write(path)
         return path.read_bytes()
+
+
+@cache
+def sample(name: str) -> bytes:
+    """Return the content of an undamaged file of one of :data:`KINDS`."""
+    ending, write, _ = KINDS[name]
+    return content_of(ending, write)
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:

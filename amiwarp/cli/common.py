@@ -292,7 +292,9 @@ class EncoderOptions:
 
 Format = Annotated[
     OutputFormat | None,
-    typer.Option(help="Format to write, if not that of the extension: dsec (.h5), evt21 (.raw).", show_default=False),
+    typer.Option(
+        help="Format to write, if the extension means another one: dsec (.h5), evt21 (.raw).", show_default=False
+    ),
 ]
 """Option that chooses a format whose extension means another one."""
 

@@ -45,14 +45,15 @@ class FrameOptions:
     decay_ms: Annotated[
         float | None,
         _in_frames(
-            min=0.001, help="Time constant of the time surface (ms). Default: that of three frames.", show_default=False
+            min=0.001, help="Time constant of the time surface (ms). Default: three frames.", show_default=False
         ),
     ] = None
     window: Annotated[
         str | None,
-        _in_frames(help="Show the events of this time (s from the first event); both ends are optional.",
-                   metavar="START:END"),
-    ] = None  # fmt: skip
+        _in_frames(
+            help="Show the events of this time (s from the first event); both ends are optional.", metavar="START:END"
+        ),
+    ] = None
     scale: Annotated[
         int | None,
         _in_frames(

@@ -428,7 +428,7 @@ def _write_kept(
         imu, frames = _imu_within(imu, chosen.window), _frames_within(frames, chosen.window)
         held = (("imu_samples", recording.imu, imu), ("frames", recording.frames, frames))
         removed_records = {name: len(whole) - len(part or ()) for name, whole, part in held if whole is not None}
-        # The counts in the metadata are of the whole recording. Those of triggers in the window are not known.
+        # The counts in the metadata are of the whole recording. How many triggers the window has is not known.
         lost = ("triggers",) if about.get("triggers") and recording.encoder is None else ()
         about = {name: value for name, value in about.items() if name not in RECORDS}
         about |= {name: len(part) for name, _, part in held if part is not None}

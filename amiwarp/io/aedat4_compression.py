@@ -52,7 +52,7 @@ class Decompressor:
         except (RuntimeError, MemoryError):
             content = None
         if content is None:
-            self._lz4 = None  # its state is that of an unfinished packet
+            self._lz4 = None  # its state belongs to an unfinished packet
         return content
 
     def _undo_lz4(self, data: bytes | memoryview, most: int) -> bytes | None:

@@ -40,7 +40,7 @@ class Aedat4File:
     start: int
     """Position of the first packet."""
     end: int
-    """Position behind the last packet: that of the table of the packets, or the end of the file."""
+    """Position behind the last packet: the start of the table of the packets, or the end of the file."""
 
     def first(self, kind: str) -> int | None:
         """Return the lowest number of a stream of this type, or None."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LARGEST_LIST = 1 << 22
-"""Largest packet of IMU samples or triggers that is read [bytes]. Those of cameras have a thousandth of it."""
+"""Largest packet of IMU samples or triggers that is read [bytes]. Packets of cameras have a thousandth of it."""
 
 U2 = struct.Struct("<H")
 U4 = struct.Struct("<I")

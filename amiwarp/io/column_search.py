@@ -190,7 +190,7 @@ def _check_scale(x: NDArray[Any], y: NDArray[Any]) -> None:
 
 
 def _is_openmv(columns: Sequence[Column]) -> bool:
-    """Return whether columns are those of OpenMV: type, s, ms, us, x, y."""
+    """Return whether columns are OpenMV's: type, s, ms, us, x, y."""
     if len(columns) != 6 or any(column.name for column in columns):
         return False
     if any(column.values.dtype.kind not in "iuf" or not column.values.size for column in columns):

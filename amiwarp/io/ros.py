@@ -1,6 +1,6 @@
 """Reader of ROS bags, with rosbags: ROS 1 bags, and the SQLite and MCAP files of ROS 2.
 
-Everything that touches the file runs in the reading process. The event times are those of the sensor. The messages are
+Everything that touches the file runs in the reading process. The event times are the sensor's. The messages are
 decoded in :mod:`amiwarp.io.ros_messages` and :mod:`amiwarp.io.ros_words`, those of other sensors in
 :mod:`amiwarp.io.ros_sensors`. Bags are written by :mod:`amiwarp.io.ros_writer`.
 """
@@ -169,7 +169,7 @@ def read_packets(notes: dict[str, int], path: str, topic: str, triggers: bool) -
         if each.message is not None:
             notes["truncated_bytes"] = notes.get("truncated_bytes", 0) + truncated_bytes(each.message)
         if len(events[2]):
-            latest = max(latest, int(events[2][-1]))  # those of a late message are earlier
+            latest = max(latest, int(events[2][-1]))  # the events of a late message are earlier
         notes["read"] = notes.get("read", 0) + 1
         notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
         yield edges if triggers else events

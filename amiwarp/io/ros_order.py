@@ -1,7 +1,7 @@
 """Order of the messages of a ROS bag by the numbers of their publishers: missing, late and repeated messages.
 
-A number that falls is mostly that of a late or a repeated message, and seldom a new start of the driver. These differ
-in the stamps: a late message has an earlier one than the message before it. Runs in the reading process.
+A number that falls mostly belongs to a late or a repeated message, and seldom shows a new start of the driver. These
+differ in the stamps: a late message has an earlier one than the message before it. Runs in the reading process.
 """
 
 import struct
@@ -56,7 +56,7 @@ class Numbered(NamedTuple):
 
 
 def numbered(one: Message, *, ros1: bool) -> Numbered:
-    """Return a message with its number. Arrays have that of their header, which only ROS 1 counts."""
+    """Return a message with its number. Arrays have their header's number, which only ROS 1 counts."""
     if one.connection.msgtype not in ARRAYS:
         message = deserialised(one.connection, one.raw, ros1=ros1)
         stamp = message.header.stamp
@@ -68,7 +68,7 @@ def numbered(one: Message, *, ros1: bool) -> Numbered:
 
 
 def number_of(message: Any) -> int:
-    """Return the number of a message, or that of its header, which only ROS 1 counts; 0 if it has none."""
+    """Return the number of a message, or of its header, which only ROS 1 counts; 0 if it has none."""
     number = getattr(message, "seq", None)
     return int(getattr(message.header, "seq", 0) if number is None else number)
 
@@ -205,8 +205,8 @@ def _number(each: Numbered) -> int:
 def _is_late(each: Numbered, other: Numbered) -> bool:
     """Return whether a message belongs before another one of its publisher that came before it.
 
-    Otherwise a smaller number is that of a new start. This takes a while, in which the stamps go on. If the stamps tell
-    nothing, because they stand still or were set back, the number falls far, and to one of the first.
+    Otherwise a smaller number is the first of a new start. This takes a while, in which the stamps go on. If the stamps
+    tell nothing, because they stand still or were set back, the number falls far, and to one of the first.
     """
     fall = _number(other) - _number(each)
     step = each.stamp - other.stamp

@@ -1,6 +1,6 @@
 """Reader of the messages ``sensor_msgs/Imu`` and ``sensor_msgs/Image`` in ROS bags. Runs in the reading process.
 
-Their units are rad/s and m/s^2. Their times are those of the messages' headers, the clock of events in arrays.
+Their units are rad/s and m/s^2. Their times are from the messages' headers, the clock of events in arrays.
 """
 
 from collections.abc import Iterator

@@ -2,7 +2,7 @@
 
 The reading process reads the messages. It finds what the packets do not tell a decoder of words: where packets are
 missing, so that the row and the time of the next events are unknown; where a pause was longer than the sensor's clock
-counts; and where this clock starts again. The program decodes the words, as it does those of RAW files.
+counts; and where this clock starts again. The program decodes the words, as it does with RAW files.
 """
 
 import itertools
@@ -273,7 +273,7 @@ def _with_next(values: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
 
 
 def checked_words(message: Any, encoding: str) -> NDArray[Any]:
-    """Return the words of a message. Raises :class:`AmiwarpError` for those of another encoding."""
+    """Return the words of a message. Raises :class:`AmiwarpError` for another encoding."""
     if message.encoding != encoding:
         raise AmiwarpError(
             f"has packets of the encodings '{encoding}' and '{message.encoding[:40]}' in one topic; "
@@ -284,7 +284,7 @@ def checked_words(message: Any, encoding: str) -> NDArray[Any]:
 
 
 def check_byte_order(message: Any) -> None:
-    """Raise :class:`AmiwarpError` if the words of a message are those of a big-endian machine."""
+    """Raise :class:`AmiwarpError` if a big-endian machine wrote the words of a message."""
     if message.is_bigendian:
         raise AmiwarpError("has packets of big-endian words, which are not read; record on a little-endian machine")
 
@@ -332,7 +332,7 @@ def decoded(path: Path, topic: str, layout: Layout, notes: dict[str, int]) -> It
                 np.add(events.t, offset, out=events.t)
                 np.add(edges.t, offset, out=edges.t)
             if events.t.size:
-                latest = max(latest, int(events.t[-1]))  # those of a late message are earlier
+                latest = max(latest, int(events.t[-1]))  # the events of a late message are earlier
             notes["triggers"] = notes.get("triggers", 0) + len(edges.t)
             notes["unknown_words"] = decoder.unknown
             yield Decoded(events, edges, part, lengths[start:stop], recorded[start:stop], stamps[start:stop])

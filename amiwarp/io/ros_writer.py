@@ -116,7 +116,7 @@ def _write_messages(
     bag: Bag | None,
     add_topic: Callable[[Any, dict[str, Any]], Any],
 ) -> None:
-    """Write the messages of all events, and those of the other topics of a bag, in the order of their recording."""
+    """Write the messages of all events, and of the other topics of a bag, in the order of their recording."""
     with contextlib.ExitStack() as opened:
         found = ((recorded, connection, data) for block in blocks for recorded, data in encode(block))
         streams = [opened.enter_context(contextlib.closing(found))]
@@ -130,7 +130,7 @@ def _write_messages(
 class _Clock:
     """Times of messages from the times of their events.
 
-    Without a bag they are equal. Otherwise they follow those of the messages that held the events.
+    Without a bag they are equal. Otherwise they follow the times of the messages that held the events.
     """
 
     def __init__(self, bag: Bag | None) -> None:
