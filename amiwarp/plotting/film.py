@@ -18,7 +18,7 @@ from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.export import brightest, in_two_colours, to_picture
 from amiwarp.imaging.iwe import PIECE, CanvasShape, Votes
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
-from amiwarp.imaging.tensors import time_surface
+from amiwarp.imaging.tensors import latest_times
 from amiwarp.io.spans import blocks_between
 from amiwarp.reconstruction.picture import LIMITS_UPDATE, save_film
 from amiwarp.tasks import Progress
@@ -34,8 +34,8 @@ MOST_EVENTS = 1 << 26
 """Largest number of events of a frame, which are kept in memory."""
 DECAY_FRAMES = 3.0
 """Default time constant of a time surface, in frames: edges leave a short trail."""
-REACH = 7.0
-"""Age up to which events count in a time surface, in time constants. Older ones would add a quarter of a grey level."""
+NEVER = -(2**62)
+"""Time of the latest event of a pixel that has had none [us]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ def frames_of_time(blocks: Iterable[Events], timing: Timing, reach_us: int | Non
     for frame in range(timing.count):
         end = timing.end(frame)
         low = before if reach_us is None else end - reach_us
-        # Blocks are joined once a frame: a time surface holds the events of many.
+        # Blocks are joined once a frame, which may hold the events of many.
         held = held[int(np.searchsorted(held.t, min(low, before))) :]
         parts = [held]
         count = len(held)
@@ -91,8 +91,8 @@ def frames_of_time(blocks: Iterable[Events], timing: Timing, reach_us: int | Non
             count += len(block)
             if count > MOST_EVENTS:
                 raise AmiwarpError(
-                    f"a frame holds more than {MOST_EVENTS:,} events; give a shorter --frame-ms or --decay-ms "
-                    "(frame_us, decay_us in Python), or a lower --speed"
+                    f"a frame holds more than {MOST_EVENTS:,} events; give a shorter --frame-ms (frame_us in "
+                    "Python), or a lower --speed"
                 )
         held = Events.concatenate([part for part in parts if len(part)] or [Events.empty()])
         first, since, stop = np.searchsorted(held.t, (low, before, end)).tolist()
@@ -137,20 +137,21 @@ class CountPainter:
 
 
 class SurfacePainter:
-    """Pictures of the time surfaces of OFF and ON events."""
+    """Pictures of the time surfaces of OFF and ON events. Each event is looked at once, however slowly it decays."""
 
     def __init__(self, size: tuple[int, int], decay_us: float, device: Any) -> None:
         """Take the width and height of the sensor [px], and the time constant of the decay [us]."""
         self._size, self._decay_us, self._device = size, decay_us, device
+        width, height = size
+        self._latest = np.full((2, height, width), NEVER, np.int64)
 
     def __call__(self, shown: Shown) -> NDArray[np.uint8]:
-        """Return the picture of the events, shape ``(height, width, 3)``."""
-        width, height = self._size
-        if not len(shown.events):
-            return np.zeros((height, width, 3), np.uint8)
-        off, on = np.asarray(
-            time_surface(shown.events, width, height, self._decay_us, t_end=shown.end_us, device=self._device)
-        )
+        """Return the picture after the events since the frame before, shape ``(height, width, 3)``."""
+        if len(shown.events):
+            latest = latest_times(shown.events, *self._size, device=self._device)
+            np.maximum(self._latest, np.asarray(latest), out=self._latest)
+        age = (shown.end_us - self._latest).astype(np.float32)
+        off, on = np.exp(age / np.float32(-self._decay_us))
         return np.asarray(np.rint(np.clip(in_two_colours(off, on), 0.0, 1.0) * 255.0), np.uint8)
 
 
@@ -352,8 +353,7 @@ def render(
     else:
         timing = _timing(start, stop, fps, speed, frame_us)
         decay = _decay(mode, decay_us, timing)
-        reach = frame_us if decay is None else math.ceil(REACH * decay)
-        chosen = frames_of_time(blocks_between(source, start, stop), timing, reach)
+        chosen = frames_of_time(blocks_between(source, start, stop), timing, frame_us)
     paint: CountPainter | SurfacePainter = CountPainter((width, height), device)
     if decay is not None:
         paint = SurfacePainter((width, height), decay, device)
