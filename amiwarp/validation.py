@@ -616,3 +616,12 @@ def check_names(given: Collection[str], known: Collection[str], what: str) -> No
             near = difflib.get_close_matches(str(name), known, 1)
             meant = f"did you mean {near[0]}?" if near else f"choose among {', '.join(known)}"
             raise AmiwarpError(f"{what}{shown(name)[1:-1]} is unknown; {meant}")
+
+
+def check_slice(start: int, stop: int) -> None:
+    """Raise :class:`AmiwarpError` for a negative index in ``slice``, which counts from the first event."""
+    if min(start, stop) < 0:
+        raise AmiwarpError(
+            f"slice({start}, {stop}) has a negative index, and counts from the first event; events[-5:] are the last "
+            "five, as of a list"
+        )

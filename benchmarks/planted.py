@@ -51,6 +51,11 @@ class Defect:
         return self.file, self.before, self.after
 
 
+def name_of(row: dict[str, Any]) -> tuple[str, str, str]:
+    """Return the name of the defect of a row of a file of outcomes, as :attr:`Defect.name`."""
+    return row["file"], row["before"], row["after"]
+
+
 def load() -> list[Defect]:
     """Return all defects."""
     rows = tomllib.loads(DEFECTS.read_text())["defect"]
@@ -114,9 +119,13 @@ def main() -> None:
         earlier = json.loads(given.again.read_text())
         first = earlier["first_run"]
         judged = {(row["file"], row["before"], row["after"]) for row in earlier["defects"]}
-        rows = [row for row in earlier["defects"] if row["outcome"] == "killed"]
-        settled = {(row["file"], row["before"], row["after"]) for row in rows}
-        chosen = [defect for defect in chosen if defect.name not in settled]
+        killed = {
+            (row["file"], row["before"], row["after"]) for row in earlier["defects"] if row["outcome"] == "killed"
+        }
+        chosen = [defect for defect in chosen if defect.name not in killed]
+        today = {defect.name for defect in chosen}
+        # Defects of other areas keep their outcome, whatever it was.
+        rows = [row for row in earlier["defects"] if name_of(row) not in today]
     wp.init()
     with tempfile.TemporaryDirectory() as scratch, ThreadPoolExecutor(given.jobs) as pool:
         kernels = Path(scratch) / "kernels"  # a copy without what others compile now; kernels of defects are not kept
@@ -145,7 +154,7 @@ def main() -> None:
         seconds = dict(zip(files, pool.map(measure, files), strict=True))
         list(pool.map(one, chosen))
     order = {defect.name: k for k, defect in enumerate(load())}
-    rows.sort(key=lambda row: order.get((row["file"], row["before"], row["after"]), len(order)))
+    rows.sort(key=lambda row: order.get(name_of(row), len(order)))
     print(found := score(rows))
     if given.out:
         result = {"first_run": first_scores(first, found), "now": found, "defects": rows}

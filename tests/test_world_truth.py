@@ -180,8 +180,13 @@ def test_slices_of_events_and_truth_stay_aligned(
         np.testing.assert_array_equal(events.t, recording.events.slice(start, stop).t)
         for name in PER_EVENT:
             assert len(getattr(truth, name)) == len(events)
-            expected = getattr(whole, name)[max(start, 0) : max(stop, 0)]
-            np.testing.assert_array_equal(getattr(truth, name), expected)
+            np.testing.assert_array_equal(getattr(truth, name), getattr(whole, name)[start:stop])
+
+
+@pytest.mark.parametrize("read", ["of_events", "points"])
+def test_truth_has_no_negative_indices(recording: amiwarp.Recording, read: str) -> None:
+    with pytest.raises(AmiwarpError, match=r"slice\(-3, 4\) has a negative index"):
+        getattr(truth_of(recording), read)(-3, 4)
 
 
 def test_truth_of_a_file_is_sliced_without_steps(stored: Path) -> None:

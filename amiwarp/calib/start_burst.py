@@ -17,11 +17,10 @@ from amiwarp.events.recording import (
     EventSource,
     MemoryEvents,
     Recording,
-    check_slice,
     check_window,
     regroup,
 )
-from amiwarp.validation import guarded
+from amiwarp.validation import check_slice, guarded
 
 FEWEST_EVENTS = 200
 """Smallest number of events at the first time stamp that may be a burst."""

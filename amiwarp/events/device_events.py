@@ -20,7 +20,18 @@ from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, describ
 from amiwarp.kernels import events as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import TIME_LIMIT, as_times, guarded, instance, on_gpu, one_of, packed, shown, whole
+from amiwarp.validation import (
+    TIME_LIMIT,
+    as_times,
+    check_slice,
+    guarded,
+    instance,
+    on_gpu,
+    one_of,
+    packed,
+    shown,
+    whole,
+)
 
 # Arrays of any library as Warp arrays, through DLPack: without a copy if the type allows, else with a checked copy.
 
@@ -568,7 +579,7 @@ class DeviceMemoryEvents(EventSource):
         AmiwarpError
             If an index is negative.
         """
-        checks.check_slice(start, stop)
+        check_slice(start, stop)
         return self[start:stop]
 
     def find(self, t: int) -> int:

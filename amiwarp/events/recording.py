@@ -20,7 +20,18 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.truth import Instants, StoredInstants, Truth
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import NominalPrism
-from amiwarp.validation import INT64, TIME_LIMIT, as_times, guarded, instance, not_called, packed, shown, whole
+from amiwarp.validation import (
+    INT64,
+    TIME_LIMIT,
+    as_times,
+    check_slice,
+    guarded,
+    instance,
+    not_called,
+    packed,
+    shown,
+    whole,
+)
 from amiwarp.validation import array as as_numbers
 
 # Conversion and checks of event arrays: types, time limits, frame and order.
@@ -173,15 +184,6 @@ def slice_bounds(which: object, length: int, what: str = "events") -> tuple[int,
     if step != 1:
         raise AmiwarpError(f"{what} are sliced in steps of {step}; slice without steps, then NumPy arrays with them")
     return start, max(start, stop)
-
-
-def check_slice(start: int, stop: int) -> None:
-    """Raise :class:`AmiwarpError` for a negative index in ``slice``, which counts from the first event."""
-    if min(start, stop) < 0:
-        raise AmiwarpError(
-            f"slice({start}, {stop}) has a negative index, and counts from the first event; events[-5:] are the last "
-            "five, as of a list"
-        )
 
 
 def check_window(t_start: int, t_end: int) -> None:

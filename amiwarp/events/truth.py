@@ -17,6 +17,7 @@ from amiwarp.validation import (
     array,
     as_times,
     check_ascending,
+    check_slice,
     finite,
     guarded,
     instance,
@@ -545,8 +546,14 @@ class Truth:
         -------
         numpy.ndarray or None
             Pixels without the prism [px], shape (n, 2), or None if they are not stored.
+
+        Raises
+        ------
+        AmiwarpError
+            If an index is negative.
         """
-        return None if self.stored_points is None else self.stored_points[max(start, 0) : max(stop, 0)]
+        check_slice(start, stop)
+        return None if self.stored_points is None else self.stored_points[start:stop]
 
     def known_at(self, t_us: ArrayLike, xy: ArrayLike) -> NDArray[np.bool_]:
         """Return whether the scene is known at pixels without the prism.
@@ -593,7 +600,13 @@ class Truth:
         -------
         EventTruth
             The arrays that are stored, with one row per event.
+
+        Raises
+        ------
+        AmiwarpError
+            If an index is negative.
         """
-        which = slice(max(start, 0), max(stop, 0))
+        points = self.points(start, stop)
+        which = slice(start, stop)
         stores = self.stored_causes, self.stored_instances, self.stored_depths, self.stored_places
-        return EventTruth(self.points(start, stop), *(None if store is None else store[which] for store in stores))
+        return EventTruth(points, *(None if store is None else store[which] for store in stores))

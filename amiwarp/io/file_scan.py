@@ -30,7 +30,6 @@ from amiwarp.events.recording import (
     MetadataValue,
     as_coordinate,
     as_polarity,
-    check_slice,
     check_window,
     regroup,
 )
@@ -38,7 +37,7 @@ from amiwarp.events.truth import Instants
 from amiwarp.io.files import errors_name, open_input, register_reader
 from amiwarp.io.reading_process import packets
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
-from amiwarp.validation import guarded, rounded_times
+from amiwarp.validation import check_slice, guarded, rounded_times
 
 Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""

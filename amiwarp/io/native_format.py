@@ -57,7 +57,18 @@ from amiwarp.optics.camera import (
 from amiwarp.optics.prism import FlatSide, NominalPrism, Plate, Prism, UnsizedPrism, as_wedge
 from amiwarp.tasks import Progress, Result, in_order
 from amiwarp.validation import array as as_numbers
-from amiwarp.validation import as_times, choice, guarded, instance, one_of, real, rounded_times, shown, whole
+from amiwarp.validation import (
+    as_times,
+    check_slice,
+    choice,
+    guarded,
+    instance,
+    one_of,
+    real,
+    rounded_times,
+    shown,
+    whole,
+)
 
 # Layout of the file.
 
@@ -373,7 +384,7 @@ class NativeEvents(EventSource):
 
     def slice(self, start: int, stop: int) -> Events:
         """Return the events with ``start <= index < stop``, and check them. Threads may call it in parallel."""
-        checks.check_slice(start, stop)
+        check_slice(start, stop)
         stop = min(max(stop, start), self._count)
         with errors_name(self.path, lambda: f"events {start} .. {stop}"):
             x, y, p = (self._read(name, start, stop) for name in ("x", "y", "p"))
