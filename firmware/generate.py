@@ -30,6 +30,10 @@ def described() -> str:
         f"#define PROTOCOL_VERSION {protocol.VERSION}",
         f"#define LONGEST_FRAME {protocol.LONGEST}",
         f"#define MOST_SAMPLES {protocol.MOST_SAMPLES}",
+        *(
+            f"#define {which}_PULSE_MS {ms}u"
+            for which, ms in zip(("LEAST", "MOST"), protocol.PULSE_INTERVAL_MS, strict=True)
+        ),
         f"#define SAMPLES_TYPE 0x{protocol.Samples.KIND:02X}",
         "#define SAMPLE_BYTES 8",
     ]

@@ -561,3 +561,43 @@ def test_the_streams_encoders_must_suit_the_model() -> None:
         Compensator(MIRROR, EncoderStream())
     with pytest.raises(AmiwarpError, match="the model has one prism; use the model 'risley', or 'mirror'"):
         Compensator(MODEL, EncoderStream(second=-0.5))
+
+
+def test_samples_that_turn_out_to_be_on_another_clock_are_forgotten_on_the_device_too() -> None:
+    """Samples are copied to the device ahead of the events."""
+    t = np.arange(0, 200_000, 1000)
+    encoder = EncoderStream()
+    encoder.append(t, t * 1e-4)
+    compensator = Compensator(MODEL, encoder)
+    compensator.put(Events.from_arrays([30], [20], [5000], [1]), 0)
+    compensator.take(0)
+    encoder.clear()
+    assert (len(encoder), encoder.first) == (0, None)
+    encoder.append(t, t * 1e-4 + 2.0)
+    compensator.put(Events.from_arrays([30], [20], [20_000], [1]), 0)
+    [packet] = compensator.take(0)
+    assert packet.flags.tolist() == [0]
+    expected = MODEL.compensate_points(np.array([[30.0, 20.0]], np.float32), np.array([4.0], np.float32))
+    np.testing.assert_allclose([packet.events.x[0], packet.events.y[0]], expected[0], atol=1e-3)
+
+
+def test_samples_of_both_encoders_are_forgotten() -> None:
+    t = np.arange(0, 10_000, 1000)
+    second = EncoderStream()
+    encoder = EncoderStream(second=second)
+    for each in (encoder, second):
+        each.append(t, t * 1e-4)
+    encoder.clear()
+    assert (len(encoder), len(second)) == (0, 0)
+    for each in (encoder, second):
+        each.append(t, t * 1e-4 + 2.0)
+    np.testing.assert_allclose(encoder.over(0, 9000).angles_at([5000])[0], 2.5)
+
+
+def test_all_angles_count_as_guesses_while_the_clock_is_not_sure() -> None:
+    encoder = EncoderStream()
+    encoder.append([0, 1000, 2000], [0.0, 0.1, 0.2])
+    assert encoder.knows(100, 1900)
+    encoder.sure = False
+    assert not encoder.knows(100, 1900)
+    assert encoder.guessed(np.array([100, 1900])).tolist() == [True, True]

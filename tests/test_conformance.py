@@ -174,7 +174,7 @@ def test_the_command_prints_a_table_and_ends_with_status_1_for_a_failure(monkeyp
     done = motor("check", "--port", "p", "--yes")
     assert done.exit_code == 1
     assert "1 of 19 checks failed" in done.stdout
-    assert "sync pulses: send two to ten pulses per second" in done.stdout
+    assert "sync pulses: send a pulse every 70 to 130 ms, drawn at random for each" in done.stdout
 
 
 @pytest.mark.parametrize(

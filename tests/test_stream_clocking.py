@@ -5,13 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from amiwarp.live.link.clocks import CameraClock, fit_to_round_trips
+from amiwarp.live.link.camera_clock import CameraClock, ClockSource
+from amiwarp.live.link.clocks import fit_to_round_trips
 
 OFFSET, DRIFT = 1_700_000_000_000_000, 40e-6
 
 
 def camera_time(t: float) -> int:
     return round(t + OFFSET + DRIFT * t)
+
+
+def irregular(count: int, seed: int = 0) -> np.ndarray:
+    """Return the times of pulses at intervals of 70 to 130 whole milliseconds [us]."""
+    return np.cumsum(np.random.default_rng(seed).integers(70, 131, count)) * 1000
 
 
 def follow(
@@ -90,20 +96,150 @@ def test_triggers_that_come_at_once_beside_prompt_syncs_wait_for_others() -> Non
     assert int(found(600_000)) == pytest.approx(7_600_000, abs=3)
 
 
-def test_three_pulses_are_enough_and_two_are_not() -> None:
-    assert follow(np.arange(2) * 100_000).clock(None) is None
-    clock = follow(np.arange(3) * 100_000).clock(None)
-    assert clock is not None
-    assert abs(int(clock(300_000)) - camera_time(300_000)) <= 20
+@pytest.mark.parametrize("seed", range(20))
+def test_six_irregular_pulses_are_enough_and_five_are_not(seed: int) -> None:
+    assert follow(irregular(5, seed), seed=seed).clock(None) is None
+    clock = follow(irregular(6, seed), seed=seed)
+    found = clock.clock(None)
+    assert found is not None
+    assert clock.source is ClockSource.PULSES
+    assert abs(int(found(300_000)) - camera_time(300_000)) <= 20
+
+
+def test_seven_regular_pulses_are_enough_and_six_are_not() -> None:
+    assert follow(np.arange(6) * 100_000).clock(None) is None
+    clock = follow(np.arange(7) * 100_000)
+    found = clock.clock(None)
+    assert found is not None
+    assert abs(int(found(300_000)) - camera_time(300_000)) <= 20
+    assert clock.source is ClockSource.REGULAR
+    assert found.offset_std_us == 100_000  # by which it may be wrong
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("delay_us", [0, 50_000, 300_000, 1_000_000, 5_000_000, 9_000_000])
+@pytest.mark.parametrize("missed", [0.0, 0.3])
+def test_irregular_pulses_meet_their_own_however_late_the_reports_are(seed: int, delay_us: int, missed: float) -> None:
+    rng = np.random.default_rng(seed)
+    times = irregular(200, seed)
+    sync, seen = (set(np.flatnonzero(rng.uniform(size=200) >= missed).tolist()) for _ in range(2))
+    clock = follow(times, delay_us=delay_us, sync=sync, seen=seen, seed=seed)
+    found = clock.clock(None)
+    assert found is not None
+    assert clock.source is ClockSource.PULSES
+    late = int(times[-1])
+    assert abs(int(found(late)) - camera_time(late)) <= 3
+    assert found.offset_std_us < 1.0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_triggers_of_something_else_are_never_paired(seed: int) -> None:
+    """Pulses of the controller, and triggers at other irregular times."""
+    clock = CameraClock()
+    heard = [(int(t), 0) for t in irregular(150, seed)] + [(int(t), 1) for t in irregular(150, seed + 1000)]
+    for t, is_trigger in sorted(heard):
+        if is_trigger:
+            clock.triggers([camera_time(t)], t)
+        else:
+            clock.sync(t, t)
+        assert clock.clock(None) is None
+
+
+def test_irregular_pulses_that_repeat_fit_under_two_shifts_and_are_not_paired() -> None:
+    """Eight different intervals, again and again: nothing tells one round from the next."""
+    times = np.cumsum(np.tile(np.array([71, 95, 128, 88, 101, 119, 77, 110]), 10)) * 1000
+    assert follow(times, seen=set(range(24)), delay_us=9_000_000).clock(None) is None
+    assert follow(times, delay_us=9_000_000).clock(None) is None
+
+
+def test_a_clock_that_has_drifted_while_no_pulse_was_seen_is_still_met() -> None:
+    """Quartzes that warm up: 0.4 ms in five minutes without triggers."""
+    times = irregular(3200)
+    clock = CameraClock()
+    for k, t in enumerate(times.tolist()):
+        clock.sync(t, t + 500)
+        if k < 100:
+            clock.triggers([camera_time(t)], t + 4000)
+        elif k >= 3100:
+            clock.triggers([camera_time(t) + 400], t + 4000)
+        if k >= 10:
+            assert clock.clock(None) is not None
+    found = clock.clock(None)
+    assert found is not None
+    assert abs(int(found(int(times[-1]))) - camera_time(int(times[-1])) - 400) <= 5
+
+
+def test_extra_triggers_between_the_pulses_do_no_harm() -> None:
+    """As the falling edges, which some cameras report, too."""
+    times = irregular(30)
+    clock = CameraClock()
+    for t in times.tolist():
+        clock.sync(t, t + 500)
+        clock.triggers([camera_time(t), camera_time(t + 1000)], t + 4000)
+    found = clock.clock(None)
+    assert found is not None
+    assert abs(int(found(int(times[-1]))) - camera_time(int(times[-1]))) <= 2
+
+
+def test_a_camera_clock_that_jumps_is_noticed_and_found_again() -> None:
+    times = irregular(80)
+    clock = CameraClock()
+    errors = []
+    for k, t in enumerate(times.tolist()):
+        jump = 0 if k < 40 else 250_000
+        clock.sync(t, t + 500)
+        clock.triggers([camera_time(t) + jump], t + 4000)
+        found = clock.clock(None)
+        errors.append(None if found is None else int(found(t)) - camera_time(t) - jump)
+    assert errors[39] is not None
+    assert abs(errors[39]) <= 2
+    assert None in errors[40:60]
+    assert errors[-1] is not None
+    assert abs(errors[-1]) <= 2
+
+
+def test_a_pulled_trigger_cable_keeps_the_map_and_the_pulses_after_it_match_again() -> None:
+    times = irregular(1500)
+    clock = CameraClock()
+    for k, t in enumerate(times.tolist()):
+        clock.sync(t, t + 500)
+        if not 50 <= k < 1200:
+            clock.triggers([camera_time(t)], t + 4000)
+        if k >= 10:
+            assert clock.clock(None) is not None
+            assert clock.source is ClockSource.PULSES
+    found = clock.clock(None)
+    assert found is not None
+    assert abs(int(found(int(times[-1]))) - camera_time(int(times[-1]))) <= 2
+    assert found.pairs >= 90
+
+
+@pytest.mark.parametrize(("with_triggers", "patience_us"), [(False, 3_000_000), (True, 10_000_000)])
+def test_arrival_times_are_used_only_after_pulses_were_waited_for(with_triggers: bool, patience_us: int) -> None:
+    sent = np.arange(20) * 50_000
+    host, clock = fit_to_round_trips(sent, sent + 150, sent + 300), CameraClock()
+    rng = np.random.default_rng(0)
+    for t in range(0, 12_000_000, 50_000):
+        clock.packet(camera_time(t), t + 2000)
+        if with_triggers:
+            clock.triggers([camera_time(t)], t + 2000)
+            clock.sync(int(rng.integers(t, t + 40_000)), t)  # at other intervals
+        known = clock.clock(host) is not None
+        assert known == (t >= patience_us)
+        assert clock.source is (ClockSource.ARRIVAL if known else ClockSource.UNKNOWN)
+    clock.restart()
+    assert clock.clock(host) is None
+    clock.settle()
+    assert clock.clock(host) is not None
 
 
 def test_after_a_restart_of_the_controller_it_is_found_anew() -> None:
     clock = follow(np.arange(10) * 100_000)
     clock.restart()
     assert clock.clock(None) is None
-    for k in range(5):
-        clock.sync(k * 100_000, 9_000_000 + k * 100_000)
-        clock.triggers([5_000_000 + k * 100_000], 9_004_000 + k * 100_000)
+    for t in irregular(8).tolist():
+        clock.sync(t, 9_000_000 + t)
+        clock.triggers([5_000_000 + t], 9_004_000 + t)
     again = clock.clock(None)
     assert again is not None
     assert abs(int(again(400_000)) - 5_400_000) <= 3
@@ -116,6 +252,7 @@ def test_without_pulses_arrivals_tell_within_what_they_say() -> None:
     host = fit_to_round_trips(sent, sent - 7_000_000 + 150, sent + 300)
     for t in range(0, 1_000_000, 1000):
         clock.packet(camera_time(t), t + 7_000_000 + 2000 + int(rng.integers(0, 3000)))
+    clock.settle()
     found = clock.clock(host)
     assert found is not None
     error = int(found(1_000_000)) - camera_time(1_000_000)
@@ -134,6 +271,7 @@ def test_without_pulses_a_controller_that_runs_fast_is_followed(ahead_us: int) -
     host = fit_to_round_trips(sent + ahead_us, answered, sent + ahead_us + 300)
     for t in sent.tolist():
         clock.packet(t - 2000, t + ahead_us)
+    clock.settle()
     found = clock.clock(host)
     assert found is not None
     for seconds in (0, 10, 20):
@@ -148,6 +286,7 @@ def test_a_camera_that_returns_has_no_delay_of_its_former_clock() -> None:
     assert clock.clock(host) is None
     for t in (50_000_000, 50_010_000, 50_020_000):  # its clock begins anew
         clock.packet(t - 50_000_000, t)
+    clock.settle()
     found = clock.clock(host)
     assert found is not None
     assert int(found(50_005_000)) == 5000

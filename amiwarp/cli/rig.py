@@ -181,7 +181,8 @@ def describe(s: SessionStatus, width: int = 80) -> str:
     parts += [] if s.sharpness is None else [f"sharpness {s.sharpness:.2f}"]
     parts += [] if s.coverage is None else [f"edges {100.0 * s.coverage:.0f} %"]
     parts += [f"{s.events:,} events", *lost[2:]]
-    parts += [] if s.clock is None else [f"clocks ±{s.clock.offset_std_us:.0f} µs"]
+    parts += [] if s.clock is None else [f"clocks ±{s.clock.offset_std_us:.0f} µs by {s.clock_source}"]
+    parts += ["clocks unknown"] if s.clock is None and s.clock_source is not None else []
     while len(", ".join(parts)) > width:
         parts.pop()
     return ", ".join(parts)
@@ -245,7 +246,16 @@ def session_summary(s: SessionStatus, source: Source) -> dict[str, Any]:
         "compensated": s.done, "outside": s.outside, "extrapolated": s.guessed, "without_angle": s.unknown,
         "dropped": s.dropped, "late": s.late, "returns": getattr(source, "returns", 0),
         "lost_usb_packets": getattr(source, "lost", 0), "broke_off": getattr(source, "problem", None),
+        "clock": None if s.clock_source is None else _clock_summary(s),
     }  # fmt: skip
+
+
+def _clock_summary(s: SessionStatus) -> dict[str, Any]:
+    """Return how the clocks of controller and camera are related, and within what [us]."""
+    source, clock = str(s.clock_source), s.clock
+    if clock is None:
+        return {"from": source, "uncertainty_us": None, "pulses": 0}
+    return {"from": source, "uncertainty_us": clock.offset_std_us, "pulses": clock.pairs}
 
 
 # ``amiwarp live``: motion compensation of a live stream.
@@ -571,8 +581,18 @@ def _live_lines(d: dict[str, Any]) -> list[str]:
     speed = f"{d['seconds']:.1f} s, {d['mev_per_s']:.3g} Mev/s by the {d['model']} model on {d['device']}"
     return [
         f"{d['compensated']:,} events ({', '.join(marked) or 'all inside the image with a measured angle'}), {speed}",
+        *_clock_lines(d["clock"]),
         *d["files"],
     ]
+
+
+def _clock_lines(clock: dict[str, Any] | None) -> list[str]:
+    """Return what is said at the end about the clocks of controller and camera."""
+    if clock is None:
+        return []
+    if clock["uncertainty_us"] is None:
+        return ["clocks of controller and camera: never related"]
+    return [f"clocks of controller and camera: by {clock['from']}, ±{clock['uncertainty_us']:.1f} µs"]
 
 
 # ``amiwarp record``: recording of a live camera and encoder to a file that survives crashes.

@@ -585,6 +585,7 @@ class Compensator:
         self._in_flight: tuple[BatchInFlight, NDArray[np.bool_] | None] | None = None
         self._t_last = -(2**62)
         self._covered: tuple[int, int] | None = None
+        self._cleared = encoder.cleared
 
     def put(self, events: Events | DeviceEvents, now_us: int, *, arrived_us: int | None = None) -> None:
         """Queue a packet. The packet is kept, not copied.
@@ -807,6 +808,8 @@ class Compensator:
 
     def _set_encoder(self, first: int, last: int, last_known: int) -> None:
         """Copy the encoder's samples over a span of event times [us] to the device, unless it has them already."""
+        if self._cleared != self.encoder.cleared:  # the samples on the device were on another clock
+            self._cleared, self._covered = self.encoder.cleared, None
         if self._covered is None or first < self._covered[0] or last > self._covered[1]:
             until = max(last, min(last_known, last + AHEAD_US))
             self._pipeline.set_encoder(self.encoder.over(first, until), first, until)

@@ -1096,6 +1096,10 @@ class EncoderStream:
         """Stream of the second encoder, or the speed of the second prism relative to the first; None for one prism."""
         self.dropped = 0
         """Number of samples that were dropped because they were not later than the sample before them."""
+        self.sure = True
+        """Whether the clock of the samples is known. Until it is, all angles count as estimates."""
+        self.cleared = 0
+        """How many times :meth:`clear` was called, by which is known whether copies of samples are still good."""
         self._t, self._angle = np.zeros(2 * capacity, np.int64), np.zeros(2 * capacity, np.float64)
         self._stop = 0
         self._gaps: list[tuple[int, int]] = []
@@ -1134,6 +1138,16 @@ class EncoderStream:
         if not self._started:
             return None
         return min(math.floor(int(e._t[e._stop - 1]) - self.clock_offset_us) for e in self._encoders)
+
+    def clear(self) -> None:
+        """Forget all samples, for example because their times turned out to be on another clock.
+
+        It applies to the second encoder too.
+        """
+        self.cleared += 1
+        for each in self._encoders:
+            each._stop, each._gaps = 0, []
+            each._restarted, each._commands = False, CommandAngles()
 
     def restart(self) -> None:
         """Mark that later samples do not continue earlier samples, for example after a reset of the controller.
@@ -1321,6 +1335,8 @@ class EncoderStream:
 
     def _estimated_spans(self) -> Iterator[tuple[int, int]]:
         """Yield the spans of event times [us], ends excluded, in which an angle is extrapolated or in a gap."""
+        if not self.sure:
+            yield -(2**62), 2**62
         for e in self._encoders:
             yield -(2**62), math.ceil(int(e._t[0]) - self.clock_offset_us)
             for begin, end in e._gaps:
@@ -1338,7 +1354,8 @@ class EncoderStream:
         Returns
         -------
         numpy.ndarray
-            True for times in a gap, before the first sample or after the last, shape (n,).
+            True for times in a gap, before the first sample or after the last, or for all if the clock is not
+            :attr:`sure`, shape (n,).
         """
         t = _event_times(t)
         if t.ndim != 1:

@@ -250,6 +250,19 @@ static void execute(struct controller *c, uint32_t size, uint32_t now) {
     check(c, now);
 }
 
+/* Draw the next interval between two pulses to the camera. It is irregular, so that the host finds which of the camera's
+   triggers belongs to which pulse, however late they are reported. The time of the host's last message makes the intervals others
+   after each reset. Xorshift of Marsaglia, 2003. */
+static void draw_interval(struct controller *c) {
+    uint32_t x = c->random ^ c->heard;
+    if (!x) x = 1;
+    x ^= x << 13;
+    x ^= x >> 17;
+    x ^= x << 5;
+    c->random = x;
+    c->interval = (uint8_t)(LEAST_PULSE_MS + (uint16_t)(x >> 8) % (MOST_PULSE_MS - LEAST_PULSE_MS + 1u));
+}
+
 void controller_begin(struct controller *c, const struct settings *settings, uint32_t now) {
     uint8_t *bytes = (uint8_t *)c;
     for (uint32_t k = 0; k < sizeof *c; k++) bytes[k] = 0;
@@ -259,9 +272,16 @@ void controller_begin(struct controller *c, const struct settings *settings, uin
     tracker_begin(&c->tracker, 0, settings->counts_per_turn);
     c->heard = now;
     c->checked_at = now;
+    c->random = now;
+    draw_interval(c);
+    c->until_pulse = c->interval;
 }
 
 void controller_poll(struct controller *c, uint32_t now) {
+    if (c->interval_used) {
+        c->interval_used = false;
+        draw_interval(c);
+    }
     while (WAITING(c->rx)) {
         uint8_t byte = *FIRST(c->rx, RX_BYTES);
         DROP(c->rx);

@@ -76,7 +76,8 @@ struct controller {
     volatile uint32_t ticks, edges_lost, overruns; /* overruns: samples, pulses or bytes that found their ring full */
     volatile bool too_fast;                        /* more edges than the port counts */
     volatile uint8_t bad_answers;                  /* of the magnetic encoder, one after the other */
-    uint8_t since_pulse;                           /* ticks since the last tenth of a second */
+    uint8_t until_pulse;                           /* ticks until the next pulse to the camera */
+    volatile bool interval_used;                   /* whether the main loop shall draw another interval */
     uint8_t levels;                                /* 2 A + B at the last edge */
     bool backwards;                                /* direction; written by the main loop with a magnetic encoder */
     uint16_t angle;                                /* of the magnetic encoder */
@@ -86,6 +87,7 @@ struct controller {
     RING(struct stamp, WAITING_PULSES) sync;
     RING(uint8_t, RX_BYTES) rx;
     /* Written by the main loop. */
+    volatile uint8_t interval; /* between the next two pulses to the camera [ms] */
     RING(uint8_t, TX_BYTES) tx;
     int32_t duty;
     bool enabled;
@@ -94,7 +96,7 @@ struct controller {
     struct tracker tracker;
     struct speed_control control;
     struct stamp batch[BATCH], last, last_index;
-    uint32_t heard, status_at, checked_at, pulse_number, edges_seen, target_bits, sent_target, sent_counts;
+    uint32_t random, heard, status_at, checked_at, pulse_number, edges_seen, target_bits, sent_target, sent_counts;
     uint16_t sequence, stalled_ms, runaway_ms, over_ms, current_ms, bad_turns, lost_ms;
     uint16_t faults, sent_faults;
     uint8_t batched, state, sent_state, still;
@@ -160,8 +162,9 @@ static inline void on_sync(struct controller *c, uint32_t t) { PUT(c, c->sync, W
 static inline bool on_tick(struct controller *c, uint32_t t, int32_t count) {
     c->ticks++;
     PUT(c, c->samples, WAITING_SAMPLES, (struct stamp){t, count});
-    if (++c->since_pulse < TICK_HZ / 10u) return false;
-    c->since_pulse = 0;
+    if (--c->until_pulse) return false;
+    c->until_pulse = c->interval;
+    c->interval_used = true;
     return c->settings.pulses == PULSES_TIMED;
 }
 

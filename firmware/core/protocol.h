@@ -6,6 +6,8 @@
 #define PROTOCOL_VERSION 1
 #define LONGEST_FRAME 512
 #define MOST_SAMPLES 32
+#define LEAST_PULSE_MS 70u
+#define MOST_PULSE_MS 130u
 #define SAMPLES_TYPE 0x01
 #define SAMPLE_BYTES 8
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.live.link import protocol
+from amiwarp.live.link.camera_clock import are_multiples
 from amiwarp.live.link.clocks import FEWEST_PAIRS, UnwrappedClock, fit_to_round_trips, monotonic_us
 from amiwarp.live.link.link import open_port
 
@@ -363,9 +364,15 @@ class _Suite:
             return Check(name, None, "none; without them clocks agree to about a millisecond", "")
         rate = len(pulses) / STEADY_S
         consecutive = all((b - a) % (1 << 32) == 1 for (_, a), (_, b) in itertools.pairwise(pulses))
-        what = f"{rate:.1f} per second, numbers {'in order' if consecutive else 'with gaps'}"
+        regular = are_multiples(np.unwrap(np.array([t for t, _ in pulses], np.int64), period=1 << 32))
+        order = "numbers in order" if consecutive else "numbers with gaps"
+        spacing = (
+            "at regular intervals, by which clocks are not known for sure" if regular else "at irregular intervals"
+        )
         good = consecutive and SYNC_HZ[0] <= rate <= SYNC_HZ[1]
-        return Check(name, good, what, "send two to ten pulses per second and number them from 0")
+        least, most = protocol.PULSE_INTERVAL_MS
+        remedy = f"send a pulse every {least} to {most} ms, drawn at random for each, and number them from 0"
+        return Check(name, good, f"{rate:.1f} per second, {spacing}, {order}", remedy)
 
     def _check_bad_frames(self) -> Check:
         rng = random.Random(0)

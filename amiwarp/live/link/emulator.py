@@ -221,7 +221,7 @@ class Controller:
         sample_hz: float = 1000.0,
         drift_ppm: float = 0.0,
         clock_start: int = 0,
-        sync_hz: float = 10.0,
+        sync_hz: float | None = None,
         start_us: int = 0,
         faults: Iterable[EmulatedFault] = (),
         seed: int = 0,
@@ -236,9 +236,10 @@ class Controller:
         self.pulses: deque[tuple[int, int]] = deque(maxlen=1000)
         """Latest sync pulses, each with its number and emulation time [us]."""
         self._rate = 1.0 + drift_ppm * 1e-6
-        self._sample_us, self._sync_us = 1e6 / sample_hz, 1e6 / sync_hz
+        self._sample_us, self._sync_hz = 1e6 / sample_hz, sync_hz
         self._batch_size = min(max(int(BATCH_US / self._sample_us), 1), protocol.MOST_SAMPLES)
         self._rng = random.Random(seed)
+        self._pulse_rng = random.Random(seed)
         due = [(edge, fault, on) for fault in faults for edge, on in _edges_of(fault, start_us)]
         self._fault_edges = sorted(due, key=itemgetter(0))
         self._active_faults: list[str] = []
@@ -282,6 +283,13 @@ class Controller:
         self._frozen_count: int | None = None
         self._sent_status: tuple[int, int, float, int] | None = None
         self._checked_us = self._now
+        self._pulse_number, self._next_pulse_us = 0, self._pulse_interval_us()
+
+    def _pulse_interval_us(self) -> float:
+        """Return the time until the next sync pulse: irregular as that of a controller, or by ``sync_hz`` [us]."""
+        if self._sync_hz is not None:
+            return 1e6 / self._sync_hz
+        return 1000.0 * self._pulse_rng.randint(*protocol.PULSE_INTERVAL_MS)
 
     def _position(self) -> float:
         """Return the encoder's position in counts since the index pulse of turn 0."""
@@ -311,10 +319,12 @@ class Controller:
         due += self._index_pulses(np.append(self._before[0], time_us), np.append(self._before[1], angle))
         if len(time_us):
             self._before = time_us[-1], angle[-1]
-        for k in range(math.floor(first / self._sync_us) + 1, math.floor(last / self._sync_us) + 1):
-            at = k * self._sync_us
-            self.pulses.append((k - 1, round(self._boot_us + at / self._rate)))
-            due.append((at, protocol.Sync(self._t(at), (k - 1) % WRAP)))
+        while self._next_pulse_us <= last:
+            at = self._next_pulse_us
+            self.pulses.append((self._pulse_number, round(self._boot_us + at / self._rate)))
+            due.append((at, protocol.Sync(self._t(at), self._pulse_number % WRAP)))
+            self._pulse_number += 1
+            self._next_pulse_us += self._pulse_interval_us()
         for at, what in sorted(due, key=itemgetter(0)):
             if isinstance(what, int):
                 self._batch.append((self._t(at), _int32(self._count(what))))

@@ -16,6 +16,9 @@ LONGEST = 512
 """Longest frame, including the zero byte [bytes]. A longer run of bytes without a zero is discarded as garbage."""
 MOST_SAMPLES = 32
 """Largest number of encoder samples in one message."""
+PULSE_INTERVAL_MS = 70, 130
+"""Shortest and longest interval between two sync pulses [ms]. It is drawn anew for each, so that only one shift between
+the clocks fits the pulses that a camera has seen."""
 STATES = ("stopped", "at speed", "on the way to its speed", "fault")
 """Meaning of each value of :attr:`ControllerStatus.state`."""
 FAULTS = ("stall", "over-current", "encoder lost", "index missed", "host lost", "over-speed")

@@ -25,7 +25,8 @@ from amiwarp.events.recording import OVERHEAD, Events, MemoryEvents, Recording, 
 from amiwarp.imaging.iwe import CanvasShape
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.io.native_format import LiveWriter
-from amiwarp.live.link.clocks import CameraClock, ClockMap, monotonic_us
+from amiwarp.live.link.camera_clock import CameraClock, ClockSource
+from amiwarp.live.link.clocks import ClockMap, monotonic_us
 from amiwarp.live.link.link import Link, LinkUpdate
 from amiwarp.live.queues import BackgroundWorker, EventSorter, PacketQueue, Policy
 from amiwarp.live.stream.adaptive import SpeedKeeper
@@ -331,13 +332,19 @@ class SessionStatus:
     covered: float = 1.0
     """Share of events since the last report whose prism angle was interpolated between encoder samples."""
     latency_ms: tuple[float, float] = (0.0, 0.0)
-    """Median and 99th percentile of the time from a packet's arrival to its output [ms]."""
+    """Median and 99th percentile of the time from an event to its output [ms], with all that it waited for.
+
+    It counts from the event's own time if the clocks are known, else from the earliest time at which the event can have
+    happened: as if the packet with the shortest delay so far had none.
+    """
     sharpness: float | None = None
     """Sharpness of the latest image of compensated events, over :data:`IMAGE_US`; None before the first."""
     rpm: float | None = None
     """Speed of the prism [turns/min]; None if it is unknown."""
     clock: ClockMap | None = None
     """Map from the controller's clock to the camera's; None without a link."""
+    clock_source: ClockSource | None = None
+    """How this map is known; None without a link."""
     coverage: float | None = None
     """Share of the scene's edges that the last window showed, 0 to 1; None without adaptive speed."""
 
@@ -348,17 +355,17 @@ class IntervalFigures:
     def __init__(self, began_us: int) -> None:
         # at the last report: time [us]; numbers of events received, compensated, without a measured angle
         self._reported = (began_us, 0, 0, 0)
-        self._latencies: list[int] = []
+        self._latencies: list[float] = []
 
-    def add(self, packet: Compensated, now_us: int, status: SessionStatus) -> None:
-        """Count a compensated packet in the figures of the interval."""
+    def add(self, packet: Compensated, delay_us: float, status: SessionStatus) -> None:
+        """Count a compensated packet in the figures of the interval. ``delay_us``: time from its last event [us]."""
         flags = packet.flags
         status.done += len(flags)
         if flags.any():
             status.outside += int(np.count_nonzero(flags & OUTSIDE))
             status.guessed += int(np.count_nonzero(flags & EXTRAPOLATED))
             status.unknown += int(np.count_nonzero(flags & NO_ANGLE))
-        self._latencies.append(now_us - packet.arrived_us)
+        self._latencies.append(delay_us)
 
     def report(self, now_us: int, status: SessionStatus) -> None:
         """Write the figures since the last report into the status, and start the next interval."""
@@ -586,7 +593,7 @@ class Session:
 
     def _poll_encoder(self) -> None:
         self._feed.poll()
-        self.status.clock = self._feed.clock
+        self.status.clock, self.status.clock_source = self._feed.clock, self._feed.clock_source
 
     def _take(self, packet: Packet) -> None:
         self._feed.take(packet)
@@ -608,7 +615,8 @@ class Session:
         """Pass compensated packets to all their consumers."""
         now = monotonic_us()
         for packet in packets:
-            self._figures.add(packet, now, self.status)
+            event_us = int(packet.events.t[-1])
+            self._figures.add(packet, now - self._feed.host_time(event_us), self.status)
             self._consumers.append_compensated(packet)
             for sink in list(self._sinks):
                 try:
@@ -648,11 +656,16 @@ class Session:
             if last is not None and last > self._last_us:  # the encoder samples cover the last events
                 break
             time.sleep(POLL_S)
+        if self._link is not None and self._feed.clock is None:
+            self._feed.settle()
+            self._poll_encoder()
         if self._compensator is not None:
             self._give(self._compensator.flush())
         self._consumers.finish(self._drain_left)
 
 
+WAITING_S = 1.5
+"""Time without a relation between the clocks after which the user is told [s]."""
 MOST_WAITING = 1 << 20
 """Largest number of samples and index pulses that wait until the camera's clock is known. Beyond it, the oldest are
 dropped."""
@@ -678,8 +691,13 @@ class EncoderFeed:
         """
         self.clock: ClockMap | None = None
         """Map from the controller's clock to the camera's; None while it is unknown."""
+        self.clock_source: ClockSource | None = None if link is None else ClockSource.UNKNOWN
+        """How this map is known; None without a link."""
         self._link, self._encoder, self._give, self._say = link, encoder, give, say
         self._camera_clock = CameraClock()
+        self._unknown_since = time.monotonic()
+        self._has_related = False
+        self._shortest_us: int | None = None
         self._waiting: deque[LinkUpdate] = deque()
         self._waiting_samples = 0
         self._warned = False
@@ -694,13 +712,15 @@ class EncoderFeed:
         if update.restarted:
             self._camera_clock.restart()
             self._encoder.restart()
+            self._has_related = False
             self._clear()
         for _number, t_us, host_us in update.sync:
             self._camera_clock.sync(t_us, host_us)
         if _size(update):
             self._waiting.append(update)
             self._waiting_samples += _size(update)
-        clock = self.clock = self._camera_clock.clock(self._link.clock())
+        clock = self._camera_clock.clock(self._link.clock())
+        self._follow_clock(clock, self._camera_clock.source)
         if clock is None:
             self._drop_oldest()
             return
@@ -708,13 +728,60 @@ class EncoderFeed:
             self._append(clock(waiting.t_us), waiting.angle, clock(waiting.index_t_us))
         self._clear()
 
+    def settle(self) -> None:
+        """Wait for no more pulses, because the stream has ended."""
+        self._camera_clock.settle()
+
+    def host_time(self, event_us: int) -> float:
+        """Return the host's time of an event [us]: by the clocks, else the earliest that its arrival allows."""
+        host = None if self._link is None else self._link.clock()
+        if host is not None and self.clock is not None and self._encoder.sure:
+            controller = event_us - self.clock.offset_us - self.clock.drift * (event_us - self.clock.at_us)
+            return controller - host.offset_us - host.drift * (controller - host.at_us - host.offset_us)
+        return float(event_us + (self._shortest_us or 0))
+
+    def _follow_clock(self, clock: ClockMap | None, source: ClockSource) -> None:
+        """Take the relation between the clocks, and say how it is known if that has changed."""
+        before, self.clock, self.clock_source = self.clock_source, clock, source
+        now = time.monotonic()
+        if source is ClockSource.UNKNOWN:
+            if before is not source:
+                self._unknown_since = now
+            elif now - self._unknown_since > WAITING_S:
+                self._unknown_since = math.inf
+                self._say(
+                    "the clocks of controller and camera are not known yet: events wait for sync pulses at the "
+                    "camera's trigger input, and those that wait too long have no angle (flag 4)"
+                )
+            return
+        if source is before or clock is None:
+            return
+        self._encoder.sure = source.sure
+        if self._has_related:  # the samples so far may be at wrong times
+            self._encoder.clear()
+        self._has_related = True
+        known = {
+            ClockSource.PULSES: f"by {clock.pairs} pulses, within {max(clock.offset_std_us, 0.1):.1f} µs",
+            ClockSource.REGULAR: "by pulses at regular intervals, as an older controller sends them: arrival times "
+            f"chose among shifts of {clock.offset_std_us * 1e-3:.0f} ms, so all angles count as guessed (flag 2); "
+            "install newer firmware",
+            ClockSource.ARRIVAL: f"by arrival times, within {clock.offset_std_us * 1e-3:.2g} ms at best, without sync "
+            "pulses at the camera's trigger input: all angles count as guessed (flag 2)",
+        }
+        self._say(f"the clocks of controller and camera are related {known[source]}")
+
     def take(self, packet: Packet) -> None:
         """Process a source's packet: its arrival time and triggers with a link, else its own encoder samples."""
         if packet.returned:
             self._camera_clock.returned()
             self._encoder.restart()
+            self._has_related = False
+            self._shortest_us = None
         if len(packet.events):
-            self._camera_clock.packet(int(packet.events.t[-1]), packet.arrived_us)
+            last_us = int(packet.events.t[-1])
+            self._camera_clock.packet(last_us, packet.arrived_us)
+            delay_us = packet.arrived_us - last_us
+            self._shortest_us = delay_us if self._shortest_us is None else min(self._shortest_us, delay_us)
         if self._link is not None:
             self._camera_clock.triggers(packet.triggers, packet.arrived_us)
             return
