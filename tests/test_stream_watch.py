@@ -114,6 +114,21 @@ def test_of_two_phases_the_larger_offset_counts_whatever_its_sign(
         assert watch.update(EncoderStream()) == max(first, second, key=abs)
 
 
+@pytest.mark.parametrize("sure", [True, False])
+def test_a_phase_that_is_off_may_be_a_wrong_clock_while_this_is_not_sure(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch, sure: bool
+) -> None:
+    said: list[str] = []
+    watch = PhaseCheck(known(recording, 0.0), 1e9, said.append)
+    monkeypatch.setattr(watch, "result", lambda: [PhaseEstimate("phase", 0.3, 0.001)])
+    encoder = EncoderStream()
+    encoder.sure = sure
+    watch.update(encoder)
+    assert len(said) == 1
+    assert ("the clocks of controller and camera are probably wrong" in said[0]) is not sure
+    assert said[0].endswith("calibrate again")
+
+
 def test_a_watch_compares_with_the_calibration_by_sharpness(recording: Recording) -> None:
     """Which has the same bias. Beyond the search, the difference is at least that large."""
     plain, said = known(recording, 1.0), list[str]()

@@ -107,13 +107,16 @@ class PhaseCheck:
             self._first_estimate = self._first_estimate or estimates
             self._offset = max((estimate.offset for estimate in estimates), key=abs)
             for estimate, first in zip(estimates, self._first_estimate, strict=True):
-                self._report(estimate, first)
+                self._report(estimate, first, sure=encoder.sure)
         if time.monotonic() >= self._due and self.start_check(encoder):
             self._due = time.monotonic() + self._every_s
         return self._offset
 
-    def _report(self, estimate: PhaseEstimate, first: PhaseEstimate) -> None:
-        """Report a large offset from the calibrated phase, or a significant change since the first estimate."""
+    def _report(self, estimate: PhaseEstimate, first: PhaseEstimate, *, sure: bool) -> None:
+        """Report a large offset from the calibrated phase, or a significant change since the first estimate.
+
+        ``sure``: whether the clocks of controller and camera are known. A wrong one turns the phase, too.
+        """
         changed, phase = estimate.offset - first.offset, estimate.name.replace("_", " ")
         reported = self._reported.pop(estimate.name, None)
         if reported is not None and abs(estimate.offset - reported) < CHANGE_RAD:
@@ -122,7 +125,10 @@ class PhaseCheck:
             self._reported[estimate.name] = estimate.offset
             least = "at least " if abs(estimate.offset) > 0.99 * SEARCH_RAD else ""
             offset = f"{least}{math.degrees(estimate.offset):+.1f} deg"
-            self._say(f"the {phase} differs from the calibrated one by {offset}: calibrate again")
+            remedy = "calibrate again"
+            if not sure:
+                remedy = f"the clocks of controller and camera are probably wrong: connect the sync pulses, or {remedy}"
+            self._say(f"the {phase} differs from the calibrated one by {offset}: {remedy}")
         elif abs(changed) > max(CHANGE_RAD, 4.0 * math.hypot(estimate.std, first.std)):
             self._reported[estimate.name] = estimate.offset
             since = f"since the first check, to {math.degrees(estimate.offset):+.1f} deg from the calibrated one"
