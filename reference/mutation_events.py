@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Writer1
 
 from amiwarp import Events, MemoryEvents, Recording, convert, save_recording
-from amiwarp.io.aedat import _read_aedat2_header
+from amiwarp.io.aedat2_header import read_aedat2_header
 from amiwarp.io.file_scan import smallest_sensor
 from reference.aedat4_files import whole_file
 from reference.ecf_files import ecf_chunk, write_ecf
@@ -138,7 +138,7 @@ def said_by_dat(recording: Recording, data: bytes) -> list[Said]:
 
 
 def said_by_aedat2(recording: Recording, data: bytes) -> list[Said]:
-    chip, offset, _ = _read_aedat2_header(recording.events.path)  # type: ignore[attr-defined]
+    chip, offset, _ = read_aedat2_header(recording.events.path)  # type: ignore[attr-defined]
     body = data[offset:]
     words = [struct.unpack_from(">II", body, at) for at in range(0, len(body) - 7, 8)]
     rows: list[tuple[int, int, int, int]] = []

@@ -20,7 +20,7 @@ from amiwarp import (
     save_recording,
 )
 from amiwarp.cli.recordings import _rows, describe
-from amiwarp.io import aedat
+from amiwarp.io import aedat2_imu
 from amiwarp.io.file_scan import head_only
 from reference.io_samples import SIZE, make_events, refusal
 from reference.io_samples_extra import arrays, packets, typestore, write_aedat2, write_mvsec, write_ros1, write_ros2
@@ -256,7 +256,7 @@ def test_aedat2_samples_have_the_ranges_of_the_header(tmp_path: Path, monkeypatc
     now = int(EVENTS.t[100])
     values = [4096, -8192, 100, 0, 328, -656, 131]
     # Blocks of few records, so that samples cross their ends; the last sample lacks a record.
-    monkeypatch.setattr("amiwarp.io.aedat.DEFAULT_BLOCK", 4)
+    monkeypatch.setattr("amiwarp.io.aedat2.DEFAULT_BLOCK", 4)
     extra = aedat2_sample(now, values) * 3 + aedat2_sample(now, values[:6])
     write_aedat2(tmp_path / "a.aedat", EVENTS, between=extra)
     recording = open_recording(tmp_path / "a.aedat")
@@ -336,4 +336,4 @@ def test_info_shows_both(tmp_path: Path) -> None:
 
 def test_samples_of_jaer_start_where_seven_records_follow() -> None:
     for numbers, starts in ((range(7), [0]), (range(6), []), ([3, *range(7), 0, 1], [1]), ([0, *range(7)] * 2, [1, 9])):
-        assert aedat._starts(np.array(numbers)).tolist() == starts
+        assert aedat2_imu._starts(np.array(numbers)).tolist() == starts

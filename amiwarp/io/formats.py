@@ -98,8 +98,8 @@ OPENERS = {
     Format.EVT: "prophesee:open_evt",
     Format.DAT: "dat:open_dat",
     Format.AEDAT4: "aedat4:open_aedat4",
-    Format.AEDAT3: "aedat:open_aedat3",
-    Format.AEDAT2: "aedat:open_aedat2",
+    Format.AEDAT3: "aedat3:open_aedat3",
+    Format.AEDAT2: "aedat2:open_aedat2",
     Format.ROSBAG: "ros:open_rosbag",
     Format.ES: "event_stream:open_es",
     Format.TEXT: "text_files:open_text",
@@ -115,8 +115,8 @@ OPENERS = {
 TRIGGERS = {
     Format.EVT: "prophesee:trigger_packets",
     Format.AEDAT4: "aedat4:aedat4_triggers",
-    Format.AEDAT3: "aedat:aedat3_triggers",
-    Format.AEDAT2: "aedat:aedat2_triggers",
+    Format.AEDAT3: "aedat3:aedat3_triggers",
+    Format.AEDAT2: "aedat2:aedat2_triggers",
     Format.ROSBAG: "ros:trigger_packets",
     Format.HDF5: "hdf5_files:trigger_packets",
 }

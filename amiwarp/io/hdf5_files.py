@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
+from amiwarp.io import ecf
 from amiwarp.io.file_scan import FileEvents, Packet, read_sensors
 from amiwarp.io.files import input_path, read_at, write_at
 from amiwarp.io.formats import Codec
@@ -706,7 +707,11 @@ def open_rows(path: Path, layout: str, group: str) -> Recording:
     source = path.absolute()
     about = run(f"{SERVER}:read_head", source, group)
     size = about["size"] and tuple(about["size"])
-    events = FileEvents(path, partial(packets, f"{SERVER}:read_rows", source, f"{group}/events"), size=size)
+    name = f"{group}/events"
+    read = partial(packets, f"{SERVER}:read_rows", source, name)
+    if about["coded"]:
+        read = partial(ecf.event_packets, SERVER, source, name)
+    events = FileEvents(path, read, size=size)
     imu, frames, notes = read_sensors(path, about["counts"], SERVER, group)
     metadata = {"format": layout, "topic": group, **about["counts"], **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)

@@ -542,17 +542,20 @@ MVSEC_SIZE = (346, 260)
 
 
 def read_head(path: str, group: str) -> Reply:
-    """Return the sensor size, or None, and the counts of other records, of a file of rows."""
+    """Return the sensor size, or None, counts of other records, and whether the events are coded, of a file of rows."""
     with h5py.File(path, "r") as file:
+        events = member(file, f"{group}/events")
+        coded = is_dataset(events) and _filters(events) == [ECF]
         if group != "CD":
             others = {"frames": member(file, f"{group}/image_raw"), "imu_samples": member(file, f"{group}/imu")}
             counts = {name: int(found.shape[0]) for name, found in others.items() if is_dataset(found)}
-            return {"size": MVSEC_SIZE, "counts": counts}, []
+            return {"size": MVSEC_SIZE, "counts": counts, "coded": coded}, []
         texts = [str(file.attrs[name])[:100] for name in ("geometry", "format") if name in file.attrs]
         match = re.search(r"(\d+)x(\d+)", " ".join(texts)) or re.search(r"width=(\d+);.*height=(\d+)", " ".join(texts))
         triggers = member(file, "EXT_TRIGGER/events")
         counts = {"triggers": int(triggers.shape[0])} if is_dataset(triggers) and triggers.shape[0] else {}
-        return {"size": [int(match[1]), int(match[2])] if match else None, "counts": counts}, []
+        size = [int(match[1]), int(match[2])] if match else None
+        return {"size": size, "counts": counts, "coded": coded}, []
 
 
 def read_rows(notes: dict[str, int], path: str, name: str) -> Iterator[Columns]:
@@ -560,10 +563,9 @@ def read_rows(notes: dict[str, int], path: str, name: str) -> Iterator[Columns]:
     with h5py.File(path, "r") as file:
         dataset = member(file, name)
         _check_rows(dataset, name, path)
+        if _filters(dataset) == [ECF]:  # triggers: the codec holds events
+            raise _not_events(dataset)
         notes["total"] = max(int(dataset.shape[0]), 1)
-        if _filters(dataset) == [ECF]:
-            yield from _ecf_columns(dataset, notes)
-            return
         for start in range(0, dataset.shape[0], PIECE):
             rows = dataset[start : start + PIECE]
             notes["read"] = min(start + PIECE, dataset.shape[0])
@@ -582,28 +584,48 @@ def _filters(dataset: Any) -> list[int]:
     return [creation.get_filter(at)[0] for at in range(creation.get_nfilters())]
 
 
-def _ecf_columns(dataset: Any, notes: dict[str, int]) -> Iterator[Columns]:
-    """Yield the events in the chunks of a dataset of Metavision, without Prophesee's plugin for HDF5."""
-    if not {"x", "y", "t", "p"} <= set(dataset.dtype.names or ()):
-        raise AmiwarpError(f"dataset '{dataset.name}' is {dataset.dtype}; the ECF codec holds rows of x, y, t, p")
-    count, length = dataset.shape[0], dataset.chunks[0]
-    for start in range(0, count, length):
-        size = dataset.id.get_chunk_info_by_coord((start,)).size
-        if size > ecf.MOST_BYTES:
-            raise AmiwarpError(f"dataset '{dataset.name}': a chunk has {size} bytes; expected at most {ecf.MOST_BYTES}")
-        mask, data = dataset.id.read_direct_chunk((start,))
-        rows = min(length, count - start)
-        if mask & 1:  # the codec was left out for this chunk
-            plain = np.frombuffer(data, dataset.dtype)
-            columns = ecf.EventColumns(*(plain[name] for name in ecf.EventColumns._fields))
-        else:
-            columns = ecf.decode_chunk(data)
-        if len(columns.t) < rows:
-            raise AmiwarpError(
-                f"dataset '{dataset.name}': a chunk has {len(columns.t)} events; expected {rows}; the file is damaged"
-            )
-        notes["read"] = start + rows
-        yield columns.x[:rows], columns.y[:rows], columns.t[:rows], columns.p[:rows]
+CODED_BYTES = 1 << 20
+"""Size of chunks in Prophesee's codec from which on they are sent [bytes]: many are decoded at the same time."""
+
+
+def read_coded(notes: dict[str, int], path: str, name: str) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield chunks of a dataset in Prophesee's codec: their bytes, sizes, rows, and whether they are without it."""
+    with h5py.File(path, "r") as file:
+        dataset = member(file, name)
+        _check_rows(dataset, name, path)
+        if not {"x", "y", "t", "p"} <= set(dataset.dtype.names or ()):
+            raise _not_events(dataset)
+        count = int(dataset.shape[0])
+        length = dataset.chunks[0]
+        notes["total"] = max(count, 1)
+        chunks: list[bytes] = []
+        rows: list[int] = []
+        plain: list[bool] = []
+        for start in range(0, count, length):
+            size = dataset.id.get_chunk_info_by_coord((start,)).size
+            if size > ecf.MOST_BYTES:
+                raise AmiwarpError(
+                    f"dataset '{dataset.name}': a chunk has {size} bytes; expected at most {ecf.MOST_BYTES}"
+                )
+            mask, data = dataset.id.read_direct_chunk((start,))
+            is_plain = bool(mask & 1)  # the codec was left out for this chunk
+            if is_plain:
+                data = np.frombuffer(data, dataset.dtype)[list(ecf.PLAIN.names or ())].astype(ecf.PLAIN).tobytes()
+            chunks.append(data)
+            rows.append(min(length, count - start))
+            plain.append(is_plain)
+            if sum(map(len, chunks)) >= CODED_BYTES or start + length >= count:
+                notes["read"] = start + rows[-1]
+                sizes = np.array([len(chunk) for chunk in chunks])
+                yield np.frombuffer(b"".join(chunks), np.uint8), sizes, np.array(rows), np.array(plain)
+                chunks = []
+                rows = []
+                plain = []
+
+
+def _not_events(dataset: Any) -> AmiwarpError:
+    """Return the error to raise for a dataset in Prophesee's codec that holds no events."""
+    return AmiwarpError(f"dataset '{dataset.name}' is {dataset.dtype}; the ECF codec holds rows of x, y, t, p")
 
 
 def is_dataset(found: Any) -> bool:
