@@ -2,12 +2,17 @@
 
 import itertools
 import random
+import struct
 
 import numpy as np
 import pytest
+import warp as wp
 
 from amiwarp import AmiwarpError
 from amiwarp.io import ecf
+from amiwarp.kernels import ecf as kernels
+from amiwarp.kernels.evt import new_event_arrays
+from amiwarp.kernels.launch import launch
 from reference import ecf_codec
 from reference.ecf_files import ecf_chunk, ecf_events
 from reference.mutation_files import mutated
@@ -32,6 +37,34 @@ def test_chunks_that_follow_one_another_are_decoded_as_numpy_does(mode: str, dev
     assert counts.tolist() == [1, 3, 796, 0, 1, 2, 1697, 2500]
     for name, column in zip("xytp", known(chunks), strict=True):
         np.testing.assert_array_equal(getattr(found, name).numpy(), column)
+
+
+@pytest.mark.parametrize(("count", "is_damaged"), [(15, False), (16, True)])
+def test_a_gap_of_time_has_at_most_fifteen_bytes(count: int, is_damaged: bool, device: str) -> None:
+    packed = bytes(12)
+    chunk = ecf.HEAD.pack(1 << 2 | 2, 7) + b"\xf0" * (count - 2) + b"\xf1\xf0" + b"\x21" + packed
+    if is_damaged:
+        with pytest.raises(AmiwarpError, match="holds other times than events"):
+            ecf.decode_chunks(chunk, [len(chunk)], device)
+    else:
+        found, _ = ecf.decode_chunks(chunk, [len(chunk)], device)
+        assert found.t.numpy().tolist() == [7 + (1 << 4 * 13) + 2] == known([chunk])[2].tolist()
+
+
+def test_columns_behind_the_last_event_are_not_written(device: str) -> None:
+    """The last word tells of five more. An array with room for them keeps what it holds."""
+    data = struct.pack("<BHHB", 1 << 4 | 2, 5 << 5 | 2, 3 << 5 | 31, 2)  # times, rows, columns, polarities
+    chunk = np.zeros(1, kernels.Chunk.numpy_dtype())
+    chunk["stop"] = len(data)
+    chunk["count"] = 2
+    arrays = new_event_arrays(8, device)
+    arrays.x.fill_(9)
+    words = wp.array(np.frombuffer(data, np.uint8), dtype=wp.uint8, device=device)
+    chunks = wp.array(chunk, dtype=kernels.Chunk, device=device)
+    parts = wp.empty(1, dtype=kernels.Parts, device=device)
+    launch(kernels.survey_ecf, 1, [words, chunks], [parts], device=device, smallest=1)
+    launch(kernels.decode_ecf, 1, [words, chunks, parts], [arrays], device=device, smallest=1)
+    assert arrays.x.numpy().tolist() == [3, 4, 9, 9, 9, 9, 9, 9]
 
 
 @pytest.mark.parametrize("mode", MODES)
