@@ -48,7 +48,8 @@ from amiwarp.viewer.drawing import (
     prepare,
     scale_state,
 )
-from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector, Selection
+from amiwarp.viewer.filters import Selection
+from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector
 from amiwarp.viewer.window import LEAST_POINTS, Window
 
 WIDTH, HEIGHT = 640, 480
@@ -66,8 +67,8 @@ OPENED = """
 import sys, time
 began, cpu = time.perf_counter(), time.process_time()
 from amiwarp.io import open_recording
+from amiwarp.viewer.filters import Selection
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.inspector import Selection
 opened = Inspector(open_recording(sys.argv[1]), device=sys.argv[2])
 start, length = opened.first_window()
 opened.open(start, int(sys.argv[3]) or length)

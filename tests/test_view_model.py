@@ -46,10 +46,10 @@ from amiwarp.plotting.colours import Scale, table_of
 from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.drawing import ImageKind, events_text, make_images
+from amiwarp.viewer.filters import Selection
 from amiwarp.viewer.inspector import (
     Inspector,
     Knobs,
-    Selection,
     Source,
     foreign_names,
     size_name,

@@ -29,7 +29,8 @@ from amiwarp.plotting.colours import CAUSE_COLOURS, GREY
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer import inspector as window
 from amiwarp.viewer.drawing import Look, Scene, colours_of, event_text, legend_of
-from amiwarp.viewer.inspector import Inspector, Selection, colours_on_offer, truth_text
+from amiwarp.viewer.filters import Selection
+from amiwarp.viewer.inspector import Inspector, colours_on_offer, truth_text
 from amiwarp.viewer.layout import initial_state
 
 COUNT, SIZE = 6000, (40, 30)

@@ -31,7 +31,8 @@ from amiwarp.imaging.residuals import WIDEST_PX, residual
 from amiwarp.io.spans import read_span
 from amiwarp.optics.models import build_model, rungs
 from amiwarp.viewer.drawing import Look, Scene, axis_range, colours_of, legend, orbit_lines, third_axis, unknown_rows
-from amiwarp.viewer.inspector import Inspector, Knobs, Selection
+from amiwarp.viewer.filters import Selection
+from amiwarp.viewer.inspector import Inspector, Knobs
 from reference.calibration_sample import exact_calibration
 
 TRUE = Prism(math.radians(1.0))

@@ -103,6 +103,8 @@ def run_filter(
 
 
 def _lines(d: dict[str, Any]) -> Iterator[str]:
+    from amiwarp.imaging.filters import NAMES
+
     rate = d["events"] / max(d["seconds"], 1e-9) / 1e6
     share = 100.0 * d["kept"] / d["events"]
     kept = f"{d['kept']:,} of {d['events']:,} events ({share:.3g} %)"
@@ -127,15 +129,3 @@ def _lines(d: dict[str, Any]) -> Iterator[str]:
 
 RECORD_NAMES = {"imu_samples": "IMU samples", "frames": "frames"}
 """Names of the records of other sensors."""
-
-NAMES = {
-    "window": "time",
-    "region": "region",
-    "polarity": "polarity",
-    "hot_pixels": "hot pixels",
-    "refractory_us": "refractory period",
-    "background_us": "background activity",
-    "most_per_s": "rate",
-    "every": "every n-th",
-}
-"""Names of the parts of a filter."""

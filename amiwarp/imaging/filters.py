@@ -153,7 +153,7 @@ class RunningFilter:
             self._last_t = int(events.t[-1])
         kept = np.ones(len(events), np.bool_)
         for name, part in PARTS.items():
-            if not _is_given(self.chosen, name):
+            if not is_given(self.chosen, name):
                 continue
             candidates = np.flatnonzero(kept)
             wanted = part(self, events[candidates])
@@ -246,6 +246,17 @@ PARTS = {
     "every": RunningFilter._every,
 }
 """Parts of a filter by the names of the fields of :class:`EventFilter`, in the order in which they are applied."""
+NAMES = {
+    "window": "time",
+    "region": "region",
+    "polarity": "polarity",
+    "hot_pixels": "hot pixels",
+    "refractory_us": "refractory period",
+    "background_us": "background activity",
+    "most_per_s": "rate",
+    "every": "every n-th",
+}
+"""Names of the parts, for people."""
 
 
 def described(chosen: EventFilter) -> str:
@@ -255,12 +266,12 @@ def described(chosen: EventFilter) -> str:
         value = getattr(chosen, name)
         if name == "hot_pixels" and value is not None:
             texts.append(f"hot_pixels {np.count_nonzero(value)}")
-        elif _is_given(chosen, name):
+        elif is_given(chosen, name):
             texts.append(f"{name} {value}")
     return "; ".join(texts)
 
 
-def _is_given(chosen: EventFilter, name: str) -> bool:
+def is_given(chosen: EventFilter, name: str) -> bool:
     """Return whether a part of a filter may remove events."""
     value = getattr(chosen, name)
     return value is not None and not (isinstance(value, int | float) and name != "polarity" and value == NOTHING[name])

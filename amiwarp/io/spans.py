@@ -43,6 +43,12 @@ class Span:
         """Start of the time window after the recording's first event [ms]."""
         return (self.start_us - self.first_us) * 1e-3
 
+    @property
+    def run_starts(self) -> NDArray[np.int64]:
+        """Times of the first events of the runs [us], shape ``(n,)``."""
+        lengths = [run.stop - run.start for run in self.runs]
+        return np.asarray(self.events.t[np.cumsum([0, *lengths])[:-1]], np.int64)
+
     def rows(self, values: EventValues) -> NDArray[Any]:
         """Return the rows of ``values`` for :attr:`events`; ``values`` has one row per event of the recording."""
         return np.concatenate([values[run] for run in self.runs])

@@ -20,6 +20,7 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.export import GAMMA, save_png
+from amiwarp.imaging.frequencies import pixel_frequencies, strongest
 from amiwarp.imaging.palette import OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK
 from amiwarp.imaging.regions import SMOOTHING_PX, Region, inside
 from amiwarp.imaging.residuals import WIDEST_PX, at_pixels, outside, residual
@@ -177,6 +178,10 @@ class ImageKind(enum.StrEnum):
     """Numbers of OFF and ON events per pixel, in two colours."""
     TIME_SURFACE = "time surface"
     """Time of the latest event of each pixel."""
+    DECAY = "decaying time surface"
+    """How recent the latest event of each pixel is: its weight falls by 1/e with each decay time."""
+    FREQUENCY = "frequency"
+    """Frequency with which each pixel changes, such as that of a lamp or of a vibration."""
     LOG_INTENSITY = "log intensity"
     """Log intensity of the scene, reconstructed from the compensated events."""
     DEPTH = "depth"
@@ -200,16 +205,29 @@ class ShownImages:
     """Scale of the second image if it has one of its own."""
 
 
+DECAY_US = 10_000
+"""Decay time of a decaying time surface at the start [us]."""
+MOST_FREQUENCIES = 3
+"""Largest number of frequencies that are named below an image of frequencies."""
+
+
 def make_images(
-    inspector: Inspector, kind: ImageKind, *, against: Knobs | None = None, shown: DisplayedWindow | None = None,
+    inspector: Inspector,
+    kind: ImageKind,
+    *,
+    against: Knobs | None = None,
+    shown: DisplayedWindow | None = None,
     difference: bool = False,
-) -> ShownImages:  # fmt: skip
+    decay_us: int = DECAY_US,
+    same_scale: bool = False,
+) -> ShownImages:
     """Return the images of the inspector's window.
 
     ``against``: parameters of the first image instead of none. ``shown``: the window with these parameters, if it is
     known: its counts are not made again. ``difference``: of counts, the second image shows after minus before, with a
-    scale of its own. Raises :class:`AmiwarpError` if a log intensity cannot be reconstructed, or
-    there is no depth map.
+    scale of its own. ``decay_us``: decay time of a decaying time surface [us]. ``same_scale``: whether counts of
+    another recording beside have the scale of this one; otherwise each has its own. Raises :class:`AmiwarpError` if a
+    log intensity cannot be reconstructed, or there is no depth map.
     """
     window, knobs = inspector.loaded, inspector.knobs
     left, top, right, bottom = window.region
@@ -231,12 +249,23 @@ def make_images(
         before, after = (_time_surface(*each)[top:bottom, left:right] for each in pair)
         scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, "viridis")
         return ShownImages(before, after, scale)
+    if kind is ImageKind.DECAY:
+        ages = (w.span.length_us * 1e-3 - _time_surface(i, w, k)[top:bottom, left:right] for i, w, k in pair)
+        before, after = (np.exp(-age / (decay_us * 1e-3)).astype(np.float32) for age in ages)
+        scale = Scale(f"exp(-age / {decay_us * 1e-3:g} ms)", "1", 0.0, 1.0, "inferno")
+        return ShownImages(before, after, scale)
+    if kind is ImageKind.FREQUENCY:
+        before, after = (_frequencies(*each)[top:bottom, left:right] for each in pair)
+        return ShownImages(before, after, _frequency_scale(before, after), frequency_text(after))
     if kind is ImageKind.COUNT and shown is not None:
         images = [shown.image_before, shown.image_after]
     else:
         images = [each.counts(w, k, per_polarity=kind is ImageKind.POLARITY) for each, w, k in pair]
     before, after = (each[..., top:bottom, left:right] for each in images)
-    scale = count_scale((before, after), "polarity" if kind is ImageKind.POLARITY else "gray")
+    colours = "polarity" if kind is ImageKind.POLARITY else "gray"
+    if first is not inspector and not same_scale:
+        return ShownImages(before, after, count_scale((before,), colours), after_scale=count_scale((after,), colours))
+    scale = count_scale((before, after), colours)
     if not (difference and kind is ImageKind.COUNT):
         return ShownImages(before, after, scale)
     most = max(float(np.abs(after - before).max()), 1.0)
@@ -251,6 +280,29 @@ def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | Non
     latest = latest_times(window.counted, *inspector.recording.events.size, per_polarity=False, model=model,
                           encoder=encoder, device=inspector.device)  # fmt: skip
     return np.where(latest < window.span.start_us, np.nan, (latest - window.span.start_us) * 1e-3).astype(np.float32)
+
+
+def _frequencies(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
+    """Return the frequency of each pixel [Hz], shape ``(height, width)``; NaN without one."""
+    events = inspector.at_pixels(window, knobs if math.isfinite(inspector.turn_us) else None)
+    starts = window.span.run_starts if len(window.span.runs) > 1 else None
+    return pixel_frequencies(events, inspector.recording.events.size, starts=starts)
+
+
+def _frequency_scale(*images: NDArray[np.float32]) -> Scale:
+    """Return one scale for images of frequencies."""
+    known = np.concatenate([image[np.isfinite(image)] for image in images])
+    low, high = np.percentile(known, (2.0, 98.0)).tolist() if len(known) else (0.0, 1.0)
+    low, high = 0.9 * low, 1.1 * high  # so that one frequency alone has a colour of the middle
+    return Scale("frequency", "Hz", low, high, "viridis", missing_text="no frequency")
+
+
+def frequency_text(image: NDArray[np.float32]) -> str:
+    """Return which frequencies most pixels of an image have."""
+    found = strongest(image, MOST_FREQUENCIES)
+    if not found:
+        return "no pixel has a frequency: it takes 4 equal periods in the window"
+    return "; ".join(f"{hz:.4g} Hz: {count:,} px" for hz, count in found)
 
 
 # Colours for events by cause, instance and depth, and the legend of these colours.

@@ -25,7 +25,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, check_prisms, turn_between
 from amiwarp.events.recording import Events, Recording
 from amiwarp.events.truth import Cause, Truth
-from amiwarp.imaging.corners import find_background_activity
+from amiwarp.imaging.filters import find_hot_pixels
 from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, iwe, upload_events
 from amiwarp.imaging.regions import Region, RegionSharpness, inside, suggest_region
 from amiwarp.io.depth_map import DepthMap
@@ -35,6 +35,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, Model, PlateModel, RisleyModel, alternatives, build_model
 from amiwarp.optics.prism import NominalPrism, Plate, Prism, as_wedge
 from amiwarp.reconstruction.picture import Picture, border_displacements
+from amiwarp.viewer.filters import FilterStep, HotPixel, SelectedEvents, Selection, list_hot_pixels
 
 
 def _in_pixels(span: Span, size: tuple[int, int]) -> Span:
@@ -199,20 +200,6 @@ CURVE_HALF_WIDTH = {
 """Half width of the range of each parameter over which its sharpness curve is drawn, in the parameter's unit."""
 
 
-@dataclass(frozen=True)
-class Selection:
-    """Conditions for the events that are shown."""
-
-    polarity: int | None = None
-    """Polarity of the shown events: 1 for only ON, 0 for only OFF, None for both."""
-    region: Region | None = None
-    """Region of the image: left, top, right and bottom [px], right and bottom exclusive. None: the whole image."""
-    hide_hot: bool = False
-    """Whether the events of hot pixels are left out."""
-    noise_us: int | None = None
-    """Time within which an earlier event at a neighbouring pixel must support an event [us]; None: no noise filter."""
-
-
 # Time windows of the inspector: their selected events, and what the page shows of them.
 
 
@@ -232,6 +219,13 @@ class DrawnWindow:
     """Ground truth of these events."""
     before: NDArray[np.float32]
     """Pixels of the drawn events as recorded [px], shape ``(n, 2)``."""
+    steps: tuple[FilterStep, ...]
+    """Numbers of events before and after each part of the selection."""
+
+    @property
+    def read_us(self) -> float:
+        """Time of which events were read [us]; of a window with too many events, that of its runs."""
+        return max(1.0, self.span.length_us * len(self.span.events) / max(self.span.count, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,6 +355,8 @@ class Inspector:
         )  # fmt: skip
         self.window: tuple[int, int] | None = None
         """Start and length of the time window [us]; None: that of :meth:`first_window`."""
+        self.fixed_count: int | None = None
+        """Number of events of each time window that is opened, from its start on; None: windows have their length."""
         self.selection = Selection()
         self.most_points = most_points or MOST_POINTS
         """Largest number of points in each event cloud."""
@@ -503,6 +499,8 @@ class Inspector:
     @property
     def margin_px(self) -> int:
         """How far outside a region the events of its images may be: how far the optic may move them [px]."""
+        if not self.has_optic:
+            return 0
         if isinstance(self.prism, Plate):
             reach = self.prism.shift * (LARGEST_INVERSE if self.depth is None else float(self._depths.max()))
         else:
@@ -515,11 +513,24 @@ class Inspector:
         """Optical model with the parameters that are set on the page."""
         return self.model_of(self.knobs)
 
-    @cached_property
+    @property
     def hot(self) -> NDArray[np.bool_]:
-        """Hot and flickering pixels of the recording, shape (height, width)."""
+        """Hot pixels of the recording, and behind a prism that rotates the flickering ones; shape (height, width)."""
+        return self._searched[0]
+
+    @property
+    def hot_pixels(self) -> tuple[HotPixel, ...]:
+        """The pixels of :attr:`hot`, the busiest first. Rates and shares are of the part that was searched for them."""
+        return self._searched[1]
+
+    @cached_property
+    def _searched(self) -> tuple[NDArray[np.bool_], tuple[HotPixel, ...]]:
+        """Hot pixels as a mask and as a list, found in the middle of the recording."""
         source, encoder = self.recording.events, self.encoder
-        return strange_pixels(stretch(source, encoder), encoder, source.size)[0]
+        events = stretch(source, encoder)
+        turns = math.isfinite(self.turn_us)
+        hot = strange_pixels(events, encoder, source.size)[0] if turns else find_hot_pixels(events, source.size)
+        return hot, list_hot_pixels(events, hot)
 
     def first_window(self) -> tuple[int, int]:
         """Return start and length of one turn in the middle of the recording [us].
@@ -547,6 +558,17 @@ class Inspector:
         last = int(source.slice(first + count - 1, first + count).t[0])
         return start_us, last - start_us + 1
 
+    def start_after(self, windows: int) -> int:
+        """Return the start of the window [us] that lies by a number of windows of equal count after the current one."""
+        source = self.recording.events
+        start_us, length_us = self.window or self.first_window()
+        if windows >= 0:
+            index = source.find(start_us + length_us) + (windows - 1) * (self.fixed_count or 1)
+        else:
+            index = source.find(start_us) + windows * (self.fixed_count or 1)
+        index = min(max(index, 0), len(source) - 1)
+        return int(source.slice(index, index + 1).t[0])
+
     def renew(self) -> None:
         """Take the current events of a live stream; call :meth:`open` afterwards.
 
@@ -560,7 +582,7 @@ class Inspector:
 
     def _forget_angles(self) -> None:
         """Forget what depends on the encoder's angles."""
-        for name in ("hot", "_corrected"):
+        for name in ("_searched", "_corrected"):
             self.__dict__.pop(name, None)
         if self._window is not None:
             self._window.angles.clear()
@@ -646,15 +668,20 @@ class Inspector:
         check_prisms(self._encoder(0.0), MODELS[knobs.model].ANGLES)
         shown = self.sources.keys() - {"camera", "prism"}
         changed = {name for name in shown if knobs.value(name) != self.knobs.value(name)}
+        had_optic = self.has_optic
         self.sources |= dict.fromkeys(changed, Source.HAND)
         self.knobs = knobs
+        if self.has_optic != had_optic:  # events around the region may now be moved into it
+            self._window = None
 
     def open(self, start_us: int, length_us: int, selection: Selection | None = None) -> None:
-        """Read a time window of events.
+        """Read a time window of events. With a :attr:`fixed_count`, the length follows from it.
 
         Raises :class:`AmiwarpError` if it has no events that meet the ``selection``.
         """
         chosen = selection or self.selection
+        if self.fixed_count is not None:
+            start_us, length_us = self.window_of(start_us, self.fixed_count)
         self._window = self._load(start_us, max(1, length_us), chosen)
         self.selection, self.window = chosen, (start_us, length_us)
 
@@ -706,8 +733,8 @@ class Inspector:
         w = self.loaded
         image, sharpness = self._measured(w, None)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.events, w.truth, w.before, w.before, self._wrapped(w, self.knobs), image,
-            image_after, sharpness, sharpness, is_beside=True,
+            w.span, w.region, w.selected, w.events, w.truth, w.before, w.steps, w.before,
+            self._wrapped(w, self.knobs), image, image_after, sharpness, sharpness, is_beside=True,
         )  # fmt: skip
 
     def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
@@ -726,8 +753,8 @@ class Inspector:
         else:
             image, sharpness = self._measured(w, against)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.events, w.truth, xy, self._moved(w, knobs), self._wrapped(w, knobs), image,
-            image_after, sharpness, sharpness_after, other,
+            w.span, w.region, w.selected, w.events, w.truth, xy, w.steps, self._moved(w, knobs),
+            self._wrapped(w, knobs), image, image_after, sharpness, sharpness_after, other,
         )  # fmt: skip
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -768,14 +795,13 @@ class Inspector:
         """
         events, span, (left, top, right, bottom) = self.loaded.counted, self.loaded.span, self.loaded.region
         events = events[inside(events, self.loaded.region)]
-        starts = span.events.t[np.cumsum([0, *(run.stop - run.start for run in span.runs)])[:-1]]
-        run = np.searchsorted(starts, events.t, side="right")
+        run = np.searchsorted(span.run_starts, events.t, side="right")
         pixel = (run * (bottom - top) + events.y.astype(np.int64) - top) * (right - left) + events.x - left
         order = np.argsort(pixel, kind="stable")
         steps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
         counts, _ = np.histogram(np.clip(steps, 1, 999_999), INTERVALS_US)
         n, area, known, decades = len(events), (right - left) * (bottom - top), bool(len(steps)), np.log10(INTERVALS_US)
-        pixels, read_us = len(np.unique(pixel % area)), max(1, round(span.length_us * len(span.events) / span.count))
+        pixels, read_us = len(np.unique(pixel % area)), self.loaded.read_us
         median_us = float(np.median(steps)) if known else math.nan
         rows = [
             ("rate", f"{n / read_us * 1e6:,.0f} events/s"), ("events per pixel", f"{n / area:.3g}"),
@@ -860,9 +886,10 @@ class Inspector:
 
     def select(self, span: Span, selection: Selection) -> LoadedWindow:
         """Select the events of a time window. Raises :class:`AmiwarpError` if no event meets the selection."""
-        recording, m = self.recording, self.margin_px
-        left, top, right, bottom = region = selection.region or (0, 0, *recording.events.size)
-        keep = self.kept(span.events, selection, (left - m, top - m, right + m, bottom + m))
+        recording = self.recording
+        region = selection.region or (0, 0, *recording.events.size)
+        running = self.selected_events(selection)
+        keep = running.keep(span.events)
         if span.places is not None:  # compensated events outside of the image have no pixel
             half = np.array(recording.events.size) / 2.0
             keep &= (np.abs(span.places + 0.5 - half) <= half).all(axis=1)
@@ -879,23 +906,22 @@ class Inspector:
         drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
         xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
         xy = xy if span.places is None else span.places[truth.positions]
-        return LoadedWindow(span, region, n, drawn, truth, xy, events)
+        return LoadedWindow(span, region, n, drawn, truth, xy, running.steps, events)
 
-    def kept(self, events: Events, selection: Selection, region: Region) -> NDArray[np.bool_]:
-        """Return whether each event meets the selection, with another region, shape ``(n,)``."""
-        keep = np.ones(len(events), np.bool_)
-        if self.recording.encoder is not None:
-            first, last = self.recording.encoder.coverage
-            keep &= (events.t >= first) & (events.t <= last)
-        if selection.polarity is not None:
-            keep &= events.p == selection.polarity
-        if selection.region is not None:
-            keep &= inside(events, region)
-        if selection.hide_hot:
-            keep &= ~self.hot[events.y, events.x]
-        if selection.noise_us is not None:
-            keep &= ~find_background_activity(events, self.recording.events.size, window_us=selection.noise_us)
-        return keep
+    def selected_events(self, selection: Selection) -> SelectedEvents:
+        """Return a selection that can run over the events of a window.
+
+        It also keeps the events near the region, which compensation may move into it.
+        """
+        m = self.margin_px
+        left, top, right, bottom = selection.region or (0, 0, *self.recording.events.size)
+        return SelectedEvents(
+            selection,
+            self.recording.events.size,
+            (left - m, top - m, right + m, bottom + m),
+            self.hot if selection.hide_hot else None,
+            None if self.recording.encoder is None else self.recording.encoder.coverage,
+        )
 
     def _drift_us(self, knobs: Knobs) -> float:
         """Return how far the clock offset is from that of the recording's own encoder [us]."""
@@ -934,6 +960,18 @@ class Inspector:
             return np.asarray(compensate_events(w.events, self.model_of(knobs), encoder, device=self.device))
         theta = self._theta(w, knobs).astype(np.float32)
         return np.asarray(self.model_of(knobs).compensate_points(w.before, theta), np.float32)
+
+    def at_pixels(self, w: LoadedWindow, knobs: Knobs | None) -> Events:
+        """Return a window's events at the pixels in which they lie with given parameters; None: as recorded."""
+        if knobs is None:
+            return w.counted
+        e = w.counted
+        recorded = np.stack([e.x, e.y], axis=1).astype(np.float32)
+        moved = self._moved(replace(w, events=e, before=recorded, angles={}), knobs)
+        half = np.array(self.recording.events.size) / 2.0
+        seen = (np.abs(moved + 0.5 - half) < half).all(axis=1)  # False for NaN
+        x, y = np.rint(moved[seen]).astype(np.uint16).T
+        return Events(x, y, e.t[seen], e.p[seen])
 
     def counts(self, w: LoadedWindow, knobs: Knobs | None, *, per_polarity: bool = False) -> NDArray[np.float32]:
         """Return the number of a window's events at each pixel, shape ``(height, width)``, or two such images.

@@ -22,7 +22,7 @@ from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
-from amiwarp.imaging.regions import MOST_SEARCHED, busiest
+from amiwarp.imaging.regions import MOST_SEARCHED, busiest, inside
 from amiwarp.io import RecordingWriter
 from amiwarp.io.formats import check_ending
 from amiwarp.io.plain_files import save_map, save_rows
@@ -32,6 +32,7 @@ from amiwarp.plotting.colours import Scale
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.tasks import Progress, silent
 from amiwarp.viewer.drawing import Look, Scene, caption, picture_state, select_part, shown_lines
+from amiwarp.viewer.filters import rate_text
 from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, Inspector, Knobs, Source, size_name
 from amiwarp.viewer.layout import EXPORTS, SLIDERS, UNITS, orbit_text
 
@@ -132,6 +133,9 @@ def calibrated_events(inspector: Inspector, *, whole: bool = False) -> tuple[Rec
         texts.append(f"x {left} to {right - 1}, y {top} to {bottom - 1} px")
     texts += ["without hot pixels"] if s.hide_hot else []
     texts += [f"without background activity ({s.noise_us * 1e-3:g} ms)"] if s.noise_us is not None else []
+    texts += [f"refractory period {s.refractory_us * 1e-3:g} ms"] if s.refractory_us else []
+    texts += [f"at most {rate_text(s.most_per_s)}"] if s.most_per_s else []
+    texts += [f"one of {s.every} events"] if s.every > 1 else []
     return part, ", ".join(texts)
 
 
@@ -255,16 +259,11 @@ def write_table(inspector: Inspector, path: Path) -> None:
 
 
 def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
-    """Yield all selected events of the window, in blocks.
-
-    The noise filter of a block sees the last events of the block before it.
-    """
-    noise_us, last = inspector.selection.noise_us or 0, None
+    """Yield all selected events of the window, in blocks. The selection goes on from block to block."""
+    running, region = inspector.selected_events(inspector.selection), inspector.loaded.region
     for block in filter(len, span_blocks(inspector.recording.events, inspector.loaded.span)):
-        events = block if last is None else Events.concatenate([last, block])
-        chosen = inspector.kept(events, inspector.selection, inspector.loaded.region)[-len(block) :]
-        yield block if chosen.all() else block[chosen]
-        last = events[int(np.searchsorted(events.t, block.t[-1] - noise_us)) :] if noise_us else None
+        kept = running.keep(block) & inside(block, region)
+        yield block if kept.all() else block[kept]
 
 
 def _cut(encoder: Encoder, first_us: int, last_us: int) -> Encoder:

@@ -13,13 +13,13 @@ from amiwarp.calib.result import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS, alternatives, size_names
-from amiwarp.viewer.drawing import AGAINST, ImageKind, Look
+from amiwarp.viewer.drawing import AGAINST, DECAY_US, ImageKind, Look
+from amiwarp.viewer.filters import Selection
 from amiwarp.viewer.inspector import (
     OTHERS,
     SLIDING,
     Inspector,
     Knobs,
-    Selection,
     Source,
     colours_on_offer,
     foreign_names,
@@ -35,7 +35,11 @@ LONGEST_QUERY = 2000
 LONGEST_HISTORY = 200
 """Largest number of states that can be undone."""
 LONGEST_NOISE_US = 10_000_000
-"""Largest time of the noise filter in an address [us]."""
+"""Largest time of a filter or a decay in an address [us]."""
+RATE_LIMITS = (0.0, 1e12)
+"""Smallest and largest rate to which events are limited [events/s]; 0 for no limit."""
+MOST_EVERY, MOST_COUNT = 1_000_000, 1_000_000_000
+"""Largest n of every n-th event, and largest number of events of a window set by its number."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,13 @@ class ViewState:
     """Horizontal field of view [deg]; None if the recording holds its camera."""
     prism_index: float | None = None
     """Refractive index; None if the recording holds its prism."""
+    fixed_count: int | None = None
+    """Number of events by which the time window was set, and which it keeps when it moves; None: it keeps its length.
+    """
+    decay_us: int = DECAY_US
+    """Decay time of a decaying time surface [us]."""
+    same_scale: bool = False
+    """Whether images of two recordings have one scale."""
 
 
 def current_state(inspector: Inspector, **look: Any) -> ViewState:
@@ -76,7 +87,12 @@ def current_state(inspector: Inspector, **look: Any) -> ViewState:
     first = inspector.recording.events.t_first
     axis = Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME
     sources = tuple(inspector.sources.items())
-    of = {"axis": axis, **{field["name"]: field["value"] for field in given_fields(inspector)}, **look}
+    of = {
+        "axis": axis,
+        "fixed_count": inspector.fixed_count,
+        **{field["name"]: field["value"] for field in given_fields(inspector)},
+        **look,
+    }
     return ViewState(start_us - first, length_us, inspector.selection, inspector.knobs, sources, **of)
 
 
@@ -86,8 +102,14 @@ def apply_state(inspector: Inspector, state: ViewState) -> None:
     Raises :class:`AmiwarpError`, and changes nothing, if no events meet the state's window and selection.
     """
     window = state.start_us + inspector.recording.events.t_first, state.length_us
-    if (window, state.selection) != (inspector.window, inspector.selection):
-        inspector.open(*window, state.selection)
+    shown = inspector.window, inspector.selection, inspector.fixed_count
+    if (window, state.selection, state.fixed_count) != shown:
+        inspector.fixed_count = state.fixed_count
+        try:
+            inspector.open(*window, state.selection)
+        except AmiwarpError:
+            inspector.fixed_count = shown[-1]
+            raise
     set_given(inspector, state.fov_deg, state.prism_index)
     inspector.set(state.knobs)
     held = {name for name in ("camera", "prism") if inspector.sources[name] is Source.FILE}
@@ -226,6 +248,12 @@ def _fields(size: tuple[int, int], duration_us: int) -> dict[str, _Field]:
         "region": ("selection.region", lambda sides: "all" if sides is None else ",".join(map(str, sides)), region),
         "hide_hot": one_of("selection.hide_hot", flags),
         "noise_us": ("selection.noise_us", lambda us: str(us or 0), lambda us: _whole(us, 0, LONGEST_NOISE_US) or None),
+        "refractory_us": ("selection.refractory_us", str, lambda us: _whole(us, 0, LONGEST_NOISE_US)),
+        "most_per_s": ("selection.most_per_s", "{:.10g}".format, lambda rate: _number(RATE_LIMITS, rate)),
+        "every": ("selection.every", str, lambda n: _whole(n, 1, MOST_EVERY)),
+        "events": ("fixed_count", lambda n: str(n or 0), lambda n: _whole(n, 0, MOST_COUNT) or None),
+        "decay_us": ("decay_us", str, lambda us: _whole(us, 1, LONGEST_NOISE_US)),
+        "same_scale": one_of("same_scale", flags),
         "overlaid": one_of("overlaid", flags),
         **{name: one_of(name, {each.value: each for each in kind}) for name, kind in choices.items()},
         **{name: (name, "{:.10g}".format, partial(_number, ends)) for name, (_, _, ends) in GIVEN.items()},
@@ -384,6 +412,10 @@ class Actions:
     """Request updates, by their names. Successive ones with an equal ``change`` are undone in one step."""
     say: Callable[..., None]
     """Show a text as a message."""
+    decay_us: int = DECAY_US
+    """Decay time of a decaying time surface [us]."""
+    same_scale: bool = False
+    """Whether images of two recordings have one scale."""
     steps: tuple[Callable[[History], ViewState], ...] = ()
     """Steps through the history that are to be made after the changes which were requested before them."""
 
@@ -465,8 +497,12 @@ class Actions:
     # Time
 
     def step(self, count: int) -> None:
-        """Move the time window by turns; without a prism, by its length."""
+        """Move the time window by turns; without a prism, by its length; set by number, by as many events."""
         start_us, length_us = self.time_window
+        if self.inspector.fixed_count is not None:
+            self.move(self.inspector.start_after(count))
+            self.released()
+            return
         self.move(start_us + count * (round(self.inspector.turn_us) if self.compensates else length_us))
         self.released()
 
@@ -521,7 +557,8 @@ class Actions:
         """Add what is shown now to the history, and return it. Equal ``change`` of successive states make one step."""
         look = self.look
         now = current_state(self.inspector, against=self.against, image=self.image, axis=look.axis, colour=look.colour,
-                            view=self.view, overlaid=look.overlaid)  # fmt: skip
+                            view=self.view, overlaid=look.overlaid, decay_us=self.decay_us,
+                            same_scale=self.same_scale)  # fmt: skip
         self.history = self.history or History(now)
         self.history.add(now, change)
         return self.history

@@ -34,7 +34,8 @@ from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
-from amiwarp.viewer.inspector import WINDOW_POINTS, DisplayedWindow, Inspector, Knobs, Library, Selection
+from amiwarp.viewer.filters import Selection
+from amiwarp.viewer.inspector import WINDOW_POINTS, DisplayedWindow, Inspector, Knobs, Library
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
 from amiwarp.viewer.serve import address, finite, serve, use_page
 
