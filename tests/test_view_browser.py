@@ -199,7 +199,7 @@ def page(kept: tuple[Any, Any, dict[str, Any]], tabs: Tabs, nothing_fails: None)
 
 def ready(page: Any) -> None:
     """Wait until the page shows a window, and no part of it waits for an update."""
-    page.locator("#curve-text, #sharpness").first.wait_for()
+    page.locator("#curve-text, #sharpness, #two").first.wait_for()
     # trame keeps changes back while a call is pending
     page.wait_for_function("!trame.state.dirtyKeys.size && !trame.state.client.isBusy()")
     page.evaluate("trame.trigger('answer')")  # the server has taken what the test has changed
@@ -687,6 +687,7 @@ def test_pictures_have_legend_colour_bar_and_caption_and_images_the_difference(
             return np.asarray(image.convert("RGB"))
 
     inspector = kept[1].inspector
+    page.locator("#picture_scale").select_option("1")
     page.locator("#colour").select_option("residual")
     ready(page)
     height = page.locator(".clouds canvas").bounding_box()["height"]
@@ -694,7 +695,7 @@ def test_pictures_have_legend_colour_bar_and_caption_and_images_the_difference(
     assert colours_in(below, table_of("cividis")[10:-10:10]) > 0.95
     words = drawing.caption(inspector, inspector.show())
     left, top, right, bottom = region(page)
-    assert f"x {left} to {right - 1}, y {top} to {bottom - 1} px" in words
+    assert f"x {left} to {right}, y {top} to {bottom} px" in words
     assert " ms; " in words
     ink = (below.max(axis=2) < 100).any(axis=1)  # rows of text
     assert np.count_nonzero(np.diff(ink.astype(np.int8)) == 1) >= 4
@@ -1412,7 +1413,32 @@ def test_another_recording_is_shown_on_the_left(
 
     page = tabs.open(context, make)
     try:
-        assert page.locator("#against-title").inner_text() == "noise (other recording)"
+        assert page.locator("#against-title").inner_text() == "noise, as recorded"
+        assert page.locator("#after-title").inner_text() == "discs, compensated"
+        titles = [title for _, title in tabs.panels[-1].state.titles]
+        assert titles == ["noise, as recorded, at the prism angles of discs", "discs, compensated"]
+        shown, inspector = tabs.panels[-1].shown, tabs.panels[-1].inspector
+        assert shown.beside is not None
+        assert page.locator("#sharpness, #difference").count() == 0  # they would read as before and after
+        sharp = (shown.beside.sharpness_before, shown.sharpness_after)
+        assert page.locator("#two").inner_text().endswith(f"discs: sharpness {sharp[1]:.3f}")
+        assert "→" not in page.locator("#two").inner_text()
+        figures = page.locator("#recordings dd").all_inner_texts()
+        for part, figure, counts in zip((shown.beside, shown), figures[::2], figures[1::2], strict=True):
+            seconds = 1e-6 * part.span.length_us
+            rate = float(figure.split(" ")[0]) * {"ev/s,": 1.0, "kev/s,": 1e3, "Mev/s,": 1e6}[figure.split(" ")[1]]
+            assert rate == pytest.approx(part.selected / seconds, rel=0.01)
+            assert f"{part.span.count:,} events" in counts
+        before, after = (tabs.panels[-1].state[name]["high"] for name in ("before", "after"))
+        assert before < after  # the noise has few events per pixel: its image has a brightness of its own
+        page.locator("#same_scale").check()
+        ready(page)
+        assert tabs.panels[-1].state.before["high"] == tabs.panels[-1].state.after["high"] == after
+        words = drawing.caption(inspector, shown)
+        assert "noise: " in words
+        assert "discs: " in words
+        page.locator("#axis").select_option("time")
+        until(lambda: tabs.panels[-1].state.titles[0][1] == "noise, as recorded")
         picture = cloud(page)
         half = picture.shape[1] // 2
         coloured = [(np.ptp(each, axis=2) > 60).mean() for each in (picture[:, :half], picture[:, half:])]

@@ -875,7 +875,7 @@ def test_a_calibration_uses_what_is_selected(
     assert after == pytest.approx(inspector.show(replace(truth, model=model)).sharpness_after, rel=0.1)
     scope = calibrated_events(inspector)[1]
     assert scope.startswith(f"{inspector.loaded.selected:,} events from 0.020 s to 0.200 s")
-    assert ("x 20 to 139, y 10 to 109 px" in scope) is (region is not None)
+    assert ("x 20 to 140, y 10 to 110 px" in scope) is (region is not None)
     assert text.startswith(f"found on {scope}: {model} model, apex {math.degrees(apex):.4g}°")
     assert inspector.knobs.apex == 0.5 * truth.apex  # nothing is accepted yet
     inspector.accept(found)

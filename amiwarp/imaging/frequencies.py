@@ -76,7 +76,7 @@ def strongest(frequencies: NDArray[np.float32], most: int) -> list[tuple[float, 
     Frequencies within 5 % count as one. ``most``: largest number of them.
     """
     left = frequencies[np.isfinite(frequencies)].astype(np.float64)
-    found = []
+    found: list[tuple[float, int]] = []
     while len(left) and len(found) < most:
         groups = np.floor(np.log(left) / BIN)
         numbers, counts = np.unique(groups, return_counts=True)

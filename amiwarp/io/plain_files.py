@@ -272,6 +272,11 @@ class ArrayMap:
         save_map(Path(path), self._WHAT, {name: getattr(self, name) for name in self._KINDS}, overwrite=overwrite)
 
     @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the names of the arrays."""
+        return tuple(cls._KINDS)
+
+    @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a map that :meth:`save` wrote.
 

@@ -47,6 +47,7 @@ from amiwarp.plotting.meshes import Box
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.tasks import interrupts_later
 from amiwarp.validation import choice
+from amiwarp.viewer.filters import rate_text
 from amiwarp.viewer.inspector import DisplayedWindow, DrawnTruth, Inspector, Knobs, LoadedWindow, colours_on_offer
 
 if TYPE_CHECKING:
@@ -178,8 +179,8 @@ class ImageKind(enum.StrEnum):
     """Numbers of OFF and ON events per pixel, in two colours."""
     TIME_SURFACE = "time surface"
     """Time of the latest event of each pixel."""
-    DECAY = "decaying time surface"
-    """How recent the latest event of each pixel is: its weight falls by 1/e with each decay time."""
+    DECAY = "decay"
+    """Decaying time surface: a weight for the latest event of each pixel that falls to 1/e in the decay time."""
     FREQUENCY = "frequency"
     """Frequency with which each pixel changes, such as that of a lamp or of a vibration."""
     LOG_INTENSITY = "log intensity"
@@ -205,6 +206,8 @@ class ShownImages:
     """Scale of the second image if it has one of its own."""
 
 
+ON_BLACK = "viridis on dark"
+"""Colours of images in which pixels without a value are black."""
 DECAY_US = 10_000
 """Decay time of a decaying time surface at the start [us]."""
 MOST_FREQUENCIES = 3
@@ -220,14 +223,16 @@ def make_images(
     difference: bool = False,
     decay_us: int = DECAY_US,
     same_scale: bool = False,
+    kept: tuple[Scale, Scale] | None = None,
 ) -> ShownImages:
     """Return the images of the inspector's window.
 
     ``against``: parameters of the first image instead of none. ``shown``: the window with these parameters, if it is
     known: its counts are not made again. ``difference``: of counts, the second image shows after minus before, with a
     scale of its own. ``decay_us``: decay time of a decaying time surface [us]. ``same_scale``: whether counts of
-    another recording beside have the scale of this one; otherwise each has its own. Raises :class:`AmiwarpError` if a
-    log intensity cannot be reconstructed, or there is no depth map.
+    another recording beside have the scale of this one; otherwise each has its own. ``kept``: scales of both images of
+    counts that do not follow the values, while a slider moves. Raises :class:`AmiwarpError` if a log intensity cannot
+    be reconstructed, or there is no depth map.
     """
     window, knobs = inspector.loaded, inspector.knobs
     left, top, right, bottom = window.region
@@ -247,7 +252,7 @@ def make_images(
     pair = (first, first.loaded, against), (inspector, window, knobs)
     if kind is ImageKind.TIME_SURFACE:
         before, after = (_time_surface(*each)[top:bottom, left:right] for each in pair)
-        scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, "viridis")
+        scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, ON_BLACK)
         return ShownImages(before, after, scale)
     if kind is ImageKind.DECAY:
         ages = (w.span.length_us * 1e-3 - _time_surface(i, w, k)[top:bottom, left:right] for i, w, k in pair)
@@ -263,6 +268,8 @@ def make_images(
         images = [each.counts(w, k, per_polarity=kind is ImageKind.POLARITY) for each, w, k in pair]
     before, after = (each[..., top:bottom, left:right] for each in images)
     colours = "polarity" if kind is ImageKind.POLARITY else "gray"
+    if kept is not None and not difference:
+        return ShownImages(before, after, kept[0], after_scale=kept[1])
     if first is not inspector and not same_scale:
         return ShownImages(before, after, count_scale((before,), colours), after_scale=count_scale((after,), colours))
     scale = count_scale((before, after), colours)
@@ -294,7 +301,7 @@ def _frequency_scale(*images: NDArray[np.float32]) -> Scale:
     known = np.concatenate([image[np.isfinite(image)] for image in images])
     low, high = np.percentile(known, (2.0, 98.0)).tolist() if len(known) else (0.0, 1.0)
     low, high = 0.9 * low, 1.1 * high  # so that one frequency alone has a colour of the middle
-    return Scale("frequency", "Hz", low, high, "viridis", missing_text="no frequency")
+    return Scale("frequency", "Hz", low, high, ON_BLACK, missing_text="no frequency")
 
 
 def frequency_text(image: NDArray[np.float32]) -> str:
@@ -422,17 +429,17 @@ def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | N
     """
     from matplotlib.colors import to_rgb
 
-    unknown = to_rgb(LIGHT_GREY)
+    unknown, paper = to_rgb(LIGHT_GREY), " on dark" if dark else ""  # the darkest colours are like a dark background
     if colour is Colour.ANGLE:
         return Scale("prism angle θ", "°", 0.0, 360.0, f"twilight on {'dark' if dark else 'light'}")
     if colour is Colour.TIME:
-        return Scale("time", "ms", *axis_range(shown, Axis.TIME), "viridis")
+        return Scale("time", "ms", *axis_range(shown, Axis.TIME), f"viridis{paper}")
     if colour is Colour.DENSITY:
         image = shown.image_after
         top = math.ceil(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0
-        return Scale("events", "per pixel", 0.0, float(top), "cividis", GAMMA, missing=unknown)
+        return Scale("events", "per pixel", 0.0, float(top), f"cividis{paper}", GAMMA, missing=unknown)
     if colour is Colour.RESIDUAL:
-        return Scale("residual σ", "px", 0.0, WIDEST_PX, "cividis", missing=unknown)
+        return Scale("residual σ", "px", 0.0, WIDEST_PX, f"cividis{paper}", missing=unknown)
     return None
 
 
@@ -513,50 +520,83 @@ LEAST_CERTAIN = 0.05
 def against_title(inspector: Inspector, against: str) -> str:
     """Return the title of what the left cloud shows, by its name in :data:`AGAINST`."""
     beside = inspector.beside if against == "recorded" else None
-    return AGAINST[against] if beside is None else f"{beside.recording.name} (other recording)"
+    return AGAINST[against] if beside is None else f"{beside.recording.name}, as recorded"
 
 
-def cloud_titles(inspector: Inspector, against: str) -> tuple[str, ...]:
-    """Return the titles of the clouds. ``against``: name of what the left one shows, see :data:`AGAINST`."""
-    if math.isfinite(inspector.turn_us):
-        return against_title(inspector, against), "compensated" if against == "recorded" else "compensated with A"
-    if inspector.beside is not None:
-        return against_title(inspector, "recorded"), f"{inspector.recording.name}, as recorded"
-    return (RECORDED,)
+def cloud_titles(inspector: Inspector, against: str, axis: Axis | None = None) -> tuple[str, ...]:
+    """Return the titles of the clouds. ``against``: name of what the left one shows, see :data:`AGAINST`.
+
+    Of two recordings, the titles have both names. ``axis``: third axis; a recording without angles of its own is said
+    to be at those of the other.
+    """
+    turns, two = math.isfinite(inspector.turn_us), inspector.beside is not None and against == "recorded"
+    if not turns and not two:
+        return (RECORDED,)
+    right = "compensated" if against == "recorded" else "compensated with A"
+    if not two:
+        return against_title(inspector, against), right
+    name = inspector.recording.name
+    lent = f", at the prism angles of {name}" if turns and axis is Axis.ANGLE and inspector.angles_lent else ""
+    return against_title(inspector, against) + lent, f"{name}, {right if turns else 'as recorded'}"
 
 
 def caption(inspector: Inspector, shown: DisplayedWindow, stride: int = 1) -> str:
     """Return what a picture of the clouds shows: recording, time, region, numbers of events and sharpness.
 
-    ``stride``: only every ``stride``-th point is drawn.
+    ``stride``: only every ``stride``-th point is drawn. Right and bottom of the region are exclusive, as its edges are
+    in fields and options. Of two recordings, each has its own numbers.
     """
     left, top, right, bottom = shown.region
     end_ms = shown.span.start_ms + shown.span.length_us * 1e-3
+    place = f"{shown.span.start_ms:.3f} to {end_ms:.3f} ms; x {left} to {right}, y {top} to {bottom} px"
+    if shown.beside is not None:
+        return f"{place}; {'; '.join(': '.join([row[0], ', '.join(row[1:])]) for row in beside_rows(inspector, shown))}"
     sharpness = sharpness_text(shown, compensated=math.isfinite(inspector.turn_us))
-    beside = "" if shown.beside is None or inspector.beside is None else f"; left: {inspector.beside.recording.name}"
-    return (
-        f"{inspector.recording.name}: {shown.span.start_ms:.3f} to {end_ms:.3f} ms; x {left} to {right - 1}, "
-        f"y {top} to {bottom - 1} px; {events_text(shown, stride)}; sharpness {sharpness}{beside}"
-    )
+    return f"{inspector.recording.name}: {place}; {events_text(shown, stride)}; sharpness {sharpness}"
+
+
+def beside_rows(inspector: Inspector, shown: DisplayedWindow) -> list[list[str]]:
+    """Return the figures of two recordings that are shown side by side: name, numbers of events, rate, sharpness."""
+    if shown.beside is None or inspector.beside is None:
+        return []
+    both = (inspector.beside, shown.beside, shown.sharpness_before), (inspector, shown, shown.sharpness_after)
+    return [
+        [each.recording.name, chosen_text(part), rate_text(1e6 * part.selected / part.read_us),
+         f"sharpness {_certain(part, sharpness)}"]
+        for each, part, sharpness in both
+    ]  # fmt: skip
 
 
 def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
-    """Return the sharpness of the images as text, with the gain if there are two images.
+    """Return the sharpness of the images as text, with the gain if there are two images of one recording.
 
-    So few events that their sharpness may be that of random ones have none.
+    So few events that their sharpness may be that of random ones have none. Of two recordings, the text is empty: each
+    has its own, see :func:`beside_rows`.
     """
     before, after = shown.sharpness_before, shown.sharpness_after
+    if shown.beside is not None:
+        return ""
+    if _is_random(shown, max(abs(before), abs(after))):
+        return _certain(shown, before)
+    if not compensated:
+        return f"{before:.3f}"
+    gain = f" (×{after / before:.2f})" if before > 1e-3 and after > 0.0 else ""
+    return f"{before:.3f} → {after:.3f}{gain}"
+
+
+def _certain(shown: DisplayedWindow, sharpness: float) -> str:
+    """Return a sharpness as text, or that it is unknown."""
+    return "unknown: too few events" if _is_random(shown, abs(sharpness)) else f"{sharpness:.3f}"
+
+
+def _is_random(shown: DisplayedWindow, sharpness: float) -> bool:
+    """Return whether a sharpness may be that of as many random events."""
     left, top, right, bottom = shown.region
     area = (right - left) * (bottom - top)
     # for random events, the variance over mean varies by sqrt(2 / area) of itself, and with the places in the pixels
     relative = math.sqrt(2.0 / area + PLACE_VARIANCE / shown.selected)
     deviation = random_variance(SMOOTHING_PX) * area / shown.selected * relative
-    if deviation > LEAST_CERTAIN and max(abs(before), abs(after)) < 3.0 * deviation:
-        return "unknown: too few events"
-    if not compensated:
-        return f"{before:.3f}"
-    gain = f" (×{after / before:.2f})" if before > 1e-3 and after > 0.0 else ""
-    return f"{before:.3f} → {after:.3f}{gain}"
+    return deviation > LEAST_CERTAIN and sharpness < 3.0 * deviation
 
 
 def events_text(shown: DisplayedWindow, stride: int = 1) -> str:
@@ -577,11 +617,16 @@ def chosen_text(shown: DisplayedWindow) -> str:
 
 
 def drawn_text(shown: DisplayedWindow, stride: int = 1) -> str:
-    """Return how many of the selected events are drawn, if every ``stride``-th point is."""
+    """Return how many of the selected events are drawn, if every ``stride``-th point is.
+
+    Those of the drawn ones that the model cannot compensate are counted apart: they are missing in the second cloud.
+    """
     drawn = len(range(0, len(shown.events), stride))
+    unmoved = int(np.count_nonzero(np.isnan(shown.after).any(axis=1)))
+    rest = f", {unmoved:,} not compensated" if unmoved else ""
     if drawn < shown.selected:
-        return f"{drawn:,} of these drawn"
-    return "all drawn" if shown.selected == shown.span.count else "all of these drawn"
+        return f"{drawn:,} of these drawn{rest}"
+    return f"{'all drawn' if shown.selected == shown.span.count else 'all of these drawn'}{rest}"
 
 
 # VTK scene with the event clouds before and after compensation, drawn off screen without a user interface.

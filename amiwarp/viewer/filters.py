@@ -145,22 +145,26 @@ def list_hot_pixels(events: Events, hot: NDArray[np.bool_]) -> tuple[HotPixel, .
     )
 
 
+PREFIXES = ((1e6, "M"), (1e3, "k"), (1.0, ""))
+"""Sizes and prefixes of the units of rates, the largest first."""
+
+
 def rate_text(events_per_s: float) -> str:
-    """Return a rate as text, such as ``1.20 Mev/s``."""
-    for size, prefix in ((1e6, "M"), (1e3, "k")):
-        if events_per_s >= 0.9995 * size:
-            return f"{events_per_s / size:.3g} {prefix}ev/s"
-    return f"{events_per_s:.3g} ev/s"
+    """Return a rate as text, such as ``1.2 Mev/s``."""
+    size, prefix = next((each for each in PREFIXES if events_per_s >= 0.9995 * each[0]), PREFIXES[-1])
+    return f"{events_per_s / size:.3g} {prefix}ev/s"
 
 
 def step_rows(steps: tuple[FilterStep, ...], read_us: float) -> list[list[str]]:
-    """Return a row of texts for each step: its name, numbers of events, and rates before and after.
+    """Return a row of texts for each step: its name, rates before and after, and numbers of events.
 
     ``read_us``: time of which the events were read [us].
     """
     rows = []
     for step in steps:
-        before, after = (rate_text(1e6 * count / read_us) for count in (step.before, step.after))
+        before, after = (1e6 * count / read_us for count in (step.before, step.after))
+        size, prefix = next((each for each in PREFIXES if before >= each[0]), PREFIXES[-1])
+        rates = f"{before / size:.3g} → {after / size:.3g} {prefix}ev/s"
         share = 100.0 * (1.0 - step.after / max(step.before, 1))
-        rows.append([step.name, f"{step.before:,} → {step.after:,}", f"{before} → {after}", f"−{share:.3g} %"])
+        rows.append([step.name, rates, f"{step.before:,} → {step.after:,} events (−{share:.3g} %)"])
     return rows

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -30,6 +31,7 @@ from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, iwe, upload_
 from amiwarp.imaging.regions import Region, RegionSharpness, inside, suggest_region
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.formats import EXTENSIONS
+from amiwarp.io.pixel_map import PixelMap
 from amiwarp.io.spans import Span, read_span
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, Model, PlateModel, RisleyModel, alternatives, build_model
@@ -362,6 +364,8 @@ class Inspector:
         """Largest number of points in each event cloud."""
         self.beside: Inspector | None = None
         """Another recording that is shown beside this one, see :meth:`put_beside`."""
+        self.angles_lent = False
+        """Whether the recording beside has no encoder of its own, and is shown at this recording's prism angles."""
         self.depth: DepthMap | None = None
         """Depths of what the pixels see through a plate, see :meth:`use_depths`."""
         self._is_beside = False
@@ -706,7 +710,8 @@ class Inspector:
     def put_beside(self, recording: Recording) -> None:
         """Show another recording beside this one: its events, as recorded, at the same time after its first event.
 
-        Without an encoder it gets the prism's angles of this recording at these times. Raises :class:`AmiwarpError` if
+        Without an encoder it gets the prism's angles of this recording at these times, with the speed and the clock
+        offset that are set for this one: :attr:`angles_lent` says so. Raises :class:`AmiwarpError` if
         it has no events, or another number of pixels.
         """
         source, size = recording.events, self.recording.events.size
@@ -716,17 +721,24 @@ class Inspector:
                 f"{size[0]}x{size[1]}; give two recordings of one size"
             )
         own = self.recording.encoder
+        self.angles_lent = recording.encoder is None
         if recording.encoder is None and own is not None and len(source):
             shift = source.t_first - self.recording.events.t_first
             recording = replace(recording, encoder=Encoder(own.t + shift, own.angle, own.clock_offset_us))
         self.beside = Inspector(recording, device=self.device, most_points=self.most_points)
         self.beside._is_beside = True
+        self.beside.zero_us = source.t_first + self.zero_us - self.recording.events.t_first
 
-    def _beside(self, span: Span, selection: Selection, image_after: NDArray[np.float32]) -> DisplayedWindow:
+    def _beside(
+        self, span: Span, selection: Selection, image_after: NDArray[np.float32], lent: Knobs | None
+    ) -> DisplayedWindow:
         """Return what this recording, as recorded, shows beside another one in the time of that one's ``span``.
 
-        ``image_after``: compensated image of the other recording, which sets the scale of colours.
+        ``image_after``: compensated image of the other recording, which sets the scale of colours. ``lent``: parameters
+        of the other one whose speed and clock offset this one gets; None for its own.
         """
+        if lent is not None:
+            self.knobs = replace(self.knobs, rpm=lent.rpm, clock_offset=lent.clock_offset)
         window = span.start_us - span.first_us + self.recording.events.t_first, span.length_us
         if (window, selection) != (self.window, self.selection):
             self.open(*window, selection)
@@ -748,7 +760,8 @@ class Inspector:
         xy = w.before if against is None else self._moved(w, against)
         (image_after, sharpness_after), other = self._measured(w, knobs), None
         if self.beside is not None and against is None:
-            other = self.beside._beside(w.span, self.selection, image_after)
+            lent = knobs if self.angles_lent else None
+            other = self.beside._beside(w.span, self.selection, image_after, lent)
             image, sharpness = other.image_before, other.sharpness_before
         else:
             image, sharpness = self._measured(w, against)
@@ -1025,6 +1038,7 @@ class Library:
         found = sorted(
             path for path in self.folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
             and path.is_file() and path.resolve().parent == self.folder  # also if it is a link
+            and not _is_map(path)
         )  # fmt: skip
         return [[path.name, f"{path.stat().st_size / 1e6:,.1f} MB"] for path in found[:MOST_FILES]]
 
@@ -1033,3 +1047,12 @@ class Library:
         if name not in [file for file, _ in self.files()]:
             raise AmiwarpError(f"{name!r}: is no recording in {self.folder}; choose one from the list")
         return self._open_file(self.folder / name)
+
+
+def _is_map(path: Path) -> bool:
+    """Return whether a file holds a depth map or a map of pixels, and no recording."""
+    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        names = {name.removesuffix(".npy") for name in archive.namelist()}
+    return any(names >= set(kind.names()) for kind in (DepthMap, PixelMap))

@@ -17,21 +17,23 @@ from numpy.typing import NDArray
 from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import AUTO, Settings
-from amiwarp.choices import View
+from amiwarp.choices import Axis, View
 from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.regions import MOST_SEARCHED, busiest, inside
 from amiwarp.io import RecordingWriter
+from amiwarp.io.files import check_output
 from amiwarp.io.formats import check_ending
 from amiwarp.io.plain_files import save_map, save_rows
 from amiwarp.io.spans import span_blocks
 from amiwarp.optics.models import ExactModel, alternatives
 from amiwarp.plotting.colours import Scale
+from amiwarp.plotting.meshes import Box
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.tasks import Progress, silent
-from amiwarp.viewer.drawing import Look, Scene, caption, picture_state, select_part, shown_lines
+from amiwarp.viewer.drawing import Look, Scene, axis_range, caption, picture_state, select_part, shown_lines
 from amiwarp.viewer.filters import rate_text
 from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, Inspector, Knobs, Source, size_name
 from amiwarp.viewer.layout import EXPORTS, SLIDERS, UNITS, orbit_text
@@ -130,7 +132,7 @@ def calibrated_events(inspector: Inspector, *, whole: bool = False) -> tuple[Rec
     texts = [f"{len(part.events):,} {kind}events from {start_s:.3f} s to {end_s:.3f} s"]
     if s.region is not None:
         left, top, right, bottom = s.region
-        texts.append(f"x {left} to {right - 1}, y {top} to {bottom - 1} px")
+        texts.append(f"x {left} to {right}, y {top} to {bottom} px")
     texts += ["without hot pixels"] if s.hide_hot else []
     texts += [f"without background activity ({s.noise_us * 1e-3:g} ms)"] if s.noise_us is not None else []
     texts += [f"refractory period {s.refractory_us * 1e-3:g} ms"] if s.refractory_us else []
@@ -256,6 +258,38 @@ def write_table(inspector: Inspector, path: Path) -> None:
     columns = {name: np.concatenate(parts) for name, *parts in zip(COLUMNS, *tables, strict=True)}
     width, height = map(np.array, inspector.recording.events.size)
     save_map(path, "table", {**columns, "width": width, "height": height}, overwrite=False)
+
+
+def write_cloud(inspector: Inspector, path: Path, axis: Axis, *, compensated: bool) -> None:
+    """Write all selected events of the window as points to a new .vtp file, as :func:`amiwarp.event_clouds` does.
+
+    Points lie at x [px], -y [px], and angle [deg] or time [ms] on the third axis, in the scale of the clouds. Events
+    that the model cannot compensate are left out of compensated points. Raises :class:`AmiwarpError` if the file
+    exists.
+    """
+    import pyvista
+
+    shown, encoder, model = inspector.show(), inspector.encoder_of(inspector.knobs), inspector.model
+    events = Events.concatenate(list(_selected_blocks(inspector)))
+    xy = np.stack([events.x, events.y], axis=1).astype(np.float32)
+    if compensated:
+        xy = np.asarray(model.compensate_points(xy, encoder.angles_at(events.t).astype(np.float32)), np.float32)
+    theta = np.mod(encoder.angle_at(events.t), math.tau)
+    t_us = events.t - shown.span.first_us
+    box = Box(*shown.region, *axis_range(shown, axis))
+    along, unit = (np.degrees(theta), "theta [deg]") if axis is Axis.ANGLE else (t_us * 1e-3, "t [ms]")
+    known = np.isfinite(xy).all(axis=1)
+    cloud = pyvista.PolyData(box.positions(xy[known], along[known]))
+    arrays: dict[str, NDArray[Any]] = {"t_us": t_us, "polarity": events.p}
+    if math.isfinite(inspector.turn_us):
+        arrays["theta_rad"] = theta
+    for name, values in arrays.items():
+        cloud.point_data[name] = values[known]
+    cloud.field_data["axes"] = ["x [px]", "-y [px]", f"({unit} - z_start) * z_scale"]
+    cloud.field_data["z_scale"], cloud.field_data["z_start"] = [box.stretch], [box.low]
+    cloud.field_data["t_first_us"] = np.array([shown.span.first_us], np.int64)
+    check_output(path)
+    cloud.save(path)
 
 
 def _selected_blocks(inspector: Inspector) -> Iterator[Events]:

@@ -321,6 +321,12 @@ SLIDERS: dict[str, tuple[str, str, tuple[float, float, float]]] = {
     **{name: slider for name, slider in _OF_MODELS.items() if name not in size_names()},
 }
 """Sliders by parameter, in their order: label, unit, and (minimum, maximum, step). That of the apex may be longer."""
+FILTER_FIELDS = {
+    "noise_ms": ("noise filter", "ms", (0.01, 1000.0)), "refractory_ms": ("refractory period", "ms", (0.0, 10_000.0)),
+    "most_mev_s": ("largest rate", "Mev/s", (0.0, 1e6)), "every": ("every n-th event", "", (1.0, float(MOST_EVERY))),
+    "decay_ms": ("decay time", "ms", (0.001, 10_000.0)),
+}  # fmt: skip
+"""Fields of filters and of the decay by name: label, unit, and smallest and largest value."""
 FIELD_LIMITS = {**{name: LIMITS[name] for name in SLIDERS}, **{name: ends for name, (_, _, ends) in GIVEN.items()}}
 """Smallest and largest value of the fields of the prism and the camera, in the page's units."""
 SCOPES = ("selection", "whole recording")
@@ -353,18 +359,20 @@ KEYS = (
 EXPORTS = {
     "picture": ("picture", ".png"), "image": ("images", ".png"), "values": ("image values", ".tif"),
     "events": ("events", ".h5"), "compensated": ("compensated events", ".h5"), "csv": ("events, CSV", ".csv"),
-    "npz": ("events, NPZ", ".npz"), "calibration": ("calibration", ".json"), "turntable": ("film, turning", ".mp4"),
+    "npz": ("events, NPZ", ".npz"), "vtp": ("cloud, VTP", ".vtp"), "vtp_after": ("compensated cloud, VTP", ".vtp"),
+    "calibration": ("calibration", ".json"), "turntable": ("film, turning", ".mp4"),
     "film": ("film from here", ".mp4"),
 }  # fmt: skip
 """Downloads by name: text of the button, and suffix."""
 FILMS = ("turntable", "film")
 """Downloads that take long."""
-OF_OPTICS = ("compensated", "calibration")
+OF_OPTICS = ("compensated", "vtp_after", "calibration")
 """Downloads that only a recording with an optic has."""
 CALLS = (
     "key", "released", "choose", "slide", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline", "undo", "redo",
     "reset", "restore", "answer", "keep_b", "swap_b", "export", "open_file", "use_card", "end_film",
+    "list_hot",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {
@@ -374,12 +382,12 @@ SETTABLE: dict[str, Check] = {
     "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
     "message": one_of(""),
     **dict.fromkeys(("hide_hot", "noise_filter", "dark", "overlaid", "orbit_shown", "help_shown", "open_shown", "loop",
-                     "difference", "optic"),
+                     "difference", "optic", "same_scale"),
                     flag),
 }  # fmt: skip
 """State variables that the page may set directly, with the check of their values. The page changes all others through
 :data:`CALLS`."""
-CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice", "sliced")
+CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice", "sliced", "marked", "picture_scale")
 """State variables that the browser keeps to itself."""
 EMPTY: tuple[tuple[Any, str], ...] = (
     ("", "trame_error_report_msg stream_note hover measured address events drawn sharpness message rate_note "
@@ -387,9 +395,10 @@ EMPTY: tuple[tuple[Any, str], ...] = (
     (b"", "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off orbit "
           "column"),
     (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
-            "difference has_b calibrating"),
-    (None, "overview before after surface image_scale after_scale"),
-    ((), "live_rows updating titles against_choices old"),
+            "difference has_b calibrating same_scale"),
+    (None, "overview before after surface image_scale after_scale marked hot_rows"),
+    ((), "live_rows updating titles against_choices old steps beside_rows"),
+    (0, "fixed_count"),
 )  # fmt: skip
 """Values of state variables before the first update, and their names."""
 
@@ -412,10 +421,6 @@ class Actions:
     """Request updates, by their names. Successive ones with an equal ``change`` are undone in one step."""
     say: Callable[..., None]
     """Show a text as a message."""
-    decay_us: int = DECAY_US
-    """Decay time of a decaying time surface [us]."""
-    same_scale: bool = False
-    """Whether images of two recordings have one scale."""
     steps: tuple[Callable[[History], ViewState], ...] = ()
     """Steps through the history that are to be made after the changes which were requested before them."""
 
@@ -444,6 +449,16 @@ class Actions:
     def image(self) -> ImageKind:
         """What the images show."""
         return ImageKind.COUNT
+
+    @property
+    def decay_us(self) -> int:
+        """Decay time of a decaying time surface [us]."""
+        return DECAY_US
+
+    @property
+    def same_scale(self) -> bool:
+        """Whether images of two recordings have one scale."""
+        return False
 
     @property
     def compensates(self) -> bool:
@@ -572,6 +587,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
     recording = inspector.recording
     size = recording.events.size
     return {
+        **{name: value for value, names in EMPTY for name in names.split()},
         **source_state(inspector), **knob_state(inspector), "turn_ms": turn_ms(inspector),
         "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "truth": truth_text(recording.truth),
         "size": list(size), "optic": inspector.has_optic, "count": 0, "live": inspector.latest is not None,
@@ -583,16 +599,30 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
         "kind": ImageKind.COUNT.value,
         "kinds": [each.value for each in ImageKind if each is not ImageKind.DEPTH or inspector.depth is not None],
-        "speed": 0.1, "polarity": "both", "noise_ms": 2.0, "region_kind": "whole", "region_wanted": [0, 0, *size],
+        "speed": 0.1, "noise_ms": 2.0, "region_kind": "whole", "region_wanted": [0, 0, *size],
         "region": [0, 0, *size], "knob": inspector.orbit_names[0], "point_size": 2, "opacity": 1.0, "orbit_shown": True,
         "view": [View.FREE.value, 0], "tool": "region", "late": 0, "slice": [0.0, 1.0], "sliced": "",
-        "severity": "info", "picked": -1, "against": "recorded", "progress": 0, "calibrate_on": ["", ""],
+        "severity": "info", "picked": -1, "picture_scale": 2, **filter_state(inspector.selection),
+        "decay_ms": DECAY_US * 1e-3, "against": "recorded", "progress": 0, "calibrate_on": ["", ""],
         "curve_mark": 0.0, "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
         "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
         "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
         "statistics": {"rows": [], "x": [], "y": [], "median": None},
-        **{name: value for value, names in EMPTY for name in names.split()},
     }  # fmt: skip
+
+
+def filter_state(selection: Selection) -> dict[str, Any]:
+    """Return the state variables of the filters of events."""
+    noise = {} if selection.noise_us is None else {"noise_ms": selection.noise_us * 1e-3}
+    return {
+        "polarity": {None: "both", 1: "ON", 0: "OFF"}[selection.polarity],
+        "hide_hot": selection.hide_hot,
+        "noise_filter": selection.noise_us is not None,
+        **noise,
+        "refractory_ms": selection.refractory_us * 1e-3,
+        "most_mev_s": selection.most_per_s * 1e-6,
+        "every": selection.every,
+    }
 
 
 def source_state(inspector: Inspector) -> dict[str, Any]:

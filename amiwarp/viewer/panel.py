@@ -29,12 +29,12 @@ from amiwarp.imaging.iwe import iwe
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.event_rates import EventRates
 from amiwarp.live.stream.session import LiveSource
-from amiwarp.plotting.colours import count_scale
+from amiwarp.plotting.colours import Scale, count_scale
 from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
-from amiwarp.viewer.filters import Selection
+from amiwarp.viewer.filters import Selection, step_rows
 from amiwarp.viewer.inspector import WINDOW_POINTS, DisplayedWindow, Inspector, Knobs, Library
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
 from amiwarp.viewer.serve import address, finite, serve, use_page
@@ -86,6 +86,10 @@ class Panel(layout.Actions):
         self.plays = False
         """Whether the playback runs; after a stop it runs until it notices the stop."""
         self._picked, self._card = -1, False
+        self._held = False
+        """Whether a change lasts, such as a drag: meanwhile the brightness of images does not follow it."""
+        self._scales: tuple[Scale, Scale] | None = None
+        self._scales_of: ImageKind | None = None
         self._made_for: dict[str, Any] = {}  # window and selection of which the slow parts of the page are, by name
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._rates: EventRates
@@ -159,6 +163,16 @@ class Panel(layout.Actions):
         return ImageKind(self.state.kind)
 
     @property
+    def decay_us(self) -> int:
+        """Decay time of a decaying time surface [us]."""
+        return max(1, round(1e3 * float(self.state.decay_ms)))
+
+    @property
+    def same_scale(self) -> bool:
+        """Whether images of two recordings have one scale."""
+        return bool(self.state.same_scale)
+
+    @property
     def time_window(self) -> tuple[int, int]:
         """Start and length of the time window that the page shows, on the events' clock [us]."""
         return self._clock_us(float(self.state.start_ms)), max(1, round(float(self.state.length_ms) * 1e3))
@@ -174,6 +188,7 @@ class Panel(layout.Actions):
         ``change``: name of a change that lasts, such as a drag; it is undone in one step.
         """
         self._change = f"{change} {self._drags}" if change else ""
+        self._held = bool(change)
         self._quick_requests.update(what)
         self._show_pending()
         if self._quick is None or self._quick.done():
@@ -269,7 +284,7 @@ class Panel(layout.Actions):
         follow(("polarity", "hide_hot", "noise_filter"), self.request, "window")
         follow(("colour", "axis", "dark", "orbit_shown"), self.request, "look")
         follow(("model",), lambda: self._wanted.update(model=self.state.model))
-        follow(("model", "against", "kind", "difference"), self.request, "knobs")
+        follow(("model", "against", "kind", "difference", "same_scale"), self.request, "knobs")
         follow(("model", "kind", "polarity", "hide_hot", "noise_filter"), self.released)
         for name in layout.CALLS:
             self.server.trigger(name)(getattr(self, name))
@@ -278,6 +293,10 @@ class Panel(layout.Actions):
 
     def released(self) -> None:
         """Update the slow parts of the page after a change, and end what is undone in one step."""
+        if self._held:  # the images get the scale of what is shown now, as part of the same change
+            change = self._change
+            self.request("knobs")
+            self._change = change
         self._drags += 1
         self.request_slow(*SLOW)
 
@@ -289,7 +308,7 @@ class Panel(layout.Actions):
 
     def typed(self, name: str, text: str) -> None:
         """Set the value that a user typed into a number field."""
-        if name not in (*layout.FIELD_LIMITS, "start_ms", "length_ms", "turns", "events", "noise_ms"):
+        if name not in (*layout.FIELD_LIMITS, *layout.FILTER_FIELDS, "start_ms", "length_ms", "turns", "events"):
             return
         try:
             value = finite(text)
@@ -298,21 +317,49 @@ class Panel(layout.Actions):
             return
         if name in layout.FIELD_LIMITS:
             self.slide(name, value)
+        elif name in layout.FILTER_FIELDS:
+            self._set_filter(name, value)
         elif name == "events":
-            self.start_job(self._take_events(round(value)))
-            return
+            self.state.fixed_count = min(max(1, round(value)), layout.MOST_COUNT)
+            self.request("window")
         else:
             length = name == "turns"
             self.state["length_ms" if length else name] = round(value * float(self.state.turn_ms if length else 1.0), 4)
+            self.state.fixed_count = self.state.fixed_count if name == "start_ms" else 0
             self.request("window")
         self.released()
 
-    async def _take_events(self, count: int) -> None:
-        """Show a time window with a number of events."""
+    def _set_filter(self, name: str, value: float) -> None:
+        """Set a field of a filter, or the decay time of images."""
+        label, unit, (low, high) = layout.FILTER_FIELDS[name]
+        if not low <= value <= high:
+            self.say(f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error")
+            return
+        self.state[name] = round(value) if name == "every" else value
+        self.request("knobs" if name == "decay_ms" else "window")
+
+    def step(self, count: int) -> None:
+        """Move the time window by turns or by its length; set by number, by as many events, found in a thread."""
+        if self.inspector.fixed_count is None:
+            super().step(count)
+        else:
+            self.start_job(self._step_events(count))
+
+    async def _step_events(self, count: int) -> None:
         with self.errors_shown("window"):
-            self.time_window = await self.in_thread(self.inspector.window_of, self.time_window[0], count)
-            self.request("window")
+            self.move(await self.in_thread(self.inspector.start_after, count))
             self.released()
+
+    def list_hot(self) -> None:
+        """List the hot pixels of the recording."""
+        self.start_job(self._list_hot())
+
+    async def _list_hot(self) -> None:
+        with self.errors_shown("hot pixels"):
+            found = await self.in_thread(lambda: self.inspector.hot_pixels)
+            rows = [[each.x, each.y, f"{each.rate:,.0f}", f"{100.0 * each.share:.3g}"] for each in found]
+            with self.state:
+                self.state.hot_rows = rows
 
     def slide(self, name: str, value: float) -> None:
         """Set a parameter of the prism or the camera, in the unit of its slider or field."""
@@ -397,6 +444,7 @@ class Panel(layout.Actions):
         """Set the ends of the time window [ms]."""
         start, end = max(0.0, float(start_ms)), min(float(end_ms), float(self.state.whole_ms))
         if end > start:
+            self.state.fixed_count = 0
             self.time_window = self._clock_us(start), max(1, round(1e3 * (end - start)))
             self.request("window", change="length_ms")
 
@@ -440,7 +488,12 @@ class Panel(layout.Actions):
                 if start_s >= counted_s + RATES_S:
                     counted_s = start_s
                     self.start_job(self._count_events())
-                self.move(self.inspector.recording.events.t_last)
+                newest_us = self.inspector.recording.events.t_last
+                if self.state.fixed_count:  # the window ends there, whatever its length
+                    self.time_window = newest_us, self.time_window[1]
+                    self.request("window")
+                else:
+                    self.move(newest_us)
             await self.until_drawn()
             await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
@@ -597,6 +650,8 @@ class Panel(layout.Actions):
             "events": partial(jobs.write_events, inspector, compensated=False),
             "compensated": partial(jobs.write_events, inspector, compensated=True),
             "calibration": lambda path: inspector.as_calibration().save(path),
+            "vtp": partial(jobs.write_cloud, inspector, axis=self.look.axis, compensated=False),
+            "vtp_after": partial(jobs.write_cloud, inspector, axis=self.look.axis, compensated=True),
         }  # fmt: skip
         async with self.device_lock, self.buffers_lock:
             await self._download(what, write[what])
@@ -663,15 +718,12 @@ class Panel(layout.Actions):
         kind = s.region_kind if region == s.region_wanted else "whole" if selection.region is None else "drawn"
         self.time_window = self.inspector.window or self.time_window
         s.update({
-            "polarity": {None: "both", 1: "ON", 0: "OFF"}[selection.polarity],
-            "hide_hot": selection.hide_hot, "noise_filter": selection.noise_us is not None, "region_wanted": region,
-            "region_kind": kind, "kind": wanted.image.value,
+            **layout.filter_state(selection), "region_wanted": region, "region_kind": kind, "kind": wanted.image.value,
+            "fixed_count": wanted.fixed_count or 0, "decay_ms": wanted.decay_us * 1e-3, "same_scale": wanted.same_scale,
         })  # fmt: skip
         self.look = replace(self.look, colour=wanted.colour, axis=wanted.axis, overlaid=wanted.overlaid)
         if wanted.view is not self.view:
             self.view = wanted.view
-        if selection.noise_us is not None:
-            s.noise_ms = selection.noise_us * 1e-3
         if wanted.against != self.against:
             self.show_b(wanted.against)
 
@@ -691,6 +743,7 @@ class Panel(layout.Actions):
                     if self.inspector.window is not None and not state.playing:
                         self.time_window = self.inspector.window
                         state.region_wanted = list(self.inspector.loaded.region)
+                        state.update(layout.filter_state(self.inspector.selection))
                     raise
         with self.errors_shown("knobs"):
             good = self.inspector.knobs, dict(self.inspector.sources)
@@ -746,8 +799,16 @@ class Panel(layout.Actions):
         if not float(s.length_ms) > 0.0:
             raise AmiwarpError(f"a window of {s.length_ms:g} ms; give a length above 0")
         start_us, length_us = self.time_window
-        length_us = min(length_us, self.whole_us)
-        await in_thread(inspector.open, start_us, length_us, self._selection())
+        length_us, known_count = min(length_us, self.whole_us), inspector.fixed_count
+        inspector.fixed_count = int(s.fixed_count) or None
+        try:
+            await in_thread(inspector.open, start_us, length_us, self._selection())
+        except AmiwarpError:
+            inspector.fixed_count = known_count
+            s.fixed_count = known_count or 0
+            raise
+        if inspector.fixed_count is not None and inspector.window is not None:
+            self.time_window = start_us, length_us = inspector.window
         if suggest:
             await in_thread(jobs.estimate_phase, inspector)
             region = await in_thread(inspector.suggest_region)
@@ -759,9 +820,15 @@ class Panel(layout.Actions):
         """Return the conditions for events that the page shows."""
         s = self.state
         region, whole = tuple(s.region_wanted), (0, 0, *s.size)
-        noise_us = round(1e3 * float(s.noise_ms)) if s.noise_filter else None
-        return Selection({"both": None, "ON": 1, "OFF": 0}[s.polarity], None if region == whole else region,
-                         bool(s.hide_hot), noise_us)  # fmt: skip
+        return Selection(
+            polarity={"both": None, "ON": 1, "OFF": 0}[s.polarity],
+            region=None if region == whole else region,
+            hide_hot=bool(s.hide_hot),
+            noise_us=round(1e3 * float(s.noise_ms)) if s.noise_filter else None,
+            refractory_us=round(1e3 * float(s.refractory_ms)),
+            most_per_s=1e6 * float(s.most_mev_s),
+            every=int(s.every),
+        )
 
     def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
         """Return what is to be shown, and the state variables that show it."""
@@ -778,9 +845,10 @@ class Panel(layout.Actions):
             counts = iwe(shown.span.events, *self.inspector.recording.events.size, vote=Vote.NEAREST)
             values["overview"] = drawing.picture_state(counts, count_scale([counts]))
         left = "recorded" if against is None else s.against
-        titles = drawing.cloud_titles(self.inspector, left)
+        titles = drawing.cloud_titles(self.inspector, left, Axis(s.axis))
         return shown, {
             **values, "titles": [list(each) for each in enumerate(titles)], "events": drawing.chosen_text(shown),
+            "steps": step_rows(shown.steps, shown.read_us), "beside_rows": drawing.beside_rows(self.inspector, shown),
             "drawn": drawing.drawn_text(shown), "count": shown.span.count,
             "sharpness": drawing.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
             "picked_text": "" if self._picked < 0 else drawing.event_text(shown, self._picked),
@@ -794,6 +862,7 @@ class Panel(layout.Actions):
         except AmiwarpError as error:
             return {"before": None, "after": None, "image_note": str(error)}
         scales = pair.scale, pair.after_scale or pair.scale
+        self._scales, self._scales_of = scales, self.image
         before, after = (
             None if image is None else drawing.picture_state(image, scale)
             for image, scale in zip((pair.before, pair.after), scales, strict=True)
@@ -802,8 +871,16 @@ class Panel(layout.Actions):
         return {"before": before, "after": after, "image_scale": first, "after_scale": second, "image_note": pair.note}
 
     def _pair(self, shown: DisplayedWindow | None = None) -> drawing.ShownImages:
-        difference = bool(self.state.difference)
-        return drawing.make_images(self.inspector, self.image, against=self.against, shown=shown, difference=difference)
+        return drawing.make_images(
+            self.inspector,
+            self.image,
+            against=self.against,
+            shown=shown,
+            difference=bool(self.state.difference),
+            decay_us=self.decay_us,
+            same_scale=self.same_scale,
+            kept=self._scales if self._held and self._scales_of == self.image else None,
+        )
 
     async def _curve(self) -> None:
         s, name = self.state, self.state.knob

@@ -71,6 +71,7 @@ export const EventClouds = {
       return `${count.toLocaleString('en')} of these drawn (slice)`;
     });
     let waiting = false;
+    let saved = 0; // pixels of the picture for each pixel of the page, while a picture is made that is to be saved
 
     function ask() {
       if (waiting) return;
@@ -103,7 +104,7 @@ export const EventClouds = {
       const view = canvas.value;
       const [W, H] = [view.clientWidth, view.clientHeight];
       if (!W || !H || !props.titles.length) return;
-      const ratio = Math.min(window.devicePixelRatio || 1, Math.sqrt(MOST_PIXELS / (W * H)));
+      const ratio = saved || Math.min(window.devicePixelRatio || 1, Math.sqrt(MOST_PIXELS / (W * H)));
       const size = [Math.round(W * ratio), Math.round(H * ratio)];
       if (view.width !== size[0] || view.height !== size[1]) [view.width, view.height] = size;
       const style = window.getComputedStyle(view);
@@ -139,6 +140,17 @@ export const EventClouds = {
         context.restore();
       });
       view.dataset.frames = Number(view.dataset.frames || 0) + 1;
+    }
+
+    // Return a canvas with what is seen, with more pixels than the screen has.
+    function pictureAt(ratio) {
+      saved = ratio;
+      draw();
+      const copy = Object.assign(document.createElement('canvas'), { width: canvas.value.width, height: canvas.value.height });
+      copy.getContext('2d').drawImage(canvas.value, 0, 0);
+      saved = 0;
+      draw();
+      return copy;
     }
 
     function drawContent(context, projection, pane, [ink, paper], size) {
@@ -233,6 +245,7 @@ export const EventClouds = {
     }
 
     onMounted(() => {
+      canvas.value.pictureAt = pictureAt;
       emit('card', rasters[0] instanceof GpuRaster);
       ask();
     });

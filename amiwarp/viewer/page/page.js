@@ -130,7 +130,24 @@ const PageDialog = {
     <slot/></dialog>`,
 };
 
+// Button that copies a text. Where a frame of another site has no clipboard, the text is selected in a dialog instead.
+const CopyButton = {
+  props: { text: String },
+  template: `<button type="button" @click="copy">{{ done || 'copy' }}</button>`,
+  data: () => ({ done: '' }),
+  methods: {
+    copy() {
+      const say = (done) => {
+        this.done = done;
+        window.setTimeout(() => (this.done = ''), RETRY_MS);
+      };
+      const asked = navigator.clipboard ? navigator.clipboard.writeText(this.text) : Promise.reject();
+      asked.then(() => say('copied'), () => window.prompt('Copy this text:', this.text));
+    },
+  },
+};
+
 const COMPONENTS = {
-  EventClouds, EventPicture, RateTimeline, CurvePlot, CostSurface, ColourBar, KnobField, NumberField, PageFrame, PageDialog,
+  CopyButton, EventClouds, EventPicture, RateTimeline, CurvePlot, CostSurface, ColourBar, KnobField, NumberField, PageFrame, PageDialog,
 };
 window.amiwarp_page = { install: (app) => Object.entries(COMPONENTS).forEach((each) => app.component(...each)) };

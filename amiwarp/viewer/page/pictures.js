@@ -48,7 +48,7 @@ function valueAt(picture, x, y) {
 }
 
 export const EventPicture = {
-  props: { picture: Object, label: String, size: Array, crop: Array, frame: Array, link: String, tool: String },
+  props: { picture: Object, label: String, size: Array, crop: Array, frame: Array, link: String, tool: String, mark: Array },
   emits: ['region', 'at', 'measured'],
   template: `<canvas ref="canvas" class="picture" tabindex="0" role="img" :aria-label="text" @pointerdown="pressed"
     @pointermove="hovered" @dblclick="zoom(0)" @contextmenu.prevent @keydown="typed" @wheel.prevent="wheeled"></canvas>`,
@@ -92,9 +92,22 @@ export const EventPicture = {
         const size = props.picture.step * scale(); // of the last row and column, a part may lie outside
         context.drawImage(image, ...seen(left, top), image.width * size, image.height * size);
       }
+      if (props.mark) ring(context, ...seen(props.mark[0] + 0.5, props.mark[1] + 0.5));
       if (props.frame) outline(context, props.frame, BLUE);
       if (drawn) outline(context, drawn, YELLOW, props.tool === 'measure');
       bar(context);
+    }
+
+    // Draw a ring around a pixel, light on dark, so that it is seen on every image.
+    function ring(context, x, y) {
+      const radius = Math.max(9, scale());
+      for (const [colour, wide] of [['#000000', 5], [YELLOW, 2.5]]) {
+        context.lineWidth = wide;
+        context.strokeStyle = colour;
+        context.beginPath();
+        context.arc(x, y, radius, 0, 2 * Math.PI);
+        context.stroke();
+      }
     }
 
     // Draw a rectangle between two places, or the line between them.
@@ -198,7 +211,7 @@ export const EventPicture = {
       emit('measured', '');
       draw();
     });
-    watch([() => props.frame, () => props.crop, () => props.size, view], draw);
+    watch([() => props.frame, () => props.crop, () => props.size, () => props.mark, view], draw);
     return { canvas, text, pressed, hovered, typed, wheeled, zoom };
   },
 };
