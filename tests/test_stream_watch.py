@@ -340,6 +340,95 @@ def test_a_ring_holds_the_last_seconds(recording: Recording) -> None:
     assert (found.camera, found.prism) == (CAMERA, PRISM)
 
 
+def made_source() -> Any:
+    """Return what a ring needs to know of a source."""
+    return type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made", "encoders": 1})()
+
+
+def put_events(ring: RecentEvents, start: int, stop: int) -> None:
+    t = np.arange(start, stop, 500)
+    ring.append(Events.from_arrays(np.full(t.size, 5), np.full(t.size, 5), t, np.zeros(t.size)))
+
+
+@pytest.mark.parametrize("lag_us", [500_000, 3_000_000, 9_000_000])
+def test_the_newest_whole_turn_is_given_however_late_the_events_are(lag_us: int) -> None:
+    """A computer that is too slow gets the angles at once, and the events with a growing lag."""
+    ring, speed = RecentEvents(made_source()), 720.0 * math.tau / 60e6
+    live = None
+    for start in range(0, 20_000_000, 50_000):
+        samples = np.arange(start, start + 50_000, 1000)
+        ring.append_encoder(samples, samples * speed)
+        if start >= lag_us:
+            put_events(ring, start - lag_us, start - lag_us + 50_000)
+            if ring.recording() is not None:
+                live = live or LiveSource(ring, [])
+                newest = live().events.t_last
+                assert newest == start - lag_us + 49_500
+    assert live is not None
+    assert ring.lag_s == pytest.approx(lag_us * 1e-6, abs=0.01)
+    rows, note = live.figures()
+    lag = next(row for row in rows if row[0] == "lag")
+    assert lag[1:] == [f"{lag_us * 1e-6:.1f} s", "bad" if lag_us > 2e6 else ""]
+    assert note.startswith(f"The events are {lag_us * 1e-6:.1f} s late: ") is (lag_us > 2e6)
+    assert live().encoder.covers(live().events.t_first, live().events.t_last)  # type: ignore[union-attr]
+
+
+def test_events_that_come_long_before_their_angles_are_kept() -> None:
+    ring, speed = RecentEvents(made_source()), 720.0 * math.tau / 60e6
+    for start in range(0, 8_000_000, 50_000):
+        put_events(ring, start, start + 50_000)
+        if start >= 5_000_000:
+            samples = np.arange(start - 5_000_000, start - 4_950_000, 1000)
+            ring.append_encoder(samples, samples * speed)
+    found = ring.recording()
+    assert found is not None
+    assert found.events.t_last == pytest.approx(2_999_000, abs=1000)
+    assert found.events.t_last - found.events.t_first == pytest.approx(SECONDS * 1e6, abs=100_000)
+    for start in range(8_000_000, 40_000_000, 50_000):  # the angles end
+        put_events(ring, start, start + 50_000)
+    held = ring.event_bytes
+    put_events(ring, 40_000_000, 40_050_000)
+    assert ring.event_bytes == pytest.approx(held, rel=0.02)
+
+
+def test_gaps_in_the_angles_that_the_late_events_have_not_reached_hide_no_turn() -> None:
+    """The angles have a gap each second; the events are 2.5 s late."""
+    ring, speed = RecentEvents(made_source()), 720.0 * math.tau / 60e6
+    for start in range(0, 10_000_000, 50_000):
+        if start % 1_000_000:
+            samples = np.arange(start, start + 50_000, 1000)
+            ring.append_encoder(samples, samples * speed)
+        if start >= 2_500_000:
+            put_events(ring, start - 2_500_000, start - 2_450_000)
+    found = ring.recording()
+    assert found is not None
+    assert found.events.t_last == 7_499_500
+    assert found.events.t_first >= 7_049_000  # since the gap before it
+    assert ring.turn_share == 1.0
+    put_events(ring, 7_500_000, 8_080_000)
+    found = ring.recording()
+    assert found is not None
+    assert ring.turn_share == pytest.approx(0.36, abs=0.02)  # since the last gap
+    assert 7_900_000 < found.events.t_last < 8_000_000  # the turn before it
+
+
+def test_the_lag_of_a_stream_with_its_own_angles_is_that_after_its_promptest_events(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(ring_module.time, "monotonic", lambda: now[0])
+    ring = RecentEvents(made_source())
+    assert ring.lag_s == 0.0
+    for k, late in enumerate((0.5, 0.2, 3.2)):
+        now[0] = 100.0 + k + late
+        put_events(ring, 1_000_000 * k, 1_000_000 * k + 500)
+    assert ring.lag_s == pytest.approx(3.0)
+    ring.restart()
+    now[0] = 200.0
+    put_events(ring, 0, 500)
+    assert ring.lag_s == 0.0
+
+
 def test_the_speed_is_that_of_the_first_turn() -> None:
     """The motor was at rest for a second before the first events."""
     source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made", "encoders": 1})()

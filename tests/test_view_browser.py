@@ -1212,7 +1212,7 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     events, asked = recording.events, [0]
     width, height = events.size
 
-    status: Any = SimpleNamespace(silence="", encoder_silence="", age_s=0.012, turn_share=1.0, segment=1)
+    status: Any = SimpleNamespace(silence="", encoder_silence="", age_s=0.012, lag_s=0.0, turn_share=1.0, segment=1)
     status.status = SimpleNamespace(rate_mev_s=1.25, dropped=3, late=0)
 
     class Stream(LiveSource):
@@ -1234,7 +1234,9 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     status.silence, status.encoder_silence = "", "the port COM3 of the controller is gone"
     page.locator("#stream-note").filter(has_text="No prism angles arrive: the port COM3").wait_for()
     assert f"{RPM:.1f} rpm, last measured" in page.locator("#live dd.bad").all_inner_texts()
-    status.encoder_silence = ""
+    status.encoder_silence, status.lag_s = "", 3.25
+    page.locator("#stream-note").filter(has_text="The events are 3.2 s late").wait_for()
+    status.lag_s = 0.0
     page.locator("#stream-note").wait_for(state="detached")
     assert page.locator("#live dd.bad").inner_text() == "3"
     assert page.locator("#do-play").inner_text() == "stop"
@@ -1255,6 +1257,38 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     assert field(page, "start_ms") == start
     page.locator("#do-play").click()
     until(lambda: field(page, "start_ms") > start)
+
+
+def test_a_stream_that_goes_on_does_not_disturb_what_is_computed_of_it(
+    opened: Open, tabs: Tabs, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The encoder of each picture covers only its own events, and a curve takes longer than a picture."""
+    events, encoder, asked = recording.events, recording.encoder, [0]
+    assert encoder is not None
+
+    def latest() -> Recording:
+        asked[0] += 1
+        start = events.t_first + 1000 * (asked[0] % 140)
+        part = events.between(start, start + round(1.2e3 * TURN_MS))
+        low, high = np.searchsorted(encoder.t, (part.t[0] - 2000, part.t[-1] + 2000))
+        own = Encoder(encoder.t[low:high], encoder.angle[low:high])
+        return replace(recording, events=MemoryEvents(part, *events.size), encoder=own, truth=None)
+
+    curve = Inspector.curve
+
+    def slow(inspector: Inspector, name: str) -> Any:
+        until(lambda then=asked[0]: asked[0] > then + 40)  # the stream goes on
+        return curve(inspector, name)
+
+    monkeypatch.setattr(Inspector, "curve", slow)
+    page = opened(of=latest(), latest=latest)
+    page.locator("#curve polyline").wait_for()
+    enter(page, "apex", 1.1)
+    page.locator("#curve-text").filter(has_text="now 1.1").wait_for()
+    shown = asked[0]
+    until(lambda: asked[0] > shown + 20)
+    assert page.locator("#message").count() == 0
+    assert tabs.panels[-1].state.message == ""
 
 
 def test_a_live_stream_comes_back_after_its_source_was_restarted(

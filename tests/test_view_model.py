@@ -481,7 +481,7 @@ def test_a_closed_inspector_measures_no_longer(inspector: Inspector) -> None:
     """So a server ends soon, even in the middle of a curve of a large sensor."""
     measure = inspector.sharpness_meter()
     measure(inspector.knobs)
-    inspector.closed = True
+    inspector.close()
     with pytest.raises(AmiwarpError, match="is closed"):
         measure(inspector.knobs)
 

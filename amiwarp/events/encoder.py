@@ -1390,8 +1390,8 @@ def _second_stream(second: EncoderStream | float | None, clock_offset_us: float)
     return second
 
 
-def start_of_last_run(t: NDArray[np.int64], angle: NDArray[np.float64]) -> int:
-    """Return the index of the first sample after the last gap or restart in samples of an :class:`EncoderStream`.
+def starts_of_runs(t: NDArray[np.int64], angle: NDArray[np.float64]) -> list[int]:
+    """Return the indices of the first sample, and of those after a gap or a restart of an :class:`EncoderStream`.
 
     A gap is longer than :attr:`EncoderStream.GAP_US`, and than three usual intervals. ``t``: times [us], shape (n,).
     ``angle``: angles [rad], shape (n,).
@@ -1401,4 +1401,4 @@ def start_of_last_run(t: NDArray[np.int64], angle: NDArray[np.float64]) -> int:
     # the angle of a command jumps as fast as at a restart, but forwards, and its cosine stays
     jumps = (turned > LONGEST_TURN) & (turned <= TWO_PI) & (np.abs(np.diff(np.cos(angle))) < SAME_COMMAND)
     breaks = np.flatnonzero((steps > longest) | ((steps <= RESTART_US) & ~jumps))
-    return int(breaks[-1]) + 1 if breaks.size else 0
+    return [0, *(breaks + 1).tolist()]

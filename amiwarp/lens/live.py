@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.first_guess import ANGLE_RANGES
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder, start_of_last_run
+from amiwarp.events.encoder import TWO_PI, Encoder, starts_of_runs
 from amiwarp.events.recording import Events, MemoryEvents, Recording, held_bytes
 from amiwarp.lens import poses
 from amiwarp.lens.board import Board, Corners, opencv
@@ -65,7 +65,7 @@ class StillSpans:
         """
         self.samples += len(t_us)
         self._t, self._angle = np.concatenate([self._t, t_us]), np.concatenate([self._angle, angle])
-        if first := start_of_last_run(self._t, self._angle):
+        if first := starts_of_runs(self._t, self._angle)[-1]:
             self._restart(first)
         self._advance()
 

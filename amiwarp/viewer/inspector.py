@@ -10,7 +10,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from threading import Lock
+from threading import Event, Lock
 from typing import Any
 
 import numpy as np
@@ -373,8 +373,7 @@ class Inspector:
         self._harmonics: tuple[float, ...] | None = None
         self._window: LoadedWindow | None = None
         self._span: Span | None = None
-        self.closed = False
-        """Whether nobody looks any more: measuring the sharpness then raises :class:`AmiwarpError`."""
+        self._closing = Event()
         self.lock = Lock()
         """Lock for the events on the device and the buffers of their images."""
         self._imager = RegionSharpness(source.size, device)
@@ -390,6 +389,25 @@ class Inspector:
         made._window = made._span = None
         made.beside = None if self.beside is None else self.beside.copy()
         return made
+
+    def snapshot(self) -> Inspector:
+        """Return an inspector of what is shown now, for work in another thread that takes long.
+
+        It shares window and buffers, but what is set or renewed in this inspector meanwhile does not change it: a live
+        stream goes on to events and angles that do not belong together with the window.
+        """
+        made = copy(self)
+        made.sources = dict(self.sources)
+        return made
+
+    @property
+    def closed(self) -> bool:
+        """Whether nobody looks any more: measuring the sharpness then raises :class:`AmiwarpError`."""
+        return self._closing.is_set()
+
+    def close(self) -> None:
+        """End the measurements of this inspector, and of its copies."""
+        self._closing.set()
 
     @property
     def camera(self) -> Camera:

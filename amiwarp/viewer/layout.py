@@ -529,6 +529,13 @@ class Actions:
         self.request("window", change=change)
         return start_us >= last
 
+    def newest_window(self) -> tuple[int, int]:
+        """Return start and length of the window that ends with the last event [us]."""
+        source, (_, length_us) = self.inspector.recording.events, self.time_window
+        if self.inspector.fixed_count is not None:  # it starts as early as it takes
+            return int(source.t_last), length_us
+        return int(source.t_first) + max(0, self.whole_us - length_us), length_us
+
     def can_play(self) -> bool:
         """Go back to the start from the end. Return whether there is something to play, or a live stream to follow."""
         start_us, length_us = self.time_window

@@ -49,7 +49,10 @@ WAIT_S = 0.02
 """Interval between two checks of the number of unsent messages [s]."""
 _CUDA_LOCK = asyncio.Lock()
 """Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""
-QUICK = {**dict.fromkeys(("window", "suggestion", "state", "knobs"), ("clouds", "images")), "look": ("clouds",)}
+QUICK = {
+    **dict.fromkeys(("newest", "window", "suggestion", "state", "knobs"), ("clouds", "images")),
+    "look": ("clouds",),
+}
 SLOW = ("curve", "picture", "statistics")
 """Updates that are made at once, with the parts of the page that wait for them, and updates that take longer."""
 PLAY_S, FOLLOW_S, RATES_S = 0.05, 0.1, 1.0
@@ -125,7 +128,7 @@ class Panel(layout.Actions):
         """Stop all work of the browser tab, and remove its downloads. A thread ends when its current work is done."""
         self._folder.cleanup()
         self.cancel()
-        self.inspector.closed = True
+        self.inspector.close()
         for task in self._jobs:
             task.cancel()
         self._threads.shutdown(wait=False, cancel_futures=True)
@@ -183,7 +186,7 @@ class Panel(layout.Actions):
         self.state.update({"start_ms": round(start_us * 1e-3, 3), "length_ms": round(length_us * 1e-3, 3)})
 
     def request(self, *what: str, change: str = "") -> None:
-        """Request quick updates: "window", "knobs", "look", "suggestion" or "state".
+        """Request quick updates: "newest" (of a live stream), "window", "knobs", "look", "suggestion" or "state".
 
         ``change``: name of a change that lasts, such as a drag; it is undone in one step.
         """
@@ -481,19 +484,10 @@ class Panel(layout.Actions):
         loop, counted_s = asyncio.get_running_loop(), -math.inf
         while self.state.playing:
             start_s = loop.time()
-            with self.state:
-                with self.errors_shown("stream"):
-                    self.inspector.renew()
-                self.state.update(layout.source_state(self.inspector))
-                if start_s >= counted_s + RATES_S:
-                    counted_s = start_s
-                    self.start_job(self._count_events())
-                newest_us = self.inspector.recording.events.t_last
-                if self.state.fixed_count:  # the window ends there, whatever its length
-                    self.time_window = newest_us, self.time_window[1]
-                    self.request("window")
-                else:
-                    self.move(newest_us)
+            if start_s >= counted_s + RATES_S:
+                counted_s = start_s
+                self.start_job(self._count_events())
+            self.request("newest")
             await self.until_drawn()
             await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
@@ -730,8 +724,14 @@ class Panel(layout.Actions):
     # Updates of what the page shows
 
     async def make(self, todo: set[str]) -> None:
-        """Make quick updates: "suggestion", "window", "knobs", "look" and "state"."""
+        """Make quick updates: "newest", "suggestion", "window", "knobs", "look" and "state"."""
         state = self.state
+        if "newest" in todo:  # here, because no other update uses the events that it replaces
+            with self.errors_shown("stream"):
+                await self.in_thread(self.inspector.renew)
+                state.update(layout.source_state(self.inspector))
+                self.time_window = self.newest_window()
+            todo = {*todo, "window"}
         if self.shown is not None and "state" in todo and len(todo) > 1:  # what came before an undo can be redone
             await self.make(todo - {"state"})
             todo = {"state"}
@@ -777,21 +777,22 @@ class Panel(layout.Actions):
 
     async def make_slow(self, name: str) -> None:
         """Make a slow update: "curve", "picture", "statistics", or "preparation" of the first picture."""
-        chosen = self.inspector.chosen
-        await self._make_slow(name)
+        inspector = self.inspector.snapshot()  # of which a live stream changes nothing
+        chosen = inspector.chosen
+        await self._make_slow(name, inspector)
         if name != "preparation":
             self._made_for[name] = chosen
             self._show_old()
 
-    async def _make_slow(self, name: str) -> None:
+    async def _make_slow(self, name: str, inspector: Inspector) -> None:
         if name == "preparation":
-            await self.in_thread(drawing.prepare, self.inspector)
+            await self.in_thread(drawing.prepare, inspector)
         elif name == "statistics":
-            self.state.statistics = await self.in_thread(self.inspector.statistics)
+            self.state.statistics = await self.in_thread(inspector.statistics)
         elif name == "curve":
-            await self._curve()
+            await self._curve(inspector)
         elif self.image is ImageKind.LOG_INTENSITY and self.shown is not None:
-            self.state.update(await self.in_thread(self._images, self.shown))
+            self.state.update(await self.in_thread(self._images, self.shown, inspector))
 
     async def _open(self, *, suggest: bool) -> None:
         """Read the window and the selection that the page shows."""
@@ -855,10 +856,10 @@ class Panel(layout.Actions):
             "against_title": drawing.against_title(self.inspector, left), "against_choices": self._against_choices(),
         }  # fmt: skip
 
-    def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
+    def _images(self, shown: DisplayedWindow, inspector: Inspector | None = None) -> dict[str, Any]:
         """Return the state variables of the images of the region, or why there are none."""
         try:
-            pair = self._pair(shown)
+            pair = self._pair(shown, inspector)
         except AmiwarpError as error:
             return {"before": None, "after": None, "image_note": str(error)}
         scales = pair.scale, pair.after_scale or pair.scale
@@ -870,9 +871,9 @@ class Panel(layout.Actions):
         first, second = map(drawing.scale_state, scales)
         return {"before": before, "after": after, "image_scale": first, "after_scale": second, "image_note": pair.note}
 
-    def _pair(self, shown: DisplayedWindow | None = None) -> drawing.ShownImages:
+    def _pair(self, shown: DisplayedWindow | None = None, inspector: Inspector | None = None) -> drawing.ShownImages:
         return drawing.make_images(
-            self.inspector,
+            inspector or self.inspector,
             self.image,
             against=self.against,
             shown=shown,
@@ -882,13 +883,13 @@ class Panel(layout.Actions):
             kept=self._scales if self._held and self._scales_of == self.image else None,
         )
 
-    async def _curve(self) -> None:
+    async def _curve(self, inspector: Inspector) -> None:
         s, name = self.state, self.state.knob
-        find = partial(jobs.calibrated_events, self.inspector)
+        find = partial(jobs.calibrated_events, inspector)
         s.calibrate_on = [(await self.in_thread(find, whole=whole))[1] for whole in (False, True)]
         if not self.compensates:
             return
-        values, scores = await self.in_thread(self.inspector.curve, name)
+        values, scores = await self.in_thread(inspector.curve, name)
         x: list[float] = (values / layout.UNITS[name]).tolist()
         if not x:
             return

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,7 +21,7 @@ from amiwarp.calib.result import Calibration, check_made_with_encoder
 from amiwarp.choices import Sharpness
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder, EncoderStream, rpm_between, start_of_last_run
+from amiwarp.events.encoder import TWO_PI, Encoder, EncoderStream, rpm_between, starts_of_runs
 from amiwarp.events.recording import OVERHEAD, Events, MemoryEvents, Recording, held_bytes
 from amiwarp.imaging.iwe import CanvasShape
 from amiwarp.imaging.sharpness import SharpnessMeter
@@ -837,6 +838,10 @@ SECONDS, MOST_BYTES = 2.0, 1 << 27
 
 Encoder samples have a memory limit of the same size.
 """
+LONGEST_WAIT_S = 10.0
+"""Longest time for which events are kept that are newer than all encoder samples [s]."""
+LATE_S = 2.0
+"""Lag of the events from which it is said [s]."""
 SILENT_S = 1.0
 """Time without events or encoder samples after which they count as interrupted [s]."""
 REOPEN_S = 0.2
@@ -868,15 +873,22 @@ class RecentEvents:
         self.link: Link | None = None
         """Link to the controller that sends the encoder samples; None if they come with the events."""
         self._arrived_s = self._sampled_s = time.monotonic()
+        self._delay_us = self._least_delay_us = 0.0
         self._lock = threading.Lock()
 
     def append(self, events: Events) -> None:
         """Append events, in order of time."""
         with self._lock:
             self._arrived_s = time.monotonic()
+            newest = int(events.t[-1])
+            self._delay_us = 1e6 * self._arrived_s - newest
+            self._least_delay_us = min(self._least_delay_us, self._delay_us) if self._events else self._delay_us
             self._events.append(events)
             self.event_bytes += held_bytes(events)
-            since = int(events.t[-1]) - round(SECONDS * 1e6)
+            # events whose encoder samples have not come yet are kept for longer
+            sampled = [int(samples[-1][0][-1]) for samples in self._samples if samples]
+            awaited = min([newest, *sampled]) - round(1e6 * SECONDS) if sampled else -(2**62)
+            since = max(awaited, newest - round(1e6 * max(SECONDS, LONGEST_WAIT_S)))
             while len(self._events) > 1 and (self.event_bytes > MOST_BYTES or self._events[0].t[-1] < since):
                 self.event_bytes -= held_bytes(self._events.popleft())
 
@@ -894,6 +906,8 @@ class RecentEvents:
                 samples.append((t_us, angle))
                 self.sample_bytes += OVERHEAD + t_us.nbytes + angle.nbytes
                 since = int(t_us[-1]) - round(2e6 * SECONDS)
+                if self._events:  # samples are kept until their events come, however late these are
+                    since = min(since, int(self._events[0].t[0]) - round(1e6 * SECONDS))
                 while len(samples) > 1 and (self.sample_bytes > MOST_BYTES or samples[0][0][-1] < since):
                     t_us, angle = samples.popleft()
                     self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
@@ -914,6 +928,19 @@ class RecentEvents:
         return time.monotonic() - self._arrived_s
 
     @property
+    def lag_s(self) -> float:
+        """How late the latest events arrived [s]: after the encoder samples of their time, or after the promptest ones.
+
+        Events are late if this computer, or the one that sends them, is slower than the stream.
+        """
+        with self._lock:
+            if not self._events:
+                return 0.0
+            newest = int(self._events[-1].t[-1])
+            behind = [int(samples[-1][0][-1]) - newest for samples in self._samples if samples]
+            return max(0.0, 1e-6 * max([self._delay_us - self._least_delay_us, *behind]))
+
+    @property
     def silence(self) -> str:
         """Why no events arrive; empty if they do."""
         return self.ended or _silence("events", self.age_s)
@@ -931,39 +958,54 @@ class RecentEvents:
     def recording(self) -> Recording | None:
         """Return the kept events that the encoder covers, as a recording; None if they are shorter than one turn.
 
-        Events before a gap or a restart of the encoder samples are left out, because their angles do not continue.
+        The angles of an encoder do not continue over a gap or a restart of its samples. So the events are those of the
+        newest part without one in which they cover a turn. :attr:`turn_share` is that of the newest part with events.
         """
         with self._lock:
             events, samples = list(self._events), [list(each) for each in self._samples]
-        if not events:
-            return None
-        joined = Events.concatenate(events)
-        encoder, second = (_last_run(each, int(joined.t[0])) for each in samples)
+        first, second = (_runs(each, int(events[0].t[0])) if events else [] for each in samples)
         pair = self._encoders == 2 and self.link is None
-        if encoder is None or (pair and second is None):
-            return None
-        encoder = replace(encoder, second=second)
-        first, last = np.searchsorted(joined.t, encoder.coverage)
-        covered = joined[first:last]
-        self.turn_share = (
-            min(float(np.ptp(encoder.angle_at(covered.t[[0, -1]]))) / TWO_PI, 1.0) if len(covered) else 0.0
-        )
-        if self.turn_share < 1.0:
-            return None
-        return Recording(MemoryEvents(covered, *self._size), self._camera, encoder, self._prism, name=self._name)
+        newest_share: float | None = None
+        found = None
+        for encoder in first if second or not pair else []:
+            encoder = replace(encoder, second=second[0] if second else None)
+            covered = _covered(events, encoder)
+            if not len(covered):  # its events have not come yet
+                continue
+            share = min(float(np.ptp(encoder.angle_at(covered.t[[0, -1]]))) / TWO_PI, 1.0)
+            newest_share = share if newest_share is None else newest_share
+            if share >= 1.0:
+                source = MemoryEvents(covered, *self._size)
+                found = Recording(source, self._camera, encoder, self._prism, name=self._name)
+                break
+        self.turn_share = newest_share or 0.0
+        return found
 
 
-def _last_run(samples: list[tuple[NDArray[np.int64], NDArray[np.float64]]], t_first: int) -> Encoder | None:
-    """Return the encoder of samples since their last gap or restart, from shortly before ``t_first`` [us] on.
+def _covered(events: list[Events], encoder: Encoder) -> Events:
+    """Return the events of packets, in order of time, that an encoder covers."""
+    low, high = encoder.coverage
+    near = [each for each in events if each.t[-1] >= low and each.t[0] <= high]
+    if not near:
+        return Events.empty()
+    joined = Events.concatenate(near)
+    return joined[slice(*np.searchsorted(joined.t, (low, high)))]
 
-    None with fewer than two samples.
+
+def _runs(samples: list[tuple[NDArray[np.int64], NDArray[np.float64]]], t_first: int) -> list[Encoder]:
+    """Return the encoders of samples without a gap or a restart, the newest first, from shortly before ``t_first`` on.
+
+    Parts of fewer than two samples are left out. ``t_first``: time [us].
     """
     if not samples:
-        return None
+        return []
     t, angle = (np.concatenate(column) for column in zip(*samples, strict=True))
-    run = start_of_last_run(t, angle)
-    since = run + max(min(int(np.searchsorted(t[run:], t_first)) - 2, len(t) - run - 2), 0)
-    return Encoder(t[since:], angle[since:]) if len(t) - since >= 2 else None
+    starts, found = [*starts_of_runs(t, angle), len(t)], []
+    for start, stop in reversed([*pairwise(starts)]):
+        since = start + max(min(int(np.searchsorted(t[start:stop], t_first)) - 2, stop - start - 2), 0)
+        if stop - since >= 2:
+            found.append(Encoder(t[since:stop], angle[since:stop]))
+    return found
 
 
 def _silence(what: str, seconds: float) -> str:
@@ -1000,12 +1042,14 @@ class LiveSource:
         rpm = None if encoder is None else rpm_between(encoder, round(last - turn_us), last)
         said, speed = self._messages[-1] if self._messages else "", "unknown" if rpm is None else f"{rpm:.1f} rpm"
         angles, rate = not (problem or no_angles), 0.0 if problem else status.rate_mev_s
+        lag_s = 0.0 if problem else recent.lag_s
         fresh, latency_ms = angles and recent.turn_share >= 1.0, 1e3 * recent.age_s
         rows = [
             ("events", "interrupted, last ones shown" if problem else "receiving", problem),
             ("prism angles", "receiving" if angles else "interrupted, last turn shown", not angles),
             ("rate", f"{rate:.2f} million events/s", False),
             ("latency", "–" if problem else f"{latency_ms:.0f} ms", not problem and latency_ms > 1e3),
+            ("lag", "–" if problem else f"{lag_s:.1f} s", lag_s > LATE_S),
             ("turn covered", f"{100.0 * recent.turn_share:.0f} %", recent.turn_share < 1.0),
             ("speed of the prism", speed if fresh else f"{speed}, last measured", rpm is None or not fresh),
             ("lost events", f"{status.dropped:,}", status.dropped), ("out of order", f"{status.late:,}", status.late),
@@ -1018,6 +1062,11 @@ class LiveSource:
         note = f"The stream is interrupted: {problem}. {message}".strip() if problem else ""
         if no_angles:
             note = f"No prism angles arrive: {no_angles}. The last turn before it is shown, until they return."
+        if lag_s > LATE_S and not note:
+            note = (
+                f"The events are {lag_s:.1f} s late: this computer, or the one that sends them, is slower than the "
+                "stream. The newest whole turn that has come is shown."
+            )
         return [[name, text, "bad" if bad else ""] for name, text, bad in rows], note
 
 
