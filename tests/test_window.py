@@ -16,9 +16,12 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
 from amiwarp.plotting.colours import GREY, depth_image
 from amiwarp.viewer import jobs, layout
-from amiwarp.viewer.drawing import BACKGROUND_AND_INK, RECORDED, Look, orbit_lines
+from amiwarp.viewer.drawing import RECORDED, Look, orbit_lines
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector
-from amiwarp.viewer.window import HELP_PAPER, MORE_KEYS, Window
+from amiwarp.viewer.window import Window
+from amiwarp.viewer.window_charts import Chart
+from amiwarp.viewer.window_keys import MORE_KEYS, OF_PLAIN
+from amiwarp.viewer.window_sheets import PANEL_COLOURS
 
 SIZE = (900, 600)
 TRUE = Prism(math.radians(1.0))
@@ -64,16 +67,24 @@ def check(window: Window) -> None:
 
 
 def drag(window: Window, name: str, value: float) -> None:
-    """Move a slider as the mouse does, and draw."""
-    slider = window.sliders[name]
-    slider.GetRepresentation().SetValue(value)
-    slider.InvokeEvent("InteractionEvent")
+    """Move a slider to a value, and draw."""
+    window.slide(name, value)
     assert window.turn()
+
+
+def said(window: Window) -> str:
+    """Return what the column says."""
+    return " ".join(window.sheets.controls.texts)
+
+
+def chart(window: Window, name: str) -> Chart:
+    """Return a chart by the name of the parameter, or "orbit" and "intervals"."""
+    return window.sheets.charts[name]
 
 
 def test_the_window_starts_as_the_page_does(window: Window, recording: Recording) -> None:
     """It shows the suggested region, with an estimated phase, one turn in the middle."""
-    assert "phase estimated" in window._texts[0].input
+    assert "phase estimated" in said(window)
     assert window.inspector.selection.region is not None
     assert window.inspector.window == Inspector(recording).first_window()
     assert set(window.sliders) == {"apex", "phase", "clock_offset", "tilt_x", "tilt_y", "start_ms", "length_ms"}
@@ -91,7 +102,7 @@ def test_a_slider_moves_the_compensated_cloud(window: Window, name: str, value: 
     check(window)
     assert np.abs(points(window, 1)[:, :2] - after[:, :2]).max() > 0.05
     np.testing.assert_array_equal(points(window, 0)[:, :2], before[:, :2])
-    assert f"{value:g}" in window.sliders[name].GetRepresentation().GetTitleText()
+    assert f"{value:g}" in window.sliders[name].title
     assert window.knob == name
 
 
@@ -178,8 +189,8 @@ def test_a_drag_that_leaves_a_cloud_turns_it_nevertheless(window: Window) -> Non
     assert window.turn()
     camera = window.scene._views[0].camera
     for end in ((450, 450), (600, 60), (60, 300)):  # help, charts, sliders
-        mouse(window, "LeftButtonPress", (320, 200))
-        mouse(window, "MouseMove", (330, 210))
+        mouse(window, "LeftButtonPress", (320, 260))
+        mouse(window, "MouseMove", (330, 270))
         before = camera.position
         mouse(window, "MouseMove", end)
         mouse(window, "LeftButtonRelease", end)
@@ -194,8 +205,7 @@ def test_the_slider_of_the_size_is_that_of_a_vibrating_camera(recording: Recordi
     made = Window(inspector, size=SIZE, off_screen=True)
     assert list(made.sliders) == ["amplitude", "phase", "rpm", "start_ms", "length_ms"]
     drag(made, "amplitude", 0.35)
-    title = made.sliders["amplitude"].GetRepresentation().GetTitleText()
-    assert title == "amplitude 0.35° (set by hand)"
+    assert made.sliders["amplitude"].title == "amplitude 0.35° (set by hand)"
     assert made.inspector.knobs.value("amplitude") == pytest.approx(math.radians(0.35), abs=1e-6)
     made.scene.close()
 
@@ -203,7 +213,7 @@ def test_the_slider_of_the_size_is_that_of_a_vibrating_camera(recording: Recordi
 def test_a_depth_map_is_shown_as_an_image_and_as_points(window: Window) -> None:
     window.key("5")
     assert window.turn()
-    assert "there is no depth map" in window._texts[0].input
+    assert "there is no depth map" in said(window)
     camera = Camera.from_fov(40, 30, 1.0)
     rng = np.random.default_rng(0)
     x, y = (rng.integers(0, size, 4000).astype(np.uint16) for size in (40, 30))
@@ -217,7 +227,7 @@ def test_a_depth_map_is_shown_as_an_image_and_as_points(window: Window) -> None:
     inspector.use_depths(DepthMap(inverse, 0.05 * inverse, points))
     made = Window(inspector, size=SIZE, off_screen=True)
     assert list(made.sliders) == ["phase", "clock_offset", "start_ms", "length_ms"]  # the map gives the depths
-    bar, image, cloud = made._depth
+    bar, image, cloud = made.sheets.depth
     place = (500, 400)  # on the left cloud
     assert made.plotter.iren.interactor.FindPokedRenderer(*place) is made.scene._views[0]
     made.key("5")
@@ -235,7 +245,7 @@ def test_a_depth_map_is_shown_as_an_image_and_as_points(window: Window) -> None:
     np.testing.assert_array_equal(shown[1]["colour"], scale.rgb(metres[known]))
     made.key("1")
     assert made.turn()
-    assert not any(each.GetDraw() for each in made._depth)
+    assert not any(each.GetDraw() for each in made.sheets.depth)
     assert made.plotter.iren.interactor.FindPokedRenderer(*place) is made.scene._views[0]
     made.scene.close()
 
@@ -256,10 +266,9 @@ def test_a_slider_stays_the_same_while_it_is_dragged(window: Window) -> None:
     for value in (10.0, 20.0):
         drag(window, "phase", value)
         assert window.sliders["phase"] is slider
-        assert slider.GetEnabled()
-        assert slider.GetRepresentation().GetValue() == pytest.approx(value)
+        assert slider.value == pytest.approx(value)
     assert window.knob == "phase"
-    assert "phase" in window._plots
+    assert "phase" in window.sheets.charts
 
 
 def test_parameters_that_cannot_be_shown_are_refused(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,10 +281,9 @@ def test_parameters_that_cannot_be_shown_are_refused(window: Window, monkeypatch
 
     monkeypatch.setattr(window.inspector, "show", refusing)
     drag(window, "apex", 2.2)
-    assert "no such prism" in window._texts[0].input
+    assert "no such prism" in said(window)
     assert window.inspector.knobs == good
-    value = window.sliders["apex"].GetRepresentation().GetValue()
-    assert value == pytest.approx(math.degrees(good.apex), abs=1e-3)
+    assert window.sliders["apex"].value == pytest.approx(math.degrees(good.apex), abs=1e-3)
 
 
 def test_events_without_a_solution_are_not_drawn(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -310,8 +318,7 @@ def test_many_moves_of_a_slider_cost_one_picture(window: Window, monkeypatch: py
     show = window.inspector.show
     monkeypatch.setattr(window.inspector, "show", lambda **given: shows.append(0.0) or show(**given))
     for value in (0.5, 0.6, 0.7):
-        window.sliders["apex"].GetRepresentation().SetValue(value)
-        window.sliders["apex"].InvokeEvent("InteractionEvent")
+        window.slide("apex", value)
     window.turn()
     assert len(shows) == 1
     assert window.inspector.knobs.apex == pytest.approx(math.radians(0.7), abs=1e-6)
@@ -333,17 +340,16 @@ def test_a_slow_renderer_draws_fewer_points_until_nothing_moves(
 
 def test_curves_of_the_window_before_are_grey_until_the_new_ones_are_there(window: Window) -> None:
     def shown() -> list[tuple[str, str]]:
-        lines = [window._plots[name][1][0] for name in window._curve_names()]
-        return [(line.label, line.color.hex_rgb) for line in lines]
+        lines = [chart(window, name).curves[0] for name in window._curve_names()]
+        return [(line.label, line.colour) for line in lines]
 
-    new = [("sharpness", BACKGROUND_AND_INK[False][1])] * 2
-    old = [("of the former window", GREY)] * 2
-    assert sum(1 for _ in window._curves) > 0
+    new, old = [("sharpness", "")] * 2, [("former window", GREY)] * 2
+    assert sum(1 for _ in window._slow) > 0
     assert shown() == new
     window.whole()
     window.update()
     assert shown() == old
-    assert sum(1 for _ in window._curves) > 0
+    assert sum(1 for _ in window._slow) > 0
     assert shown() == new
     window.step(1)
     window.update()
@@ -353,7 +359,7 @@ def test_curves_of_the_window_before_are_grey_until_the_new_ones_are_there(windo
 def test_the_curves_have_their_top_at_the_true_parameters(window: Window, recording: Recording) -> None:
     window.take_truth()
     window.update()
-    steps = sum(1 for _ in window._curves)
+    steps = sum(1 for _ in window._slow)
     assert steps == sum(len(window.curves[name][0]) for name in ("apex", "phase"))
     for name, tolerance in (("apex", 0.1), ("phase", 8.0)):
         values, sharpness = window.curves[name]
@@ -361,10 +367,10 @@ def test_the_curves_have_their_top_at_the_true_parameters(window: Window, record
         np.testing.assert_allclose(values * layout.UNITS[name], expected[0])
         np.testing.assert_allclose(sharpness, expected[1])
         assert values[np.argmax(sharpness)] == pytest.approx(layout.knob_values(window.inspector)[name], abs=tolerance)
-        _, (line, truth, now) = window._plots[name]
+        line, truth, now = chart(window, name).curves
         np.testing.assert_allclose(line.y, sharpness)
         assert truth.x[0] == now.x[0] == layout.truths(window.inspector)[name]
-    _, (x, y) = window._plots["orbit"]
+    x, y = chart(window, "orbit").curves
     radius = np.hypot(x.y, y.y)
     camera = recording.camera
     assert camera is not None
@@ -390,8 +396,8 @@ def test_a_click_describes_the_event_and_shows_its_orbit(window: Window, cloud: 
     place.SetValue(*drawn[k])
     assert math.dist(place.GetComputedDisplayValue(renderer), at) <= 6.0
     e = shown.events
-    assert f"x {e.x[k]}, y {e.y[k]} px" in " ".join(window._texts[0].input.split())
-    _, (x, _) = window._plots["orbit"]
+    assert f"x {e.x[k]}, y {e.y[k]} px" in " ".join(said(window).split())
+    x, _ = chart(window, "orbit").curves
     orbit, column = orbit_lines(window.inspector, shown, k)
     np.testing.assert_allclose(x.y, orbit[:, 0] - column[:, 0], atol=1e-3)
     np.testing.assert_allclose(column[0, :2], shown.after[k], atol=1e-3)
@@ -405,13 +411,13 @@ def test_a_click_describes_the_event_and_shows_its_orbit(window: Window, cloud: 
 def test_keys_do_what_the_help_says(window: Window) -> None:
     window.key("h")
     window.turn()
-    assert window._help.GetDraw()
-    text = window._texts[1].input
-    assert all(words in text for _, _, words in MORE_KEYS)
-    assert "redo" in text
+    assert window.sheets.help.renderer.GetDraw()
+    words = [words for _, words in window.sheets.help_rows]
+    assert all(text in words for key, _, text in MORE_KEYS if key not in OF_PLAIN | {"5"})
+    assert "redo; also Ctrl+Y" in words
     window.key("question")
     window.turn()
-    assert not window._help.GetDraw()
+    assert not window.sheets.help.renderer.GetDraw()
 
     pictures = [window.scene.picture()]
     for key in ("d", "k", "2", "o", "t", "plus", "n", "m", "w"):
@@ -466,19 +472,18 @@ def test_statistics_of_the_region_are_those_of_the_page(window: Window, monkeypa
         window.key(key)
         while window.turn():
             pass
-        assert window._statistics.background_color.hex_rgb == HELP_PAPER[True]
+        assert window.sheets.side.renderer.background_color.hex_rgb == PANEL_COLOURS[True][0]
         found = window.inspector.statistics()
         for name, text in found["rows"]:
-            assert f"{name}:  {text}" in window._texts[3].input
-        _, (line, median) = window._plots["intervals"]
+            assert f"{name}:  {text}" in window.sheets.statistics
+        line, median = chart(window, "intervals").curves
         np.testing.assert_allclose(line.y, found["y"])
         assert median.x[0] == found["median"]
     assert ["ON", "100.0 %"] in found["rows"]
-    assert window._statistics.GetDraw()
-    assert not any(slider.GetKeyPressActivation() for slider in window.sliders.values())  # VTK's i hides a widget
+    assert window.sheets.side.renderer.GetDraw()
     window.key("i")
     window.turn()
-    assert not window._statistics.GetDraw()
+    assert not window.sheets.side.renderer.GetDraw()
 
 
 def film_of(path: Path) -> np.ndarray:
@@ -526,7 +531,7 @@ def test_a_film_of_the_window_is_ended_or_cancelled(
     window.key("f")
     window.turn()
     assert [len(film_of(path)) for path in tmp_path.iterdir()] == [3] * films
-    assert ("saved" if films else "film cancelled") in window._texts[0].input
+    assert ("saved" if films else "film cancelled") in said(window)
     assert len(shares) == 3
     assert not window._progress
 
@@ -547,7 +552,7 @@ def test_a_time_without_events_is_said_and_the_picture_stays(window: Window, rec
     gap = Events.concatenate([events[:1], events[-9_000:]])
     window.inspector.recording = replace(window.inspector.recording, events=MemoryEvents(gap, *recording.events.size))
     drag(window, "start_ms", 20.0)
-    assert "take another window" in " ".join(window._texts[0].input.split())
+    assert "take another window" in " ".join(said(window).split())
     assert window.shown is shown
 
 
@@ -570,13 +575,13 @@ def test_a_file_without_a_prism_has_one_large_cloud(recording: Recording) -> Non
     window = Window(Inspector(plain), size=SIZE, off_screen=True)
     assert window._look.titles == (RECORDED,)
     assert window.look.axis is Axis.TIME
-    assert not window._charts.GetDraw()
-    assert "no encoder" in window._texts[0].input
+    assert list(window.sheets.charts) == ["intervals"]
+    assert "no encoder" in said(window)
     assert window.plotter.renderers[0].GetViewport()[2] == 1.0
     middle = window.scene.picture()[200:400, 400:700].astype(int)
     assert (np.ptp(middle, axis=2) > 100).mean() > 0.1  # its points are there, in colour
     drag(window, "rpm", 720.0)  # now there is a motion to compensate
-    assert window._charts.GetDraw()
+    assert "rpm" in window.sheets.charts
     assert len(window._look.titles) == 2
     window.scene.close()
 
@@ -585,8 +590,8 @@ def test_a_plain_recording_has_controls_of_a_prism_only_when_they_are_asked_for(
     window = Window(Inspector(replace(recording, encoder=None, prism=None)), size=SIZE, off_screen=True)
     assert list(window.sliders) == ["start_ms", "length_ms"]
     count, length_us = window.shown.span.count, window.shown.span.length_us
-    assert window._texts[0].input.startswith(f"{count / length_us * 1e6:,.0f} events/s ")
-    assert "encoder" not in window._texts[0].input
+    assert said(window).startswith(f"{count / length_us * 1e6:,.0f} events/s ")
+    assert "encoder" not in said(window)
     for key in ("Up", "Down", "Tab"):  # of the parameter moved last: there is none
         window.key(key)
         window.turn()
@@ -600,7 +605,7 @@ def test_a_plain_recording_has_controls_of_a_prism_only_when_they_are_asked_for(
     window.key("x")
     window.turn()
     assert list(window.sliders)[:3] == ["apex", "phase", "rpm"]
-    assert "no encoder" in window._texts[0].input
+    assert "no encoder" in said(window)
     window.scene.close()
 
 
@@ -615,7 +620,7 @@ def test_the_calibration_and_a_picture_are_saved_under_new_names(
     names = sorted(path.name for path in tmp_path.iterdir())
     assert len(names) == 3
     assert [name.rpartition(".")[2] for name in names] == ["json", "png", "png"]
-    assert "saved" in window._texts[0].input
+    assert "saved" in said(window)
 
 
 def test_calibrate_shows_its_progress_and_is_accepted(window: Window) -> None:
@@ -624,7 +629,7 @@ def test_calibrate_shows_its_progress_and_is_accepted(window: Window) -> None:
     window.key("c")
     window.turn()
     assert window.found is not None
-    assert "Press a to accept" in " ".join(window._texts[0].input.split())
+    assert "Press a to accept" in " ".join(said(window).split())
     window.key("a")
     window.turn()
     assert window.inspector.knobs.apex == pytest.approx(TRUE.apex, rel=0.05)
@@ -640,7 +645,7 @@ def test_a_calibration_is_cancelled_by_the_same_key(window: Window, monkeypatch:
     monkeypatch.setattr("amiwarp.viewer.jobs.find_calibration", find_calibration)
     window.key("c")
     window.turn()
-    assert "calibration cancelled" in window._texts[0].input
+    assert "calibration cancelled" in said(window)
     assert window.found is None
 
 

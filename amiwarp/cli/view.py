@@ -81,7 +81,8 @@ class LookOptions:
     size: Annotated[
         str | None,
         typer.Option(
-            help="Size of the window or the picture (px). Default: 1500x950, and 1400x620 for a picture.",
+            help="Size of the window or the picture (px). Default: 1500x950 or the largest that fits the screen; "
+            "1400x620 for a picture.",
             metavar="WIDTHxHEIGHT", rich_help_panel=_LOOK,
         ),
     ] = None  # fmt: skip
@@ -119,7 +120,7 @@ class LookOptions:
             "file": str(path), "events": shown.span.count, "drawn": len(shown.events),
             "sharpness_before": shown.sharpness_before,
             "sharpness_after": shown.sharpness_after if math.isfinite(inspector.turn_us) else None,
-            "region": list(shown.region), "notes": [*notes(inspector), *chosen],
+            "region": list(shown.region), "notes": [*(notes(inspector) if inspector.has_optic else []), *chosen],
         }  # fmt: skip
 
     def _choose_region(self, inspector: Inspector) -> list[str]:
@@ -332,7 +333,8 @@ def run_view(
             from amiwarp.viewer import window
 
             check_display()
-            window.Window(waiting[0], look=look.look(waiting[0]), view=look.view, size=look.pixels(window.SIZE)).run()
+            size = None if look.size is None else look.pixels(PICTURE_PX)
+            window.Window(waiting[0], look=look.look(waiting[0]), view=look.view, size=size).run()
             return
 
         def open_other(path: Path) -> Inspector:

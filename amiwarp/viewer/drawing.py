@@ -47,8 +47,10 @@ from amiwarp.plotting.meshes import Box
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.tasks import interrupts_later
 from amiwarp.validation import choice
+from amiwarp.viewer.axes import CloudAxes, projected, view_matrix
 from amiwarp.viewer.filters import rate_text
 from amiwarp.viewer.inspector import DisplayedWindow, DrawnTruth, Inspector, Knobs, LoadedWindow, colours_on_offer
+from amiwarp.viewer.texts import FONT_PX, VTK_FONT_FILE, font, label_actor, text_actor, text_width
 
 if TYPE_CHECKING:
     import pyvista
@@ -449,25 +451,26 @@ CORNER = (0.05, 0.985)
 """Upper left corner of the legend in its strip, in shares of the strip's width and height from the lower left."""
 BAR_BOTTOM = 0.3
 """Lower end of a scale, in shares of the height of the strip."""
-FONT_SIZE, MARK = 12, "■"
-"""Font size of the legend [px], and character that shows the colour of a row."""
-LETTER_PX, MARGIN_PX, LARGEST_STRIP = 7.2, 48, 0.35
-"""Width of a letter, width of mark and margins [px], and largest width of the strip as a fraction of the picture."""
-TITLE_PX = 32
-"""Height of the title of a scale [px]."""
+MARK = "■"
+"""Character that shows the colour of a row."""
+MARGIN_EM, LARGEST_STRIP = 4.0, 0.35
+"""Width of mark and margins in sizes of the font, and largest width of the strip as a fraction of the picture."""
+TITLE_EM = 2.7
+"""Height of the title of a scale, in sizes of the font."""
 FOOT_PX, OWN_RENDERERS = 22, 4
 """Height of the caption [px], and number of renderers of a scene: two clouds, their legend and the caption."""
 ROW_PX, LEAST_ROWS, MOST_ROWS = 40, 3, 12
 """Height of the picture per row of the legend [px], and smallest and largest number of rows."""
 
 
-def strip_share(texts: Sequence[str], width: int) -> float:
+def strip_share(texts: Sequence[str], width: int, font_px: int = FONT_PX) -> float:
     """Return the fraction of a picture's ``width`` [px] that the texts of a legend need."""
-    return min((MARGIN_PX + LETTER_PX * max(map(len, texts))) / width, LARGEST_STRIP)
+    widest = max(text_width(text, font_px) for text in texts)
+    return min((MARGIN_EM * font_px + widest) / width, LARGEST_STRIP)
 
 
-def bar_actors(bar: Scale, ink: str, height: int) -> list[Any]:
-    """Return the actors of a vertical scale. ``ink``: colour of the text; ``height``: of the whole picture [px]."""
+def bar_actors(bar: Scale, ink: str, height: int, font_px: int = FONT_PX) -> list[Any]:
+    """Return the actors of a vertical scale. ``ink``: colour of the text; ``height``: of the bar's renderer [px]."""
     import pyvista
     from vtkmodules.vtkRenderingAnnotation import vtkScalarBarActor
 
@@ -483,23 +486,9 @@ def bar_actors(bar: Scale, ink: str, height: int) -> list[Any]:
     actor.UnconstrainedFontSizeOn()
     actor.SetPosition(CORNER[0], BAR_BOTTOM)
     actor.SetWidth(0.5)
-    actor.SetHeight(CORNER[1] - TITLE_PX / height - BAR_BOTTOM)
-    actor.SetLabelTextProperty(pyvista.TextProperty(color=ink, font_size=FONT_SIZE, font_file=str(font())))
-    return [actor, text_actor(bar.label, ink, CORNER)]
-
-
-def text_actor(text: str, colour: str, place: tuple[float, float]) -> Any:
-    """Return an actor that shows a text below and to the right of a place, in shares of its renderer's size."""
-    import pyvista
-
-    actor = pyvista.Text(text)
-    actor.prop = pyvista.TextProperty(
-        color=colour, font_size=FONT_SIZE, font_file=str(font()), justification_horizontal="left",
-        justification_vertical="top",
-    )  # fmt: skip
-    actor.GetPositionCoordinate().SetCoordinateSystemToNormalizedViewport()
-    actor.position = place
-    return actor
+    actor.SetHeight(CORNER[1] - TITLE_EM * font_px / height - BAR_BOTTOM)
+    actor.SetLabelTextProperty(pyvista.TextProperty(color=ink, font_size=font_px, font_file=str(font())))
+    return [actor, text_actor(bar.label, ink, CORNER, font_px)]
 
 
 # What the clouds show, in words: their titles, and the caption of a picture.
@@ -650,8 +639,14 @@ NOWHERE = (0.0, 0.0, 0.0, 0.0)
 """Place of a renderer that is hidden."""
 VIEW_ANGLE = 26.0
 """Vertical field of view of the camera [deg]."""
-MARGIN = 0.1
-"""Margin around the clouds for labels, as a multiple of the region's width."""
+LEAST_FONT_PX, FULL_FONT_PX = 8, 800
+"""Smallest size of the texts, and width of a picture from which they have their full size [px]."""
+MARGIN = 0.02
+"""Margin around the clouds, as a multiple of the region's width."""
+LABELS_EM = (6.0, 3.4)
+"""Space on each side of the clouds, across and upwards, for title and labels of the axes, in sizes of the font."""
+PIXEL_PX = 2.0
+"""Diameter of the points at which they are as large as the pixels in the view along the third axis [px]."""
 
 
 @dataclass(frozen=True)
@@ -663,7 +658,7 @@ class Look:
     axis: Axis = Axis.ANGLE
     """Quantity along the third axis: prism angle or time."""
     point_size: float = 2.0
-    """Diameter of the points in the picture [px]."""
+    """Diameter of the points in the picture [px]. In the view along the third axis, 2 is the size of the pixels."""
     opacity: float = 1.0
     """Opacity of the points, 0 to 1."""
     dark: bool = False
@@ -682,13 +677,6 @@ class Look:
         return replace(self, titles=tuple(titles), overlaid=self.overlaid or len(titles) == 1)
 
 
-def font() -> Path:
-    """Return a font with Greek letters, which VTK's own font lacks."""
-    from matplotlib import get_data_path
-
-    return Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
-
-
 def place_renderer(renderer: Any, place: tuple[float, ...], *, shown: bool) -> None:
     """Draw a renderer at a place (left, bottom, right and top, in shares of the picture's size), or hide it.
 
@@ -703,14 +691,12 @@ class Scene:
     """Event clouds before and after compensation, with one camera for both, their legend and a caption."""
 
     def __init__(
-        self, size: tuple[int, int] = (1000, 420), *, corner: tuple[float, float] = (0.0, 0.0), more: int = 0,
-        off_screen: bool = True,
+        self, size: tuple[int, int] = (1000, 420), *, more: int = 0, off_screen: bool = True
     ) -> None:  # fmt: skip
         """Create an empty scene; ``size`` is the picture's width and height [px].
 
-        ``corner``: lower left corner of the part of the picture that the scene fills, in shares of its size. ``more``:
-        number of renderers for other parts; they follow the :data:`OWN_RENDERERS` of the scene. Without ``off_screen``,
-        a window shows the scene. Raises :class:`AmiwarpError` if VTK cannot draw on this machine.
+        ``more``: number of renderers for other parts; they follow the :data:`OWN_RENDERERS` of the scene. Without
+        ``off_screen``, a window shows the scene. Raises :class:`AmiwarpError` if VTK cannot draw on this machine.
         """
         if off_screen and sys.platform.startswith("linux"):
             if find_library("EGL") is None:  # VTK would end the process
@@ -723,7 +709,9 @@ class Scene:
         self.plotter.render_window.SetMultiSamples(0)  # doubles the speed of a software renderer
         self.plotter.link_views((0, 1))
         self._views = list(self.plotter.renderers)[:2]  # of the clouds
-        self._corner, self._foot = corner, 0.0
+        self._area, self._foot = (0.0, 0.0, 1.0, 1.0), 0.0
+        self.font_px = min(FONT_PX, max(LEAST_FONT_PX, round(FONT_PX * size[0] / FULL_FONT_PX)))
+        """Size of the texts [px]."""
         self._divide(0.0, overlaid=False)
         self.view = View.FREE
         self.stride = 1
@@ -732,12 +720,24 @@ class Scene:
         self._meshes: list[Any] = [None, None]
         self._drawn: list[tuple[Any, ...]] = [((), (), None)] * 2
         self._frame: list[Any] = []
+        self._look = Look()
+        self._titles = [label_actor("black", FONT_PX, up="top") for _ in self._views]
+        self._axes = [CloudAxes(renderer) for renderer in self._views]
+        for renderer, title in zip(self._views, self._titles, strict=True):
+            renderer.add_actor(title, render=False, pickable=False, reset_camera=False)
+            renderer.AddObserver("StartEvent", lambda caller, _: self._before_drawing(caller))
         self._lines: list[Any] = []
         self._explained: tuple[Any, ...] = ()
         self._caption = text_actor("", "black", (0.01, 0.9))
         self.plotter.renderers[3].add_actor(self._caption, render=False, pickable=False, reset_camera=False)
         self._framed: tuple[Any, ...] | None = None
+        self._size = tuple(size)
         self.box = Box(0, 0, 1, 1, 0.0, 1.0)
+
+    @property
+    def views(self) -> list[Any]:
+        """The renderers of the clouds."""
+        return self._views
 
     def show(self, shown: DisplayedWindow, look: Look, lines: Sequence[NDArray[Any]] = (), caption: str = "") -> None:
         """Draw the events of a window. The camera moves only if the region of the image has changed.
@@ -745,7 +745,7 @@ class Scene:
         ``lines``: a line for each cloud, points x, y [px] and on the third axis, shape ``(n, 3)``. ``caption``: text
         below the clouds.
         """
-        before = self.box
+        before, self._look = self.box, look
         self.box = Box(*shown.region, *axis_range(shown, look.axis))
         self._cloud(0, shown.first.before, shown.first, look)
         self._cloud(1, shown.after, shown, look)
@@ -769,9 +769,11 @@ class Scene:
         middle = (low + high) / 2.0
         corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - middle
         wide, tall, near = (np.abs(corners @ right), np.abs(corners @ up), corners @ away)
-        width, height = self.plotter.window_size
-        wide_share, tall_share = 1.0 - self._corner[0] - self._strip, 1.0 - self._corner[1] - self._foot
-        aspect = width / height * wide_share / tall_share * (1.0 if look.overlaid else 0.5)
+        width_px, height_px = self._cloud_size(look)
+        across_px, up_px = (2.0 * share * self.font_px for share in LABELS_EM)
+        tall *= height_px / max(height_px - up_px, 0.4 * height_px)
+        wide *= width_px / max(width_px - across_px, 0.4 * width_px)
+        aspect = width_px / height_px
         half = math.tan(math.radians(VIEW_ANGLE / 2.0))
         camera = self.plotter.renderers[0].camera
         camera.parallel_projection, camera.view_angle = view is not View.FREE, VIEW_ANGLE
@@ -782,34 +784,39 @@ class Scene:
             renderer.camera = camera
             renderer.reset_camera_clipping_range()
 
-    def place(self, corner: tuple[float, float], look: Look) -> None:
-        """Fill the part of the picture from another lower left corner on, in shares of its size."""
-        if corner != self._corner:
-            self._corner = corner
-            self._divide(self._strip, overlaid=self._overlaid)
-            if self._clouds:
-                self.look_from(self.view, look)
+    def _cloud_size(self, look: Look) -> tuple[float, float]:
+        """Return width and height of what shows a cloud [px]."""
+        width, height = self.plotter.render_window.GetSize()
+        left, low, right, top = self._area
+        wide = (right - left - self._strip) * (1.0 if look.overlaid else 0.5)
+        return max(width * wide, 1.0), max(height * (top - low - self._foot), 1.0)
+
+    def place(self, area: tuple[float, float, float, float], font_px: int, look: Look) -> None:
+        """Fill another part of the picture: left, low, right and top in shares of its size, with texts of a size."""
+        size = tuple(self.plotter.render_window.GetSize())
+        if (area, font_px, size) == (self._area, self.font_px, self._size):
+            return
+        self._area, self.font_px, self._size = area, font_px, size
+        self._explained, self._framed = (), None
+        self._caption.prop.font_size = font_px
+        self._divide(self._strip, overlaid=self._overlaid)
+        if self._clouds:
+            self.look_from(self.view, look)
 
     def event_at(self, place: tuple[int, int], shown: DisplayedWindow, look: Look) -> int:
         """Return the index of the front event within :data:`PICK_PX` of a place in the picture; -1 if there is none.
 
         ``place``: pixels from the left and from the bottom.
         """
-        import pyvista
-
         for k, renderer in enumerate(self._views):
             if not (renderer.GetDraw() and renderer.IsInViewport(*place)):
                 continue
             xy = shown.after if k == 1 or self._overlaid else shown.before
-            aspect = renderer.GetTiledAspectRatio()
-            matrix = pyvista.array_from_vtkmatrix(renderer.camera.GetCompositeProjectionTransformMatrix(aspect, 0, 1))
-            x, y, depth, w = matrix[:, :3] @ self.box.positions(xy, third_axis(shown, look.axis)).T + matrix[:, 3:]
-            (left, low), (width, height) = renderer.GetOrigin(), renderer.GetSize()
-            away = np.hypot(
-                left + (x / w + 1.0) * width / 2.0 - place[0], low + (y / w + 1.0) * height / 2.0 - place[1]
-            )
-            near = np.flatnonzero((away <= PICK_PX) & (w > 0.0))
-            return int(near[np.argmin(depth[near] / w[near])]) if len(near) else -1
+            points = self.box.positions(xy, third_axis(shown, look.axis))
+            places, depth = projected(points, view_matrix(renderer), renderer.GetSize())
+            away = np.hypot(*(places + renderer.GetOrigin() - place).T)
+            near = np.flatnonzero((away <= max(PICK_PX, 0.5 * self._clouds[k].prop.point_size)) & (depth >= 0.0))
+            return int(near[np.lexsort((away[near], depth[near]))[0]]) if len(near) else -1
         return -1
 
     def picture(self) -> NDArray[np.uint8]:
@@ -866,14 +873,28 @@ class Scene:
                 self._clouds[k].mapper.dataset = mesh
             if not (same[1] and fits and valid is ...):
                 mesh["colour"] = colours_of(few, look, after=k == 1)[valid]
-        prop = self._clouds[k].prop
         self._clouds[k].visibility = drawn
-        prop.point_size, prop.opacity = look.point_size, look.opacity
-        prop.render_points_as_spheres = look.point_size >= ROUND_PX
+        self._clouds[k].prop.opacity = look.opacity
+
+    def _before_drawing(self, renderer: Any) -> None:
+        """Size the points, and place the title: a window may have changed its size, and the mouse the camera."""
+        look, (width, height) = self._look, renderer.GetSize()
+        k = self._views.index(renderer)
+        self._titles[k].SetPosition(0.5 * width, height - 0.5 * self.font_px)
+        camera = renderer.camera
+        size, is_round = look.point_size, look.point_size >= ROUND_PX
+        if camera.parallel_projection and abs(camera.direction[2]) > 0.9999:  # the image: its pixels touch each other
+            pixel_px = height / (2.0 * camera.parallel_scale)
+            size, is_round = max(1.0, pixel_px * look.point_size / PIXEL_PX), False
+        for cloud in self._clouds:
+            if renderer.HasViewProp(cloud):
+                cloud.prop.point_size, cloud.prop.render_points_as_spheres = size, is_round
 
     def _draw_frame(self, look: Look) -> None:
-        """Draw the box, the ticks and the axis titles, if they have changed."""
-        wanted = (self.box, look.axis, look.dark, look.overlaid, look.titles, self.view)
+        """Draw the boxes, their titles and axes, if they have changed."""
+        import pyvista
+
+        wanted = (self.box, look.axis, look.dark, look.overlaid, look.titles, self.font_px)
         if wanted == self._framed:
             return
         self._framed = wanted
@@ -889,7 +910,17 @@ class Scene:
         for renderer in self._views:
             renderer.remove_actor(self._frame, render=False)
         titles = (" and ".join(look.titles),) if look.overlaid else look.titles
-        self._frame = [actor for k, title in enumerate(titles) for actor in self._axes(k, look, ink, title)]
+        third = "θ [°]" if look.axis is Axis.ANGLE else "t [ms]"
+        for title, axes in zip(self._titles, self._axes, strict=True):
+            title.input = ""
+            axes.hide()
+        b, self._frame = self.box, []
+        for k, text in enumerate(titles):
+            outline = pyvista.Box((b.left, b.right, -b.bottom, -b.top, 0, b.axis_height)).outline()
+            self._frame.append(self._add(k, outline, color=ink, line_width=1.0))
+            self._axes[k].label(b, ("x [px]", "y [px]", third), ink, self.font_px)
+            self._titles[k].input = text
+            self._titles[k].prop.color, self._titles[k].prop.font_size = ink, round(1.2 * self.font_px)
 
     def _draw_lines(self, lines: Sequence[NDArray[Any]], look: Look) -> None:
         """Draw a line in each cloud, instead of those drawn before."""
@@ -905,16 +936,19 @@ class Scene:
         """Draw the legend in a strip on the left, and the caption below. The clouds shrink to make room."""
         ink, camera = BACKGROUND_AND_INK[look.dark][1], self._views[0].camera
         home = self.plotter.renderers[2]
-        width, height = self.plotter.window_size
+        width, height = self.plotter.render_window.GetSize()
+        height = round(height * (self._area[3] - self._area[1]))
         bar = scale_of(shown, look.colour, dark=look.dark)
         rows = legend_of(shown.truth, look.colour, max(LEAST_ROWS, min(MOST_ROWS, height // ROW_PX)))
         rows = (*rows, *unknown_rows(shown, look.colour))
         if look.overlaid and len(look.titles) > 1:
             rows = (*rows, (GREY, look.titles[0]))
         title = [] if bar is None else [bar.label]
-        strip, foot = strip_share([*title, *(text for _, text in rows)], width), FOOT_PX / height * bool(caption)
+        strip = strip_share([*title, *(text for _, text in rows)], width, self.font_px)
+        foot = FOOT_PX * self.font_px / FONT_PX / self.plotter.render_window.GetSize()[1] * bool(caption)
         if (strip, foot) != (self._strip, self._foot):
-            grows = (1.0 - self._corner[0] - self._strip) / (1.0 - self._corner[0] - strip)
+            whole = self._area[2] - self._area[0]
+            grows = (whole - self._strip) / (whole - strip)
             self._foot = foot
             self._divide(strip, overlaid=look.overlaid)
             camera.Dolly(1.0 / grows)
@@ -928,9 +962,9 @@ class Scene:
         place, actors = CORNER if bar is None else (CORNER[0], BAR_BOTTOM - 0.05), []
         for k, (colour, text) in enumerate(rows):
             # all rows start at one corner, after line breaks: their distance does not depend on the picture's size
-            actors += [text_actor("\n" * k + MARK, colour, place)] if colour else []
-            actors.append(text_actor("\n" * k + ("     " if colour else "") + text, ink, place))
-        actors += [] if bar is None else bar_actors(bar, ink, height)
+            actors += [text_actor("\n" * k + MARK, colour, place, self.font_px)] if colour else []
+            actors.append(text_actor("\n" * k + ("     " if colour else "") + text, ink, place, self.font_px))
+        actors += [] if bar is None else bar_actors(bar, ink, height, self.font_px)
         home.clear_actors()
         for actor in actors:
             home.add_actor(actor, render=False, pickable=False, reset_camera=False)
@@ -938,48 +972,16 @@ class Scene:
     def _divide(self, strip: float, *, overlaid: bool) -> None:
         """Divide the scene's part of the picture into the legend's strip, a share of the width, and the clouds."""
         self._strip, self._overlaid, (left, right, legend, foot, *_) = strip, overlaid, self.plotter.renderers
-        start, low = self._corner[0] + strip, self._corner[1] + self._foot
-        middle = (1.0 + start) / 2.0
-        place_renderer(legend, (self._corner[0], low, start, 1.0), shown=strip > 0.0)
-        place_renderer(foot, (self._corner[0], self._corner[1], 1.0, low), shown=self._foot > 0.0)
-        place_renderer(left, (start, low, 1.0 if overlaid else middle, 1.0), shown=True)
-        place_renderer(right, (middle, low, 1.0, 1.0), shown=not overlaid)
-
-    def _axes(self, k: int, look: Look, ink: str, title: str) -> list[Any]:
-        import pyvista
-
-        b = self.box
-        frame = pyvista.Box((b.left, b.right, -b.bottom, -b.top, 0, b.axis_height)).outline()
-        actors = [self._add(k, frame, color=ink, line_width=1.0)]
-        unit = "θ [°]" if look.axis is Axis.ANGLE else "t [ms]"
-        gap = 0.05 * b.width
-        front, middle = -b.bottom - gap, ((b.left + b.right) / 2.0, -(b.top + b.bottom) / 2.0)
-        labels: list[tuple[str, tuple[float, float, float]]] = []
-        if self.view is not View.Y_AXIS:
-            labels += [(f"{v:g}", (v, front, -gap)) for v in ticks(b.left, b.right)]
-            labels.append(("x [px]", (middle[0], front - gap, -2.5 * gap)))
-        if self.view is not View.X_AXIS:
-            labels += [(f"{v:g}", (b.right + gap, -v, -gap)) for v in ticks(b.top, b.bottom)]
-            flat = self.view is View.XY  # no space to the right
-            place = (b.right + gap, -b.top + 1.2 * gap, 0.0) if flat else (b.right + 2.5 * gap, middle[1], -2.5 * gap)
-            labels.append(("y [px]", place))
-        if self.view is not View.XY:
-            y = -b.top + gap if self.view is View.Y_AXIS else front + gap  # on the left
-            labels += [(f"{v:g}", (b.left - gap, y, (v - b.low) * b.stretch)) for v in ticks(b.low, b.high)]
-            labels.append((unit, (b.left - gap, y, b.axis_height + 1.5 * gap)))
-        for text, place in labels:
-            label = pyvista.Label(text, position=place, size=13)
-            label.prop.color, label.prop.justification_horizontal = ink, "center"
-            label.prop.set_font_file(str(font()))
-            self.plotter.renderers[k].add_actor(label, render=False, pickable=False, reset_camera=False)
-            actors.append(label)
-        self.plotter.subplot(0, k)
-        actors.append(self.plotter.add_text(title, position="upper_edge", font_size=9, color=ink, render=False,
-                                            font_file=str(font())))  # fmt: skip
-        return actors
+        first, bottom, last, top = self._area
+        start, low = first + strip, bottom + self._foot
+        middle = (last + start) / 2.0
+        place_renderer(legend, (first, low, start, top), shown=strip > 0.0)
+        place_renderer(foot, (first, bottom, last, low), shown=self._foot > 0.0)
+        place_renderer(left, (start, low, last if overlaid else middle, top), shown=True)
+        place_renderer(right, (middle, low, last, top), shown=not overlaid)
 
 
-def draw_depth(plotter: pyvista.Plotter, first: int, depth: DepthMap) -> None:
+def draw_depth(plotter: pyvista.Plotter, first: int, depth: DepthMap, font_px: int = FONT_PX) -> None:
     """Draw a depth map in three renderers, from number ``first`` on: colour bar, image, and its points in space.
 
     The background is light, as the dark colours of far points need it.
@@ -996,16 +998,21 @@ def draw_depth(plotter: pyvista.Plotter, first: int, depth: DepthMap) -> None:
     cloud["colour"] = scale.rgb(metres[known])
     for renderer in list(plotter.renderers)[first : first + 3]:
         renderer.set_background(background)
-    for actor in bar_actors(scale, ink, plotter.window_size[1]):
+    for actor in bar_actors(scale, ink, plotter.renderers[first].GetSize()[1] or plotter.window_size[1], font_px):
         plotter.renderers[first].add_actor(actor, render=False, pickable=False, reset_camera=False)
     for k, mesh, title in ((1, image, "depth map"), (2, cloud, "its points")):
         plotter.subplot(0, first + k)
         plotter.add_mesh(mesh, scalars="colour", rgb=True, lighting=False, render=False, pickable=False, point_size=3.0)
-        plotter.add_text(title, position="upper_edge", font_size=9, color=ink, render=False, font_file=str(font()))
-    plotter.show_bounds(
+        text = text_actor(title, ink, (0.4, CORNER[1]), font_px)
+        plotter.renderers[first + k].add_actor(text, render=False, pickable=False, reset_camera=False)
+    bounds = plotter.show_bounds(
         mesh=cloud, xtitle="x [m]", ytitle="depth [m]", ztitle="-y [m]", color=ink, location="outer", fmt="%.1f",
-        n_xlabels=3, n_ylabels=3, n_zlabels=3, bold=False, font_size=10, use_3d_text=False, render=False,
+        n_xlabels=3, n_ylabels=3, n_zlabels=3, bold=False, font_size=font_px, use_3d_text=False, render=False,
     )  # fmt: skip
+    for axis in range(3):
+        for prop in (bounds.GetTitleTextProperty(axis), bounds.GetLabelTextProperty(axis)):
+            prop.SetFontFamily(VTK_FONT_FILE)
+            prop.SetFontFile(str(font()))
     plotter.view_vector((0.6, -1.0, 0.5), (0.0, 0.0, 1.0), render=False)
     plotter.camera.zoom(0.8)
     plotter.subplot(0, first + 1)

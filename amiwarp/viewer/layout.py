@@ -79,6 +79,8 @@ class ViewState:
     """Decay time of a decaying time surface [us]."""
     same_scale: bool = False
     """Whether images of two recordings have one scale."""
+    difference: bool = False
+    """Whether the second image shows the difference of the two images."""
 
 
 def current_state(inspector: Inspector, **look: Any) -> ViewState:
@@ -254,6 +256,7 @@ def _fields(size: tuple[int, int], duration_us: int) -> dict[str, _Field]:
         "events": ("fixed_count", lambda n: str(n or 0), lambda n: _whole(n, 0, MOST_COUNT) or None),
         "decay_us": ("decay_us", str, lambda us: _whole(us, 1, LONGEST_NOISE_US)),
         "same_scale": one_of("same_scale", flags),
+        "difference": one_of("difference", flags),
         "overlaid": one_of("overlaid", flags),
         **{name: one_of(name, {each.value: each for each in kind}) for name, kind in choices.items()},
         **{name: (name, "{:.10g}".format, partial(_number, ends)) for name, (_, _, ends) in GIVEN.items()},
@@ -461,6 +464,11 @@ class Actions:
         return False
 
     @property
+    def difference(self) -> bool:
+        """Whether the second image shows the difference of the two images."""
+        return False
+
+    @property
     def compensates(self) -> bool:
         """Whether the prism rotates, so that there is a motion to compensate."""
         return math.isfinite(self.inspector.turn_us)
@@ -580,7 +588,7 @@ class Actions:
         look = self.look
         now = current_state(self.inspector, against=self.against, image=self.image, axis=look.axis, colour=look.colour,
                             view=self.view, overlaid=look.overlaid, decay_us=self.decay_us,
-                            same_scale=self.same_scale)  # fmt: skip
+                            same_scale=self.same_scale, difference=self.difference)  # fmt: skip
         self.history = self.history or History(now)
         self.history.add(now, change)
         return self.history

@@ -176,6 +176,11 @@ class Panel(layout.Actions):
         return bool(self.state.same_scale)
 
     @property
+    def difference(self) -> bool:
+        """Whether the second image shows the difference of the two images."""
+        return bool(self.state.difference)
+
+    @property
     def time_window(self) -> tuple[int, int]:
         """Start and length of the time window that the page shows, on the events' clock [us]."""
         return self._clock_us(float(self.state.start_ms)), max(1, round(float(self.state.length_ms) * 1e3))
@@ -714,6 +719,7 @@ class Panel(layout.Actions):
         s.update({
             **layout.filter_state(selection), "region_wanted": region, "region_kind": kind, "kind": wanted.image.value,
             "fixed_count": wanted.fixed_count or 0, "decay_ms": wanted.decay_us * 1e-3, "same_scale": wanted.same_scale,
+            "difference": wanted.difference,
         })  # fmt: skip
         self.look = replace(self.look, colour=wanted.colour, axis=wanted.axis, overlaid=wanted.overlaid)
         if wanted.view is not self.view:
@@ -877,7 +883,7 @@ class Panel(layout.Actions):
             self.image,
             against=self.against,
             shown=shown,
-            difference=bool(self.state.difference),
+            difference=self.difference,
             decay_us=self.decay_us,
             same_scale=self.same_scale,
             kept=self._scales if self._held and self._scales_of == self.image else None,

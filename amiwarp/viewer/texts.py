@@ -1,0 +1,90 @@
+"""Texts that VTK draws: the one font of pictures and window, and how wide a text is."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+FONT_PX = 12
+"""Size of the font in a picture [px]. A window sets its own."""
+MEASURED_PX = 64
+"""Size of the font at which letters are measured [px]."""
+VTK_FONT_FILE = 4
+"""VTK's number for a font that comes from a file."""
+LINE = 1.35
+"""Distance between two lines, as a multiple of the font's size."""
+
+
+@cache
+def font() -> Path:
+    """Return a font with Greek letters, which VTK's own font lacks."""
+    from matplotlib import get_data_path
+
+    return Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
+
+
+@cache
+def _letter_share(letter: str) -> float:
+    """Return the width of a letter, as a share of the font's size."""
+    from matplotlib.ft2font import FT2Font
+
+    face = FT2Font(str(font()))
+    face.set_size(MEASURED_PX, 72.0)
+    return float(face.load_char(ord(letter)).linearHoriAdvance) / 65536.0 / MEASURED_PX
+
+
+def text_width(text: str, font_px: float) -> float:
+    """Return the width of a line of text [px]."""
+    return font_px * sum(map(_letter_share, text))
+
+
+def wrapped(text: str, width_px: float, font_px: int) -> list[str]:
+    """Return a text in lines that are at most so wide [px]; a longer word has a line of its own."""
+    lines: list[str] = []
+    for paragraph in text.split("\n"):
+        line = ""
+        for word in paragraph.split():
+            longer = f"{line} {word}" if line else word
+            if line and text_width(longer, font_px) > width_px:
+                lines.append(line)
+                longer = word
+            line = longer
+        lines.append(line)
+    return lines
+
+
+def text_actor(text: str, colour: str, place: tuple[float, float], font_px: int = FONT_PX) -> Any:
+    """Return an actor that shows a text below and to the right of a place, in shares of its renderer's size."""
+    import pyvista
+
+    actor = pyvista.Text(text)
+    actor.prop = pyvista.TextProperty(
+        color=colour,
+        font_size=font_px,
+        font_file=str(font()),
+        justification_horizontal="left",
+        justification_vertical="top",
+    )
+    actor.GetPositionCoordinate().SetCoordinateSystemToNormalizedViewport()
+    actor.position = place
+    return actor
+
+
+def label_actor(colour: str, font_px: int, across: str = "center", up: str = "center") -> Any:
+    """Return an empty text actor that is placed in pixels of its renderer.
+
+    ``across``: which of its sides is at the place, "left", "center" or "right"; ``up``: "bottom", "center" or "top".
+    """
+    import pyvista
+
+    actor = pyvista.Text("")
+    actor.prop = pyvista.TextProperty(
+        color=colour,
+        font_size=font_px,
+        font_file=str(font()),
+        justification_horizontal=across,
+        justification_vertical=up,
+    )
+    actor.GetPositionCoordinate().SetCoordinateSystemToViewport()
+    return actor

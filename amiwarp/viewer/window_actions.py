@@ -1,0 +1,287 @@
+"""What keys, sliders and the mouse do in the window."""
+
+import contextlib
+import itertools
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from amiwarp.choices import Axis, View
+from amiwarp.imaging.export import save_png
+from amiwarp.imaging.regions import Region
+from amiwarp.optics.models import alternatives
+from amiwarp.viewer import drawing, jobs, layout
+from amiwarp.viewer.drawing import ImageKind, Look, Scene
+from amiwarp.viewer.inspector import DisplayedWindow, colours_on_offer
+from amiwarp.viewer.window_controls import Slider
+from amiwarp.viewer.window_keys import KEYS, X_KEYS
+from amiwarp.viewer.window_sheets import Sheets
+
+SPEED = 0.1
+"""Speed of playing, relative to real time."""
+FINE = ("start_ms", "length_ms")
+"""Sliders of the time window."""
+NOISE_US = 2_000
+"""Time of the noise filter [us]."""
+DECAY_ENDS = (10, 10_000_000)
+"""Shortest and longest decay time [us]."""
+
+
+class WindowActions(layout.Actions):
+    """Actions of the window. They only change what is wanted; the window then computes and draws it."""
+
+    keys = KEYS
+    image = ImageKind.COUNT
+    decay_us = layout.DECAY_US
+    same_scale = difference = False
+    scene: Scene
+    sheets: Sheets
+    shown: DisplayedWindow
+    """What the window shows."""
+    knob: str
+    """Parameter that the arrow keys move, and over which the first curve is."""
+    message: str
+    """Text that is shown in the column."""
+    plays = loop = closed = help_shown = statistics_shown = depth_shown = False
+    optic_shown = False
+    """Whether a recording shows the controls of a prism though nothing says that there is one."""
+    _picked = -1  # the event whose orbit is shown
+    _played_s = 0.0  # when the time window was moved last by playing
+    _progress = _film_ends = False  # whether a calibration or film runs, and whether a film ends now
+
+    def close(self) -> None:
+        """Close the window after the current picture."""
+        self.closed = True
+
+    def key(self, key: str) -> None:
+        """Run the action of a key, by its name in VTK."""
+        super().key(X_KEYS.get(key, key))
+
+    def slide(self, name: str, value: float) -> None:
+        """Set a value, in the unit of its slider."""
+        if name == "start_ms":
+            self.move_window(round(value * 1e3))
+        elif name == "length_ms":
+            start_us = self.time_window[0] - self.inspector.recording.events.t_first
+            self.resize_window(start_us, start_us + round(value * 1e3))
+        elif name in self.sliders:
+            self.knob = name
+            knobs = self.inspector.knobs.with_values({name: value * layout.UNITS[name]})
+            if knobs != self.inspector.knobs:
+                self.inspector.set(knobs)
+                self.request("knobs", change=name)
+
+    @property
+    def sliders(self) -> dict[str, Slider]:
+        """Sliders by the name of their value."""
+        return self.sheets.controls.sliders
+
+    def move_window(self, start_us: int) -> None:
+        """Move the time window to a start after the first event [us]; playing stops, except a live stream's."""
+        self.plays = self.plays and self.inspector.latest is not None
+        self.move(self.inspector.recording.events.t_first + start_us, change="start_ms")
+
+    def resize_window(self, start_us: int, end_us: int) -> None:
+        """Set the ends of the time window, after the first event [us]. It then keeps its length, not its events."""
+        self.inspector.fixed_count = None
+        start_us = max(0, start_us)
+        length_us = min(max(1, end_us - start_us), self.whole_us)
+        self.time_window = self.inspector.recording.events.t_first + start_us, length_us
+        self.move(self.time_window[0], change="length_ms")
+
+    def draw_region(self, region: Region) -> None:
+        """Show a part of the image."""
+        self._select(region=region)
+
+    def sheets_changed(self) -> None:
+        """Draw again what is beside the clouds."""
+        self._sheets_old = True
+
+    def nudge(self, steps: int) -> None:
+        """Move the chosen parameter by steps of its slider."""
+        if self.knob not in self.sliders:
+            return
+        value = layout.knob_values(self.inspector)[self.knob]
+        self.slide(self.knob, value + steps * layout.SLIDERS[self.knob][2][2])
+
+    def choose_next(self, what: str) -> None:
+        """Choose the next "knob" (parameter for the keys and the curve), "model", "colour", "polarity" or "image"."""
+        inspector, knobs = self.inspector, self.inspector.knobs
+        if what == "knob":
+            self.knob = _following([name for name in self.sliders if name not in FINE] or [self.knob], self.knob)
+            self.request("look")
+        elif what == "model":
+            inspector.set(replace(knobs, model=_following(list(alternatives(knobs.model)), knobs.model)))
+            self.request("knobs")
+        elif what == "colour":
+            self.restyle(colour=_following(colours_on_offer(inspector.recording.truth), self.look.colour))
+        elif what == "image":
+            self.image, self.difference = _following(self._image_kinds(), (self.image, self.difference))
+            self.request("knobs")
+            self.say(f"images: {self._image_name}")
+        else:
+            self._select(polarity=_following([None, 1, 0], inspector.selection.polarity))
+
+    def filter(self, name: str) -> None:
+        """Leave out the events of hot pixels ("hide_hot"), or background activity ("noise_us"), or show them again."""
+        selection = self.inspector.selection
+        if name == "hide_hot":
+            self._select(hide_hot=not selection.hide_hot)
+        else:
+            self._select(noise_us=NOISE_US if selection.noise_us is None else None)
+
+    def scale_count(self, factor: float) -> None:
+        """Show a time window with so many times as many events; it keeps their number when it moves."""
+        source = self.inspector.recording.events
+        self.inspector.fixed_count = min(max(1, round(self.shown.span.count * factor)), len(source))
+        self.request("window")
+
+    def scale_decay(self, factor: float) -> None:
+        """Show the decaying time surface with another decay time."""
+        low, high = DECAY_ENDS
+        self.image, self.difference = ImageKind.DECAY, False
+        self.decay_us = min(max(round(self.decay_us * factor), low), high)
+        self.request("knobs")
+
+    def resize_points(self, px: float) -> None:
+        """Make the points larger."""
+        self.restyle(point_size=min(max(self.look.point_size + px, 1.0), 20.0))
+
+    def toggle(self, name: str) -> None:
+        """Invert "overlaid", "dark", "loop", "help_shown", "statistics_shown", "depth_shown" or "optic_shown"."""
+        if name in ("overlaid", "dark"):
+            self.restyle(**{name: not getattr(self.look, name)})
+            return
+        if name == "depth_shown" and self.inspector.depth is None:
+            self.say("there is no depth map; start with --depth FILE")
+            return
+        setattr(self, name, not getattr(self, name))
+        self._slow = self._slow_steps()
+        self.request("look")
+
+    def toggle_axis(self) -> None:
+        """Switch the third axis between angle and time. Without a motion there is no angle."""
+        if self.compensates or self.look.axis is Axis.ANGLE:
+            super().toggle_axis()
+        else:
+            self.say("there is no prism angle; x: set a prism")
+
+    def look_from(self, view: str) -> None:
+        """Set the direction from which the clouds are seen, and fit them into the window."""
+        self.view, self.depth_shown = View(view), False
+        self.scene.look_from(self.view, self._look)
+        self.request("look")
+
+    def pick(self, place: tuple[int, int]) -> None:
+        """Describe the event that is drawn at a place, and show its orbit. ``place``: pixels from left and bottom."""
+        if not self.depth_shown:
+            self._picked = self.scene.event_at(place, self.shown, self._look)
+            self.say("" if self._picked < 0 else drawing.event_text(self.shown, self._picked))
+
+    def whole(self) -> None:
+        """Show the whole image."""
+        self._select(region=None)
+
+    def keep_b(self) -> None:
+        """Keep the parameters as B, and show them on the left; a second time, show the recorded events again."""
+        self.b = None if self.b == self.inspector.knobs else self.inspector.knobs
+        self.request("knobs")
+
+    def play(self) -> None:
+        """Play the recording from the current window, or follow a live stream; stop if already playing."""
+        self.plays, self._played_s = not self.plays and self.can_play(), time.perf_counter()
+
+    def calibrate(self) -> None:
+        """Calibrate on the shown events, or cancel the running calibration. The window goes on meanwhile."""
+        if self._progress:
+            self._progress = False
+            return
+        with self._job("calibration"):
+            self.found, text = jobs.find_calibration(self.inspector, progress=self._show_progress)
+            self.message = f"{text}. Press a to accept"
+
+    def film(self) -> None:
+        """Save a film from here on under a new name in the current folder, or end it. The window goes on meanwhile."""
+        self._film_ends = self._progress
+        if self._progress:
+            return
+        with self._job("film"):
+            path = self._new_name("film")
+            jobs.write_film(
+                path,
+                self.inspector,
+                self._look,
+                self.view,
+                self._show_progress,
+                what="film",
+                against=self.b,
+                speed=SPEED,
+                ended=lambda: self._film_ends,
+            )
+            self.message = f"saved {path}"
+
+    @contextlib.contextmanager
+    def _job(self, what: str) -> Iterator[None]:
+        """Run a long job, which :meth:`calibrate` cancels."""
+        self._progress = True
+        with self.errors_shown("window"):
+            try:
+                yield
+            except jobs.JobCancelled:
+                self.message = f"{what} cancelled"
+        self._progress = False
+        self.request("look")
+
+    def export(self, what: str) -> None:
+        """Save the calibration, or a picture of the window, under a new name in the current folder."""
+        path = self._new_name(what)
+        with self.errors_shown("window"):
+            if what == "picture":
+                save_png(path, self.scene.picture())
+            else:
+                self.inspector.as_calibration().save(path)
+            self.say(f"saved {path}")
+
+    def _new_name(self, what: str) -> Path:
+        name = Path(jobs.download_name(self.inspector.recording.name, what))
+        names = (name.with_stem(f"{name.stem}-{k}") if k else name for k in itertools.count())
+        return next(each for each in names if not each.exists())
+
+    @property
+    def _look(self) -> Look:
+        against = "recorded" if self.b is None else "B"
+        return self.look.for_clouds(drawing.cloud_titles(self.inspector, against))
+
+    def say(self, text: str) -> None:
+        """Show a message."""
+        self.message = text
+        self.request("look")
+
+    def _select(self, **changes: Any) -> None:
+        inspector = self.inspector
+        with self.errors_shown("window"):
+            inspector.open(*self.time_window, replace(inspector.selection, **changes))
+            self.request("knobs")
+
+    @property
+    def _has_controls(self) -> bool:
+        """Whether there are controls of a prism."""
+        return self.optic_shown or self.inspector.has_optic
+
+    def _image_kinds(self) -> list[tuple[ImageKind, bool]]:
+        """Return the kinds of images on offer, and whether the second one is their difference."""
+        left_out = {ImageKind.DEPTH} if self.inspector.depth is None else set()
+        left_out |= set() if self.compensates else {ImageKind.LOG_INTENSITY}
+        kinds = [(kind, False) for kind in ImageKind if kind not in left_out]
+        return [*kinds, (ImageKind.COUNT, True)] if len(self._look.titles) > 1 else kinds
+
+    @property
+    def _image_name(self) -> str:
+        return "difference" if self.difference else self.image.value
+
+
+def _following(choices: list[Any], now: Any) -> Any:
+    """Return the choice after the current one."""
+    return choices[(choices.index(now) + 1) % len(choices) if now in choices else 0]
