@@ -173,5 +173,5 @@ from .tasks import Progress as Progress
 from .translation.sources import DataSet as DataSet
 from .translation.sources import Interpolation as Interpolation
 from .translation.translator import translate as translate
-from .viewer.panel import NotebookPage as NotebookPage
-from .viewer.panel import view as view
+from .viewer.handle import InspectorHandle as InspectorHandle
+from .viewer.handle import view as view

@@ -131,6 +131,11 @@ def folder(files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     for file in files:
         shutil.copy(file, tmp_path)
 
+    def no_display(remedy: str) -> None:
+        raise AmiwarpError(remedy)
+
+    monkeypatch.setattr("amiwarp.viewer.handle.check_display", no_display)  # else a window opens for each call
+
 
 @pytest.mark.parametrize("call", CALLS, ids=lambda call: call.label)
 @pytest.mark.usefixtures("folder")

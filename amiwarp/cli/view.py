@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
-import sys
 from collections.abc import Callable, Iterator
-from ctypes import CDLL, c_void_p
-from ctypes.util import find_library
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -331,8 +327,9 @@ def run_view(
             return
         if not page.web:
             from amiwarp.viewer import window
+            from amiwarp.viewer.display import check_display
 
-            check_display()
+            check_display("run with --web to serve the page for a browser, or with --screenshot to write a picture")
             size = None if look.size is None else look.pixels(PICTURE_PX)
             window.Window(waiting[0], look=look.look(waiting[0]), view=look.view, size=size).run()
             return
@@ -358,27 +355,6 @@ def warning(host: str) -> str | None:
         "recording, control the inspector and open the recordings in its folder; if you are the only user, use an SSH "
         "tunnel"
     )
-
-
-def check_display() -> None:
-    """Raise :class:`AmiwarpError` if no window can be opened, where VTK would end the process."""
-    if not sys.platform.startswith("linux"):
-        return
-    remedy = "run with --web to serve the page for a browser, or with --screenshot to write a picture"
-    libraries = find_library("X11"), find_library("GL")
-    if None in libraries:
-        raise AmiwarpError(
-            f"a window needs libX11 and libGL; on Debian run: apt-get install libx11-6 libgl1; or {remedy}"
-        )
-    x11 = CDLL(libraries[0])
-    x11.XOpenDisplay.restype, x11.XCloseDisplay.argtypes = c_void_p, [c_void_p]
-    display = x11.XOpenDisplay(None)
-    if display is None:
-        given = os.environ.get("DISPLAY")
-        found = f"the display {given!r} cannot be opened" if given else "there is no display to open a window on"
-        raise AmiwarpError(f"{found}; {remedy}")
-    x11.XCloseDisplay(display)
-    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkXOpenGLRenderWindow"
 
 
 def _lines(d: dict[str, Any]) -> list[str]:

@@ -1025,12 +1025,23 @@ def save_screenshot(
 ) -> None:
     """Write a picture of both event clouds as PNG; ``size`` is its width and height [px]."""
     check_output(path)
-    look = (look or Look()).for_clouds(cloud_titles(inspector, "recorded"))
-    clouds = inspector.show()
-    with interrupts_later(), closing(Scene(size)) as scene:  # VTK crashes if an exception leaves it half-drawn
+    with interrupts_later():  # VTK crashes if an exception leaves it half-drawn
+        save_png(path, draw_picture(inspector, view, look or Look(), size))
+
+
+def draw_picture(
+    inspector: Inspector, view: View, look: Look, size: tuple[int, int], against: Knobs | None = None
+) -> NDArray[np.uint8]:
+    """Return a picture of both event clouds, shape ``(height, width, 3)``; ``size`` is its width and height [px].
+
+    ``against``: parameters of the first cloud; None for the recorded events.
+    """
+    clouds = inspector.show(against=against)
+    with interrupts_later(), closing(Scene(size)) as scene:
+        look = look.for_clouds(cloud_titles(inspector, "recorded" if against is None else "B"))
         scene.show(clouds, look, caption=caption(inspector, clouds))
         scene.look_from(view, look)
-        save_png(path, scene.picture())
+        return scene.picture()
 
 
 # What the browser draws of a window: points and colours as bytes, legends, and images as addresses.

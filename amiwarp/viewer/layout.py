@@ -426,6 +426,8 @@ class Actions:
     """Show a text as a message."""
     steps: tuple[Callable[[History], ViewState], ...] = ()
     """Steps through the history that are to be made after the changes which were requested before them."""
+    listener: Callable[[ViewState], None] | None = None
+    """Called with what is shown after each update; None for nobody."""
 
     def released(self) -> None:
         """End a change that lasts, such as a drag."""
@@ -583,12 +585,20 @@ class Actions:
                 state = step(self.history)
         return state
 
+    def state_now(self) -> ViewState:
+        """Return the state that is shown now."""
+        look = self.look
+        return current_state(self.inspector, against=self.against, image=self.image, axis=look.axis,
+                             colour=look.colour, view=self.view, overlaid=look.overlaid)  # fmt: skip
+
+    def announce(self) -> None:
+        """Tell the listener what is shown now, unless steps through the history will change it at once."""
+        if self.listener is not None and not self.steps:
+            self.listener(self.state_now())
+
     def remember(self, change: str) -> History:
         """Add what is shown now to the history, and return it. Equal ``change`` of successive states make one step."""
-        look = self.look
-        now = current_state(self.inspector, against=self.against, image=self.image, axis=look.axis, colour=look.colour,
-                            view=self.view, overlaid=look.overlaid, decay_us=self.decay_us,
-                            same_scale=self.same_scale, difference=self.difference)  # fmt: skip
+        now = self.state_now()
         self.history = self.history or History(now)
         self.history.add(now, change)
         return self.history

@@ -1,4 +1,4 @@
-"""Page of the inspector: passes input from the browser to the inspector, and results back; ways to show the page."""
+"""Page of the inspector: passes input from the browser to the inspector, and results back; the page in a browser."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import contextlib
 import logging
 import math
 import secrets
-import socket
 import tempfile
 import traceback
 import weakref
@@ -20,24 +19,20 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.calib.result import Calibration
 from amiwarp.choices import Axis, Colour, View, Vote
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import iwe
-from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.event_rates import EventRates
 from amiwarp.live.stream.session import LiveSource
 from amiwarp.plotting.colours import Scale, count_scale
 from amiwarp.tasks import Progress
-from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
 from amiwarp.viewer.filters import Selection, step_rows
 from amiwarp.viewer.inspector import WINDOW_POINTS, DisplayedWindow, Inspector, Knobs, Library
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
-from amiwarp.viewer.serve import address, finite, serve, use_page
+from amiwarp.viewer.serve import finite, serve, use_page
 
 BINS = 400
 """Number of points of the drawn event rates."""
@@ -775,6 +770,7 @@ class Panel(layout.Actions):
             state.update({**values, "turn_ms": layout.turn_ms(self.inspector), "curve_mark": mark})
             if not state.playing:
                 self.remember("" if todo & {"suggestion", "state"} else self._change)
+            self.announce()
 
     def _show_old(self) -> None:
         """Show which slow parts of the page are still of another window or selection."""
@@ -923,7 +919,7 @@ def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progre
         known = None
 
 
-# Ways to show the page, in a browser or in a notebook.
+# The page in a browser.
 
 LOCAL_HOST = "127.0.0.1"
 """Address of this machine that only this machine can reach."""
@@ -945,118 +941,21 @@ def serve_panel(
     """
     with contextlib.suppress(KeyboardInterrupt):
         token = secrets.token_urlsafe(16)
-        asyncio.run(_serve(make_inspector, library, host=host, port=port, token=token, ready=ready))
+        asyncio.run(serve_tabs(make_inspector, library, host=host, port=port, token=token, ready=ready))
 
 
-async def _serve(make_inspector: Callable[[], Inspector], library: Library | None = None, **options: Any) -> None:
+async def serve_tabs(
+    make_inspector: Callable[[], Inspector],
+    library: Library | None = None,
+    *,
+    opened: Callable[[Panel], None] = lambda panel: None,
+    **options: Any,
+) -> None:
+    """Serve the page, as :func:`serve_panel` does. ``opened`` is called with the panel of each tab that opens."""
+
     def build(server: Any) -> Callable[[], None]:
-        return Panel(server, make_inspector(), library).close
+        panel = Panel(server, make_inspector(), library)
+        opened(panel)
+        return panel.close
 
     await serve(build, settable=layout.SETTABLE, **options)
-
-
-@guarded
-class NotebookPage:
-    """The inspector's page below a notebook cell.
-
-    Parameters
-    ----------
-    serving : asyncio.Task
-        Task that serves the page.
-
-    Examples
-    --------
-    >>> page = amiwarp.view(amiwarp.open_recording("recording.h5"))  # doctest: +SKIP
-    >>> page.close()  # doctest: +SKIP
-    """
-
-    def __init__(self, serving: asyncio.Task[None]) -> None:
-        self._serving = serving
-
-    def close(self) -> None:
-        """Stop serving the page.
-
-        Examples
-        --------
-        >>> page.close()  # doctest: +SKIP
-        """
-        self._serving.cancel()
-
-    def _ipython_display_(self) -> None:
-        """Show nothing more than the page, which is already shown."""
-
-
-@guarded
-def view(
-    recording: Recording,
-    calibration: Calibration | None = None,
-    *,
-    beside: Recording | None = None,
-    depth: DepthMap | None = None,
-    device: Any = "cpu",
-    height: int = 700,
-) -> NotebookPage:
-    """Show the inspector below a notebook cell. Warp's messages are switched off, so that the cell shows only the page.
-
-    The page is in the cell's output before this returns, so that tools that run notebooks, such as nbclient and
-    papermill, keep it.
-
-    Parameters
-    ----------
-    recording : Recording
-        Events to show. Encoder, camera and prism may be missing.
-    calibration : Calibration or None
-        Parameters of the prism at the start. Without it, the page starts with the nominal prism.
-    beside : Recording or None
-        Another recording with as many pixels, which the left cloud shows as recorded, at the same time after its first
-        event.
-    depth : DepthMap or None
-        Depth map of a recording behind a plate. It is shown, and the events are compensated at its depths.
-    device : str or warp.Device
-        Device that compensates the events.
-    height : int
-        Height of the page in the notebook [px].
-
-    Returns
-    -------
-    NotebookPage
-        The page, which is served until the kernel ends or its ``close`` is called.
-
-    Raises
-    ------
-    AmiwarpError
-        If a recording holds no events, the calibration, the recording beside or the depth map belongs to a camera of
-        another size, or the depth map is given for another optic than a plate.
-
-    Examples
-    --------
-    >>> amiwarp.view(amiwarp.open_recording("recording.h5"))  # doctest: +SKIP
-    """
-    try:
-        loop = asyncio.get_running_loop()
-        from IPython.display import IFrame, display
-    except (ImportError, RuntimeError) as error:  # no IPython, or no running loop
-        given = f"{recording.name}: view shows a recording in a notebook"
-        raise AmiwarpError(f"{given}; elsewhere, run in a shell: amiwarp view FILE") from error
-
-    from amiwarp.kernels.launch import start_quietly
-
-    start_quietly()
-
-    def make_inspector() -> Inspector:
-        made = Inspector(recording, calibration, device=device)
-        if beside is not None:
-            made.put_beside(beside)
-        if depth is not None:
-            made.use_depths(depth)
-        return made
-
-    make_inspector()  # raises errors in the cell, before the page is served
-    # The port is opened here, because programs that run notebooks keep only what a cell shows before it ends, and the
-    # server starts after that. A browser that is faster waits until the server answers.
-    listening = socket.create_server((LOCAL_HOST, 0))
-    token = secrets.token_urlsafe(16)
-    serving = loop.create_task(_serve(make_inspector, host=LOCAL_HOST, token=token, listening=listening))
-    serving.add_done_callback(lambda _: listening.close())  # also if it ends before the server takes the socket
-    display(IFrame(address(LOCAL_HOST, listening.getsockname()[1], token), "100%", height))
-    return NotebookPage(serving)

@@ -168,6 +168,7 @@ class Window(WindowActions):
         self._show()
         if not self.plays:
             self.remember(self._change)
+        self.announce()
 
     def request(self, *what: str, change: str = "") -> None:
         """Request an update: "window", "suggestion", "knobs", "state" or "look"."""
