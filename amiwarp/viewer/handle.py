@@ -135,8 +135,8 @@ class InspectorHandle:
 
     Parameters
     ----------
-    inspector : Inspector
-        Inspector of the recording, in which values are set and of which pictures are made.
+    inspector : Any
+        What :func:`view` makes of the recording: values are set in it, and pictures made of it.
 
     Examples
     --------
@@ -145,8 +145,8 @@ class InspectorHandle:
     >>> inspector.seek(1_200_000)  # doctest: +SKIP
     """
 
-    def __init__(self, inspector: Inspector) -> None:
-        self._own = inspector
+    def __init__(self, inspector: Any) -> None:  # users get a handle from view, and make none
+        self._own: Inspector = inspector
         self._state: ViewState | None = None
         self._callbacks: list[Callable[[dict[str, Any]], object]] = []
         self._tabs: weakref.WeakSet[Panel] = weakref.WeakSet()
