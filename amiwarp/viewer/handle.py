@@ -27,7 +27,7 @@ from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector, Source, colours_o
 from amiwarp.viewer.layout import Actions, ViewState
 
 if TYPE_CHECKING:
-    from PIL.Image import Image
+    from PIL.Image import Image as PillowImage
 
     from amiwarp.viewer.panel import Panel
     from amiwarp.viewer.window import Window
@@ -239,7 +239,7 @@ class InspectorHandle:
 
         return stop
 
-    def picture(self, size: tuple[int, int] = PICTURE_PX, *, dark: bool = False) -> Image:
+    def picture(self, size: tuple[int, int] = PICTURE_PX, *, dark: bool = False) -> PillowImage:
         """Return a picture of both event clouds as they are shown, which a notebook keeps after its kernel has ended.
 
         Parameters
