@@ -308,12 +308,13 @@ class InspectorHandle:
     def _known(self) -> ViewState:
         """Return the last known state; before anybody looks, the one with which page and window start."""
         if self._state is None:
-            own = self._own
-            own.open(*(own.window or own.first_window()))
-            if math.isfinite(own.turn_us):
-                jobs.estimate_phase(own)
-                own.open(*(own.window or own.first_window()), replace(own.selection, region=own.suggest_region()))
-            self._state = layout.current_state(own)
+            inspector = self._own
+            window = inspector.window or inspector.first_window()
+            inspector.open(*window)
+            if math.isfinite(inspector.turn_us):
+                jobs.estimate_phase(inspector)
+                inspector.open(*window, replace(inspector.selection, region=inspector.suggest_region()))
+            self._state = layout.current_state(inspector)
         return self._state
 
     def _attach_tab(self, panel: Panel) -> None:
