@@ -364,7 +364,8 @@ class _Suite:
             return Check(name, None, "none; without them clocks agree to about a millisecond", "")
         rate = len(pulses) / STEADY_S
         consecutive = all((b - a) % (1 << 32) == 1 for (_, a), (_, b) in itertools.pairwise(pulses))
-        regular = are_multiples(np.unwrap(np.array([t for t, _ in pulses], np.int64), period=1 << 32))
+        times = np.unwrap(np.array([t for t, _ in pulses], np.int64), period=1 << 32).astype(np.int64)
+        regular = are_multiples(times)
         order = "numbers in order" if consecutive else "numbers with gaps"
         spacing = (
             "at regular intervals, by which clocks are not known for sure" if regular else "at irregular intervals"
