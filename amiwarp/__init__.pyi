@@ -74,6 +74,7 @@ from .imaging.tensors import stacked_histogram as stacked_histogram
 from .imaging.tensors import time_surface as time_surface
 from .imaging.tensors import voxel_grid as voxel_grid
 from .imaging.tensors import windows as windows
+from .io.bytes_decoder import BytesDecoder as BytesDecoder
 from .io.camera_files import load_camera as load_camera
 from .io.camera_files import save_camera as save_camera
 from .io.depth_map import DepthMap as DepthMap

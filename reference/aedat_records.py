@@ -1,4 +1,4 @@
-"""Decoders of AEDAT 2.0 records and AEDAT 3.1 packets with NumPy: what the kernels are compared with."""
+"""Decoders of AEDAT 2.0 records and AEDAT 3.1 and 4 packets with NumPy: what the kernels are compared with."""
 
 from typing import Any
 
@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.io.aedat2_header import Chip
+from amiwarp.io.aedat4_packets import EVENT
+from amiwarp.io.aedat4_tables import DAMAGE, root_of, vector_of
 from amiwarp.io.file_scan import Columns, unwrapped
 
 
@@ -57,3 +59,12 @@ def polarity_events(parts: list[bytes], bases: list[int]) -> Columns:
         found.append(words)
     data, t = np.concatenate([np.zeros((0, 2), np.int64), *found]).T
     return data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, t, data >> 1 & 1
+
+
+def aedat4_rows(content: bytes) -> NDArray[Any] | None:
+    """Return the events in a packet of AEDAT 4 whose compression is undone, or None if it is damaged."""
+    try:
+        place, count = vector_of(content, root_of(content), 0, EVENT.itemsize)
+    except DAMAGE:
+        return None
+    return np.frombuffer(content, EVENT, count, place)

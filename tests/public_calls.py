@@ -237,6 +237,8 @@ OWN: dict[str, dict[str, Any]] = {
     "MemoryEvents.find": {"t": 5},
     "Encoder": _all(ENCODER),
     "EvtDecoder": {"version": "2.1", "swapped": True, "device": "cpu"},
+    "BytesDecoder": {"format": "aedat2", "chip": "dvs128", "device": "cpu"},
+    "BytesDecoder.decode": {"data": b"\0" * 8},
     "EvtDecoder.decode": {"data": b"\x00\x80\x01\x60"},
     "Encoder.from_counts": {"count": [0, 1], "counts_per_turn": 100},
     "Encoder.constant_speed": {"rpm": 720.0},
@@ -500,6 +502,7 @@ OBJECTS: dict[str, Any] = {
     "Trajectory": STILL,
     "MemoryImages": IMAGES,
     "EventFilter": aw.EventFilter(every=2),
+    "BytesDecoder": aw.BytesDecoder("dat2"),
     "EvtDecoder": aw.EvtDecoder("3.0"),
 }
 """Objects whose methods are called."""

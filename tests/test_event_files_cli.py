@@ -34,7 +34,7 @@ def large(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("amiwarp.cli.recordings.LARGE_BYTES", 1000)
     monkeypatch.setattr("amiwarp.cli.recordings.HEAD_EVENTS", 600)
     for name, value in (
-        ("aedat.DEFAULT_BLOCK", 500),
+        ("aedat2.DEFAULT_BLOCK", 500),
         ("dat.PIECE_EVENTS", 500),
         ("prophesee.EVT_BYTES", 4000),
         ("text_files.READ_BYTES", 4000),

@@ -143,6 +143,15 @@ def test_words_that_are_rare_are_found_anywhere_in_a_block(rare: float, device: 
         np.testing.assert_array_equal(np.concatenate([edges.t for _, edges in parts]), known_edges[2])
 
 
+def test_blocks_that_hold_nothing_but_full_vectors_are_counted(device: str) -> None:
+    """More events and more words of a kind than 16 bits can count."""
+    vectors = 40_000
+    words = np.array([0x8000, 0x6001, 0x0000, 0x3000, *[0x4FFF] * vectors], np.uint16)
+    events, _ = EvtDecoder("3.0", device=device).decode(words)
+    assert len(events) == 12 * vectors
+    assert events.x.numpy()[:65535].tolist() == list(range(65535))
+
+
 def test_a_single_event_between_vectors_moves_no_vector() -> None:
     words = [0x8000, 0x6001, 0x0000, 0x300A, 0x2805, 0x4001]
     assert decoded("3.0", words)[0] == [[5, 0, 1, 1], [10, 0, 0, 1]]

@@ -196,16 +196,16 @@ def test_a_step_back_at_the_end_of_a_batch_is_decided_by_the_next_one(count):
     earlier = 5_000_000 + np.arange(100)
     wrong = np.concatenate([earlier, 1000 + np.arange(count)])
     clock = Clock()
-    clock.shift_all(wrong.copy(), [0], [10])
+    clock.shift_all(wrong.copy(), [0], [10], in_order=False)
     later = 5_000_100 + np.arange(100)
-    clock.shift_all(later, [0], [20])
+    clock.shift_all(later, [0], [20], in_order=False)
     assert clock.restarts == []
     assert later.tolist() == (5_000_100 + np.arange(100)).tolist()
 
     clock = Clock()
-    clock.shift_all(wrong.copy(), [0], [10])
+    clock.shift_all(wrong.copy(), [0], [10], in_order=False)
     behind = 1000 + count + np.arange(100)
-    clock.shift_all(behind, [0], [20])
+    clock.shift_all(behind, [0], [20], in_order=False)
     assert [place for place, _ in clock.restarts] == [20]
     assert behind.tolist() == (5_000_099 + count + np.arange(100)).tolist()
 

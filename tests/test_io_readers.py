@@ -334,7 +334,7 @@ def test_pixels_that_no_sensor_has_are_named_without_a_size(tmp_path):
 @pytest.mark.parametrize("piece", [1, 7])
 def test_dat_times_run_on_past_32_bits(tmp_path, monkeypatch, start, back, piece):
     monkeypatch.setattr("amiwarp.io.dat.PIECE_EVENTS", piece)
-    monkeypatch.setattr("amiwarp.io.dat.BLOCK_EVENTS", 3)
+    monkeypatch.setattr("amiwarp.io.dat.BLOCK_RECORDS", {True: 3})
     t = start + np.arange(0, 600) * 15_000_000
     if back:
         after = int(np.searchsorted(t, 2**32))

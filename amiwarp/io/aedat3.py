@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.decoding import BLOCK_RECORDS, sums_before
+from amiwarp.io.decoding import address_of, cut_into_blocks, sums_before
 from amiwarp.io.file_scan import FileEvents, Packet, only_counted
 from amiwarp.io.files import errors_name, open_input
 
@@ -176,28 +176,26 @@ def _are_edges(words: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 def _decoded(parts: list[bytes], bases: list[int], notes: dict[str, int]) -> DeviceEvents:
     """Return the valid events of some packets, and count invalid ones. ``bases``: what is added to their times [us]."""
-    import warp as wp
-
     counts = np.array([len(part) // EVENT_BYTES for part in parts])
-    words = wp.array(np.frombuffer(b"".join(parts), "<u4"), dtype=wp.uint32, device="cpu", copy=False)
-    events = decode_packets(words, 2 * sums_before(counts), counts, np.array(bases))
+    addresses = np.array([address_of(part) for part in parts], np.uint64)
+    events = decode_packets(addresses, counts, np.array(bases), "cpu")
     _add_invalid(notes, int(counts.sum()) - len(events))
     return events
 
 
 def decode_packets(
-    words: Any, starts: NDArray[np.int64], counts: NDArray[np.int64], bases: NDArray[np.int64]
+    addresses: NDArray[np.uint64], counts: NDArray[np.int64], bases: NDArray[np.int64], device: Any
 ) -> DeviceEvents:
-    """Return the valid events of some packets, on the device of their words.
+    """Return the valid events of some packets in the memory of a device.
 
     Parameters
     ----------
-    words : wp.array
-        Words of the packets, uint32, shape ``(n,)``.
-    starts, counts : array
-        Index of the first word and number of the events of each packet, shape ``(m,)``.
+    addresses, counts : array
+        Address of the first event of each packet, and number of its events, shape ``(m,)``.
     bases : array
         Time that is added to those of each packet's events [us], shape ``(m,)``.
+    device : str or wp.Device
+        The device.
     """
     import warp as wp
 
@@ -206,24 +204,20 @@ def decode_packets(
     from amiwarp.kernels.evt import new_event_arrays
     from amiwarp.kernels.launch import launch
 
-    device = words.device
-    # A large packet is several blocks.
-    length = BLOCK_RECORDS[device.is_cpu]
-    parts = -(-counts // length)
-    packet = np.repeat(np.arange(counts.size), parts)
-    before = length * (np.arange(packet.size) - sums_before(parts)[packet])
+    device = wp.get_device(device)
+    packet, before, held = cut_into_blocks(counts, device)
     blocks = np.zeros(packet.size, aedat3.Block.numpy_dtype())
-    blocks["start"] = starts[packet] + 2 * before
-    blocks["events"] = np.minimum(counts[packet] - before, length)
+    blocks["address"] = addresses[packet] + (EVENT_BYTES * before).astype(np.uint64)
+    blocks["events"] = held
     blocks["base"] = bases[packet]
     on_device = wp.array(blocks, dtype=aedat3.Block, device=device)
 
     valid = wp.empty(blocks.size, dtype=int, device=device)
-    launch(aedat3.count_valid, blocks.size, [words, on_device], [valid], device=device, smallest=1)
+    launch(aedat3.count_valid, blocks.size, [on_device], [valid], device=device, smallest=1)
     found = valid.numpy()
     arrays = new_event_arrays(int(found.sum()), device)
     places = wp.array(sums_before(found), dtype=int, device=device)
-    launch(aedat3.decode_polarity, blocks.size, [words, on_device, places], [arrays], device=device, smallest=1)
+    launch(aedat3.decode_polarity, blocks.size, [on_device, places], [arrays], device=device, smallest=1)
     return DeviceEvents(arrays.x, arrays.y, arrays.t, arrays.p)
 
 

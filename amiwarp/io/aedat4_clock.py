@@ -2,6 +2,7 @@
 
 import bisect
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,13 +38,16 @@ class Clock:
         """What is added to the times now [us]."""
         return self.restarts[-1][1] if self.restarts else 0
 
-    def shift_all(self, t: NDArray[np.int64], starts: list[int], places: list[int]) -> None:
+    def shift_all(
+        self, t: NDArray[np.int64], starts: Sequence[int] | NDArray[np.int64], places: list[int], *, in_order: bool
+    ) -> None:
         """Shift the times of the next events, at least one, in place [us].
 
-        ``places`` are the positions of their packets, ``starts`` the index of the first event of each.
+        ``places`` are the positions of their packets, ``starts`` the index of the first event of each. ``in_order``:
+        whether none of these times is before the one in front of it.
         """
         count = self._last.size
-        if self._is_open or bool((t[1:] < t[:-1]).any()) or (count and self._last[-1] > t[0]):
+        if self._is_open or not in_order or (count and self._last[-1] > t[0]):
             stored = np.concatenate([self._last, t])
             back = np.flatnonzero(stored[1:] < stored[:-1] - RESTART_US) + 1
         else:

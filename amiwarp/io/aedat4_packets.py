@@ -23,7 +23,7 @@ from amiwarp.io.aedat4_tables import U4, number_at
 from amiwarp.io.files import open_input
 from amiwarp.tasks import in_order
 
-BATCH_BYTES = 1 << 21
+BATCH_BYTES = 1 << 23
 """Size of the packets that are decoded together [bytes]."""
 BATCH_PACKETS = 1 << 12
 """Largest number of packets that are decoded together."""

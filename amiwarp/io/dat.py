@@ -5,25 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, Recording
-from amiwarp.io.file_scan import FileEvents, Packet, last_word, read_words, unwrapped
+from amiwarp.io.decoding import BLOCK_RECORDS, sums_before
+from amiwarp.io.file_scan import FileEvents, Packet, last_word, read_words
 from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.formats import LONGEST_DAT_US, Outline, origin_of
 from amiwarp.io.prophesee import read_header, stated_origin
 
 if TYPE_CHECKING:
+    from amiwarp.events.device_events import DeviceEvents
     from amiwarp.kernels.dat import Layout
 
 PIECE_EVENTS = 1 << 20
 """Number of events that are decoded at once."""
-BLOCK_EVENTS = 1 << 15
-"""Number of events that one thread decodes."""
 
 
 def open_dat(path: Path) -> Recording:
@@ -58,6 +58,68 @@ def _last_time(path: Path, offset: int, origin: int, estimate: int) -> int | Non
     return None if last is None else last + origin
 
 
+def _packets(path: Path, offset: int, version: str, origin: int, notes: dict[str, int]) -> Iterator[Packet]:
+    """Yield the events."""
+    import warp as wp
+
+    from amiwarp.kernels.launch import start_once
+
+    start_once()
+    decoder = DatDecoder(version, "cpu")
+    for records in read_words(path, offset, "<u4", PIECE_EVENTS, notes):
+        words = wp.array(records.ravel(), dtype=wp.uint32, device="cpu", copy=False)
+        events = decoder.decode(words).to_host()
+        if origin:
+            np.add(events.t, origin, out=events.t)
+        yield events
+
+
+# Decoder of the records, on a CPU or a GPU.
+
+
+class DatDecoder:
+    """Decoder of the records of one file or stream, in pieces. Times run on where those of 32 bits wrap."""
+
+    def __init__(self, version: str, device: Any) -> None:
+        import warp as wp
+
+        self._device = wp.get_device(device)
+        self._layout = _layout(version)
+        self._last = -1  # time of the last record as stored [us]
+        self._wraps = 0
+
+    def decode(self, words: Any) -> DeviceEvents:
+        """Return the events of the records that follow the last call's. ``words``: a Warp array of uint32."""
+        import warp as wp
+
+        from amiwarp.events.device_events import DeviceEvents
+        from amiwarp.kernels.dat import decode_dat
+        from amiwarp.kernels.evt import new_event_arrays
+        from amiwarp.kernels.launch import launch
+
+        device = self._device
+        count = words.shape[0] // 2
+        length = BLOCK_RECORDS[device.is_cpu]
+        blocks = -(-count // length)
+        arrays = new_event_arrays(count, device)
+        wraps = wp.empty(blocks, dtype=int, device=device)
+
+        def decode(turns: NDArray[np.int64]) -> NDArray[np.int64]:
+            """Decode all blocks, before which the time has wrapped so often, and return how often it wraps in each."""
+            inputs = [words, length, self._layout, self._last, wp.array(turns, dtype=int, device=device)]
+            launch(decode_dat, blocks, inputs, [arrays, wraps], device=device, smallest=1)
+            return np.asarray(wraps.numpy().astype(np.int64))
+
+        turns = np.full(blocks, self._wraps)
+        found = decode(turns)
+        if found[:-1].any():  # rare, as the time wraps after 71 min: the blocks behind it were wrong
+            decode(turns + sums_before(found))
+        if count:
+            self._wraps += int(found.sum())
+            self._last = int(arrays.t[count - 1 :].numpy()[0]) % 2**32
+        return DeviceEvents(arrays.x, arrays.y, arrays.t, arrays.p)
+
+
 def _layout(version: str) -> Layout:
     """Return the bits of the second word, according to Prophesee's documentation of the format."""
     from amiwarp.kernels.dat import Layout
@@ -74,46 +136,6 @@ def _layout(version: str) -> Layout:
         layout.y_shift = 14
         layout.p_shift = 28
     return layout
-
-
-def _packets(path: Path, offset: int, version: str, origin: int, notes: dict[str, int]) -> Iterator[Packet]:
-    """Yield the events."""
-    layout = _layout(version)
-    last: int | None = None
-    for words in read_words(path, offset, "<u4", PIECE_EVENTS, notes):
-        if not len(words):
-            return
-        events, wrapped = _decoded(words, layout, last)
-        if wrapped:
-            events.t[:] = unwrapped(words[:, 0].astype(np.int64), 32, last)
-        last = int(events.t[-1])
-        if origin:
-            np.add(events.t, origin, out=events.t)
-        yield events
-
-
-def _decoded(words: NDArray[np.uint32], layout: Layout, last: int | None) -> tuple[Events, bool]:
-    """Return the events of some records, and whether a time wraps in them, after ``last`` [us].
-
-    Then the times after it are wrong.
-    """
-    import warp as wp
-
-    from amiwarp.events.device_events import DeviceEvents
-    from amiwarp.kernels.dat import decode_dat
-    from amiwarp.kernels.evt import new_event_arrays
-    from amiwarp.kernels.launch import launch, start_once
-
-    start_once()
-    count = len(words)
-    arrays = new_event_arrays(count, "cpu")
-    before = int(words[0, 0]) if last is None else last
-    blocks = -(-count // BLOCK_EVENTS)
-    wrapped = wp.empty(blocks, dtype=int, device="cpu")
-    flat = wp.array(words.ravel(), dtype=wp.uint32, device="cpu", copy=False)
-    launch(decode_dat, blocks, [flat, BLOCK_EVENTS, layout, before], [arrays, wrapped], device="cpu", smallest=1)
-    events = DeviceEvents(arrays.x, arrays.y, arrays.t, arrays.p).to_host()
-    return events, bool(wrapped.numpy().any())
 
 
 # Writer of DAT files, version 2, of CD events: a header, then 8 bytes for each event.

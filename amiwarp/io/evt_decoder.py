@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import array
-import mmap
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.validation import guarded, one_of, shown
+from amiwarp.io.decoding import words_on
+from amiwarp.validation import guarded, one_of
 
 if TYPE_CHECKING:
     from amiwarp.events.device_events import DeviceEvents
@@ -123,7 +121,8 @@ class EvtDecoder:
         from amiwarp.kernels.launch import launch, load
 
         device = self._device
-        words = self._words(data)
+        word = np.dtype(WORD_TYPES[self._version])
+        words = words_on(device, data, word, "EVT words", f"EVT {self._version}", word.itemsize)
         length = BLOCK_WORDS[device.is_cpu]
         blocks = -(-words.shape[0] // length)
         if self._version == "3.0":
@@ -167,47 +166,3 @@ class EvtDecoder:
         self._state = wp.clone(group_states[groups:])
         found = DeviceEvents(event_arrays.x, event_arrays.y, event_arrays.t, event_arrays.p)
         return found, Triggers(*(getattr(trigger_arrays, one.name).numpy() for one in fields(Triggers)))
-
-    def _words(self, data: Any) -> Any:
-        """Return the words of some data as an array on the device."""
-        import warp as wp
-
-        from amiwarp.events.device_events import import_array
-
-        word = np.dtype(WORD_TYPES[self._version])
-        dtype = wp.dtype_from_numpy(word)
-        if isinstance(data, (bytes, bytearray)):
-            data = np.frombuffer(data, np.uint8)
-        elif isinstance(data, (memoryview, array.array, mmap.mmap)):
-            data = np.asarray(data)
-        if isinstance(data, np.ma.MaskedArray):
-            raise AmiwarpError("EVT words are a masked array; give the words without a mask")
-        if isinstance(data, np.ndarray):
-            self._check(data.shape, data.dtype, word)
-            given = np.ascontiguousarray(data, data.dtype.newbyteorder("<"))
-            words = given.view(word)
-            return wp.array(words, dtype=dtype, device=self._device, copy=not self._device.is_cpu)
-        if not hasattr(data, "__dlpack__") and not isinstance(data, wp.array):
-            raise AmiwarpError(f"EVT words are {shown(data)}; expected bytes or an array")
-        given = import_array(data, "EVT words").to(self._device)
-        self._check(given.shape, np.dtype(wp.dtype_to_numpy(given.dtype)), word)
-        if given.size and given.ptr % word.itemsize:  # a GPU reads no word across its borders
-            given = wp.clone(given)
-        count = given.size * wp.types.type_size_in_bytes(given.dtype) // word.itemsize
-        words = wp.array(ptr=given.ptr, dtype=dtype, shape=count, device=self._device)
-        words._owner = given  # whose memory it is
-        return words
-
-    def _check(self, shape: tuple[int, ...], given: np.dtype[Any], word: np.dtype[Any]) -> None:
-        """Raise :class:`AmiwarpError` for data that are not whole words."""
-        sizes = (1, word.itemsize)
-        if len(shape) != 1 or given.kind not in "iu" or given.itemsize not in sizes:
-            raise AmiwarpError(
-                f"EVT words are {given} of shape {shape}; expected bytes or {word.name} of shape (n,) for EVT "
-                f"{self._version}"
-            )
-        if shape[0] * given.itemsize % word.itemsize:
-            raise AmiwarpError(
-                f"EVT words are {shape[0]} bytes, which end within a word of {word.itemsize} bytes; keep the rest for "
-                "the next call"
-            )

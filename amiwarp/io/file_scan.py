@@ -42,7 +42,25 @@ from amiwarp.validation import check_slice, guarded, rounded_times
 Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
 
-Packet: TypeAlias = Columns | Events
+
+@dataclass(frozen=True, slots=True)
+class Surveyed:
+    """Events whose decoder has also noted what blocks of them hold."""
+
+    events: Events
+    surveys: NDArray[Any] | None
+    """What each block holds, see :class:`amiwarp.kernels.event_order.Survey`; None if the events have been changed."""
+
+    @property
+    def is_in_order(self) -> bool:
+        """Whether no event is earlier than the one before it."""
+        if self.surveys is None:
+            return not bool((self.events.t[1:] < self.events.t[:-1]).any())
+        first = self.surveys["first"]
+        return not self.surveys["falls"].any() and bool((first[1:] >= self.surveys["latest"][:-1]).all())
+
+
+Packet: TypeAlias = Columns | Events | Surveyed
 """Packet of events: arrays x, y [px], t [us] and p (ON if positive) as stored in the file: integers or booleans of one
 shape ``(n,)``. x and y of compensated events are floating. Events of a sensor, whose arrays nobody else holds, are
 checked by a kernel, in less than a tenth of the time."""
@@ -417,7 +435,11 @@ class FileEvents(EventSource):
     def _pass(self, counts: PassCounts) -> Generator[Events, None, None]:
         with errors_name(self.path, counts.position):
             for packet in self._packets(counts.notes):
-                if isinstance(packet, Events) and self._order(packet, counts):
+                surveys = None
+                if isinstance(packet, Surveyed):
+                    surveys = packet.surveys
+                    packet = packet.events
+                if isinstance(packet, Events) and self._order(packet, counts, surveys):
                     yield from (packet[k : k + DEFAULT_BLOCK] for k in range(0, len(packet), DEFAULT_BLOCK))
                     continue
                 if isinstance(packet, Events):  # some lie outside
@@ -429,41 +451,28 @@ class FileEvents(EventSource):
                     if len(block):
                         yield block
 
-    def _order(self, events: Events, counts: PassCounts) -> bool:
+    def _order(self, events: Events, counts: PassCounts, surveys: NDArray[Any] | None) -> bool:
         """Raise times that are out of order, in place, and count the events. Return False if some lie outside.
 
-        It does the same as :meth:`_repair`, which takes those that lie outside.
+        It does the same as :meth:`_repair`, which takes those that lie outside. ``surveys``: what the events hold, if
+        it is known.
         """
-        import warp as wp
-
-        from amiwarp.kernels.event_order import Survey, raise_times, survey_events
-        from amiwarp.kernels.launch import launch, start_once
-
-        start_once()
-
         if not len(events):
             return True
-        x, y, t = (wp.array(each, device="cpu", copy=False) for each in (events.x, events.y, events.t))
-        blocks = -(-len(events) // CHECKED_EVENTS)
-        surveys = wp.empty(blocks, dtype=Survey, device="cpu")
-        launch(survey_events, blocks, [x, y, t, CHECKED_EVENTS], [surveys], device="cpu", smallest=1)
-        found = surveys.numpy()
-        right, bottom = int(found["right"].max()), int(found["bottom"].max())
+        found = _surveys(events) if surveys is None else surveys
+        right = int(found["right"].max())
+        bottom = int(found["bottom"].max())
         width, height = self._size or (LARGEST_SIZE, LARGEST_SIZE)
         if right >= width or bottom >= height:
             return False
         rounded_times(found["latest"])  # which refuses times beyond its limit
         rounded_times(found["first"])
-        floors = np.maximum.accumulate(found["latest"])
         before = counts.t_last if counts.count else int(found["first"][0])
-        floors = np.maximum(np.concatenate([[before], floors[:-1]]), before)
+        floors = np.maximum.accumulate(np.concatenate([[before], found["latest"][:-1]]))
         if found["falls"].any() or (found["first"] < floors).any():
-            raised = wp.empty(blocks, dtype=int, device="cpu")
-            furthest = wp.empty(blocks, dtype=wp.int64, device="cpu")
-            inputs = [CHECKED_EVENTS, wp.array(floors, dtype=wp.int64, device="cpu")]
-            launch(raise_times, blocks, inputs, [t, raised, furthest], device="cpu", smallest=1)
-            counts.late += int(raised.numpy().sum())
-            counts.late_us = max(counts.late_us, int(furthest.numpy().max()))
+            late, late_us = _raise_times(events, before)
+            counts.late += late
+            counts.late_us = max(counts.late_us, late_us)
         counts.t_first = counts.t_first if counts.count else int(events.t[0])
         counts.t_last = int(events.t[-1])
         counts.count += len(events)
@@ -499,6 +508,38 @@ class FileEvents(EventSource):
         return Events(x, y, ordered, np.array(as_polarity(p)))
 
 
+def _surveys(events: Events) -> NDArray[Any]:
+    """Return what blocks of some events hold, see :class:`amiwarp.kernels.event_order.Survey`."""
+    import warp as wp
+
+    from amiwarp.kernels.event_order import Survey, survey_events
+    from amiwarp.kernels.launch import launch, start_once
+
+    start_once()
+    x, y, t = (wp.array(each, device="cpu", copy=False) for each in (events.x, events.y, events.t))
+    blocks = -(-len(events) // CHECKED_EVENTS)
+    surveys = wp.empty(blocks, dtype=Survey, device="cpu")
+    launch(survey_events, blocks, [x, y, t, CHECKED_EVENTS], [surveys], device="cpu", smallest=1)
+    return np.asarray(surveys.numpy())
+
+
+def _raise_times(events: Events, before: int) -> tuple[int, int]:
+    """Raise each time to the largest so far, ``before`` the events [us]. Return how many were, and by how much most."""
+    import warp as wp
+
+    from amiwarp.kernels.event_order import raise_times
+    from amiwarp.kernels.launch import launch
+
+    latest = _surveys(events)["latest"]
+    floors = np.maximum.accumulate(np.concatenate([[before], latest[:-1]]))
+    t = wp.array(events.t, device="cpu", copy=False)
+    raised = wp.empty(latest.size, dtype=int, device="cpu")
+    furthest = wp.empty(latest.size, dtype=wp.int64, device="cpu")
+    inputs = [CHECKED_EVENTS, wp.array(floors, dtype=wp.int64, device="cpu")]
+    launch(raise_times, latest.size, inputs, [t, raised, furthest], device="cpu", smallest=1)
+    return int(raised.numpy().sum()), int(furthest.numpy().max())
+
+
 def _sorted_packets(
     path: Path, packets: Callable[[dict[str, int]], Iterator[Packet]]
 ) -> Callable[[dict[str, int]], Iterator[Packet]]:
@@ -511,6 +552,8 @@ def _sorted_packets(
     count = 0
     with errors_name(path, lambda: f"after {count} events"):
         for packet in packets(counts):
+            if isinstance(packet, Surveyed):
+                packet = packet.events
             columns = (packet.x, packet.y, packet.t, packet.p) if isinstance(packet, Events) else packet
             parts.append(columns)
             count += len(columns[2])

@@ -9,11 +9,9 @@ import warp as wp
 
 from amiwarp.kernels.evt import EventArrays, store_event
 from amiwarp.kernels.native_code import load_uint32
+from amiwarp.kernels.records import wraps_between
 
 wp.set_module_options({"enable_backward": False})
-
-HALF = wp.constant(wp.int64(1 << 31))
-"""Half the range of the time. A larger step is a wrap."""
 
 # What a record is.
 EVENT = wp.constant(0)
@@ -109,16 +107,6 @@ def kind_of(address: wp.uint32, davis: int) -> int:
     if kind == 1 and ((address >> wp.uint32(12)) & wp.uint32(0x7FFFF)) == wp.uint32(0):
         return FRAME
     return OTHER
-
-
-@wp.func
-def wraps_between(last: wp.int64, now: wp.int64) -> int:
-    """Return 1 if the time wraps between two records, -1 if it wraps backwards, else 0."""
-    if last - now > HALF:
-        return 1
-    if now - last > HALF:
-        return -1
-    return 0
 
 
 @wp.func

@@ -4,11 +4,9 @@ import warp as wp
 
 from amiwarp.kernels.evt import EventArrays, store_event
 from amiwarp.kernels.native_code import load_uint32
+from amiwarp.kernels.records import wraps_between
 
 wp.set_module_options({"enable_backward": False})
-
-HALF = wp.constant(wp.int64(1 << 31))
-"""Half the range of the time. A larger step is a wrap."""
 
 
 @wp.struct
@@ -31,28 +29,31 @@ def decode_dat(
     length: int,
     layout: Layout,
     before: wp.int64,
+    turns: wp.array(dtype=int),
     start: int,
     events: EventArrays,
-    wrapped: wp.array(dtype=int),
+    wraps: wp.array(dtype=int),
 ):
-    """Write the events of each block of ``length`` records, as if no time wrapped after the time ``before`` [us].
+    """Write the events of each block of ``length`` records, and count how often the time wraps in it.
 
-    ``wrapped``: 1 for a block in which a time wraps.
+    ``before``: time of the record before all, as stored [us], or -1 if there is none. ``turns``: how often the time has
+    wrapped before each block.
     """
     block = wp.tid() + start
     first = block * length
-    turns = (before >> wp.int64(32)) << wp.int64(32)
-    last = before - turns
+    last = before
     if first > 0:
         last = wp.int64(load_uint32(words, 2 * first - 2))
-    found = int(0)
+    elif before < wp.int64(0):
+        last = wp.int64(load_uint32(words, 0))
+    turn = turns[block]
     for i in range(first, wp.min(first + length, words.shape[0] // 2)):
-        now = wp.int64(load_uint32(words, 2 * i))
+        stored = wp.int64(load_uint32(words, 2 * i))
         rest = int(load_uint32(words, 2 * i + 1))
-        if now - last > HALF or last - now > HALF:
-            found = 1
-        last = now
+        turn += wraps_between(last, stored)
+        last = stored
+        now = stored + (wp.int64(turn) << wp.int64(32))
         column = wp.uint16(rest & layout.x_mask)
         row = wp.uint16((rest >> layout.y_shift) & layout.y_mask)
-        store_event(events, i, column, row, turns + now, wp.uint8((rest >> layout.p_shift) & 1))
-    wrapped[block] = found
+        store_event(events, i, column, row, now, wp.uint8((rest >> layout.p_shift) & 1))
+    wraps[block] = turn - turns[block]

@@ -1,0 +1,66 @@
+"""What decoders of records and packets share: times of 32 bits that wrap, and numbers at any address."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+HALF = wp.constant(wp.int64(1 << 31))
+"""Half the range of a time of 32 bits. A larger step is a wrap."""
+OUTSIDE = wp.constant(wp.int64(-(1 << 62)))
+"""Stands for a number that lies outside of what is read."""
+
+
+@wp.struct
+class Span:
+    """A part of the memory."""
+
+    address: wp.uint64
+    size: wp.int64
+    """Number of bytes."""
+
+
+@wp.func
+def wraps_between(last: wp.int64, now: wp.int64) -> int:
+    """Return 1 if the time wraps between two records, -1 if it wraps backwards, else 0."""
+    if last - now > HALF:
+        return 1
+    if now - last > HALF:
+        return -1
+    return 0
+
+
+@wp.func_native("""
+    const char* from = (const char*)address + at;
+    if (width == 2) { uint16_t part; memcpy(&part, from, 2); return part; }
+    if (is_signed) { int32_t part; memcpy(&part, from, 4); return part; }
+    uint32_t part;
+#ifdef __CUDA_ARCH__
+    if (((uint64_t)from & 3) == 0) return *(const uint32_t*)from;
+#endif
+    memcpy(&part, from, 4);
+    return part;
+""")
+def load_number(address: wp.uint64, at: wp.int64, width: int, is_signed: int) -> wp.int64:
+    """Load a number of 2 or 4 bytes, which may begin at any address."""
+
+
+@wp.func
+def number_at(span: Span, at: wp.int64, width: int, is_signed: int) -> wp.int64:
+    """Return a number of 2 or 4 bytes; :data:`OUTSIDE` if a part of it lies outside the span."""
+    if at < wp.int64(0) or at + wp.int64(width) > span.size:
+        return OUTSIDE
+    return load_number(span.address, at, width, is_signed)
+
+
+@wp.func_native("return (uint64_t)data.data;")
+def address_of(data: wp.array(dtype=wp.uint8)) -> wp.uint64:
+    """Return the address of an array."""
+
+
+@wp.func
+def span_of(data: wp.array(dtype=wp.uint8)) -> Span:
+    """Return the memory of an array."""
+    span = Span()
+    span.address = address_of(data)
+    span.size = wp.int64(data.shape[0])
+    return span
