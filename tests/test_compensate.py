@@ -47,8 +47,8 @@ from amiwarp.cli.app import app
 from amiwarp.events.encoder import TWO_PI
 from amiwarp.events.recording import inside_image
 from amiwarp.io import read_encoder_csv
+from amiwarp.io.evt_writers import Evt3Encoder
 from amiwarp.io.hdf5_files import CHUNK
-from amiwarp.io.prophesee import Evt3Encoder
 from amiwarp.io.ros_bags import PACKET_DEFINITION, opened_bag
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.prism_angle import EncoderParams, encoder_params, theta_u32_at

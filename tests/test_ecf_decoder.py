@@ -11,7 +11,7 @@ import warp as wp
 from amiwarp import AmiwarpError
 from amiwarp.io import ecf
 from amiwarp.kernels import ecf as kernels
-from amiwarp.kernels.evt import new_event_arrays
+from amiwarp.kernels.event_arrays import new_event_arrays
 from amiwarp.kernels.launch import launch
 from reference import ecf_codec
 from reference.ecf_files import ecf_chunk, ecf_events

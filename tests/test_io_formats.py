@@ -36,8 +36,8 @@ from amiwarp import (
 from amiwarp.io import ecf, read_encoder_triggers
 from amiwarp.io import file_scan as scan
 from amiwarp.io.evt_decoder import EvtDecoder
+from amiwarp.io.evt_words import Halves, halves_of, words_of
 from amiwarp.io.export import left_out
-from amiwarp.io.prophesee import Halves, halves_of, words_of
 from amiwarp.io.ros import read_packets
 from amiwarp.io.ros_words import Layout
 from amiwarp.io.ros_writer import _types_of

@@ -31,10 +31,10 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
+from amiwarp.io.evt_writers import Evt3Encoder, Evt21Encoder
 from amiwarp.io.export import export
 from amiwarp.io.formats import LIMITS
 from amiwarp.io.hdf5_files import CHUNK
-from amiwarp.io.prophesee import Evt3Encoder, Evt21Encoder
 from reference.io_samples import SIZE, make_events
 from reference.io_samples_extra import CLIENTS, HOURS_28, Columns, by_dv_processing, by_eventcv, by_words
 

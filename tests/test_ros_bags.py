@@ -17,8 +17,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from amiwarp import AmiwarpError, Events, MemoryEvents, Recording, convert, open_recording, save_recording
-from amiwarp.io import read_encoder_triggers, ros_bags
-from amiwarp.io.prophesee import Halves, halves_of, words_of
+from amiwarp.io import read_encoder_triggers, ros_bags, ros_packed
+from amiwarp.io.evt_words import Halves, halves_of, words_of
 from amiwarp.io.ros_bags import Message
 from amiwarp.io.ros_messages import decode_array
 from amiwarp.io.ros_order import AHEAD, FIRST_NUMBERS, LATE, RESTART, MessageNumbers, Numbered, number_of
@@ -823,9 +823,9 @@ def test_damaged_compressed_bags_are_named_and_leave_no_copy(
     assert "damaged" in message_ or "malformed" in message_
     bomb = zstd(tmp_path / "bomb.db3.zstd", plain + bytes(1 << 26))
     with monkeypatch.context() as patch:
-        patch.setattr(ros_bags, "SMALLEST_LIMIT", len(plain))
-        patch.setattr(ros_bags, "LARGEST_RATIO", 10)
-        patch.setattr(ros_bags, "run", in_this_process)
+        patch.setattr(ros_packed, "SMALLEST_LIMIT", len(plain))
+        patch.setattr(ros_packed, "LARGEST_RATIO", 10)
+        patch.setattr(ros_packed, "run", in_this_process)
         most = max(len(plain), 10 * bomb.stat().st_size)
         text = str(refusal(open_recording, bomb))
     assert f"bomb.db3.zstd unpacks to over {most:,} bytes, too many for its size" in text
@@ -844,8 +844,8 @@ def test_a_full_disk_and_an_interrupt_leave_no_copy(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(ros_bags, "_unpack_file", full)
-        patch.setattr(ros_bags, "run", in_this_process)
+        patch.setattr(ros_packed, "_unpack_file", full)
+        patch.setattr(ros_packed, "run", in_this_process)
         text = str(refusal(open_recording, path))
         assert f"is compressed, and {scratch}" in text
         assert "set TMPDIR to a folder with more space" in text
@@ -855,7 +855,7 @@ def test_a_full_disk_and_an_interrupt_leave_no_copy(
         assert os.listdir(scratch)
         raise KeyboardInterrupt
 
-    for where in ("amiwarp.io.ros_bags.run", "amiwarp.io.ros.run"):
+    for where in ("amiwarp.io.ros_packed.run", "amiwarp.io.ros.run"):
         with monkeypatch.context() as patch:
             patch.setattr(where, interrupted)
             with pytest.raises(KeyboardInterrupt):
@@ -864,12 +864,12 @@ def test_a_full_disk_and_an_interrupt_leave_no_copy(
 
 
 def test_a_compressed_message_that_grows_too_much_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ros_bags, "LARGEST_MESSAGE", 1 << 20)
-    assert ros_bags._unpacked_message(zstandard.compress(bytes(1 << 20))) == bytes(1 << 20)
+    monkeypatch.setattr(ros_packed, "LARGEST_MESSAGE", 1 << 20)
+    assert ros_packed.unpacked_message(zstandard.compress(bytes(1 << 20))) == bytes(1 << 20)
     with pytest.raises(AmiwarpError, match=r"a message unpacks to over 1048576 bytes"):
-        ros_bags._unpacked_message(zstandard.compress(bytes((1 << 20) + 1)))
+        ros_packed.unpacked_message(zstandard.compress(bytes((1 << 20) + 1)))
     with pytest.raises(AmiwarpError, match=r"a compressed message cannot be unpacked"):
-        ros_bags._unpacked_message(b"\x28\xb5\x2f\xfd" + bytes(range(40)))
+        ros_packed.unpacked_message(b"\x28\xb5\x2f\xfd" + bytes(range(40)))
 
 
 # Words of any kind, against a model that reads one word after the other.

@@ -226,8 +226,8 @@ OPENED_OTHERWISE = {
     "amiwarp.io.hdf5_server: h5py.h5f.open(name, how | h5py.h5f.ACC_SWMR_READ, fapl=access)": "reading process",
     "amiwarp.io.hdf5_server: open(path, 'rb')": "reading process",
     "amiwarp.io.ros_bags: open(path, 'rb')": "reading process",
-    "amiwarp.io.ros_bags: open(source, 'rb')": "reading process",
-    "amiwarp.io.ros_bags: open(source / 'metadata.yaml', encoding='utf-8')": "reading process",
+    "amiwarp.io.ros_packed: open(source, 'rb')": "reading process",
+    "amiwarp.io.ros_packed: open(source / 'metadata.yaml', encoding='utf-8')": "reading process",
     "amiwarp.io.ros_bags: bag.open()": "reading process",
     # Files of the system and of the package.
     "amiwarp.io.files: Path('/proc/sys/kernel/random/boot_id').read_text(encoding='ascii')": "system",

@@ -21,7 +21,7 @@ from amiwarp.events.recording import DEFAULT_BLOCK, Events, ImuSamples, Metadata
 from amiwarp.io import file_scan
 from amiwarp.io.aedat2_header import Chip, read_aedat2_header
 from amiwarp.io.aedat2_imu import RANGES, SampleCount, read_ranges, read_samples
-from amiwarp.io.decoding import BLOCK_RECORDS, sums_before
+from amiwarp.io.decoding import BLOCK_RECORDS, new_rows, sums_before
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.files import errors_name
 
@@ -134,7 +134,7 @@ class Aedat2Decoder:
 
         from amiwarp.events.device_events import DeviceEvents
         from amiwarp.kernels import aedat2
-        from amiwarp.kernels.evt import new_event_arrays
+        from amiwarp.kernels.event_arrays import new_event_arrays
         from amiwarp.kernels.launch import launch
 
         device = self._device
@@ -144,7 +144,7 @@ class Aedat2Decoder:
         counts = wp.empty(blocks, dtype=aedat2.Counts, device=device)
         launch(aedat2.survey_aedat2, blocks, inputs, [counts], device=device, smallest=1)
         found = counts.numpy()
-        starts = np.zeros(blocks, aedat2.Start.numpy_dtype())
+        starts = new_rows(blocks, aedat2.Start)
         starts["event"] = sums_before(found["events"])
         starts["edge"] = sums_before(found["edges"])
         starts["imu"] = sums_before(found["imu"])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.decoding import address_of, cut_into_blocks, sums_before
+from amiwarp.io.decoding import address_of, cut_into_blocks, new_rows, sums_before
 from amiwarp.io.file_scan import FileEvents, Packet, only_counted
 from amiwarp.io.files import errors_name, open_input
 
@@ -201,12 +201,12 @@ def decode_packets(
 
     from amiwarp.events.device_events import DeviceEvents
     from amiwarp.kernels import aedat3
-    from amiwarp.kernels.evt import new_event_arrays
+    from amiwarp.kernels.event_arrays import new_event_arrays
     from amiwarp.kernels.launch import launch
 
     device = wp.get_device(device)
     packet, before, held = cut_into_blocks(counts, device)
-    blocks = np.zeros(packet.size, aedat3.Block.numpy_dtype())
+    blocks = new_rows(packet.size, aedat3.Block)
     blocks["address"] = addresses[packet] + (EVENT_BYTES * before).astype(np.uint64)
     blocks["events"] = held
     blocks["base"] = bases[packet]

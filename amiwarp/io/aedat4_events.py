@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.io.decoding import address_of, cut_into_blocks, sums_before
+from amiwarp.io.decoding import address_of, cut_into_blocks, new_rows, sums_before
 
 if TYPE_CHECKING:
     from amiwarp.events.device_events import DeviceEvents
@@ -33,7 +33,7 @@ def packets_in_memory(contents: list[bytes]) -> NDArray[Any]:
     """Return where some packets lie in memory. They must be kept as long as this is used."""
     from amiwarp.kernels.records import Span
 
-    packets = np.zeros(len(contents), Span.numpy_dtype())
+    packets = new_rows(len(contents), Span)
     packets["address"] = [address_of(content) for content in contents]
     packets["size"] = [len(content) for content in contents]
     return packets
@@ -59,8 +59,8 @@ def decode_packets(packets: NDArray[Any], device: Any) -> PacketEvents:
 
     from amiwarp.events.device_events import DeviceEvents
     from amiwarp.kernels import aedat4
+    from amiwarp.kernels.event_arrays import new_event_arrays
     from amiwarp.kernels.event_order import Survey
-    from amiwarp.kernels.evt import new_event_arrays
     from amiwarp.kernels.launch import launch
 
     device = wp.get_device(device)
@@ -69,7 +69,7 @@ def decode_packets(packets: NDArray[Any], device: Any) -> PacketEvents:
 
     present = np.maximum(counts, 0)
     packet, before, held = cut_into_blocks(present, device)
-    blocks = np.zeros(packet.size, aedat4.Block.numpy_dtype())
+    blocks = new_rows(packet.size, aedat4.Block)
     first = places["start"][packet] + EVENT_BYTES * before
     blocks["address"] = packets["address"][packet] + first.astype(np.uint64)
     blocks["count"] = held

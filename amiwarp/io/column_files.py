@@ -29,7 +29,6 @@ from amiwarp.io.columns import SAMPLE, Column, Hints, Layout
 from amiwarp.io.file_scan import SENSORS, FileEvents, Packet
 from amiwarp.io.files import errors_name, input_path, open_input
 from amiwarp.io.plain_files import Array, array_header, is_of_kind, lengths, next_rows, open_any_array, open_array
-from amiwarp.io.reading_process import packets, run_with_arrays
 
 Pieces: TypeAlias = Callable[[tuple[int, ...], dict[str, int]], Iterator[tuple[NDArray[Any], ...]]]
 """Function that yields pieces of the columns with these indices, and notes how much of the file it has read."""
@@ -272,44 +271,3 @@ def _fields_table(array: Array, opened: Opened, name: str) -> Table:
 
     promised = any(column.name == "t" and column.values.dtype.kind in "iu" for column in columns)
     return Table(columns, pieces, Hints(unit="us" if promised else None))
-
-
-# HDF5, MATLAB and Parquet.
-
-SERVER = "amiwarp.io.table_server"
-"""Name of the module that runs in the reading process."""
-
-
-SERVED = {"hdf5": "the HDF5 file", "mat": "the MATLAB file", "parquet": "the Parquet table"}
-"""Kinds of files that the reading process reads, for messages."""
-
-
-def open_hdf5_columns(path: Path, given: GivenLayout) -> Recording:
-    """Open an HDF5 file with datasets, records or a table of events."""
-    return _open_served(path, "hdf5", given)
-
-
-def open_mat(path: Path, given: GivenLayout) -> Recording:
-    """Open a MATLAB file with arrays, a structure or a table of events. Its arrays are read as a whole."""
-    return _open_served(path, "mat", given)
-
-
-def open_parquet(path: Path, given: GivenLayout) -> Recording:
-    """Open a Parquet table of events."""
-    return _open_served(path, "parquet", given)
-
-
-def _open_served(path: Path, kind: str, given: GivenLayout) -> Recording:
-    """Open a file of events that the reading process reads."""
-    source = path.absolute()
-    with errors_name(path, lambda: f"finding events in {SERVED[kind]}"):
-        about, head = run_with_arrays(f"{SERVER}:head_of", source, kind, given.columns)
-    columns = [
-        Column(name, values, unit) for name, values, unit in zip(about["names"], head, about["units"], strict=True)
-    ]
-
-    def pieces(chosen: tuple[int, ...], notes: dict[str, int]) -> Iterator[tuple[NDArray[Any], ...]]:
-        return packets(f"{SERVER}:read_columns", source, kind, given.columns, list(chosen), notes)
-
-    size = about["size"] and tuple(about["size"])
-    return open_table(path, kind, Table(columns, pieces, size=size), given)

@@ -94,7 +94,7 @@ class DatDecoder:
 
         from amiwarp.events.device_events import DeviceEvents
         from amiwarp.kernels.dat import decode_dat
-        from amiwarp.kernels.evt import new_event_arrays
+        from amiwarp.kernels.event_arrays import new_event_arrays
         from amiwarp.kernels.launch import launch
 
         device = self._device

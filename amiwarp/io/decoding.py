@@ -28,6 +28,11 @@ def address_of(data: bytes) -> int:
     return int(np.frombuffer(data, np.uint8).ctypes.data)
 
 
+def new_rows(count: int, struct: Any) -> NDArray[Any]:
+    """Return rows of the fields of a Warp struct, all 0."""
+    return np.zeros(count, struct.numpy_dtype())
+
+
 def cut_into_blocks(
     counts: NDArray[np.int64], device: Any
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

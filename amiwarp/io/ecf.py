@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.decoding import sums_before
+from amiwarp.io.decoding import new_rows, sums_before
 from amiwarp.io.file_scan import Columns, Packet
 from amiwarp.io.reading_process import packets
 
@@ -83,12 +83,12 @@ def decode_chunks(
 
     from amiwarp.events.device_events import DeviceEvents
     from amiwarp.kernels import ecf
-    from amiwarp.kernels.evt import new_event_arrays
+    from amiwarp.kernels.event_arrays import new_event_arrays
     from amiwarp.kernels.launch import launch, start_once
 
     start_once()
     values = np.frombuffer(data, np.uint8)
-    chunks = np.zeros(len(sizes), ecf.Chunk.numpy_dtype())
+    chunks = new_rows(len(sizes), ecf.Chunk)
     at = 0
     for chunk, size in zip(chunks, sizes, strict=True):
         head, chunk["origin"] = _read_head(values[at : at + size])
@@ -117,7 +117,7 @@ def _read_head(chunk: NDArray[np.uint8]) -> tuple[int, int]:
     """Return number of events with packing, and first time [us], of a chunk."""
     if chunk.size < HEAD.size:
         raise AmiwarpError("a chunk of the ECF codec lacks its head; the file is damaged")
-    head, origin = HEAD.unpack_from(chunk)
+    head, origin = HEAD.unpack_from(chunk.data)
     count = head >> 2
     if count > MOST_EVENTS or chunk.size > MOST_BYTES:
         raise AmiwarpError(

@@ -41,8 +41,8 @@ def _packets(path: Path, atis: bool, height: int, notes: dict[str, int]) -> Iter
     """Yield the events."""
     import warp as wp
 
+    from amiwarp.kernels.event_arrays import new_event_arrays
     from amiwarp.kernels.event_stream import EVENT_BYTES, Progress, decode_stream
-    from amiwarp.kernels.evt import new_event_arrays
     from amiwarp.kernels.launch import load, start_once
 
     start_once()

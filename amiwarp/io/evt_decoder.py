@@ -118,6 +118,7 @@ class EvtDecoder:
 
         from amiwarp.events.device_events import DeviceEvents
         from amiwarp.kernels import evt, evt2, evt3
+        from amiwarp.kernels.event_arrays import new_event_arrays
         from amiwarp.kernels.launch import launch, load
 
         device = self._device
@@ -156,7 +157,7 @@ class EvtDecoder:
         events, edges = int(total["event"]), int(total["trigger"])
         self._untimed += int(total["untimed"])
         self._unknown += int(total["unknown"])
-        event_arrays = evt.new_event_arrays(events, device)
+        event_arrays = new_event_arrays(events, device)
         trigger_arrays = evt.TriggerArrays()
         trigger_arrays.channel = wp.empty(edges, dtype=wp.uint8, device=device)
         trigger_arrays.t = wp.empty(edges, dtype=wp.int64, device=device)

@@ -24,7 +24,8 @@ from amiwarp.io.column_options import GivenLayout
 from amiwarp.io.file_scan import GivenSource, given_source
 from amiwarp.io.files import check_regular, errors_name, name_kind, note_folders, open_input
 from amiwarp.io.json_files import read_json
-from amiwarp.io.ros_bags import MCAP, ROS1, SQLITE, ZSTANDARD, packed_head
+from amiwarp.io.ros_bags import MCAP, ROS1, SQLITE
+from amiwarp.io.ros_packed import ZSTANDARD, packed_head
 from amiwarp.io.text_rows import HEAD_BYTES, looks_like_text, why_no_rows
 from amiwarp.io.text_size import read_size
 from amiwarp.optics.camera import LARGEST_SIZE
@@ -105,8 +106,8 @@ OPENERS = {
     Format.TEXT: "text_files:open_text",
     Format.NPZ: "column_files:open_npz",
     Format.NPY: "column_files:open_npy",
-    Format.MAT: "column_files:open_mat",
-    Format.PARQUET: "column_files:open_parquet",
+    Format.MAT: "served_columns:open_mat",
+    Format.PARQUET: "served_columns:open_parquet",
     Format.EVIMO: "plain_files:open_evimo",
     Format.BIN: "plain_files:open_bin",
 }
@@ -510,8 +511,8 @@ LIMITS = {
 
 WRITERS = {
     OutputFormat.DSEC: "native_format:write_dsec",
-    OutputFormat.EVT3: "prophesee:write_evt3",
-    OutputFormat.EVT21: "prophesee:write_evt21",
+    OutputFormat.EVT3: "evt_writers:write_evt3",
+    OutputFormat.EVT21: "evt_writers:write_evt21",
     OutputFormat.DAT: "dat:write_dat",
     OutputFormat.AEDAT4: "aedat4_writer:write_aedat4",
     OutputFormat.NPZ: "plain_files:write_npz",

@@ -36,7 +36,7 @@ from amiwarp.events.truth import (
     WorldLabels,
     check_truth,
 )
-from amiwarp.io import column_files, hdf5_files
+from amiwarp.io import hdf5_files, served_columns
 from amiwarp.io.column_options import GivenLayout
 from amiwarp.io.column_units import are_microseconds
 from amiwarp.io.columns import SAMPLE, is_plain_polarity
@@ -195,7 +195,7 @@ def open_hdf5(path: Path, topic: str | None, given: GivenLayout) -> Recording:
                 raise AmiwarpError(f"{path}: is amiwarp's own format, whose layout is fixed; leave out {given.options}")
             if file.layout == "columns" or given != GivenLayout() or _has_other_values(file):
                 file.close()
-                return column_files.open_hdf5_columns(path, given)
+                return served_columns.open_hdf5_columns(path, given)
             if file.layout in ("mvsec", "ecf"):
                 file.close()
                 return hdf5_files.open_rows(path, file.layout, file.group)

@@ -30,11 +30,12 @@ from amiwarp.io.ros_bags import (
     note_unread,
     opened_bag,
     typestore,
-    unpacked,
 )
+from amiwarp.io.ros_events import edge_packets, event_packets, stamp_packets
 from amiwarp.io.ros_messages import Columns, decode_array, decode_packet, truncated_bytes
 from amiwarp.io.ros_order import Placed, in_order, note_largest_gap, numbered
-from amiwarp.io.ros_words import EVT, Layout, edge_packets, event_packets, layout_of, stamp_packets
+from amiwarp.io.ros_packed import unpacked
+from amiwarp.io.ros_words import EVT, Layout, layout_of
 
 SENSORS = "amiwarp.io.ros_sensors"
 """Name of the module that reads the messages of other sensors, in the reading process."""

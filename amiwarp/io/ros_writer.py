@@ -25,13 +25,14 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import optional_module
 from amiwarp.events.recording import Events, regroup
+from amiwarp.io.evt_writers import Evt3Encoder
 from amiwarp.io.files import scratch_folder
 from amiwarp.io.formats import Bag, Outline, origin_of
-from amiwarp.io.prophesee import Evt3Encoder
 from amiwarp.io.reading_process import packets, run
 from amiwarp.io.ros import event_topic, read_others, read_topics
-from amiwarp.io.ros_bags import PACKET_DEFINITION, unpacked
+from amiwarp.io.ros_bags import PACKET_DEFINITION
 from amiwarp.io.ros_messages import PACKED
+from amiwarp.io.ros_packed import unpacked
 
 # ROS 2: packets in EVT 3.0.
 

@@ -7,8 +7,8 @@ writes the events and notes what they are. One thread reads one packet, or a par
 
 import warp as wp
 
+from amiwarp.kernels.event_arrays import EventArrays
 from amiwarp.kernels.event_order import Survey, count_falls, largest_coordinate, latest_time
-from amiwarp.kernels.evt import EventArrays
 from amiwarp.kernels.native_code import load_int64
 from amiwarp.kernels.records import OUTSIDE, Span, number_at, span_of
 

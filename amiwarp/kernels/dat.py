@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from amiwarp.kernels.evt import EventArrays, store_event
+from amiwarp.kernels.event_arrays import EventArrays, store_event
 from amiwarp.kernels.native_code import load_uint32
 from amiwarp.kernels.records import wraps_between
 

@@ -6,7 +6,7 @@ https://github.com/neuromorphic-paris/event_stream.
 
 import warp as wp
 
-from amiwarp.kernels.evt import EventArrays, store_event
+from amiwarp.kernels.event_arrays import EventArrays, store_event
 
 wp.set_module_options({"enable_backward": False})
 

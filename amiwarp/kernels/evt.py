@@ -10,10 +10,9 @@ and :mod:`amiwarp.kernels.evt3`.
 The words are described at https://docs.prophesee.ai/stable/data/encoding_formats/index.html.
 """
 
-from typing import Any
-
-import numpy as np
 import warp as wp
+
+from amiwarp import evt_types
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,11 +21,8 @@ NONE = wp.constant(-1)
 LARGEST = wp.constant(65535)
 """Largest coordinate that can be stored [px]."""
 
-# Types of words in all versions, in their upper four bits.
-TIME_HIGH = wp.constant(0x8)
-"""Upper bits of the time."""
-TRIGGER = wp.constant(0xA)
-"""Edge of an external trigger."""
+TIME_HIGH = wp.constant(evt_types.TIME_HIGH)
+TRIGGER = wp.constant(evt_types.TRIGGER)
 
 
 @wp.struct
@@ -90,38 +86,6 @@ class Place:
 
 
 @wp.struct
-class EventArrays:
-    """Decoded events."""
-
-    x: wp.array(dtype=wp.uint16)
-    """Columns [px]."""
-    y: wp.array(dtype=wp.uint16)
-    """Rows [px]."""
-    t: wp.array(dtype=wp.int64)
-    """Times [us]."""
-    p: wp.array(dtype=wp.uint8)
-    """Polarities: 1 is ON."""
-
-
-def new_event_arrays(count: int, device: Any) -> Any:
-    """Return :class:`EventArrays` for a number of events, without values, on a device."""
-
-    def empty(dtype: Any) -> Any:
-        if not wp.get_device(device).is_cpu:
-            return wp.empty(count, dtype=dtype, device=device)
-        # NumPy asks for large pages, with which memory is there in half of the time.
-        values = np.empty(count, wp.dtype_to_numpy(dtype))
-        return wp.array(values, dtype=dtype, device=device, copy=False)
-
-    arrays = EventArrays()
-    arrays.x = empty(wp.uint16)
-    arrays.y = empty(wp.uint16)
-    arrays.t = empty(wp.int64)
-    arrays.p = empty(wp.uint8)
-    return arrays
-
-
-@wp.struct
 class TriggerArrays:
     """Decoded edges of external triggers."""
 
@@ -155,16 +119,6 @@ def unchanged() -> Change:
 """)
 def lowest_bit(mask: wp.uint32) -> int:
     """Return the position of the lowest set bit of a mask that is not 0."""
-
-
-@wp.func_native("""
-    ((uint16_t*)events.x.data)[i] = column;
-    ((uint16_t*)events.y.data)[i] = row;
-    ((int64_t*)events.t.data)[i] = now;
-    ((uint8_t*)events.p.data)[i] = polarity;
-""")
-def store_event(events: EventArrays, i: int, column: wp.uint16, row: wp.uint16, now: wp.int64, polarity: wp.uint8):
-    """Store event ``i`` in contiguous arrays."""
 
 
 @wp.func

@@ -8,27 +8,26 @@ from typing import Any
 
 import warp as wp
 
+from amiwarp import evt_types
+from amiwarp.kernels.event_arrays import EventArrays, store_event
 from amiwarp.kernels.evt import (
     NONE,
     TIME_HIGH,
     TRIGGER,
     Change,
-    EventArrays,
     Place,
     State,
     TriggerArrays,
     lowest_bit,
     step_of,
-    store_event,
     unchanged,
 )
 
 wp.set_module_options({"enable_backward": False})
 
-ON = wp.constant(0x1)
-"""Type of a change detection ON. OFF is 0."""
-TYPES = wp.constant(0b1100_0101_0000_0011)
-"""Types that EVT 2.0 and 2.1 define, a bit for each: those above, and words for other uses (0xE, 0xF)."""
+ON = wp.constant(evt_types.ON)
+TYPES = wp.constant(sum(1 << kind for kind in evt_types.EVT2))
+"""Types that EVT 2.0 and 2.1 define, a bit for each."""
 
 
 @wp.func

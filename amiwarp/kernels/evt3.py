@@ -7,33 +7,31 @@ words and searches for the last one of each type, in loops that CPU compilers ve
 
 import warp as wp
 
+from amiwarp import evt_types
+from amiwarp.kernels.event_arrays import EventArrays, store_event
 from amiwarp.kernels.evt import (
     LARGEST,
     NONE,
     TIME_HIGH,
     TRIGGER,
     Change,
-    EventArrays,
     Place,
     State,
     TriggerArrays,
     lowest_bit,
     step_of,
-    store_event,
     unchanged,
 )
 from amiwarp.kernels.native_code import load_uint16
 
 wp.set_module_options({"enable_backward": False})
 
-# Types of words, in their upper four bits.
-ROW = wp.constant(0x0)
-SINGLE = wp.constant(0x2)
-VECTOR_BASE = wp.constant(0x3)
-VECTOR_12 = wp.constant(0x4)
-VECTOR_8 = wp.constant(0x5)
-TIME_LOW = wp.constant(0x6)
-
+ROW = wp.constant(evt_types.ROW)
+SINGLE = wp.constant(evt_types.SINGLE)
+VECTOR_BASE = wp.constant(evt_types.VECTOR_BASE)
+VECTOR_12 = wp.constant(evt_types.VECTOR_12)
+VECTOR_8 = wp.constant(evt_types.VECTOR_8)
+TIME_LOW = wp.constant(evt_types.TIME_LOW)
 
 # Counts of 16 bits, in parts of so few words that they do not overflow: CPU compilers make the widest vectors of them.
 
