@@ -13,7 +13,7 @@ from amiwarp.io.aedat2 import Aedat2Decoder
 from amiwarp.io.aedat2_header import CHIPS
 from amiwarp.io.dat import DatDecoder
 from amiwarp.io.decoding import words_on
-from amiwarp.validation import guarded, one_of
+from amiwarp.validation import guarded, instance, one_of
 
 if TYPE_CHECKING:
     from amiwarp.events.device_events import DeviceEvents
@@ -74,7 +74,7 @@ class BytesDecoder:
         if self._format in ("dat1", "dat2"):
             self._dat = DatDecoder(self._format[-1], self._device)
         elif chip is not None:
-            self._aedat2 = Aedat2Decoder(CHIPS[one_of(chip.lower(), CHIPS, "chip")], self._device)
+            self._aedat2 = Aedat2Decoder(CHIPS[one_of(instance(chip, str, "chip").lower(), CHIPS, "chip")], self._device)
         self._source: int | None = None
 
     def decode(self, data: Any) -> DeviceEvents:
