@@ -1213,6 +1213,7 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     width, height = events.size
 
     status: Any = SimpleNamespace(silence="", encoder_silence="", age_s=0.012, lag_s=0.0, turn_share=1.0, segment=1)
+    status.recorder = SimpleNamespace(text="", problem="")
     status.status = SimpleNamespace(rate_mev_s=1.25, dropped=3, late=0)
 
     class Stream(LiveSource):
@@ -1289,6 +1290,39 @@ def test_a_stream_that_goes_on_does_not_disturb_what_is_computed_of_it(
     until(lambda: asked[0] > shown + 20)
     assert page.locator("#message").count() == 0
     assert tabs.panels[-1].state.message == ""
+
+
+def test_a_live_stream_is_recorded_to_a_new_file(
+    opened: Open, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "stream.h5").write_bytes(b"mine")
+    events, encoder, size = recording.events.slice(0, len(recording.events)), recording.encoder, recording.events.size
+    assert encoder is not None
+    named = SimpleNamespace(size=size, camera=recording.camera, prism=recording.prism, name="stream", encoders=1)
+    ring = RecentEvents(named)  # type: ignore[arg-type]
+
+    def arrive(start_us: int, stop_us: int) -> None:
+        first, last = np.searchsorted(encoder.t, (start_us, stop_us))
+        ring.append_encoder(encoder.t[first:last], encoder.angle[first:last])
+        ring.append(events[(events.t >= start_us) & (events.t < stop_us)])
+
+    arrive(0, 150_000)
+    live = LiveSource(ring, [])
+    page = opened(of=live(), latest=live)
+    page.locator("#do-record").click()
+    message(page, "recording to ")
+    page.locator("#do-record").filter(has_text="stop recording").wait_for()
+    arrive(150_000, 250_000)
+    count = int(((events.t >= 150_000) & (events.t < 250_000)).sum())
+    page.locator("#live dd").filter(has_text=f"stream-1.h5: {count:,} events").wait_for()
+    page.locator("#do-record").click()
+    message(page, f"stream-1.h5: {count:,} events")
+    page.locator("#do-record").filter(has_text=re.compile("^record$")).wait_for()
+    found = open_recording(tmp_path / "stream-1.h5")
+    assert len(found.events) == count
+    assert found.encoder is not None
+    assert (tmp_path / "stream.h5").read_bytes() == b"mine"
 
 
 def test_a_live_stream_comes_back_after_its_source_was_restarted(

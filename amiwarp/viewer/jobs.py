@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import math
 import re
 import weakref
@@ -319,11 +320,22 @@ FILM_SIZE = (1280, 560)
 """Width and height of a film [px]."""
 
 
+def file_stem(recording: str) -> str:
+    """Return the name of a recording or of a stream, as file names may have it."""
+    return re.sub(r"[^\w.+=@-]+", "_", recording)[:60].strip("._-~ ") or "recording"
+
+
 def download_name(recording: str, what: str) -> str:
     """Return the file name of a download. ``recording``: name of the recording, which may be that of a stream."""
-    name = re.sub(r"[^\w.+=@-]+", "_", recording)[:60].strip("._-~ ") or "recording"
-    suffix = EXPORTS[what][1]
+    name, suffix = file_stem(recording), EXPORTS[what][1]
     return f"{name}{suffix}" if suffix == f".{what}" else f"{name}.{what}{suffix}"
+
+
+def unused_path(name: str) -> Path:
+    """Return a path in the current folder with this name, or with a number after it, that no file has."""
+    path = Path(name)
+    names = (path.with_stem(f"{path.stem}-{k}") if k else path for k in itertools.count())
+    return next(each for each in names if not (each.exists() or each.with_name(f"{each.stem}.part.h5").exists()))
 
 
 def write_film(

@@ -375,7 +375,7 @@ CALLS = (
     "key", "released", "choose", "slide", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline", "undo", "redo",
     "reset", "restore", "answer", "keep_b", "swap_b", "export", "open_file", "use_card", "end_film",
-    "list_hot",
+    "list_hot", "record",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {
@@ -398,7 +398,7 @@ EMPTY: tuple[tuple[Any, str], ...] = (
     (b"", "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off orbit "
           "column"),
     (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
-            "difference has_b calibrating same_scale"),
+            "difference has_b calibrating same_scale recording"),
     (None, "overview before after surface image_scale after_scale marked hot_rows"),
     ((), "live_rows updating titles against_choices old steps beside_rows"),
     (0, "fixed_count"),

@@ -492,11 +492,27 @@ class Panel(layout.Actions):
             await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
 
+    def record(self) -> None:
+        """Save a live stream from now on to a new file in the current folder of the server, or finish the file."""
+        if isinstance(self.inspector.latest, LiveSource):
+            self.start_job(self._record(self.inspector.latest))
+
+    async def _record(self, source: LiveSource) -> None:
+        with self.errors_shown("recording"):
+            if source.is_recording:
+                self.say(f"saved {await self.in_thread(source.stop_recording)}", "success")
+            else:
+                path = jobs.unused_path(f"{jobs.file_stem(self.inspector.recording.name)}.h5")
+                await self.in_thread(source.record, path.resolve())
+                self.say(f"recording to {path.resolve()} until you press stop, or the stream or the command ends")
+        self.state.flush()
+
     async def _watch(self, source: LiveSource) -> None:
         """Show the figures of a live stream, also while it is not followed, until the page is closed."""
         while True:
             with self.state as state:
                 state.live_rows, state.stream_note = source.figures()
+                state.recording = source.is_recording
             await asyncio.sleep(FOLLOW_S)
 
     def _clock_us(self, time_ms: float) -> int:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -32,6 +33,7 @@ from amiwarp.live.link.link import Link, LinkUpdate
 from amiwarp.live.queues import BackgroundWorker, EventSorter, PacketQueue, Policy
 from amiwarp.live.stream.adaptive import SpeedKeeper
 from amiwarp.live.stream.packets import NO_TIMES, Packet, Source
+from amiwarp.live.stream.recorder import StreamRecorder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import NominalPrism
 
@@ -840,6 +842,8 @@ Encoder samples have a memory limit of the same size.
 """
 LONGEST_WAIT_S = 10.0
 """Longest time for which events are kept that are newer than all encoder samples [s]."""
+SEEN_US = 20_000
+"""Time before the first recorded event from which encoder samples are recorded [us]."""
 LATE_S = 2.0
 """Lag of the events from which it is said [s]."""
 SILENT_S = 1.0
@@ -860,6 +864,9 @@ class RecentEvents:
         self._samples = tuple(deque[tuple[NDArray[np.int64], NDArray[np.float64]]]() for _ in range(2))
         """Times and angles of the samples of both encoders."""
         self._encoders = source.encoders
+        self._metadata = {"recorded_from": source.name, **getattr(source, "metadata", {})}
+        self.recorder = StreamRecorder(self._writer)
+        """What saves the stream to a file, see :meth:`record`."""
         self.event_bytes = self.sample_bytes = 0
         """Memory of the kept events and of the kept encoder samples [bytes]."""
         self.turn_share = 0.0
@@ -876,9 +883,29 @@ class RecentEvents:
         self._delay_us = self._least_delay_us = 0.0
         self._lock = threading.Lock()
 
+    def record(self, path: Path) -> None:
+        """Save what the stream delivers from now on to a new file, which ``self.recorder.stop`` finishes.
+
+        Encoder samples of events that are late have come already; they are saved too. Raises :class:`AmiwarpError` if
+        a recording runs already, or the file cannot be made.
+        """
+        with self._lock:
+            since = int(self._events[-1].t[-1]) - SEEN_US if self._events else -(2**62)
+            known = [(bool(k), (t[t >= since], angle[t >= since])) for k in range(2) for t, angle in self._samples[k]]
+            self.recorder.start(path, [(second, pair) for second, pair in known if len(pair[0])])
+
+    def _writer(self, path: Path) -> LiveWriter:
+        width, height = self._size
+        encoders = 1 if self.link is not None else max(self._encoders, 1)
+        return LiveWriter(
+            path, width=width, height=height, camera=self._camera, prism=self._prism, metadata=self._metadata,
+            encoders=encoders,
+        )  # fmt: skip
+
     def append(self, events: Events) -> None:
         """Append events, in order of time."""
         with self._lock:
+            self.recorder.append(events)
             self._arrived_s = time.monotonic()
             newest = int(events.t[-1])
             self._delay_us = 1e6 * self._arrived_s - newest
@@ -893,7 +920,12 @@ class RecentEvents:
                 self.event_bytes -= held_bytes(self._events.popleft())
 
     def append_encoder(
-        self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None, *, second: bool = False
+        self,
+        t_us: NDArray[np.int64],
+        angle: NDArray[np.float64],
+        index_t_us: NDArray[np.int64] | None = None,
+        *,
+        second: bool = False,
     ) -> None:
         """Append samples of the first or second encoder in order of time, on the events' clock.
 
@@ -902,6 +934,8 @@ class RecentEvents:
         if len(t_us):
             with self._lock:
                 self._sampled_s = time.monotonic()
+                pulses = NO_TIMES if index_t_us is None else index_t_us
+                self.recorder.append_encoder(t_us, angle, pulses, second=second)
                 samples = self._samples[second]
                 samples.append((t_us, angle))
                 self.sample_bytes += OVERHEAD + t_us.nbytes + angle.nbytes
@@ -913,7 +947,8 @@ class RecentEvents:
                     self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
 
     def restart(self) -> None:
-        """Forget all events and encoder samples: those that follow may be on another clock."""
+        """Forget all events and encoder samples: those that follow may be on another clock, and end a recording."""
+        self.recorder.stop("the source was opened again, and its times count anew; record again")
         with self._lock:
             self._events.clear()
             for samples in self._samples:
@@ -953,7 +988,8 @@ class RecentEvents:
         return _silence("encoder samples", time.monotonic() - self._sampled_s)
 
     def tick(self) -> None:
-        """Do nothing, because no data wait to be written."""
+        """Write what waits to be recorded."""
+        self.recorder.tick()
 
     def recording(self) -> Recording | None:
         """Return the kept events that the encoder covers, as a recording; None if they are shorter than one turn.
@@ -1030,6 +1066,22 @@ class LiveSource:
         self._last = self._recent.recording() or self._last
         return self._last
 
+    def record(self, path: Path) -> None:
+        """Save what the stream delivers from now on to a new file.
+
+        Raises :class:`AmiwarpError` if a recording runs already, or the file cannot be made.
+        """
+        self._recent.record(path)
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether the stream is being saved."""
+        return bool(self._recent.recorder.text)
+
+    def stop_recording(self) -> str:
+        """Finish the recording, and return a text about it; empty if there is none."""
+        return self._recent.recorder.stop()
+
     def figures(self) -> tuple[list[list[str]], str]:
         """Return figures of this moment, as rows of name, value and "bad", and what is wrong; empty if nothing is.
 
@@ -1054,6 +1106,9 @@ class LiveSource:
             ("speed of the prism", speed if fresh else f"{speed}, last measured", rpm is None or not fresh),
             ("lost events", f"{status.dropped:,}", status.dropped), ("out of order", f"{status.late:,}", status.late),
         ]  # fmt: skip
+        if recent.recorder.text or recent.recorder.problem:
+            words = recent.recorder.text or f"ended: {recent.recorder.problem}"
+            rows.append(("recording", words, not recent.recorder.text))
         if recent.segment > 1:
             rows.append(("segment", f"{recent.segment}, since the source came back", False))
         if said and not problem:
@@ -1140,3 +1195,4 @@ def followed(
         over.set()
         stop.set()
         thread.join()
+        recent.recorder.stop()
