@@ -208,9 +208,14 @@ def test_images_of_frequencies_and_of_decay(plain: Recording) -> None:
     assert images.scale.low < 100.0 < images.scale.high
     assert images.note.startswith("100 Hz: ")
     latest, decayed = (make_images(made, kind, decay_us=20_000) for kind in (ImageKind.TIME_SURFACE, ImageKind.DECAY))
-    length_ms = made.loaded.span.length_us * 1e-3
+    length_ms = (made.recording.events.t_last - made.recording.events.t_first) * 1e-3
     np.testing.assert_allclose(decayed.after, np.exp((latest.after - length_ms) / 20.0), rtol=1e-5)
     assert decayed.scale.label == "exp(-age / 20 ms) [1]"
+    made.open(100_000, 500_000)  # longer than the rest of the recording
+    assert np.nanmax(make_images(made, ImageKind.DECAY, decay_us=20_000).after) > 0.95
+    made.open(100_000, 50_000)
+    latest, decayed = (make_images(made, kind, decay_us=20_000) for kind in (ImageKind.TIME_SURFACE, ImageKind.DECAY))
+    np.testing.assert_allclose(decayed.after, np.exp((latest.after - 50.0) / 20.0), rtol=1e-5)
 
 
 def test_behind_a_prism_the_frequency_is_at_the_compensated_pixels(texture: np.ndarray) -> None:

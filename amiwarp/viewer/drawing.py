@@ -257,8 +257,7 @@ def make_images(
         scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, ON_BLACK)
         return ShownImages(before, after, scale)
     if kind is ImageKind.DECAY:
-        ages = (w.span.length_us * 1e-3 - _time_surface(i, w, k)[top:bottom, left:right] for i, w, k in pair)
-        before, after = (np.exp(-age / (decay_us * 1e-3)).astype(np.float32) for age in ages)
+        before, after = (_decayed(*each, decay_us)[top:bottom, left:right] for each in pair)
         scale = Scale(f"exp(-age / {decay_us * 1e-3:g} ms)", "1", 0.0, 1.0, "inferno")
         return ShownImages(before, after, scale)
     if kind is ImageKind.FREQUENCY:
@@ -289,6 +288,17 @@ def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | Non
     latest = latest_times(window.counted, *inspector.recording.events.size, per_polarity=False, model=model,
                           encoder=encoder, device=inspector.device)  # fmt: skip
     return np.where(latest < window.span.start_us, np.nan, (latest - window.span.start_us) * 1e-3).astype(np.float32)
+
+
+def _decayed(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None, decay_us: int) -> NDArray[np.float32]:
+    """Return exp(-age / decay time) of the latest event of each pixel; NaN without events.
+
+    The age is that at the end of the window, or at the last event of a recording that ends before.
+    """
+    span, last_us = window.span, inspector.recording.events.t_last
+    end_ms = min(span.length_us, last_us - span.start_us) * 1e-3
+    age_ms = end_ms - _time_surface(inspector, window, knobs)
+    return np.exp(-age_ms / (decay_us * 1e-3)).astype(np.float32)
 
 
 def _frequencies(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:

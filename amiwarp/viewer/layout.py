@@ -394,7 +394,7 @@ CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice", "sliced", "marked",
 """State variables that the browser keeps to itself."""
 EMPTY: tuple[tuple[Any, str], ...] = (
     ("", "trame_error_report_msg stream_note hover measured address events drawn sharpness message rate_note "
-         "picked_text image_note against_title b_text busy found"),
+         "picked_text image_note against_title after_title b_text busy found"),
     (b"", "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off orbit "
           "column"),
     (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "

@@ -91,6 +91,7 @@ class Panel(layout.Actions):
         self._made_for: dict[str, Any] = {}  # window and selection of which the slow parts of the page are, by name
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._rates: EventRates
+        self._rates_first_us = 0
         self._progress = JobProgress(self._show_progress)  # of the latest calibration or film
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
         use_page(server, self._folder.name)
@@ -520,8 +521,9 @@ class Panel(layout.Actions):
 
     async def _count_events(self) -> None:
         """Count the recording's events in the background, for the timeline."""
-        rates, finished = EventRates(self.inspector.recording.events), False
-        self._rates = rates
+        source = self.inspector.recording.events
+        rates, finished = EventRates(source), False
+        self._rates, self._rates_first_us = rates, source.t_first
         while not finished and rates is self._rates:
             finished = await self.in_thread(rates.fill, STEP_S)
             with self.state:
@@ -529,7 +531,11 @@ class Panel(layout.Actions):
 
     def _show_rates(self) -> None:
         start_ms, end_ms = self.state.rate_span
-        _, rates = self._rates.curve(self._clock_us(start_ms), self._clock_us(end_ms), BINS)
+        first_us = (
+            self._rates_first_us
+        )  # of a live stream, the counted events may be a second older than the shown ones
+        ends_us = (first_us + round(1e3 * each) for each in (start_ms, end_ms))
+        _, rates = self._rates.curve(*ends_us, BINS)
         off, on, share = *map(drawing.float_bytes, rates), self._rates.share
         note = "" if share >= 1.0 else f"counting events: {100.0 * share:.0f} %"
         self.state.update({"rate_on": on, "rate_off": off, "rate_note": note})
@@ -871,8 +877,20 @@ class Panel(layout.Actions):
             "drawn": drawing.drawn_text(shown), "count": shown.span.count,
             "sharpness": drawing.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
             "picked_text": "" if self._picked < 0 else drawing.event_text(shown, self._picked),
+            "after_title": self._after_title(shown),
             "against_title": drawing.against_title(self.inspector, left), "against_choices": self._against_choices(),
         }  # fmt: skip
+
+    def _after_title(self, shown: DisplayedWindow) -> str:
+        """Return the title of the second image."""
+        name = self.inspector.recording.name
+        if self.image is ImageKind.DEPTH:
+            return "depth map"
+        if not self.compensates:
+            return "region" if shown.beside is None else f"{name}, as recorded"
+        if shown.beside is not None:
+            return f"{name}, compensated"
+        return "difference" if self.state.difference and self.image is ImageKind.COUNT else "compensated"
 
     def _images(self, shown: DisplayedWindow, inspector: Inspector | None = None) -> dict[str, Any]:
         """Return the state variables of the images of the region, or why there are none."""
