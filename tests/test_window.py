@@ -10,17 +10,24 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+import pyvista
+from scipy.spatial import ConvexHull
 
 from amiwarp import AmiwarpError, Camera, DepthMap, Encoder, Events, MemoryEvents, Plate, Prism, Recording, simulate
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
-from amiwarp.plotting.colours import GREY, depth_image
+from amiwarp.plotting.colours import GREY, depth_image, ticks
+from amiwarp.plotting.meshes import Box
 from amiwarp.viewer import jobs, layout
-from amiwarp.viewer.drawing import RECORDED, Look, orbit_lines
+from amiwarp.viewer.axes import CORNERS, CloudAxes, Label, projected, tick_texts, view_matrix
+from amiwarp.viewer.drawing import DECAY_US, RECORDED, ImageKind, Look, make_images, orbit_lines
+from amiwarp.viewer.filters import step_rows
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector
+from amiwarp.viewer.texts import font
 from amiwarp.viewer.window import Window
 from amiwarp.viewer.window_charts import Chart
-from amiwarp.viewer.window_keys import MORE_KEYS, OF_PLAIN
+from amiwarp.viewer.window_keys import MORE_KEYS, OF_OPTICS, OF_PLAIN
+from amiwarp.viewer.window_layout import Rect, first_size, places
 from amiwarp.viewer.window_sheets import PANEL_COLOURS
 
 SIZE = (900, 600)
@@ -668,3 +675,581 @@ def test_an_empty_window_at_the_start_is_an_error(recording: Recording) -> None:
     inspector.window = recording.events.t_last + 1_000, 1_000
     with pytest.raises(AmiwarpError, match="take another window"):
         Window(inspector, size=SIZE, off_screen=True)
+
+
+# The mouse on sliders, images and timeline, as a hand moves it
+
+
+def strike(window: Window, *places: tuple[float, float], shift: bool = False) -> None:
+    """Press the left button at a place, move the mouse over others, release it at the last one, and draw."""
+    first, *others = [(round(x), round(y)) for x, y in places]
+    mouse(window, "LeftButtonPress", first, shift=shift)
+    for place in others:
+        mouse(window, "MouseMove", place, shift=shift)
+    mouse(window, "LeftButtonRelease", (others or [first])[-1], shift=shift)
+    assert window.turn()
+
+
+def settle(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the window do all that it does when nothing moves."""
+    with monkeypatch.context() as patch:
+        patch.setattr("amiwarp.viewer.window.REST_S", 0.0)
+        while window.turn():
+            pass
+
+
+def changed(window: Window, before: np.ndarray, rect: Rect) -> float:
+    """Return the share of the pixels of a part of the window that differ from a picture before."""
+    differs = (window.scene.picture() != before).any(axis=2)[::-1]
+    return float(differs[round(rect.low) : round(rect.top), round(rect.left) : round(rect.right)].mean())
+
+
+def test_the_handle_of_a_slider_follows_the_mouse(window: Window) -> None:
+    slider, camera = window.sliders["apex"], window.scene._views[0].camera.position
+    x, y = slider.column(), 0.5 * (slider.track.low + slider.track.top)
+    picture, places = window.scene.picture(), window.places
+    strike(window, (x + 2, y), (x + 12, y), (x + 42, y + 100))  # the mouse is not on the middle, and leaves the slider
+    expected = slider.least + (x + 40 - slider.track.left) / slider.track.width * (slider.most - slider.least)
+    assert math.degrees(window.inspector.knobs.apex) == pytest.approx(expected, abs=slider.step)
+    assert slider.column() == pytest.approx(x + 40, abs=1.5)
+    check(window)
+    assert changed(window, picture, places.clouds) > 0.001
+    assert changed(window, picture, places.images) > 0.01
+    assert window.scene._views[0].camera.position == camera
+    knobs = window.inspector.knobs
+    mouse(window, "MouseMove", (round(x), round(y)))  # the button is no longer pressed
+    window.turn()
+    assert window.inspector.knobs == knobs
+    strike(window, (slider.track.left + 0.25 * slider.track.width, y))  # a click beside the handle
+    quarter = slider.least + 0.25 * (slider.most - slider.least)
+    assert math.degrees(window.inspector.knobs.apex) == pytest.approx(quarter, abs=0.02)
+    now = math.degrees(window.inspector.knobs.apex)
+    mouse(window, "MouseWheelForward", (round(x), round(y)))
+    window.turn()
+    assert math.degrees(window.inspector.knobs.apex) == pytest.approx(now + slider.step, abs=1e-6)
+    for _ in range(3):  # the wheel, the click, and the drag, each in one step
+        window.key("z")
+        window.turn()
+    assert math.degrees(window.inspector.knobs.apex) == pytest.approx(1.2, abs=1e-6)
+
+
+def test_each_slider_is_under_its_own_title(window: Window) -> None:
+    """The mouse takes the slider that it is on, from the first to the last one."""
+    for name in list(window.sliders):
+        slider = window.sliders[name]
+        values = {each: window.sliders[each].value for each in window.sliders if each not in ("length_ms", "start_ms")}
+        strike(window, (slider.column(), slider.track.low), (slider.column() + 15, slider.track.low))
+        moved = {each for each, value in values.items() if window.sliders[each].value != value}
+        assert moved == {name} - {"start_ms", "length_ms"}, name
+    assert window.time_window == window.inspector.window
+
+
+def test_a_region_is_drawn_on_the_first_image(window: Window) -> None:
+    window.whole()
+    window.turn()
+    frame, size = window.sheets.images.frames[0], window.inspector.recording.events.size
+    picture, places = window.scene.picture(), window.places
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return frame.left + x / size[0] * frame.width, frame.top - y / size[1] * frame.height
+
+    mouse(window, "LeftButtonPress", tuple(map(round, place(20.5, 10.5))))
+    mouse(window, "MouseMove", tuple(map(round, place(60.5, 50.5))))
+    assert window.turn()
+    assert window.sheets.images._region_text() == "x 20 to 60, y 10 to 50 px"
+    assert changed(window, picture, frame) > 0.02  # the region is drawn while the mouse moves
+    assert changed(window, picture, places.clouds) == 0.0
+    mouse(window, "MouseMove", tuple(map(round, place(80.5, 70.5))))
+    mouse(window, "LeftButtonRelease", tuple(map(round, place(80.5, 70.5))))
+    assert window.turn()
+    assert window.shown.region == (20, 10, 81, 71)
+    assert window.inspector.selection.region == (20, 10, 81, 71)
+    assert changed(window, picture, places.clouds) > 0.01
+    check(window)
+    left, top, right, bottom = window.shown.region  # a region of a region, from its lower right corner on
+    frame, (width, height) = window.sheets.images.frames[1], (right - left, bottom - top)
+    corners = (frame.left + 40.5 / width * frame.width, frame.top - 30.5 / height * frame.height)
+    strike(window, corners, (frame.left - 50, frame.top + 50))
+    assert window.shown.region == (left, top, left + 41, top + 31)
+    strike(window, (frame.left + 20, frame.top - 20), (frame.left + 21, frame.top - 21))  # no more than a click
+    assert window.shown.region == (left, top, left + 41, top + 31)
+    window.key("z")
+    window.turn()
+    assert window.shown.region == (20, 10, 81, 71)
+    window.key("w")
+    window.turn()
+    assert window.shown.region == (0, 0, *size)
+    window.key("e")
+    window.turn()
+    assert window.inspector.selection.region == window.inspector.suggest_region()
+
+
+def test_the_mouse_reads_the_values_of_both_images(window: Window) -> None:
+    window.whole()
+    window.turn()
+    row, shown = window.sheets.images, window.shown
+    y, x = np.unravel_index(np.argmax(shown.image_after), shown.image_after.shape)
+    width, height = window.inspector.recording.events.size
+    for frame in row.frames:
+        at = frame.left + (x + 0.5) / width * frame.width, frame.top - (y + 0.5) / height * frame.height
+        mouse(window, "MouseMove", (round(at[0]), round(at[1])))
+        assert window.turn()
+        before, after = shown.image_before[y, x], shown.image_after[y, x]
+        assert row._under == f"x {x}, y {y} px: {before:g} events → {after:g} events"
+    mouse(window, "MouseMove", (round(row.frames[0].left), round(row.frames[0].top) + 5))
+    assert window.turn()
+    assert row._under == ""
+
+
+def test_the_images_are_those_of_the_page(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each kind has the values of the inspector, in the colours of its scale; what is around is paper."""
+    kinds = []
+    for _ in range(12):
+        kinds.append((window.image, window.difference))
+        settle(window, monkeypatch)
+        images = make_images(window.inspector, window.image, difference=window.difference)
+        row = window.sheets.images
+        for k, (values, scale) in enumerate(
+            ((images.before, images.scale), (images.after, images.after_scale or images.scale))
+        ):
+            if values is None:
+                assert row.panels[k].values is None
+                continue
+            np.testing.assert_array_equal(row.panels[k].values, values)
+            assert row.panels[k].scale == scale
+            frame = row.frames[k]
+            seen = window.scene.picture()[::-1][int(frame.low) : int(frame.top), int(frame.left) : int(frame.right)]
+            rgb = scale.rgb(values)
+            corners = [(0, 0), (0, -1), (-1, 0), (-1, -1)]
+            assert all((seen[::-1][corner] == rgb[corner]).all() for corner in corners), (window.image, k)
+        window.key("g")
+        assert window.turn()
+        if (window.image, window.difference) == kinds[0]:
+            break
+    names = {kind for kind, _ in kinds}
+    assert names == set(ImageKind) - {ImageKind.DEPTH}
+    assert (ImageKind.COUNT, True) in kinds
+    frame = window.sheets.images.frames[0]
+    beside = window.scene.picture()[::-1][int(frame.low) + 5, int(frame.left) - 4]
+    assert (beside == 255).all()  # not black, which means no events
+
+
+def test_the_kind_of_images_is_undone_and_set_by_a_state(window: Window) -> None:
+    window.key("g")
+    window.turn()
+    assert window.image is ImageKind.POLARITY
+    assert window.history is not None
+    assert window.history.state.image is ImageKind.POLARITY
+    window.key("z")
+    window.turn()
+    assert window.image is ImageKind.COUNT
+    state = replace(window.history.state, difference=True, axis=Axis.TIME, view=View.XY, decay_us=500)
+    window.show_state(state)
+    window.request("knobs")
+    window.turn()
+    assert window.difference
+    assert window.remember("").state == state
+    assert layout.decode_state(
+        layout.encode_state(state, window.history.first), window.history.first,
+        size=window.inspector.recording.events.size, duration_us=window.whole_us,
+    ) == (state, ())  # fmt: skip
+
+
+def test_brightness_stays_while_a_slider_moves(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    window.slide("apex", 0.2)
+    settle(window, monkeypatch)
+    slider, first = window.sliders["apex"], window.sheets.images.panels[1].scale
+    x, y = round(slider.column()), round(slider.track.low)
+    mouse(window, "LeftButtonPress", (x, y))
+    for step in (20, 40, 60):
+        mouse(window, "MouseMove", (x + step, y))
+        window.turn()
+        assert window.sheets.images.panels[1].scale == first
+    monkeypatch.setattr("amiwarp.viewer.window.REST_S", 0.0)
+    assert not window.turn()  # while the button is pressed, it does not rest
+    assert window.sheets.images.panels[1].scale == first
+    mouse(window, "LeftButtonRelease", (x + 60, y))
+    settle(window, monkeypatch)
+    now = window.sheets.images.panels[1].scale
+    assert now == make_images(window.inspector, ImageKind.COUNT).scale != first
+
+
+def test_the_timeline_moves_resizes_and_zooms(
+    window: Window, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settle(window, monkeypatch)
+    line, first = window.sheets.timeline, recording.events.t_first
+    y = 0.5 * (line.rect.low + line.rect.top)
+    start, length = line.window
+    px_us = line.column_of(1000.0) - line.column_of(0.0)  # pixels of a millisecond
+    middle = line.column_of(start + 0.5 * length)
+    camera = window.scene._views[0].camera.position
+    strike(window, (middle, y), (middle + 5 * px_us, y), (middle + 10 * px_us, y + 300))
+    assert window.inspector.window == (pytest.approx(first + start + 10_000, abs=500), length)
+    check(window)
+    assert window.scene._views[0].camera.position == camera
+    start, _ = line.window
+    strike(window, (line.column_of(start), y), (line.column_of(start + 20_000), y))
+    assert window.inspector.window == (
+        pytest.approx(first + start + 20_000, abs=500), pytest.approx(length - 20_000, abs=500),
+    )  # fmt: skip
+    end = sum(line.window)
+    strike(window, (line.column_of(end), y), (line.column_of(end + 8_000), y))
+    assert sum(line.window) == pytest.approx(end + 8_000, abs=500)
+    assert line.window[0] == pytest.approx(start + 20_000, abs=500)
+    strike(window, (line.column_of(200_000), y))  # a click moves the middle there
+    assert line.window[0] + 0.5 * line.window[1] == pytest.approx(200_000, abs=600)
+    before, picture = line.span, window.scene.picture()
+    at = line.column_of(100_000)
+    mouse(window, "MouseWheelForward", (round(at), round(y)))
+    assert window.turn()
+    assert line.span[1] - line.span[0] == pytest.approx((before[1] - before[0]) / 1.25)
+    assert line.column_of(100_000) == pytest.approx(at, abs=1.0)
+    assert changed(window, picture, window.places.timeline) > 0.005
+    assert changed(window, picture, window.places.clouds) == 0.0
+    for _ in range(4):
+        mouse(window, "MouseWheelForward", (round(at), round(y)))
+        window.turn()
+    shown, held = line.span, line.time_at(at)
+    strike(window, (at, y), (at + 60, y), shift=True)
+    assert line.span[1] - line.span[0] == pytest.approx(shown[1] - shown[0])
+    assert line.time_at(at + 60) == pytest.approx(held, abs=200)
+    for _ in range(9):
+        mouse(window, "MouseWheelBackward", (round(at), round(y)))
+        window.turn()
+    assert line.span == (0.0, window.whole_us)
+
+
+def test_the_timeline_has_the_rates_of_the_recording(
+    window: Window, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settle(window, monkeypatch)
+    line, e = window.sheets.timeline, recording.events.slice(0, len(recording.events))
+    seconds = np.diff(line.edges) * 1e-6
+    counts = (line.rates * seconds).sum(axis=1)
+    np.testing.assert_allclose(counts, [np.count_nonzero(e.p == 0), np.count_nonzero(e.p == 1)])
+    k = 120
+    inside = (e.t - recording.events.t_first >= line.edges[k]) & (e.t - recording.events.t_first < line.edges[k + 1])
+    np.testing.assert_allclose(
+        line.rates[:, k] * seconds[k], [np.sum(inside & (e.p == 0)), np.sum(inside & (e.p == 1))]
+    )
+
+
+def test_the_timeline_follows_a_window_that_leaves_it(window: Window) -> None:
+    line = window.sheets.timeline
+    line.span = 0.0, 50_000.0
+    drag(window, "length_ms", 10.0)
+    drag(window, "start_ms", 150.0)
+    low, high = line.span
+    assert low < 155_000 < high
+    assert high - low == 50_000.0
+
+
+# Layout, texts and axes
+
+
+def test_the_first_size_fits_the_screen() -> None:
+    assert first_size((1920, 1080)) == (1500, 950)
+    assert first_size((1366, 768)) == (1366, 698)
+    assert first_size((1280, 1024)) == (1280, 950)
+
+
+@pytest.mark.parametrize("size", [(900, 600), (1366, 698), (1500, 950), (2560, 1400)])
+def test_the_parts_of_the_window_lie_beside_each_other(size: tuple[int, int]) -> None:
+    for compensates in (True, False):
+        for statistics in (True, False):
+            p = places(size, compensates=compensates, statistics=statistics)
+            parts = [p.column, p.clouds, p.images, p.timeline]
+            parts += [p.charts] if compensates else []
+            parts += [p.side] if statistics else []
+            assert sum(part.width * part.height for part in parts) == pytest.approx(size[0] * size[1])
+            for k, one in enumerate(parts):
+                assert min(one.left, one.low) >= 0.0
+                assert one.right <= size[0]
+                assert one.top <= size[1]
+                for other in parts[:k]:
+                    across = min(one.right, other.right) - max(one.left, other.left)
+                    up = min(one.top, other.top) - max(one.low, other.low)
+                    assert min(across, up) <= 1e-6
+    fonts = [places((round(s * 1500), round(s * 950)), compensates=True, statistics=False).font_px for s in (0.5, 1, 2)]
+    assert fonts == [10, 12, 24]
+
+
+def texts_of(window: Window) -> list[tuple[str, tuple[float, float, float, float], tuple[int, int]]]:
+    """Return each visible text, its left, right, low and top in its renderer, and the size of that [px]."""
+    found = []
+    for renderer in window.plotter.renderers:
+        if not renderer.GetDraw() or min(renderer.GetSize()) < 2:
+            continue
+        for prop in renderer.GetViewProps():
+            if prop.IsA("vtkTextActor") and prop.GetVisibility() and prop.GetInput():
+                box = [0.0] * 4
+                prop.GetBoundingBox(renderer, box)  # from its place on
+                x, y = prop.GetPositionCoordinate().GetComputedViewportValue(renderer)
+                around = (x + box[0], x + box[1], y + box[2], y + box[3])
+                found.append((prop.GetInput(), around, renderer.GetSize()))
+    return found
+
+
+@pytest.mark.parametrize("size", [(900, 600), (1366, 698), (1500, 950)])
+@pytest.mark.parametrize("plain", [False, True])
+def test_no_text_is_cut_off(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], plain: bool
+) -> None:
+    """Also help, statistics, long notes, and texts after the window has got another size; in one font."""
+    shown = replace(recording, encoder=None, prism=None, truth=None) if plain else recording
+    window = Window(Inspector(shown), size=(1200, 800), off_screen=True)
+    settle(window, monkeypatch)
+    picture = window.scene.picture()
+    window.plotter.window_size = size
+    assert window.turn()
+    assert window.places.size == size
+    for keys in ((), ("i",), ("h",), ("k", "g"), ("k", "k", "g", "d"), ("2",), ("x", "g")):
+        for key in keys:
+            window.key(key)
+        settle(window, monkeypatch)
+        picture = window.scene.picture()
+        assert picture.shape[:2] == size[::-1]
+        texts = texts_of(window)
+        assert len(texts) > 20
+        for text, (left, right, low, top), (width, height) in texts:
+            assert left >= -1, (keys, text)
+            assert low >= -2, (keys, text)
+            assert right <= width + 1, (keys, text)
+            assert top <= height + 2, (keys, text)
+    fonts = {
+        prop.GetTextProperty().GetFontFile()
+        for renderer in window.plotter.renderers
+        for prop in renderer.GetViewProps()
+        if prop.IsA("vtkTextActor")
+    }
+    assert fonts == {str(font())}
+    window.scene.close()
+
+
+@pytest.mark.parametrize("elevation", [-70, -20, 15, 80])
+def test_labels_of_the_axes_are_outside_of_the_box(elevation: int) -> None:
+    """From each side, they are outside of the box in the picture, without overlaps, on the right edges."""
+    plotter = pyvista.Plotter(off_screen=True, window_size=[500, 400])
+    box, camera = Box(20, 30, 140, 120, 0.0, 360.0), plotter.renderer.camera
+    plotter.add_mesh(pyvista.Box((20, 140, -120, -30, 0, box.axis_height)), render=False, reset_camera=False)
+    axes, middle = CloudAxes(plotter.renderer), np.array([80.0, -75.0, 0.5 * box.axis_height])
+    axes.label(box, ("x", "y", "θ"), "black", 12)
+    camera.focal_point, camera.up, camera.view_angle = middle, (0.0, 0.0, 1.0), 30.0
+    ends = np.array([(20, 140), (-120, -30), (0, box.axis_height)])
+    for azimuth in range(0, 360, 24):
+        a, e = math.radians(azimuth), math.radians(elevation)
+        away = np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+        camera.position = tuple(middle + 450.0 * away)
+        labels = axes.labels()
+        corners, _ = projected(
+            np.take_along_axis(ends.T, CORNERS, axis=0), view_matrix(plotter.renderer), plotter.window_size
+        )
+        check_labels(labels, corners, least={"x", "y", "θ"} if abs(elevation) < 70 else {"x", "y"})
+    plotter.close()
+
+
+def check_labels(labels: list[Label], corners: np.ndarray, least: set[str]) -> None:
+    """Labels are outside of the box, apart, and those of an axis at an edge of the outline that is parallel to it.
+
+    ``corners``: those of the box in the picture [px]; ``least``: titles that are there.
+    """
+    hull = ConvexHull(corners)
+    outline = {frozenset(simplex) for simplex in hull.simplices.tolist()}
+    assert {label.text for label in labels} >= least
+    for k, label in enumerate(labels):
+        assert (hull.equations @ [*label.place, 1.0]).max() > 4.0, label  # beyond a side of the outline
+        for other in labels[:k]:
+            apart = np.abs(np.subtract(label.place, other.place))
+            assert apart[0] > 0.4 * 12 or apart[1] > 0.9 * 12, (label, other)
+        if label.text in ("x", "y", "θ"):
+            axis = "xyθ".index(label.text)
+            starts = np.flatnonzero(CORNERS[:, axis] == 0)
+            stops = starts + (4, 2, 1)[axis]
+            away = np.linalg.norm(0.5 * (corners[starts] + corners[stops]) - label.place, axis=1)
+            nearest = int(np.argmin(away))
+            assert frozenset((starts[nearest], stops[nearest])) in outline, label
+
+
+def test_numbers_of_the_axes_are_where_their_values_are(window: Window) -> None:
+    window.key("2")
+    window.turn()
+    scene, box = window.scene, window.scene.box
+    labels = scene._axes[0].labels()
+    renderer = scene._views[0]
+    for label in labels:
+        if not label.text.isdigit():
+            continue
+        ends = np.array([[float(label.text), -box.bottom, 0.0], [box.left, -float(label.text), 0.0]])
+        (at_x, at_y), _ = projected(ends, view_matrix(renderer), renderer.GetSize())
+        below = abs(label.place[0] - at_x[0]) < 1.0 and 0.0 < at_x[1] - label.place[1] < 30.0
+        beside = abs(label.place[1] - at_y[1]) < 1.0 and 0.0 < at_y[0] - label.place[0] < 50.0
+        assert below or beside, label
+    assert {"x [px]", "y [px]"} <= {label.text for label in labels}
+    assert "θ [°]" not in {label.text for label in labels}  # along which the camera looks
+
+
+def test_points_are_as_large_as_pixels_in_the_image(window: Window) -> None:
+    """So that an area with an event at each pixel has no gaps, and no point covers its neighbours."""
+    window.whole()
+    window.key("2")
+    window.turn()
+    renderer, camera = window.scene._views[0], window.scene._views[0].camera
+    pixel_px = renderer.GetSize()[1] / (2.0 * camera.parallel_scale)
+    assert window.scene._clouds[0].prop.point_size == pytest.approx(pixel_px)
+    window.key("plus")
+    window.turn()
+    assert window.scene._clouds[0].prop.point_size == pytest.approx(1.5 * pixel_px)
+    window.key("1")
+    window.turn()
+    assert window.scene._clouds[0].prop.point_size == 3.0
+
+
+def test_a_chart_has_two_numbers_at_each_axis(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    settle(window, monkeypatch)
+    for name in ("apex", "phase", "orbit"):
+        drawn = chart(window, name)
+        for low, high in (drawn.x_range, drawn.y_range):
+            values = ticks(low, high, 4 if high == 360.0 else 3)
+            assert len(values) >= 2, name
+            assert len(set(tick_texts(values.tolist()))) == len(values)
+        for curve in drawn.curves:
+            if len(curve.y):
+                assert drawn.y_range[0] <= curve.y.min() <= curve.y.max() <= drawn.y_range[1]
+
+
+def test_numbers_have_the_decimals_that_they_need() -> None:
+    assert tick_texts([0.5, 1.0, 1.5]) == ["0.5", "1.0", "1.5"]
+    assert tick_texts([0.0, 90.0, 180.0]) == ["0", "90", "180"]
+    assert tick_texts([100_000.25, 100_000.5]) == ["100000.25", "100000.50"]
+    assert tick_texts([-0.0, 0.1]) == ["0.0", "0.1"]
+
+
+def test_while_the_camera_moves_only_the_clouds_are_drawn(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    settle(window, monkeypatch)
+    window.key("h")
+    window.turn()
+    drawn: list[set[str]] = []
+    names = {window.sheets.strip.renderer: "strip", window.sheets.column.renderer: "column",
+             window.sheets.help.renderer: "help", window.scene._views[0]: "cloud"}  # fmt: skip
+    for renderer, name in names.items():
+        renderer.AddObserver("StartEvent", lambda *_, name=name: drawn[-1].add(name))
+    x, y = nine_places(window)[0]  # below the help
+    mouse(window, "LeftButtonPress", (x, y))
+    window.plotter.iren.interactor.EnableRenderOff()  # as while the window handles the events of a display
+    for step in (5, 10):
+        drawn.append(set())
+        mouse(window, "MouseMove", (x + step, y))
+        assert window.turn()
+        window.plotter.iren.interactor.EnableRenderOff()
+    assert drawn == [{"cloud", "help"}] * 2  # the help lies over the clouds
+    drawn.append(set())
+    mouse(window, "LeftButtonRelease", (x + 10, y))
+    window.key("d")
+    assert window.turn()
+    assert drawn[-1] == {"cloud", "help", "strip", "column"}
+
+
+# Plain recordings
+
+
+@pytest.fixture
+def plain(recording: Recording) -> Iterator[Window]:
+    made = Window(Inspector(replace(recording, encoder=None, prism=None, truth=None)), size=SIZE, off_screen=True)
+    yield made
+    made.scene.close()
+
+
+def test_a_plain_recording_has_no_keys_of_a_prism(plain: Window) -> None:
+    keys = {key for key, _ in plain.sheets.help_rows}
+    assert not keys & OF_OPTICS
+    assert "x" in keys
+    assert not any("prism" in words for key, words in plain.sheets.help_rows if key != "x")
+    knobs, look = plain.inspector.knobs, plain.look
+    for key in ("t", "m", "c", "b", "v"):
+        plain.key(key)
+        plain.turn()
+        assert "with a prism; x: set a prism" in said(plain)
+    assert (plain.inspector.knobs, plain.look) == (knobs, look)
+    assert plain.b is None
+    plain.key("x")
+    plain.turn()
+    assert {key for key, _ in plain.sheets.help_rows} >= OF_OPTICS
+    plain.key("t")  # there is still no motion, and so no angle
+    plain.turn()
+    assert plain.look.axis is Axis.TIME
+
+
+def test_steps_and_playing_keep_the_number_of_events(plain: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain.key("comma")
+    plain.turn()
+    count = plain.inspector.fixed_count
+    assert count is not None
+    assert f"({count:,} events)" in plain.sliders["length_ms"].title
+    assert plain.shown.span.count == pytest.approx(count, abs=5)
+    before, lengths = plain.inspector.window, set()
+    assert before is not None
+    for key in ("Right", "Right", "Left"):
+        plain.key(key)
+        plain.turn()
+        assert plain.inspector.window is not None
+        assert plain.shown.span.count == pytest.approx(count, abs=5)
+        lengths.add(plain.inspector.window[1])
+    assert len(lengths) > 1
+    assert plain.inspector.window[0] == pytest.approx(sum(before), abs=3)  # from the end of the first window on
+    plain.key("space")
+    plain._played_s -= 0.1
+    plain.turn()
+    assert plain.shown.span.count == pytest.approx(count, abs=5)
+    plain.key("space")
+    line = plain.sheets.timeline
+    y, end = 0.5 * (line.rect.low + line.rect.top), sum(line.window)
+    strike(plain, (line.column_of(end), y), (line.column_of(end) + 20, y))  # sets a length again
+    assert plain.inspector.fixed_count is None
+    length = plain.time_window[1]
+    plain.key("Left")
+    plain.turn()
+    assert plain.time_window[1] == length
+
+
+def test_filters_say_the_rates_before_and_after_them(plain: Window) -> None:
+    everything = plain.shown.selected
+    plain.key("j")
+    plain.turn()
+    assert plain.inspector.selection.noise_us == 2_000
+    assert plain.shown.selected < everything
+    rows = step_rows(plain.shown.steps, plain.shown.read_us)
+    assert [f"{name}: {rates}" for name, _, rates, _ in rows] == plain.sheets.controls.texts[1 : 1 + len(rows)]
+    assert rows
+    plain.key("j")
+    plain.key("u")
+    plain.turn()
+    assert plain.inspector.selection.noise_us is None
+    assert plain.inspector.selection.hide_hot
+    plain.key("bracketleft")
+    plain.turn()
+    assert plain.image is ImageKind.DECAY
+    assert plain.decay_us == DECAY_US // 2
+    plain.key("bracketright")
+    plain.turn()
+    assert plain.decay_us == DECAY_US
+
+
+def test_a_plain_recording_has_the_whole_image_beside_a_region(plain: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    settle(plain, monkeypatch)
+    assert plain.statistics_shown  # where a recording with a prism has its charts
+    assert len(plain.sheets.images.panels) == 1
+    plain.draw_region((20, 10, 80, 70))
+    plain.turn()
+    whole, part = plain.sheets.images.panels
+    events = plain.shown.span.events
+    expected = np.zeros((90, 120))
+    np.add.at(expected, (events.y, events.x), 1)
+    np.testing.assert_array_equal(whole.values, expected)
+    np.testing.assert_array_equal(part.values, expected[10:70, 20:80])
+    frame = plain.sheets.images.frames[0]
+    places_of = [
+        (frame.left + x / 120 * frame.width, frame.top - y / 90 * frame.height) for x, y in ((5.5, 5.5), (40.5, 50.5))
+    ]
+    strike(plain, *places_of)  # on the whole image, also beyond the region
+    assert plain.shown.region == (5, 5, 41, 51)

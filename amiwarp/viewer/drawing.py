@@ -50,7 +50,7 @@ from amiwarp.validation import choice
 from amiwarp.viewer.axes import CloudAxes, projected, view_matrix
 from amiwarp.viewer.filters import rate_text
 from amiwarp.viewer.inspector import DisplayedWindow, DrawnTruth, Inspector, Knobs, LoadedWindow, colours_on_offer
-from amiwarp.viewer.texts import FONT_PX, VTK_FONT_FILE, font, label_actor, text_actor, text_width
+from amiwarp.viewer.texts import FONT_PX, VTK_FONT_FILE, fitting_font, font, label_actor, text_actor, text_width
 
 if TYPE_CHECKING:
     import pyvista
@@ -808,7 +808,6 @@ class Scene:
             return
         self._area, self.font_px, self._size = area, font_px, size
         self._explained, self._framed = (), None
-        self._caption.prop.font_size = font_px
         self._divide(self._strip, overlaid=self._overlaid)
         if self._clouds:
             self.look_from(self.view, look)
@@ -946,7 +945,7 @@ class Scene:
         """Draw the legend in a strip on the left, and the caption below. The clouds shrink to make room."""
         ink, camera = BACKGROUND_AND_INK[look.dark][1], self._views[0].camera
         home = self.plotter.renderers[2]
-        width, height = self.plotter.render_window.GetSize()
+        whole_px = width, height = self.plotter.render_window.GetSize()
         height = round(height * (self._area[3] - self._area[1]))
         bar = scale_of(shown, look.colour, dark=look.dark)
         rows = legend_of(shown.truth, look.colour, max(LEAST_ROWS, min(MOST_ROWS, height // ROW_PX)))
@@ -955,7 +954,7 @@ class Scene:
             rows = (*rows, (GREY, look.titles[0]))
         title = [] if bar is None else [bar.label]
         strip = strip_share([*title, *(text for _, text in rows)], width, self.font_px)
-        foot = FOOT_PX * self.font_px / FONT_PX / self.plotter.render_window.GetSize()[1] * bool(caption)
+        foot = FOOT_PX * self.font_px / FONT_PX / whole_px[1] * bool(caption)
         if (strip, foot) != (self._strip, self._foot):
             whole = self._area[2] - self._area[0]
             grows = (whole - self._strip) / (whole - strip)
@@ -964,7 +963,9 @@ class Scene:
             camera.Dolly(1.0 / grows)
             camera.parallel_scale *= grows
             self._views[0].reset_camera_clipping_range()
+        room_px = 0.98 * whole_px[0] * (self._area[2] - self._area[0])
         self._caption.input, self._caption.prop.color = caption, ink
+        self._caption.prop.font_size = fitting_font(caption, room_px, self.font_px)
         explained = rows, ink, bar
         if self._explained == explained:
             return

@@ -8,8 +8,8 @@ from typing import Any
 
 FONT_PX = 12
 """Size of the font in a picture [px]. A window sets its own."""
-MEASURED_PX = 64
-"""Size of the font at which letters are measured [px]."""
+SMALLEST_PX = 6
+"""Smallest size of the font [px]."""
 VTK_FONT_FILE = 4
 """VTK's number for a font that comes from a file."""
 LINE = 1.35
@@ -25,18 +25,24 @@ def font() -> Path:
 
 
 @cache
-def _letter_share(letter: str) -> float:
-    """Return the width of a letter, as a share of the font's size."""
-    from matplotlib.ft2font import FT2Font
+def _letter_width(letter: str, font_px: int) -> float:
+    """Return the width of a letter [px], which FreeType rounds to whole pixels, as VTK draws it."""
+    from matplotlib.ft2font import FT2Font, LoadFlags
 
     face = FT2Font(str(font()))
-    face.set_size(MEASURED_PX, 72.0)
-    return float(face.load_char(ord(letter)).linearHoriAdvance) / 65536.0 / MEASURED_PX
+    face.set_size(font_px, 72.0)
+    return float(face.load_char(ord(letter), flags=LoadFlags.DEFAULT).horiAdvance) / 64.0
 
 
-def text_width(text: str, font_px: float) -> float:
+def text_width(text: str, font_px: int) -> float:
     """Return the width of a line of text [px]."""
-    return font_px * sum(map(_letter_share, text))
+    return sum(_letter_width(letter, font_px) for letter in text)
+
+
+def fitting_font(text: str, width_px: float, font_px: int) -> int:
+    """Return the largest size of the font up to a given one with which a line of text is at most so wide [px]."""
+    sizes = range(font_px, SMALLEST_PX, -1)
+    return next((size for size in sizes if text_width(text, size) <= width_px), SMALLEST_PX)
 
 
 def wrapped(text: str, width_px: float, font_px: int) -> list[str]:

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.choices import Axis, View
+from amiwarp.choices import Axis, View, Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
+from amiwarp.imaging.iwe import iwe
 from amiwarp.io.event_rates import EventRates
 from amiwarp.live.stream.session import LiveSource
+from amiwarp.plotting.colours import count_scale
 from amiwarp.tasks import interrupts_later, no_garbage_collection
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look, Scene, ShownImages
@@ -22,6 +24,7 @@ from amiwarp.viewer.filters import step_rows
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.window_actions import FINE, SPEED, WindowActions
 from amiwarp.viewer.window_controls import Slider
+from amiwarp.viewer.window_images import Panel, panels_of
 from amiwarp.viewer.window_keys import help_rows
 from amiwarp.viewer.window_layout import LARGEST, Places, first_size, places
 from amiwarp.viewer.window_mouse import Mouse
@@ -85,7 +88,7 @@ class Window(WindowActions):
         self._changed_s = 0.0
         self._coarse = 1
         self._slow: Iterator[None] = iter(())
-        self._images: ShownImages | None = None
+        self._images: tuple[str, ShownImages] | None = None  # with their name
         self._scale_held = False  # whether the images have the scale of before a slider moved
         self._rates, self._counted_s = EventRates(inspector.recording.events), 0.0
         self._rates_shown: tuple[Any, ...] = ()
@@ -244,7 +247,7 @@ class Window(WindowActions):
 
     def _expose(self) -> None:
         """Note that VTK wants to draw: all of the window, as it was hidden, unless only the camera has moved."""
-        self._exposed = self._exposed or not self.mouse.turned
+        self._exposed = self._exposed or not (self.mouse.turns or self.mouse.turned)
 
     def _start(self) -> None:
         self.inspector.renew()
@@ -369,11 +372,12 @@ class Window(WindowActions):
     def _show_timeline(self) -> None:
         """Give the time window and the rates to the timeline."""
         line, source = self.sheets.timeline, self.inspector.recording.events
-        line.window = self.time_window[0] - source.t_first, self.time_window[1]
+        before, line.window = line.window, (self.time_window[0] - source.t_first, self.time_window[1])
         if line.whole_us != self.whole_us:
             line.whole_us = self.whole_us
             line.show_all()
-        line.follow()
+        if line.window != before:  # else the mouse may have moved the timeline away from it
+            line.follow()
         wanted = line.span, self._rates, self._rates.share
         if wanted != self._rates_shown:
             self._rates_shown = wanted
@@ -387,28 +391,48 @@ class Window(WindowActions):
 
         A log intensity takes long: it is made when nothing moves.
         """
-        images, before = None, self._images
-        if self.image is not ImageKind.LOG_INTENSITY:
-            images = self._new_images()
-            if images is not None and before is not None and self._scale_held and self._images_of == self._image_name:
-                images = replace(images, scale=before.scale, after_scale=before.after_scale)
-        self._show_images(images)
+        if self.image is ImageKind.LOG_INTENSITY:
+            self._images = None
+            self.sheets.show_images([], self.shown.region, "log intensity: when nothing moves")
+            return
+        before = self._images
+        self._new_images()
+        if self._scale_held and before is not None and self._images is not None and before[0] == self._image_name:
+            kept = replace(self._images[1], scale=before[1].scale, after_scale=before[1].after_scale)
+            self._images = self._image_name, kept
+        self._show_images()
 
-    def _new_images(self) -> ShownImages | None:
+    def _new_images(self) -> None:
+        """Make the images of what is shown, or say why there are none."""
+        self._images = None
         with self.errors_shown("images"):
-            return drawing.make_images(
-                self.inspector, self.image, against=self.b, shown=self.shown, difference=self.difference,
-                decay_us=self.decay_us, same_scale=self.same_scale,
-            )  # fmt: skip
-        return None
+            images = drawing.make_images(
+                self.inspector,
+                self.image,
+                against=self.b,
+                shown=self.shown,
+                difference=self.difference,
+                decay_us=self.decay_us,
+                same_scale=self.same_scale,
+            )
+            self._images = self._image_name, images
 
-    def _show_images(self, images: ShownImages | None) -> None:
-        self._images, self._images_of = images, self._image_name
-        titles = self._look.titles
-        if self.image is ImageKind.DEPTH or self.difference:
-            titles = (titles[0], self._image_name)
-        named = tuple(f"{title}: {self._image_name}" if title != self._image_name else title for title in titles)
-        self.sheets.show_images(images, named, self.shown.region)
+    def _show_images(self) -> None:
+        """Give the images to the row. Of a recording without a prism, there is the whole image beside a region."""
+        region, titles = self.shown.region, self._look.titles
+        if self._images is None:
+            self.sheets.show_images([], region, "no images")
+            return
+        name, images = self._images
+        named = tuple(f"{title}: {name}" for title in titles)
+        if self.image is ImageKind.DEPTH or self.difference:  # beside the events as recorded
+            named = f"{titles[0]}: {ImageKind.COUNT.value}", name
+        panels = panels_of(images, named, region)
+        size = self.inspector.recording.events.size
+        if not self.compensates and region != (0, 0, *size):
+            whole = iwe(self.shown.span.events, *size, vote=Vote.NEAREST)
+            panels.insert(0, Panel("whole image: count", whole, count_scale([whole]), (0, 0, *size)))
+        self.sheets.show_images(panels, region, images.note)
 
     def _curve_names(self) -> tuple[str, ...]:
         """Return the parameters of the two sharpness curves: the chosen one, and phase or the first one."""
@@ -423,7 +447,8 @@ class Window(WindowActions):
             self.sheets_changed()
             yield
         if self.image is ImageKind.LOG_INTENSITY:
-            self._show_images(self._new_images())
+            self._new_images()
+            self._show_images()
             self._sheets_old = True
             yield
         for name in self._curve_names():

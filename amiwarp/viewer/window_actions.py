@@ -3,7 +3,7 @@
 import contextlib
 import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look, Scene
 from amiwarp.viewer.inspector import DisplayedWindow, colours_on_offer
 from amiwarp.viewer.window_controls import Slider
-from amiwarp.viewer.window_keys import KEYS, X_KEYS
+from amiwarp.viewer.window_keys import KEYS, OF_OPTICS, X_KEYS
 from amiwarp.viewer.window_sheets import Sheets
 
 SPEED = 0.1
@@ -47,6 +47,9 @@ class WindowActions(layout.Actions):
     plays = loop = closed = help_shown = statistics_shown = depth_shown = False
     optic_shown = False
     """Whether a recording shows the controls of a prism though nothing says that there is one."""
+    _slow: Iterator[None]  # what takes long, in steps
+    _slow_steps: Callable[[], Iterator[None]]
+    _show_progress: Callable[[str, float], None]
     _picked = -1  # the event whose orbit is shown
     _played_s = 0.0  # when the time window was moved last by playing
     _progress = _film_ends = False  # whether a calibration or film runs, and whether a film ends now
@@ -57,7 +60,11 @@ class WindowActions(layout.Actions):
 
     def key(self, key: str) -> None:
         """Run the action of a key, by its name in VTK."""
-        super().key(X_KEYS.get(key, key))
+        name = X_KEYS.get(key, key)
+        if name in OF_OPTICS and not self._has_controls:
+            self.say(f"{name} is for a recording with a prism; x: set a prism")
+            return
+        super().key(name)
 
     def slide(self, name: str, value: float) -> None:
         """Set a value, in the unit of its slider."""
@@ -158,6 +165,7 @@ class WindowActions(layout.Actions):
             self.say("there is no depth map; start with --depth FILE")
             return
         setattr(self, name, not getattr(self, name))
+        self.message = f"play {'in a loop' if self.loop else 'once'}" if name == "loop" else ""
         self._slow = self._slow_steps()
         self.request("look")
 

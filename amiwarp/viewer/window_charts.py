@@ -12,7 +12,7 @@ from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.plotting.colours import ticks
 from amiwarp.viewer.axes import tick_texts
 from amiwarp.viewer.drawing import ORBIT_COLOUR
-from amiwarp.viewer.texts import LINE, text_width
+from amiwarp.viewer.texts import LINE, fitting_font, text_width
 from amiwarp.viewer.window_layout import Rect
 from amiwarp.viewer.window_paper import Paper
 
@@ -24,8 +24,12 @@ INTERVAL_CURVES = ((OFF_COLOUR, 2.0, "intervals"), (ON_COLOUR, 2.0, "median"))
 """Colour, width and name of the histogram of intervals, and of the line at their median."""
 LEGEND_EM, MARK_EM = 1.5, 1.2
 """Height of the legend above the curves, and length of the line before a name, in sizes of the font."""
+MARK_TEXT = 5 * "m"
+"""Text that is wider than the line before a name, and the gap behind it."""
 NUMBERS_EM = 3.6
 """Width of the numbers left of a chart, in sizes of the font."""
+FULL_TURN = 360.0
+"""Range of prism angles, whose numbers are divisors of a turn [deg]."""
 ROOM = 0.06
 """Space above and below the curves, as a share of their height."""
 
@@ -64,24 +68,20 @@ class Chart:
     def plot_area(self, rect: Rect, font_px: int) -> Rect:
         """Return the part of the chart's place in which the curves are."""
         line = LINE * font_px
-        return rect.inset(NUMBERS_EM * font_px, 1.2 * line, 0.8 * font_px, line + LEGEND_EM * font_px)
+        return rect.inset(NUMBERS_EM * font_px, 1.2 * line, 1.3 * font_px, line + LEGEND_EM * font_px)
 
     def draw(self, paper: Paper, rect: Rect) -> None:
         """Draw the chart into a part of the window."""
         em, inner = paper.font_px, self.plot_area(rect, paper.font_px)
         (x_low, x_high), (y_low, y_high) = self.x_range, self.y_range
-        scale = min(1.0, (rect.width - em) / text_width(self.title, em))
-        paper.text(self.title, rect.left + 0.5 * em, rect.top, up="top", scale=scale)
-        x = inner.left
-        for curve in self.curves:
-            if not len(curve.x):
-                continue
-            middle = inner.top + 0.5 * LEGEND_EM * em
-            paper.line([(x, middle), (x + MARK_EM * em, middle)], curve.colour, curve.width)
-            paper.text(curve.label, x + (MARK_EM + 0.4) * em, middle)
-            x += (MARK_EM + 1.6) * em + text_width(curve.label, em)
+        size = fitting_font(self.title, rect.width - em, em)
+        paper.text(self.title, rect.left + 0.5 * em, rect.top, up="top", font_px=size)
+        self._draw_legend(paper, inner)
         paper.line([(inner.left, inner.top), (inner.left, inner.low), (inner.right, inner.low)])
-        values = ticks(x_low, x_high, int(min(max(inner.width / (5.0 * em), 3), 5)))
+        if not any(len(curve.x) for curve in self.curves):  # nothing is computed yet
+            return
+        least = 4 if x_high == FULL_TURN else 3
+        values = ticks(x_low, x_high, int(min(max(inner.width / (5.0 * em), least), 5)))
         for text, value in zip(tick_texts(values.tolist()), values, strict=True):
             at = inner.left + (value - x_low) / (x_high - x_low) * inner.width
             paper.line([(at, inner.low), (at, inner.low - 0.3 * em)])
@@ -96,6 +96,17 @@ class Chart:
                 across = inner.left + (curve.x - x_low) / (x_high - x_low) * inner.width
                 up = inner.low + (curve.y - y_low) / (y_high - y_low) * inner.height
                 paper.line(np.column_stack([across, np.clip(up, inner.low, inner.top)]), curve.colour, curve.width)
+
+    def _draw_legend(self, paper: Paper, inner: Rect) -> None:
+        """Name the curves above them, in smaller letters if there is little room."""
+        shown = [curve for curve in self.curves if len(curve.x)]
+        marks = "".join([MARK_TEXT + curve.label for curve in shown])
+        em = fitting_font(marks, inner.width, paper.font_px)
+        x, middle = inner.left, inner.top + 0.5 * LEGEND_EM * paper.font_px
+        for curve in shown:
+            paper.line([(x, middle), (x + MARK_EM * em, middle)], curve.colour, curve.width)
+            paper.text(curve.label, x + (MARK_EM + 0.4) * em, middle, font_px=em)
+            x += (MARK_EM + 1.6) * em + text_width(curve.label, em)
 
 
 def chart_places(rect: Rect) -> tuple[Rect, Rect, Rect]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from amiwarp.viewer.drawing import ORBIT_COLOUR
-from amiwarp.viewer.texts import LINE, text_width, wrapped
+from amiwarp.viewer.texts import LINE, fitting_font, wrapped
 from amiwarp.viewer.window_layout import NOWHERE, SLIDER_EM, Rect
 from amiwarp.viewer.window_paper import OVER, Paper
 
@@ -120,8 +120,8 @@ class Controls:
         em = paper.font_px
         wide, high = (share * em for share in HANDLE_EM)
         ink = ORBIT_COLOUR if slider.name == self.chosen else ""
-        scale = min(1.0, inner.width / text_width(slider.title, em))
-        paper.text(slider.title, inner.left, top, colour=ink, up="top", scale=scale)
+        size = fitting_font(slider.title, inner.width, em)
+        paper.text(slider.title, inner.left, top, colour=ink, up="top", font_px=size)
         middle = top - 2.3 * em
         slider.track = Rect(inner.left + 0.5 * wide, middle - 1, inner.right - 0.5 * wide, middle + 1)
         slider.place = Rect(inner.left - 0.5 * em, middle - high, inner.right + 0.5 * em, middle + high)

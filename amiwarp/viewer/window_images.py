@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from amiwarp.imaging.regions import Region
 from amiwarp.plotting.colours import Scale
 from amiwarp.viewer.drawing import ORBIT_COLOUR, ShownImages
 from amiwarp.viewer.texts import LINE, text_width
-from amiwarp.viewer.window_layout import NOWHERE, Rect
+from amiwarp.viewer.window_layout import Rect
 from amiwarp.viewer.window_paper import LINES, Paper
 
 BAR_EM = 1.0
@@ -39,53 +40,71 @@ def value_text(value: NDArray[np.float32], scale: Scale) -> str:
     return f"{float(value):g} events" if scale.counts else f"{float(value):.4g} {scale.unit}"
 
 
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One image of the row."""
+
+    title: str
+    values: NDArray[np.float32] | None
+    """Shape ``(height, width)``, or ``(2, height, width)`` for OFF and ON; None if there is no such image."""
+    scale: Scale
+    """How the values become colours."""
+    region: Region
+    """Part of the sensor that the image shows."""
+
+
+def panels_of(images: ShownImages, titles: tuple[str, ...], region: Region) -> list[Panel]:
+    """Return the images of a region, from the second one backwards as many as there are titles."""
+    both = (images.before, images.scale), (images.after, images.after_scale or images.scale)
+    return [Panel(title, *each, region) for title, each in zip(titles, both[-len(titles) :], strict=True)]
+
+
 class ImageRow:
-    """Two images of one region side by side, or one."""
+    """Images side by side."""
 
     def __init__(self, choose: Callable[[Region], None], changed: Callable[[], None]) -> None:
         """``choose``: shows a region that was drawn; ``changed``: draws the images again."""
         self._choose, self._changed = choose, changed
-        self.images: ShownImages | None = None
-        self.titles: tuple[str, ...] = ()
-        self.region: Region = (0, 0, 1, 1)
+        self.panels: list[Panel] = []
         self.note = ""
-        self.rect = NOWHERE
+        """What limits the images, or why there are none."""
+        self.region: Region = (0, 0, 1, 1)
+        """Part of the sensor that the clouds show."""
         self.frames: list[Rect] = []
         """Where the images are; what is around them is paper, unlike pixels without events."""
-        self._shown: list[tuple[NDArray[np.float32], Scale]] = []
-        self._drawn: dict[int, tuple[tuple[object, ...], NDArray[np.uint8]]] = {}
+        self._drawn: dict[int, tuple[NDArray[np.float32], Scale, int, NDArray[np.uint8]]] = {}
         self._bars: dict[Scale, NDArray[np.uint8]] = {}
-        self._frame: Rect | None = None
+        self._drawn_on = 0  # the image on which a region is drawn
         self._start: tuple[int, int] | None = None
         self._end: tuple[int, int] = (0, 0)
         self._under = ""  # what is under the mouse
 
-    def pixel_at(self, place: tuple[int, int]) -> tuple[int, int] | None:
-        """Return the pixel of the sensor under a place of the window; None outside of the images."""
-        for frame in self.frames:
-            if frame.holds(place):
-                return self._pixel(frame, place)
+    def pixel_at(self, place: tuple[int, int]) -> tuple[int, tuple[int, int]] | None:
+        """Return the number of the image at a place of the window, and the pixel of the sensor; None beside them."""
+        for k, frame in enumerate(self.frames):
+            if frame.holds(place) and self.panels[k].values is not None:
+                return k, self._pixel(k, place)
         return None
 
-    def _pixel(self, frame: Rect, place: tuple[int, int]) -> tuple[int, int]:
-        """Return the pixel of an image's frame at a place, or the next one if the place is outside."""
-        left, top, right, bottom = self.region
+    def _pixel(self, k: int, place: tuple[int, int]) -> tuple[int, int]:
+        """Return the pixel of an image at a place, or the next one if the place is outside."""
+        frame, (left, top, right, bottom) = self.frames[k], self.panels[k].region
         x = left + math.floor((place[0] - frame.left) / frame.width * (right - left))
         y = top + math.floor((frame.top - place[1]) / frame.height * (bottom - top))
         return min(max(x, left), right - 1), min(max(y, top), bottom - 1)
 
     def press(self, place: tuple[int, int]) -> bool:
         """Begin a region if the mouse is on an image; return whether it is."""
-        self._frame = next((frame for frame in self.frames if frame.holds(place)), None)
-        if self._frame is None:
+        found = self.pixel_at(place)
+        if found is None:
             return False
-        self._start = self._end = self._pixel(self._frame, place)
+        self._drawn_on, self._start = found
+        self._end = self._start
         return True
 
     def drag(self, place: tuple[int, int]) -> None:
         """Follow the mouse with the other corner of the region."""
-        assert self._frame is not None
-        self._end = self._pixel(self._frame, place)
+        self._end = self._pixel(self._drawn_on, place)
         self._changed()
 
     def release(self) -> None:
@@ -95,6 +114,13 @@ class ImageRow:
             self._choose((left, top, right, bottom))
         self._changed()
 
+    def _region_text(self) -> str:
+        """Return the region that is being drawn as text; empty without one."""
+        if self._start is None:
+            return ""
+        left, top, right, bottom = self._drawn_region()
+        return f"x {left} to {right - 1}, y {top} to {bottom - 1} px"
+
     def _drawn_region(self) -> Region:
         assert self._start is not None
         (x0, x1), (y0, y1) = (sorted(pair) for pair in zip(self._start, self._end, strict=True))
@@ -102,60 +128,65 @@ class ImageRow:
 
     def hover(self, place: tuple[int, int]) -> bool:
         """Describe the pixel under the mouse; return whether the description has changed."""
-        before, self._under, pixel = self._under, "", self.pixel_at(place)
-        if pixel is not None:
-            left, top, *_ = self.region
-            values = [value_text(image[..., pixel[1] - top, pixel[0] - left], scale) for image, scale in self._shown]
-            self._under = f"x {pixel[0]}, y {pixel[1]} px: {' → '.join(values)}"
+        before, self._under, found = self._under, "", self.pixel_at(place)
+        if found is not None:
+            k, (x, y) = found
+            left, top, *_ = self.panels[k].region
+            same = [each for each in self.panels if each.region == self.panels[k].region]
+            values = [(each.values[..., y - top, x - left], each.scale) for each in same if each.values is not None]
+            self._under = f"x {x}, y {y} px: {' → '.join(value_text(*each) for each in values)}"
         return self._under != before
 
     def draw(self, paper: Paper, rect: Rect) -> None:
         """Draw the images into a part of the window."""
         em, line = paper.font_px, LINE * paper.font_px
-        self.rect, self.frames, self._shown = rect, [], []
-        pair = self.images
-        if pair is None:
-            paper.text(self.note, rect.left + em, rect.top - line, up="top")
-            return
-        images = [(pair.before, pair.scale), (pair.after, pair.after_scale or pair.scale)][-len(self.titles) :]
-        own = pair.after_scale is not None
-        bars = len(images) if own else 1
-        bar_width = BAR_EM * em + max(self._bar_space(scale, em) for _, scale in images)
-        left, top, right, bottom = self.region
-        high = rect.height - 2.6 * line
-        wide = (rect.width - em * (1 + len(images)) - bars * bar_width) / len(images)
-        share = min(wide / (right - left), high / (bottom - top))
-        wide, high = (max(1.0, math.floor(share * n)) for n in (right - left, bottom - top))
-        x, low = rect.left + em, rect.top - 1.3 * line - high
-        for k, ((image, scale), title) in enumerate(zip(images, self.titles, strict=True)):
-            frame = Rect(math.floor(x), math.floor(low), math.floor(x) + wide, math.floor(low) + high)
-            paper.text(title, frame.left, rect.top, up="top")
-            if image is None:
+        self.frames = []
+        x, low = rect.left + em, rect.low + 1.3 * line
+        high, wide = rect.height - 2.6 * line, self._width_of_each(rect, em)
+        for k, panel in enumerate(self.panels):
+            left, top, right, bottom = panel.region
+            share = min(wide / (right - left), high / (bottom - top))
+            width, height = (max(1, math.floor(share * n)) for n in (right - left, bottom - top))
+            bottom_px = math.floor(rect.top - 1.3 * line - height)
+            frame = Rect(math.floor(x), bottom_px, math.floor(x) + width, bottom_px + height)
+            low = max(rect.low + 1.1 * line, min(low, bottom_px) if k else bottom_px)
+            self.frames.append(frame)
+            paper.text(panel.title, frame.left, rect.top, up="top")
+            if panel.values is None:
                 paper.text("needs compensated events", frame.left, frame.top - em, up="top")
             else:
-                paper.picture(self._rgb(k, image, scale, wide), frame)
-                self.frames.append(frame)
-                self._shown.append((image, scale))
+                paper.picture(self._rgb(k, panel, width), frame)
             paper.frame(Rect(frame.left - 1, frame.low - 1, frame.right + 1, frame.top + 1))
             x = frame.right + em
-            if own or k == len(images) - 1:
-                self._draw_bar(paper, Rect(x, frame.low, x + BAR_EM * em, frame.top), scale)
-                x += bar_width
-        self._draw_region(paper)
-        words = self._under or self.note or images[-1][1].label
+            if self._has_bar(k):
+                self._draw_bar(paper, Rect(x, frame.low, x + BAR_EM * em, frame.top), panel.scale)
+                x += BAR_EM * em + self._bar_space(panel.scale, em)
+        self._draw_regions(paper)
+        label = self.panels[-1].scale.label if self.panels else ""
+        words = self._region_text() or self._under or self.note or label
         paper.text(words, rect.left + em, low - 0.4 * em, up="top")
 
-    def _rgb(self, k: int, image: NDArray[np.float32], scale: Scale, wide: float) -> NDArray[np.uint8]:
-        """Return the colours of an image, with about as many pixels as its place in the window."""
-        step = max(1, math.floor(image.shape[-1] / wide))
-        key = image, scale, step
-        known, rgb = self._drawn.get(k, ((), np.zeros((1, 1, 3), np.uint8)))
-        if len(known) != 3 or known[0] is not image or known[1:] != key[1:]:
-            rgb = scale.rgb(thinned(image, step))
-            self._drawn[k] = key, rgb
-        return rgb
+    def _has_bar(self, k: int) -> bool:
+        """Return whether an image has a colour bar of its own: the last one of each scale."""
+        return k + 1 == len(self.panels) or self.panels[k].scale != self.panels[k + 1].scale
 
-    def _bar_space(self, scale: Scale, em: float) -> float:
+    def _width_of_each(self, rect: Rect, em: int) -> float:
+        """Return the width that there is for each image [px]."""
+        count = len(self.panels)
+        bars = [self.panels[k].scale for k in range(count) if self._has_bar(k)]
+        room = sum(BAR_EM * em + self._bar_space(scale, em) for scale in bars)
+        return max(1.0, (rect.width - em * (1 + count) - room) / max(count, 1))
+
+    def _rgb(self, k: int, panel: Panel, width: float) -> NDArray[np.uint8]:
+        """Return the colours of an image, with about as many pixels as its place in the window."""
+        assert panel.values is not None
+        step = max(1, math.floor(panel.values.shape[-1] / width))
+        known = self._drawn.get(k)
+        if known is None or known[0] is not panel.values or known[1:3] != (panel.scale, step):
+            self._drawn[k] = panel.values, panel.scale, step, panel.scale.rgb(thinned(panel.values, step))
+        return self._drawn[k][3]
+
+    def _bar_space(self, scale: Scale, em: int) -> float:
         """Return the width of the numbers of a colour bar, and of the gaps beside them [px]."""
         return (
             1.4 * em
@@ -192,18 +223,24 @@ class ImageRow:
             self._bars = dict([*self._bars.items()][-1:]) | {scale: scale.rgb(values)}
         return self._bars[scale]
 
-    def _draw_region(self, paper: Paper) -> None:
-        if self._start is None:
-            return
-        left, top, right, bottom = self.region
-        x0, y0, x1, y1 = self._drawn_region()
-        for frame in self.frames:
-            across, up = frame.width / (right - left), frame.height / (bottom - top)
-            drawn = Rect(
-                frame.left + (x0 - left) * across,
-                frame.top - (y1 - top) * up,
-                frame.left + (x1 - left) * across,
-                frame.top - (y0 - top) * up,
-            )
-            paper.area(drawn, ORBIT_COLOUR, 0.3, LINES)
-            paper.frame(drawn, ORBIT_COLOUR, 2.0)
+    def _draw_regions(self, paper: Paper) -> None:
+        """Draw the region that the mouse draws, and on images of a larger part the frame of the shown one."""
+        for frame, panel in zip(self.frames, self.panels, strict=True):
+            if panel.region != self.region:
+                paper.frame(self._on_image(frame, panel.region, self.region), ORBIT_COLOUR, 2.0)
+            if self._start is not None and panel.region == self.panels[self._drawn_on].region:
+                drawn = self._on_image(frame, panel.region, self._drawn_region())
+                paper.area(drawn, ORBIT_COLOUR, 0.3, LINES)
+                paper.frame(drawn, ORBIT_COLOUR, 2.0)
+
+    @staticmethod
+    def _on_image(frame: Rect, shown: Region, region: Region) -> Rect:
+        """Return where a region is on the image of another one."""
+        left, top, right, bottom = shown
+        across, up = frame.width / (right - left), frame.height / (bottom - top)
+        return Rect(
+            frame.left + (region[0] - left) * across,
+            frame.top - (region[3] - top) * up,
+            frame.left + (region[2] - left) * across,
+            frame.top - (region[1] - top) * up,
+        )

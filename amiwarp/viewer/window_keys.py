@@ -15,6 +15,8 @@ X_KEYS = {
     "minus": "-",
     "comma": ",",
     "period": ".",
+    "bracketleft": "[",
+    "bracketright": "]",
 }
 """Keys by their names in VTK, where these differ."""
 MORE_KEYS = (

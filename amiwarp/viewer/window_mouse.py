@@ -26,7 +26,8 @@ class Mouse:
         self.drags = 0
         """Number of drags so far; changes of one drag are undone together."""
         self._held: Any = None  # the part that follows the mouse until the button is released
-        self._turns = False
+        self.turns = False
+        """Whether the pressed button moves the camera."""
         self._from = 0, 0
         self._interactor = window.plotter.iren.interactor
         for event, follow in (
@@ -65,9 +66,9 @@ class Mouse:
 
     def _press(self, place: tuple[int, int]) -> bool:
         self.pressed, self._from, sheets = True, place, self._sheets
-        self._turns = self._on_clouds(place)
-        if self._turns or self._on_help(place):
-            return not self._turns
+        self.turns = self._on_clouds(place)
+        if self.turns or self._on_help(place):
+            return not self.turns
         if sheets.controls.press(place):
             self._held = sheets.controls
         elif sheets.images.press(place):
@@ -77,20 +78,20 @@ class Mouse:
         return True
 
     def _press_other(self, place: tuple[int, int]) -> bool:
-        self.pressed = self._turns = self._on_clouds(place)
+        self.pressed = self.turns = self._on_clouds(place)
         self._from = NO_CLICK
-        return not self._turns
+        return not self.turns
 
     def _move(self, place: tuple[int, int]) -> bool:
         if self._held is not None:
             self._held.drag(place)
             self._window.sheets_changed()
-        elif not self._turns and self._sheets.images.hover(place):
+        elif not self.turns and self._sheets.images.hover(place):
             self._window.sheets_changed()
         return self._held is not None
 
     def _release(self, place: tuple[int, int]) -> bool:
-        held, turned, self._held, self._turns, self.pressed = self._held, self._turns, None, False, False
+        held, turned, self._held, self.turns, self.pressed = self._held, self.turns, None, False, False
         self.drags += 1
         if held is not None:
             held.release()

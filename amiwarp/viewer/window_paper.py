@@ -65,13 +65,13 @@ class Paper:
         colour: str = "",
         across: str = "left",
         up: str = "middle",
-        scale: float = 1.0,
+        font_px: int = 0,
     ) -> None:
-        """Write a text. ``across`` and ``up``: which of its sides are at the place; ``scale``: of the font's size."""
+        """Write a text. ``across`` and ``up``: which of its sides are at the place; ``font_px``: another size [px]."""
         actor = self._next(TEXTS, _text_actor)
         prop = actor.GetTextProperty()
         prop.SetColor(_rgb(colour or self.ink))
-        prop.SetFontSize(round(scale * self.font_px))
+        prop.SetFontSize(font_px or self.font_px)
         prop.SetJustification(JUSTIFY[across])
         prop.SetVerticalJustification(JUSTIFY[up])
         actor.SetInput(text)
@@ -84,7 +84,7 @@ class Paper:
         import pyvista
 
         xy = np.asarray(points, np.float64).reshape(-1, 2)
-        known = np.isfinite(xy).all(axis=1)
+        known = np.isfinite(xy[:, 0]) & np.isfinite(xy[:, 1])
         first = np.flatnonzero(known[:-1] & known[1:]) if len(xy) > 1 else np.zeros(0, np.int64)
         mesh = pyvista.PolyData(self._here(np.where(known[:, None], xy, 0.0)))
         mesh.verts = np.zeros(0, np.int64)

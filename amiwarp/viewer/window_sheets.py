@@ -10,10 +10,10 @@ import numpy as np
 from amiwarp.imaging.regions import Region
 from amiwarp.plotting.colours import GREY
 from amiwarp.viewer import drawing, layout
-from amiwarp.viewer.texts import LINE, text_width
+from amiwarp.viewer.texts import LINE, SMALLEST_PX, text_width
 from amiwarp.viewer.window_charts import INTERVAL_CURVES, MARKS, ORBIT_CURVES, Chart, chart_places
 from amiwarp.viewer.window_controls import Controls, Slider
-from amiwarp.viewer.window_images import ImageRow
+from amiwarp.viewer.window_images import ImageRow, Panel
 from amiwarp.viewer.window_layout import Places, Rect
 from amiwarp.viewer.window_paper import Paper
 from amiwarp.viewer.window_timeline import Timeline
@@ -24,6 +24,8 @@ PANEL_COLOURS = {False: ("#f0f0ea", "#333333"), True: ("#24282e", "#d8d8d8")}
 """Colours of paper and ink of help and statistics, for light (False) and dark (True) mode."""
 DEPTH_SHARES = (0.0, 0.16, 0.58, 1.0)
 """Edges between colour bar, image and points of a depth map, in shares of the width of the clouds."""
+HELP_GAP_PX = 10
+"""Gap between the help and the sides of the window [px]."""
 KEY_NAMES = {"?": "h or ?", "ArrowRight": "→", "ArrowLeft": "←", " ": "space", "Up": "↑", "Down": "↓"}
 """How the help writes keys, where it does not use their names."""
 
@@ -100,11 +102,9 @@ class Sheets:
         known = found["median"] is not None
         mark.update([found["median"]] * 2 if known else [], chart.y_range if known else [])
 
-    def show_images(self, images: drawing.ShownImages | None, titles: tuple[str, ...], region: Region) -> None:
-        """Show images of a region."""
-        row = self.images
-        row.images, row.titles, row.region = images, titles, region
-        row.note = "" if images is None else images.note
+    def show_images(self, panels: list[Panel], region: Region, note: str = "") -> None:
+        """Show images; the clouds show a region. ``note``: what limits the images, or why there are none."""
+        self.images.panels, self.images.region, self.images.note = panels, region, note
 
     # Drawing
 
@@ -152,17 +152,18 @@ class Sheets:
         """Draw the keys in two columns over the clouds, with a smaller font if they need it."""
         half = (len(self.help_rows) + 1) // 2
         columns = [self.help_rows[:half], self.help_rows[half:]]
-        widths = [max((text_width(words, 1.0) for _, words in rows), default=0.0) + 6.0 for rows in columns]
-        room = places.size[0] - places.column.right
-        em = min(float(places.font_px), (room - 20) / (sum(widths) + 3.0), places.size[1] / (LINE * (half + 2)))
-        left, top = places.column.right + 10.0, float(places.size[1] - 10)
-        rect = Rect(left, top - LINE * em * (half + 1), left + em * (sum(widths) + 3.0), top)
-        self.help.clear(rect, places.size, places.font_px, PANEL_COLOURS[dark])
-        scale = em / places.font_px
-        for k, rows in enumerate(columns):
-            x = left + em * (1.0 + k * (widths[0] + 1.0))
+        width, height = places.size
+        room = width - places.column.right - 2 * HELP_GAP_PX
+        for em in range(places.font_px, SMALLEST_PX - 1, -1):
+            widths = [max((text_width(words, em) for _, words in rows), default=0.0) + 7.0 * em for rows in columns]
+            if sum(widths) <= room and LINE * em * (half + 1) <= height:
+                break
+        left, top = places.column.right + HELP_GAP_PX, float(height - HELP_GAP_PX)
+        rect = Rect(left, top - LINE * em * (half + 1), left + sum(widths), top)
+        self.help.clear(rect, places.size, em, PANEL_COLOURS[dark])
+        for rows, x in zip(columns, (left, left + widths[0]), strict=True):
             for row, (key, words) in enumerate(rows):
                 y = top - LINE * em * (row + 0.5)
-                self.help.text(KEY_NAMES.get(key, key), x + 4.5 * em, y, across="right", up="top", scale=scale)
-                self.help.text(words, x + 5.5 * em, y, up="top", scale=scale)
+                self.help.text(KEY_NAMES.get(key, key), x + 5.0 * em, y, across="right", up="top")
+                self.help.text(words, x + 6.0 * em, y, up="top")
         self.help.end()
