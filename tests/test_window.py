@@ -1219,7 +1219,7 @@ def test_filters_say_the_rates_before_and_after_them(plain: Window) -> None:
     assert plain.inspector.selection.noise_us == 2_000
     assert plain.shown.selected < everything
     rows = step_rows(plain.shown.steps, plain.shown.read_us)
-    assert [f"{name}: {rates}" for name, _, rates, _ in rows] == plain.sheets.controls.texts[1 : 1 + len(rows)]
+    assert [f"{name}: {rates}" for name, rates, _ in rows] == plain.sheets.controls.texts[1 : 1 + len(rows)]
     assert rows
     plain.key("j")
     plain.key("u")

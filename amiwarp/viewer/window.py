@@ -336,7 +336,8 @@ class Window(WindowActions):
         if self._has_controls:
             rate, notes = f"model {self.inspector.knobs.model}, {rate}", layout.notes(self.inspector)
         steps = [f"{name}: {rates}" for name, _, rates, _ in step_rows(shown.steps, shown.read_us)]
-        self.sheets.controls.texts = [rate, *steps, "h: help", "", self.message, *notes]
+        both = [", ".join(row) for row in drawing.beside_rows(self.inspector, shown)]
+        self.sheets.controls.texts = [rate, *steps, *both, "h: help", "", self.message, *notes]
         self.sheets.controls.rows = self._stream
         self.sheets.help_rows = help_rows(optic=self._has_controls, depth=self.inspector.depth is not None)
 
