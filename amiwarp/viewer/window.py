@@ -335,7 +335,7 @@ class Window(WindowActions):
         rate = f"{shown.span.count / shown.span.length_us * 1e6:,.0f} events/s"
         if self._has_controls:
             rate, notes = f"model {self.inspector.knobs.model}, {rate}", layout.notes(self.inspector)
-        steps = [f"{name}: {rates}" for name, _, rates, _ in step_rows(shown.steps, shown.read_us)]
+        steps = [f"{name}: {rates}" for name, rates, _ in step_rows(shown.steps, shown.read_us)]
         both = [", ".join(row) for row in drawing.beside_rows(self.inspector, shown)]
         self.sheets.controls.texts = [rate, *steps, *both, "h: help", "", self.message, *notes]
         self.sheets.controls.rows = self._stream
