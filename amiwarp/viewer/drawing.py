@@ -621,7 +621,7 @@ def drawn_text(shown: DisplayedWindow, stride: int = 1) -> str:
     Those of the drawn ones that the model cannot compensate are counted apart: they are missing in the second cloud.
     """
     drawn = len(range(0, len(shown.events), stride))
-    unmoved = int(np.count_nonzero(np.isnan(shown.after).any(axis=1)))
+    unmoved = int(np.count_nonzero(np.isnan(shown.after[:, 0])))
     rest = f", {unmoved:,} not compensated" if unmoved else ""
     if drawn < shown.selected:
         return f"{drawn:,} of these drawn{rest}"

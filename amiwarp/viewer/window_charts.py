@@ -14,7 +14,7 @@ from amiwarp.viewer.axes import tick_texts
 from amiwarp.viewer.drawing import ORBIT_COLOUR
 from amiwarp.viewer.texts import LINE, fitting_font, text_width
 from amiwarp.viewer.window_layout import Rect
-from amiwarp.viewer.window_paper import Paper
+from amiwarp.viewer.window_paper import GAP, Paper
 
 MARKS = ((ORBIT_COLOUR, 4.0, "truth"), (ON_COLOUR, 2.0, "now"))
 """Colour, width and name of the lines that mark values on a sharpness curve."""
@@ -24,7 +24,7 @@ INTERVAL_CURVES = ((OFF_COLOUR, 2.0, "intervals"), (ON_COLOUR, 2.0, "median"))
 """Colour, width and name of the histogram of intervals, and of the line at their median."""
 LEGEND_EM, MARK_EM = 1.5, 1.2
 """Height of the legend above the curves, and length of the line before a name, in sizes of the font."""
-MARK_TEXT = 5 * "m"
+MARK_TEXT = 3 * "m"
 """Text that is wider than the line before a name, and the gap behind it."""
 NUMBERS_EM = 3.6
 """Width of the numbers left of a chart, in sizes of the font."""
@@ -77,20 +77,21 @@ class Chart:
         size = fitting_font(self.title, rect.width - em, em)
         paper.text(self.title, rect.left + 0.5 * em, rect.top, up="top", font_px=size)
         self._draw_legend(paper, inner)
-        paper.line([(inner.left, inner.top), (inner.left, inner.low), (inner.right, inner.low)])
+        marks = [(inner.left, inner.top), (inner.left, inner.low), (inner.right, inner.low), GAP]
         if not any(len(curve.x) for curve in self.curves):  # nothing is computed yet
             return
         least = 4 if x_high == FULL_TURN else 3
         values = ticks(x_low, x_high, int(min(max(inner.width / (5.0 * em), least), 5)))
         for text, value in zip(tick_texts(values.tolist()), values, strict=True):
             at = inner.left + (value - x_low) / (x_high - x_low) * inner.width
-            paper.line([(at, inner.low), (at, inner.low - 0.3 * em)])
+            marks += [(at, inner.low), (at, inner.low - 0.3 * em), GAP]
             paper.text(text, at, inner.low - 0.4 * em, across="center", up="top")
         values = ticks(y_low, y_high, int(min(max(inner.height / (2.0 * em), 3), 5)))
         for text, value in zip(tick_texts(values.tolist()), values, strict=True):
             at = inner.low + (value - y_low) / (y_high - y_low) * inner.height
-            paper.line([(inner.left, at), (inner.left - 0.3 * em, at)])
+            marks += [(inner.left, at), (inner.left - 0.3 * em, at), GAP]
             paper.text(text, inner.left - 0.5 * em, at, across="right")
+        paper.line(marks)
         for curve in self.curves:
             if len(curve.x):
                 across = inner.left + (curve.x - x_low) / (x_high - x_low) * inner.width
