@@ -790,15 +790,16 @@ def test_the_mouse_reads_the_values_of_both_images(window: Window) -> None:
     row, shown = window.sheets.images, window.shown
     y, x = np.unravel_index(np.argmax(shown.image_after), shown.image_after.shape)
     width, height = window.inspector.recording.events.size
+    beside = round(row.frames[0].left), round(row.frames[0].top) + 5
     for frame in row.frames:
         at = frame.left + (x + 0.5) / width * frame.width, frame.top - (y + 0.5) / height * frame.height
         mouse(window, "MouseMove", (round(at[0]), round(at[1])))
         assert window.turn()
         before, after = shown.image_before[y, x], shown.image_after[y, x]
         assert row._under == f"x {x}, y {y} px: {before:g} events → {after:g} events"
-    mouse(window, "MouseMove", (round(row.frames[0].left), round(row.frames[0].top) + 5))
-    assert window.turn()
-    assert row._under == ""
+        mouse(window, "MouseMove", beside)
+        assert window.turn()
+        assert row._under == ""
 
 
 def test_the_images_are_those_of_the_page(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -822,7 +823,7 @@ def test_the_images_are_those_of_the_page(window: Window, monkeypatch: pytest.Mo
             rgb = scale.rgb(values)
             corners = [(0, 0), (0, -1), (-1, 0), (-1, -1)]
             assert all((seen[::-1][corner] == rgb[corner]).all() for corner in corners), (window.image, k)
-        window.key("g")
+        window.key("6")
         assert window.turn()
         if (window.image, window.difference) == kinds[0]:
             break
@@ -835,7 +836,7 @@ def test_the_images_are_those_of_the_page(window: Window, monkeypatch: pytest.Mo
 
 
 def test_the_kind_of_images_is_undone_and_set_by_a_state(window: Window) -> None:
-    window.key("g")
+    window.key("6")
     window.turn()
     assert window.image is ImageKind.POLARITY
     assert window.history is not None
@@ -1004,7 +1005,7 @@ def test_no_text_is_cut_off(
     window.plotter.window_size = size
     assert window.turn()
     assert window.places.size == size
-    for keys in ((), ("i",), ("h",), ("k", "g"), ("k", "k", "g", "d"), ("2",), ("x", "g")):
+    for keys in ((), ("i",), ("h",), ("k", "6"), ("k", "k", "6", "d"), ("2",), ("x", "6")):
         for key in keys:
             window.key(key)
         settle(window, monkeypatch)
@@ -1214,15 +1215,15 @@ def test_steps_and_playing_keep_the_number_of_events(plain: Window, monkeypatch:
 
 def test_filters_say_the_rates_before_and_after_them(plain: Window) -> None:
     everything = plain.shown.selected
-    plain.key("j")
+    plain.key("8")
     plain.turn()
     assert plain.inspector.selection.noise_us == 2_000
     assert plain.shown.selected < everything
     rows = step_rows(plain.shown.steps, plain.shown.read_us)
     assert [f"{name}: {rates}" for name, rates, _ in rows] == plain.sheets.controls.texts[1 : 1 + len(rows)]
     assert rows
-    plain.key("j")
-    plain.key("u")
+    plain.key("8")
+    plain.key("7")
     plain.turn()
     assert plain.inspector.selection.noise_us is None
     assert plain.inspector.selection.hide_hot

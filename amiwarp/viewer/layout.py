@@ -588,8 +588,18 @@ class Actions:
     def state_now(self) -> ViewState:
         """Return the state that is shown now."""
         look = self.look
-        return current_state(self.inspector, against=self.against, image=self.image, axis=look.axis,
-                             colour=look.colour, view=self.view, overlaid=look.overlaid)  # fmt: skip
+        return current_state(
+            self.inspector,
+            against=self.against,
+            image=self.image,
+            axis=look.axis,
+            colour=look.colour,
+            view=self.view,
+            overlaid=look.overlaid,
+            decay_us=self.decay_us,
+            same_scale=self.same_scale,
+            difference=self.difference,
+        )
 
     def announce(self) -> None:
         """Tell the listener what is shown now, unless steps through the history will change it at once."""

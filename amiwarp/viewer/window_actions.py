@@ -34,7 +34,7 @@ class WindowActions(layout.Actions):
 
     keys = KEYS
     image = ImageKind.COUNT
-    decay_us = layout.DECAY_US
+    decay_us = drawing.DECAY_US
     same_scale = difference = False
     scene: Scene
     sheets: Sheets
