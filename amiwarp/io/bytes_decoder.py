@@ -74,8 +74,8 @@ class BytesDecoder:
         if self._format in ("dat1", "dat2"):
             self._dat = DatDecoder(self._format[-1], self._device)
         elif chip is not None:
-            known = one_of(instance(chip, str, "chip").lower(), CHIPS, "chip")
-            self._aedat2 = Aedat2Decoder(CHIPS[known], self._device)
+            name = one_of(instance(chip, str, "chip").lower(), CHIPS, "chip")
+            self._aedat2 = Aedat2Decoder(CHIPS[name], self._device)
         self._source: int | None = None
 
     def decode(self, data: Any) -> DeviceEvents:
