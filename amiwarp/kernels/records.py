@@ -30,15 +30,16 @@ def wraps_between(last: wp.int64, now: wp.int64) -> int:
 
 
 @wp.func_native("""
-    const char* from = (const char*)address + at;
-    if (width == 2) { uint16_t part; memcpy(&part, from, 2); return part; }
-    if (is_signed) { int32_t part; memcpy(&part, from, 4); return part; }
-    uint32_t part;
+    const uint8_t* from = (const uint8_t*)address + at;
+    uint32_t part = 0;
 #ifdef __CUDA_ARCH__
-    if (((uint64_t)from & 3) == 0) return *(const uint32_t*)from;
-#endif
+    // Byte by byte: a GPU reads no number across its borders, and its compiler takes memcpy() for one such read.
+    for (int k = 0; k < width; ++k) part |= (uint32_t)from[k] << (8 * k);
+#else
+    if (width == 2) { uint16_t half; memcpy(&half, from, 2); return half; }
     memcpy(&part, from, 4);
-    return part;
+#endif
+    return is_signed ? (int64_t)(int32_t)part : (int64_t)part;
 """)
 def load_number(address: wp.uint64, at: wp.int64, width: int, is_signed: int) -> wp.int64:
     """Load a number of 2 or 4 bytes, which may begin at any address."""
