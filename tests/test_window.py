@@ -1,6 +1,7 @@
 """The inspector's window, drawn off screen: sliders, keys, curves, and that it shows the inspector's values."""
 
 import gc
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,6 +12,7 @@ import av
 import numpy as np
 import pytest
 import pyvista
+from pyvista.plotting.utilities.regression import image_from_window
 from scipy.spatial import ConvexHull
 
 from amiwarp import AmiwarpError, Camera, DepthMap, Encoder, Events, MemoryEvents, Plate, Prism, Recording, simulate
@@ -23,11 +25,13 @@ from amiwarp.viewer.axes import CORNERS, CloudAxes, Label, projected, tick_texts
 from amiwarp.viewer.drawing import DECAY_US, RECORDED, ImageKind, Look, make_images, orbit_lines
 from amiwarp.viewer.filters import step_rows
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector
-from amiwarp.viewer.texts import font
+from amiwarp.viewer.texts import fitting_font, font, text_width, wrapped
 from amiwarp.viewer.window import Window
 from amiwarp.viewer.window_charts import Chart
+from amiwarp.viewer.window_images import thinned
 from amiwarp.viewer.window_keys import MORE_KEYS, OF_OPTICS, OF_PLAIN
 from amiwarp.viewer.window_layout import Rect, first_size, places
+from amiwarp.viewer.window_paper import GAP, Paper
 from amiwarp.viewer.window_sheets import PANEL_COLOURS
 
 SIZE = (900, 600)
@@ -964,6 +968,7 @@ def test_the_parts_of_the_window_lie_beside_each_other(size: tuple[int, int]) ->
             parts += [p.charts] if compensates else []
             parts += [p.side] if statistics else []
             assert sum(part.width * part.height for part in parts) == pytest.approx(size[0] * size[1])
+            assert all(min(part.width, part.height) >= 5 * p.font_px for part in parts)
             for k, one in enumerate(parts):
                 assert min(one.left, one.low) >= 0.0
                 assert one.right <= size[0]
@@ -1254,3 +1259,53 @@ def test_a_plain_recording_has_the_whole_image_beside_a_region(plain: Window, mo
     ]
     strike(plain, *places_of)  # on the whole image, also beyond the region
     assert plain.shown.region == (5, 5, 41, 51)
+
+
+def test_a_large_image_shows_the_largest_values_of_squares() -> None:
+    values = np.arange(35, dtype=np.float32).reshape(5, 7)
+    values[0, 0] = np.nan
+    np.testing.assert_array_equal(thinned(values, 2), [[8, 10, 12, 13], [22, 24, 26, 27], [29, 31, 33, 34]])
+    pair = np.stack([values, -values])
+    assert thinned(pair, 3).shape == (2, 2, 3)
+    np.testing.assert_array_equal(thinned(pair, 3)[1], [[-1, -3, -6], [-21, -24, -27]])
+    assert thinned(values, 1) is values
+
+
+def test_lines_of_text_are_as_wide_as_they_may_be() -> None:
+    text = "the phase is estimated from the events: calibrate"
+    lines = wrapped(text, 120.0, 12)
+    assert " ".join(lines) == text
+    assert len(lines) > 1
+    for line, following in itertools.pairwise(lines):
+        assert text_width(line, 12) <= 120.0 < text_width(f"{line} {following.split()[0]}", 12)
+    assert wrapped("a\n\nb", 120.0, 12) == ["a", "", "b"]
+    size = fitting_font(text, 200.0, 12)
+    assert text_width(text, size) <= 200.0 < text_width(text, size + 1)
+    assert fitting_font(text, 1000.0, 12) == 12
+
+
+def test_paper_draws_where_it_is_told() -> None:
+    """A line with a gap, an area, a picture from its top on, in pixels of the window; the next drawing is empty."""
+    plotter = pyvista.Plotter(off_screen=True, window_size=[200, 100], shape=(1, 2), border=False)
+    paper, part = Paper(plotter.renderers[1]), Rect(80, 20, 200, 100)
+    rgb = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
+
+    def pixels() -> np.ndarray:
+        plotter.render_window.Render()
+        return image_from_window(plotter.render_window, ignore_alpha=True)[::-1]
+
+    paper.clear(part, (200, 100), 12, ("white", "black"))
+    paper.line([(100, 30.5), (120, 30.5), GAP, (150, 30.5), (170, 30.5)])
+    paper.area(Rect(100, 50, 110, 60), "#0000ff")
+    paper.picture(rgb, Rect(140, 40, 180, 80))
+    paper.end()
+    seen = pixels()
+    dark = np.flatnonzero((seen[29:33] < 100).all(axis=2).any(axis=0))
+    assert (dark.min(), dark.max()) == (100, pytest.approx(169, abs=1))
+    assert not ((dark > 121) & (dark < 149)).any()
+    assert (seen[55, 105] == (0, 0, 255)).all()
+    assert [seen[y, x].tolist() for y in (70, 50) for x in (150, 170)] == rgb.reshape(4, 3).tolist()
+    paper.clear(part, (200, 100), 12, ("white", "black"))
+    paper.end()
+    assert (pixels()[20:, 80:] == 255).all()
+    plotter.close()
