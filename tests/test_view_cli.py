@@ -135,6 +135,19 @@ def test_a_picture_without_a_rotating_prism_shows_one_cloud(files: Path, tmp_pat
     assert (seen.max(axis=2) - seen.min(axis=2) > 100).any()  # its points are in the middle of the picture
 
 
+def test_a_picture_of_a_plain_recording_asks_for_no_encoder(files: Path, tmp_path: Path) -> None:
+    recording = open_recording(files / "recording.h5")
+    events = MemoryEvents(recording.events.slice(0, 5_000), *recording.events.size)
+    plain = replace(recording, events=events, encoder=None, truth=None, prism=None, camera=None)
+    save_recording(tmp_path / "plain.h5", plain)
+    save_recording(tmp_path / "prism.h5", replace(plain, prism=recording.prism))
+    for name, asks in (("plain", False), ("prism", True)):
+        code, said, _ = view(tmp_path / f"{name}.h5", "--screenshot", tmp_path / f"{name}.png", "--size", "400x200")
+        assert code == 0
+        assert ("no encoder" in said) == asks
+        assert ("camera unknown" in said) == asks
+
+
 @pytest.mark.parametrize(
     ("args", "says"),
     [

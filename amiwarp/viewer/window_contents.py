@@ -1,0 +1,169 @@
+"""What the parts of the window show: sliders, texts, timeline, images and curves, as the inspector computes them."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.choices import Vote
+from amiwarp.imaging.iwe import iwe
+from amiwarp.io.event_rates import EventRates
+from amiwarp.plotting.colours import count_scale
+from amiwarp.viewer import drawing, layout
+from amiwarp.viewer.drawing import ImageKind, ShownImages
+from amiwarp.viewer.filters import step_rows
+from amiwarp.viewer.window_actions import WindowActions
+from amiwarp.viewer.window_controls import Slider
+from amiwarp.viewer.window_images import Panel, panels_of
+from amiwarp.viewer.window_keys import help_rows
+from amiwarp.viewer.window_timeline import BINS
+
+
+class WindowContents(WindowActions):
+    """Contents of the window's parts. The window says when they have changed, and draws them."""
+
+    def _prepare(self) -> None:
+        """Begin without curves and images."""
+        self.curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+        """Values and sharpness of the curves by parameter, in the units of the sliders."""
+        self._curves_of: dict[str, Any] = {}  # window and selection of which the curves are
+        self._images: tuple[str, ShownImages] | None = None  # with their name
+        self._scale_held = False  # whether the images have the scale of before a slider moved
+        self._rates = EventRates(self.inspector.recording.events)
+        self._rates_shown: tuple[Any, ...] = ()
+        self._stream: list[str] = []  # figures of a live stream
+
+    def _fields(self) -> list[Slider]:
+        """Return the sliders of the parameters that matter, and of the time window."""
+        out, always = [], (*self.inspector.orbit_names, "clock_offset", "rpm")
+        for slider in layout.sliders(self.inspector) if self._has_controls else ():
+            name, value = slider["name"], slider["value"]
+            if value or name in always or name.startswith("tilt"):
+                title = f"{slider['label']} {layout.with_unit(name, value, 6)} ({slider['note']})"
+                out.append(Slider(name, value, slider["least"], slider["most"], slider["step"], title))
+        whole_ms, length_ms = self.whole_us * 1e-3, self.time_window[1] * 1e-3
+        start_ms = (self.time_window[0] - self.inspector.recording.events.t_first) * 1e-3
+        count = self.inspector.fixed_count
+        length = f"length {length_ms:.3f} ms" + ("" if count is None else f" ({count:,} events)")
+        return [
+            *out,
+            Slider("start_ms", start_ms, 0.0, whole_ms, 1e-3, f"window from {start_ms:.3f} ms"),
+            Slider("length_ms", length_ms, min(0.1, 0.5 * whole_ms), whole_ms, 1e-3, length),
+        ]
+
+    def _set_texts(self) -> None:
+        """Set what the column says: the rate, what the filters leave, a message, and what is missing."""
+        shown, notes = self.shown, ["x: set a prism"]
+        rate = f"{shown.span.count / shown.span.length_us * 1e6:,.0f} events/s"
+        if self._has_controls:
+            rate, notes = f"model {self.inspector.knobs.model}, {rate}", layout.notes(self.inspector)
+        steps = [f"{name}: {rates}" for name, rates, _ in step_rows(shown.steps, shown.read_us)]
+        both = [", ".join(row) for row in drawing.beside_rows(self.inspector, shown)]
+        self.sheets.controls.texts = [rate, *steps, *both, "h: help", "", self.message, *notes]
+        self.sheets.controls.rows = self._stream
+        self.sheets.help_rows = help_rows(optic=self._has_controls, depth=self.inspector.depth is not None)
+
+    def _show_timeline(self) -> None:
+        """Give the time window and the rates to the timeline."""
+        line, source = self.sheets.timeline, self.inspector.recording.events
+        before, line.window = line.window, (self.time_window[0] - source.t_first, self.time_window[1])
+        if line.whole_us != self.whole_us:
+            line.whole_us = self.whole_us
+            line.show_all()
+        if line.window != before:  # else the mouse may have moved the timeline away from it
+            line.follow()
+        wanted = line.span, self._rates, self._rates.share
+        if wanted != self._rates_shown:
+            self._rates_shown = wanted
+            low, high = (source.t_first + round(each) for each in line.span)
+            edges, line.rates = self._rates.curve(low, high, BINS)
+            line.edges = np.asarray(edges - source.t_first, np.float64)
+            line.note = "" if self._rates.share >= 1.0 else f"counting events: {100.0 * self._rates.share:.0f} %"
+
+    def _make_images(self) -> None:
+        """Make the images of what is shown. While a slider moves they keep their brightness.
+
+        A log intensity takes long: it is made when nothing moves.
+        """
+        if self.image is ImageKind.LOG_INTENSITY:
+            self._images = None
+            self.sheets.show_images([], self.shown.region, "log intensity: when nothing moves")
+            return
+        before = self._images
+        self._new_images()
+        if self._scale_held and before is not None and self._images is not None and before[0] == self._image_name:
+            kept = replace(self._images[1], scale=before[1].scale, after_scale=before[1].after_scale)
+            self._images = self._image_name, kept
+        self._show_images()
+
+    def _new_images(self) -> None:
+        """Make the images of what is shown, or say why there are none."""
+        self._images = None
+        with self.errors_shown("images"):
+            images = drawing.make_images(
+                self.inspector,
+                self.image,
+                against=self.b,
+                shown=self.shown,
+                difference=self.difference,
+                decay_us=self.decay_us,
+                same_scale=self.same_scale,
+            )
+            self._images = self._image_name, images
+
+    def _show_images(self) -> None:
+        """Give the images to the row. Of a recording without a prism, there is the whole image beside a region."""
+        region, titles = self.shown.region, self._look.titles
+        if self._images is None:
+            self.sheets.show_images([], region, "no images")
+            return
+        name, images = self._images
+        named = tuple(f"{title}: {name}" for title in titles)
+        if self.image is ImageKind.DEPTH or self.difference:  # beside the events as recorded
+            named = f"{titles[0]}: {ImageKind.COUNT.value}", name
+        panels = panels_of(images, named, region)
+        size = self.inspector.recording.events.size
+        if not self.compensates and region != (0, 0, *size):
+            whole = iwe(self.shown.span.events, *size, vote=Vote.NEAREST)
+            panels.insert(0, Panel("whole image: count", whole, count_scale([whole]), (0, 0, *size)))
+        self.sheets.show_images(panels, region, images.note)
+
+    def _curve_names(self) -> tuple[str, ...]:
+        """Return the parameters of the two sharpness curves: the chosen one, and phase or the first one."""
+        if not self.compensates:
+            return ()
+        return self.knob, next(name for name in ("phase", *self.sliders) if name != self.knob)
+
+    def _slow_steps(self) -> Iterator[None]:
+        """Compute statistics, a log intensity and sharpness curves in steps, so that the window follows its user."""
+        if self.statistics_shown:
+            self.sheets.show_statistics(self.inspector.statistics())
+            self.sheets_changed()
+            yield
+        if self.image is ImageKind.LOG_INTENSITY:
+            self._new_images()
+            self._show_images()
+            self.sheets_changed()
+            yield
+        for name in self._curve_names():
+            found, chosen = [], self.inspector.chosen
+            for point in self.inspector.curve_points(name):
+                found.append(point)
+                yield
+            values, sharpness = np.array(found).T
+            self.curves[name] = values / layout.UNITS[name], sharpness
+            self._curves_of[name] = chosen
+            self._show_curve(name)
+            self.sheets_changed()
+
+    def _show_curve(self, name: str) -> None:
+        """Show a sharpness curve with the current value and the known true one.
+
+        A curve of the window or selection before is grey, until the new one is computed.
+        """
+        if name in self.sheets.charts and name in self.curves:
+            known = layout.truths(self.inspector)[name], layout.knob_values(self.inspector)[name]
+            old = self._curves_of[name] != self.inspector.chosen
+            self.sheets.show_curve(name, *self.curves[name], known, old=old)
