@@ -90,17 +90,22 @@ def find_events(packets: wp.array(dtype=Span), start: int, found: wp.array(dtype
     int64_t* __restrict__ t = (int64_t*)events.t.data + block.place;
     uint8_t* __restrict__ p = (uint8_t*)events.p.data + block.place;
     for (int i = 0; i < block.count; ++i, row += 16) {
-        uint64_t time, rest;
+        uint64_t time = 0, rest = 0;
 #ifdef __CUDA_ARCH__
+        // A GPU reads no number across its borders, and its compiler takes memcpy() for one such read.
         if (((uint64_t)row & 7) == 0) {
             time = *(const uint64_t*)row;
             rest = *(const uint64_t*)(row + 8);
-        } else
-#endif
-        {
-            memcpy(&time, row, 8);
-            memcpy(&rest, row + 8, 8);
+        } else {
+            for (int k = 0; k < 8; ++k) {
+                time |= (uint64_t)(uint8_t)row[k] << (8 * k);
+                rest |= (uint64_t)(uint8_t)row[k + 8] << (8 * k);
+            }
         }
+#else
+        memcpy(&time, row, 8);
+        memcpy(&rest, row + 8, 8);
+#endif
         x[i] = (uint16_t)rest;
         y[i] = (uint16_t)(rest >> 16);
         t[i] = (int64_t)time;
