@@ -1074,6 +1074,25 @@ def test_undo_before_a_change_is_computed_undoes_it_and_redo_brings_it_back(
     until(lambda: field(page, "apex") == 0.9)
 
 
+def test_a_drag_is_undone_in_one_step_also_if_it_is_released_before_its_last_value_is_shown(
+    page: Any, tabs: Tabs, kept: tuple[Any, Any, dict[str, Any]]
+) -> None:
+    panel, first = kept[1], field(page, "phase")
+    tabs.loop.call_soon_threadsafe(panel.slide, "phase", 10.0)
+    until(lambda: field(page, "phase") == 10.0)
+    ready(page)
+
+    def end() -> None:
+        panel.slide("phase", 20.0)
+        panel.released()
+
+    tabs.loop.call_soon_threadsafe(end)
+    until(lambda: field(page, "phase") == 20.0)
+    ready(page)
+    page.keyboard.press("z")
+    until(lambda: field(page, "phase") == first)
+
+
 @pytest.mark.parametrize("step", ["open", "show"])
 def test_a_value_typed_while_the_window_is_read_or_computed_is_kept(
     page: Any, kept: tuple[Any, Any, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, step: str
@@ -1275,13 +1294,15 @@ def test_a_stream_that_goes_on_does_not_disturb_what_is_computed_of_it(
         own = Encoder(encoder.t[low:high], encoder.angle[low:high])
         return replace(recording, events=MemoryEvents(part, *events.size), encoder=own, truth=None)
 
-    curve = Inspector.curve
+    meter = Inspector.sharpness_meter
 
-    def slow(inspector: Inspector, name: str) -> Any:
-        until(lambda then=asked[0]: asked[0] > then + 40)  # the stream goes on
-        return curve(inspector, name)
+    def slow(inspector: Inspector) -> Callable[..., float]:
+        measure, then = meter(inspector), asked[0]
+        if asked[0] > 3:  # while the stream is followed
+            until(lambda: asked[0] > then + 40)
+        return measure
 
-    monkeypatch.setattr(Inspector, "curve", slow)
+    monkeypatch.setattr(Inspector, "sharpness_meter", slow)
     page = opened(of=latest(), latest=latest)
     page.locator("#curve polyline").wait_for()
     enter(page, "apex", 1.1)

@@ -110,7 +110,8 @@ def test_a_downloaded_file_holds_the_shown_events_whatever_the_blocks(
     expected = opened(plain, selection).loaded.counted
     assert 100 < len(expected) < len(plain.events)
     monkeypatch.setattr(viewer, "MOST_EVENTS", 6400)
-    monkeypatch.setattr(spans, "BLOCK", 500)
+    assert spans.blocks_between.__kwdefaults__ is not None
+    monkeypatch.setitem(spans.blocks_between.__kwdefaults__, "count", 500)
     thinned = opened(plain, selection)
     assert len(thinned.loaded.span.events) < thinned.loaded.span.count
     assert write_events(thinned, tmp_path / "events.h5", compensated=False) == len(expected)

@@ -1041,7 +1041,8 @@ def test_the_noise_filter_of_a_download_does_not_restart_at_its_blocks(
     expected = inspector.loaded.counted
     assert 0.2 * inspector.loaded.span.count < len(expected) < 0.95 * inspector.loaded.span.count
     monkeypatch.setattr(viewer, "MOST_EVENTS", 6400)
-    monkeypatch.setattr(spans, "BLOCK", 500)
+    assert spans.blocks_between.__kwdefaults__ is not None
+    monkeypatch.setitem(spans.blocks_between.__kwdefaults__, "count", 500)
     thinned = Inspector(inspector.recording)
     thinned.open(*window, Selection(noise_us=300))
     assert write_events(thinned, tmp_path / "events.h5", compensated=False) == len(expected)

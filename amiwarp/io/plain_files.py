@@ -272,11 +272,6 @@ class ArrayMap:
         save_map(Path(path), self._WHAT, {name: getattr(self, name) for name in self._KINDS}, overwrite=overwrite)
 
     @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Return the names of the arrays."""
-        return tuple(cls._KINDS)
-
-    @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a map that :meth:`save` wrote.
 
@@ -306,6 +301,18 @@ class ArrayMap:
                         raise AmiwarpError(f"array {name} has shape {shape}; expected (height, width)")
                     values[name] = np.frombuffer(stream.read(math.prod(shape) * dtype.itemsize), dtype).reshape(shape)
             return cls(**values)
+
+
+def holds_map(path: Path, kinds: Iterable[type[ArrayMap]]) -> bool:
+    """Return whether a file holds a map of one of these kinds, by the names of its arrays."""
+    if path.suffix.lower() != ".npz":
+        return False
+    try:
+        with zipfile.ZipFile(input_path(path)) as archive:
+            names = {name.removesuffix(".npy") for name in archive.namelist()}
+    except (zipfile.BadZipFile, OSError):
+        return False
+    return any(names >= kind._KINDS.keys() for kind in kinds)
 
 
 def save_tensors(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 import math
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -32,6 +31,7 @@ from amiwarp.imaging.regions import Region, RegionSharpness, inside, suggest_reg
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.formats import EXTENSIONS
 from amiwarp.io.pixel_map import PixelMap
+from amiwarp.io.plain_files import holds_map
 from amiwarp.io.spans import Span, read_span
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, Model, PlateModel, RisleyModel, alternatives, build_model
@@ -1056,7 +1056,7 @@ class Library:
         found = sorted(
             path for path in self.folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
             and path.is_file() and path.resolve().parent == self.folder  # also if it is a link
-            and not _is_map(path)
+            and not holds_map(path, (DepthMap, PixelMap))
         )  # fmt: skip
         return [[path.name, f"{path.stat().st_size / 1e6:,.1f} MB"] for path in found[:MOST_FILES]]
 
@@ -1065,12 +1065,3 @@ class Library:
         if name not in [file for file, _ in self.files()]:
             raise AmiwarpError(f"{name!r}: is no recording in {self.folder}; choose one from the list")
         return self._open_file(self.folder / name)
-
-
-def _is_map(path: Path) -> bool:
-    """Return whether a file holds a depth map or a map of pixels, and no recording."""
-    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        names = {name.removesuffix(".npy") for name in archive.namelist()}
-    return any(names >= set(kind.names()) for kind in (DepthMap, PixelMap))
