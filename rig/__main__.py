@@ -15,6 +15,8 @@ from rig.numbers import OVERSPEED, SPEEDS, Tolerance
 from rig.parts import Part, Rig
 
 APEXES = (0.5, 1.0, 2.0)
+FASTEST, BALANCED = max(SPEEDS), 2.5
+"""Speed of the prism [turns/min], and balance quality G of ISO 21940-11 [mm/s] of a rotor that is called balanced."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -169,6 +171,8 @@ def simulated_rows() -> list[tuple[str, ...]]:
 
 def checked(rig: Rig) -> Sequence[Part]:
     """Return the rig's parts, or end with what is wrong with them."""
+    if refused := parts.impossible(rig):
+        sys.exit(f"{rig.name}: " + "; ".join(refused))
     made = parts.assembly(rig)
     wrong = parts.problems(rig, made)
     wrong += [f"{part.name} is not watertight" for part in made if not numbers.in_file(part).is_watertight]
@@ -236,6 +240,19 @@ def report() -> str:
     return "\n".join(text)
 
 
+def balance_text(rig: Rig) -> str:
+    """Return the set screws, and the unbalance that they leave."""
+    screws, body = numbers.balance(rig, numbers.rotating(rig))
+    left, grade = float(np.hypot(*numbers.unbalance(body))), numbers.grade(body, FASTEST)
+    text = f"set screws M{rig.screw[1]:g}, angles from the thick edge: {words(screws)}; they leave {left:.2f} g mm"
+    if grade <= BALANCED:
+        return text
+    return (
+        f"{text}\nNOT BALANCED: G {grade:.0f} at {FASTEST:g} rpm, more than G {BALANCED:g}; take a smaller apex or "
+        "wedge, or turn more slowly"
+    )
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Write the files."""
     parser = argparse.ArgumentParser(prog="python -m rig", description=__doc__)
@@ -269,9 +286,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if part.kind == "printed":
                 numbers.to_mesh(part).export(folder / f"{part.name.replace(' ', '_')}.stl")
         print(f"{folder}: {sum(part.kind == 'printed' for part in made)} parts to print, all watertight, none overlaps")
-        screws, _ = numbers.balance(own, numbers.rotating(own))
         print(f"lens: its front is {own.seat_z - own.lens_z:.1f} mm from the wedge")
-        print(f"set screws M{own.screw[1]:g}, angles from the thick edge: {words(screws)}")
+        print(balance_text(own))
         if given.pictures:
             from rig import drawings
 

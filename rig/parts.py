@@ -159,6 +159,11 @@ class Rig:
         return self.thickness + self.wedge / 2 * math.tan(math.radians(self.apex_deg))
 
     @property
+    def thin_edge(self) -> float:
+        """Thickness of the wedge at its thin edge; negative if the glass ends before it."""
+        return 2 * self.thickness - self.edge
+
+    @property
     def bearing_z(self) -> tuple[float, float]:
         """Rear faces of both bearings."""
         rear = 2.0 + SPRING
@@ -410,6 +415,25 @@ def ring_screws(rig: Rig) -> tuple[float, list[tuple[float, float]]]:
     root = rig.pitch(rig.teeth[0]) - PITCH_LINE - TOOTH_DEPTH
     radius = (rig.wedge / 2 + rig.seat + root) / 2
     return radius, around(radius, (45, 135, 225, 315))
+
+
+LEAST_EDGE = 0.5
+"""Smallest thickness of the wedge at its thin edge [mm]. Thinner glass chips."""
+
+
+def impossible(rig: Rig) -> list[str]:
+    """Return what is wrong with the sizes of the wedge, and the remedy; nothing if it can be made."""
+    if not 0.0 < rig.apex_deg < 90.0:
+        return [
+            f"apex {rig.apex_deg:g}°: give an angle above 0; the thick edge is at 0° of the rotor, whatever the sign"
+        ]
+    if rig.thin_edge < LEAST_EDGE:
+        least = math.ceil(10.0 * (rig.thickness - rig.thin_edge + LEAST_EDGE)) / 10.0
+        return [
+            f"thickness {rig.thickness:g} mm: with an apex of {rig.apex_deg:g}° the thin edge is "
+            f"{rig.thin_edge:.2f} mm; give {least:.1f} mm or more on the axis, or a smaller apex"
+        ]
+    return []
 
 
 def balance_holes(rig: Rig) -> tuple[float, list[float]]:
