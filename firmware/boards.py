@@ -18,6 +18,27 @@ HERE = Path(__file__).parent
 BUILD = HERE / "build"
 COUNTS = (4096, 16384)
 """Counts per turn of the quadrature encoder, and of the magnetic one if it turns with the prism."""
+FAULTS = (
+    "jammed",
+    "driver_fault",
+    "no_index",
+    "dead_a",
+    "reversed_motor",
+    "bad_spi",
+    "runaway",
+    "dead_encoder",
+    "lost_counts",
+    "no_magnet",
+    "error_flag",
+    "bouncing_index",
+    "odd_index",
+    "no_supply",
+    "sensed",
+    "load",
+    "heavy",
+)
+"""Faults of the simulated motor and encoder, explained by ``enum value`` in ``native/motor.h``, in its order."""
+MOTOR = (*FAULTS, "angle", "rpm")
 
 
 class NativeBoard:
@@ -27,8 +48,8 @@ class NativeBoard:
     """
 
     VALUES = (
-        "jammed", "driver_fault", "no_index", "dead_a", "reversed_motor", "bad_spi", "runaway", "angle", "rpm",
-        "now", "late_us", "pulses",
+        *MOTOR, "now", "late_us", "pulses", "fastest_rpm", "unfed_us", "pulse_shortest_us", "pulse_longest_us",
+        "driven",
     )  # fmt: skip
     """What :meth:`get` returns; the names before ``angle`` are faults that :meth:`set` switches."""
     plugged = True
@@ -80,7 +101,7 @@ class NativeBoard:
 
     def counters(self) -> dict[str, int]:
         """Return the firmware's statistics of received frames."""
-        names = ("frames", "damaged", "unknown", "lost", "overruns")
+        names = ("frames", "damaged", "unknown", "lost", "overruns", "encoder_errors", "index_bounces")
         return {name: self.library.board_counter(self._board, k) for k, name in enumerate(names)}
 
 
@@ -153,7 +174,7 @@ class AvrBoard(NativeBoard):
     """The image for the ATmega2560 (``.elf``) on simavr, see :class:`NativeBoard`. Times are in us, others cycles."""
 
     MHZ = 16
-    VALUES = (*NativeBoard.VALUES[:9], "now", "cycles", "watchdogs", "boot_us", "enable", "sync")
+    VALUES = (*MOTOR, "now", "cycles", "watchdogs", "boot_us", "enable", "sync")
     LISTS = ("index_us", "trigger_us", "enabled_us")
     INTERRUPTS = {  # noqa: RUF012
         "edge A": 5, "edge B": 6, "tick": 17, "UART in": 25, "UART out": 26, "index": 41, "camera": 46,

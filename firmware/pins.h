@@ -8,11 +8,12 @@
 #define PIN_B 3
 #define PIN_INDEX 4         /* index Z, high once per turn, pulled down */
 #define PIN_CAMERA_SYNC 5   /* pulses of the camera (PULSES_CAMERA), pulled down */
-#define PIN_TRIGGER 6       /* pulses to the camera's trigger input, 1 ms high */
+#define PIN_TRIGGER 6       /* pulses to the camera's trigger input, 1 to 2 ms high */
 #define PIN_PWM 8           /* motor driver: 25 kHz */
 #define PIN_DIRECTION 9     /* high: forwards */
 #define PIN_ENABLE 10       /* high: on */
 #define PIN_DRIVER_FAULT 11 /* low: over-current or over-temperature, pulled up */
+#define PIN_SUPPLY 12       /* supply of the motor, divided; low: lost. Pulled up: not connected means present */
 #define PIN_SPI_MISO 16     /* magnetic encoder, 7.8 MHz, mode 1 */
 #define PIN_SPI_CS 17
 #define PIN_SPI_SCK 18

@@ -64,8 +64,29 @@ def test_the_emulator_passes(rpm: float, at_first: float) -> None:
     controller = emulated(rpm=at_first, drift_ppm=80.0, clock_start=(1 << 32) - 9_000_000)
     checks = check_controller(VirtualWire(controller), rpm)
     assert [check.name for check in checks if not check.passed] == []
-    assert len(checks) == 19
+    assert len(checks) == 25
     assert controller.rotor.target_rpm(10**9) == 0.0
+
+
+@pytest.mark.parametrize("rpm", [240.0, -240.0, 60.0])
+def test_a_perfectly_steady_controller_passes(rpm: float) -> None:
+    """Its index pulses are whole milliseconds apart, as if its clock had such steps."""
+    steady = Controller(Motor(0.0, inertia_s=1e-6, ripple=0.0, noise=0.0))
+    assert [check.name for check in check_controller(VirtualWire(steady), rpm) if not check.passed] == []
+
+
+def test_an_older_controller_is_named_and_passes() -> None:
+    class Older(Controller):
+        """Skips unknown commands, as the emulator of amiwarp 0.1 did."""
+
+        def _execute(self, sequence: int, message: protocol.Message | None) -> None:
+            if message is not None:
+                super()._execute(sequence, message)
+
+    checks = check_controller(VirtualWire(Older(Motor(0.0))), 240.0)
+    unsure = [check for check in checks if not check.passed]
+    assert [(check.name, check.passed) for check in unsure] == [("answers unknown commands", None)]
+    assert "an older controller" in unsure[0].measured
 
 
 @pytest.mark.parametrize(
@@ -170,10 +191,10 @@ def test_the_command_prints_a_table_and_ends_with_status_1_for_a_failure(monkeyp
     controllers = [emulated(), emulated(sync_hz=100.0)]
     monkeypatch.setattr(conformance, "SerialWire", lambda port: VirtualWire(controllers.pop(0)))
     data = json.loads(motor("check", "--port", "p", "--yes", "--rpm", -120, "--json").stdout)
-    assert (data["passed"], data["rpm"], len(data["checks"])) == (True, -120.0, 19)
+    assert (data["passed"], data["rpm"], len(data["checks"])) == (True, -120.0, 25)
     done = motor("check", "--port", "p", "--yes")
     assert done.exit_code == 1
-    assert "1 of 19 checks failed" in done.stdout
+    assert "1 of 25 checks failed" in done.stdout
     assert "sync pulses: send a pulse every 70 to 130 ms, drawn at random for each" in done.stdout
 
 

@@ -154,9 +154,11 @@ def test_commands_are_obeyed_answered_and_refused() -> None:
     assert [m for m in found if isinstance(m, Pong)] == [Pong(77, S)]
     assert found[-1] == Answer(6, 1)
     assert any(isinstance(m, ControllerStatus) and (m.state, m.target_rpm) == (2, 600.0) for m in found)
-    controller.feed(encode(SetCounts(100), 8), 3 * S)
-    controller.feed(encode(Stop(), 9), 3 * S + 100_000)
+    controller.feed(encode(SetCounts(4096), 8) + encode(SetCounts(100), 9), 3 * S)
+    controller.feed(encode(Stop(), 10), 3 * S + 100_000)
+    controller.feed(encode(SetCounts(100), 11), 5 * S)
     found = [m for _, m in FrameDecoder().feed(controller.advance(6 * S))]
+    assert [(m.sequence, m.refused) for m in found if isinstance(m, Answer)] == [(8, 0), (9, 3), (10, 0), (11, 0)]
     status = [m for m in found if isinstance(m, ControllerStatus)]
     assert (status[-1].state, status[-1].rpm, status[-1].counts_per_turn) == (0, pytest.approx(0.0, abs=1.0), 100)
     assert np.ptp(counted(found)[-100:, 1]) <= 1

@@ -487,10 +487,12 @@ def test_commands_over_the_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> 
             link.set_speed(1e6, 100.0)
         with pytest.raises(AmiwarpError, match="-5 counts per turn"):
             link.set_counts(-5)
-        link.set_counts(1000)
-        wait(lambda: link.status is not None and link.status.counts_per_turn == 1000)
+        with pytest.raises(AmiwarpError, match="not possible now"):
+            link.set_counts(1000)
         link.stop()
         wait(lambda: link.status is not None and link.status.state == 0)
+        link.set_counts(1000)
+        wait(lambda: link.status is not None and link.status.counts_per_turn == 1000)
         live.controller.feed = lambda data, now_us: None  # type: ignore[method-assign]
         monkeypatch.undo()
         wait_for = link._changed.wait_for

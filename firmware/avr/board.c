@@ -90,11 +90,12 @@ static void set_levels(struct board *b) {
     set_pin(b, 'E', 4, levels & 2);
     set_pin(b, 'E', 5, levels & 1);
     set_pin(b, 'A', 2, b->motor.values[DRIVER_FAULT] == 0);
+    set_pin(b, 'A', 4, b->motor.values[NO_SUPPLY] == 0 || b->motor.values[SENSED] == 0);
 }
 
 static void booted(struct board *b) {
-    static const struct { char port; int pin; } inputs[] = {{'E', 4}, {'E', 5}, {'A', 2}, {'L', 0}, {'L', 1}};
-    for (uint32_t k = 0; k < 5; k++) { /* a reset has cleared the levels, and simavr passes on changes only */
+    static const struct { char port; int pin; } inputs[] = {{'E', 4}, {'E', 5}, {'A', 2}, {'A', 4}, {'L', 0}, {'L', 1}};
+    for (uint32_t k = 0; k < 6; k++) { /* a reset has cleared the levels, and simavr passes on changes only */
         avr_irq_t *irq = avr_io_getirq(b->avr, AVR_IOCTL_IOPORT_GETIRQ(inputs[k].port), inputs[k].pin);
         uint32_t level = irq->value & 1;
         avr_raise_irq(irq, !level);
@@ -226,6 +227,10 @@ uint32_t board_advance(struct board *b, uint64_t until, uint8_t *out, uint32_t r
             if (!motor_index(&b->motor)) continue;
             if (b->motor.in_pulse == (b->motor.rpm > 0)) note(b, INDEX_TIMES);
             set_pin(b, 'L', 0, b->motor.in_pulse);
+            for (int k = 1; b->motor.values[BOUNCING_INDEX] != 0 && k < 5; k++) {
+                run(b, b->avr->cycle + 3 * PER_US); /* less than a count */
+                set_pin(b, 'L', 0, b->motor.in_pulse == (k % 2 == 0));
+            }
         }
         run(b, end);
     }

@@ -2,7 +2,7 @@
 
    Pins (number on an Arduino Mega): A on PE4 (2), B on PE5 (3), both pulled up; index on PL0 (49) and pulses of the camera
    on PL1 (48), which the timers capture; driver: PWM of 27 kHz on PE3 (5), direction PA0 (22), enable PA1 (23), fault PA2
-   (24), pulled up; pulse to the camera PA3 (25). The link is UART 0 at 500,000 baud: 16 MHz cannot divide to 460,800. */
+   (24), pulled up; pulse to the camera PA3 (25); supply of the motor, divided, PA4 (26), pulled up. The link is UART 0 at 500,000 baud: 16 MHz cannot divide to 460,800. */
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <avr/sleep.h>
@@ -64,6 +64,7 @@ static void send_pulse(void) {
     cli();
     PORTA |= TRIGGER;
     uint32_t t = now();
+    pulse_begins(&c);
     sei();
     on_sync(&c, t);
 }
@@ -88,13 +89,20 @@ ISR(TIMER4_CAPT_vect) { /* index: the timer has captured the time of the edge */
     uint16_t captured = ICR4, ago = TCNT4 - captured;
     uint32_t t = time_before(ago);
     bool rising = TCCR4B & 1 << ICES4;
-    TCCR4B ^= 1 << ICES4; /* the other edge next */
-    TIFR4 = 1 << ICF4;
+    uint8_t high;
+    do { /* next is the other edge, by the level: edges of a sensor that bounces may have been missed */
+        high = PINL & 1;
+        TCCR4B = (uint8_t)((TCCR4B & ~(1 << ICES4)) | (high ? 0 : 1 << ICES4));
+        TIFR4 = 1 << ICF4;
+    } while (high != (PINL & 1));
     take_edges();
     int32_t count = c.count;
     TIMSK4 = 0;
     sei();
-    if (on_index(&c, t, count, rising) && PULSES == PULSES_INDEX) send_pulse();
+    if (is_index(&c, t, count, rising)) {
+        on_index(&c, t, count);
+        if (PULSES == PULSES_INDEX) send_pulse();
+    }
     cli();
     TIMSK4 = 1 << ICIE4;
 }
@@ -116,7 +124,7 @@ ISR(TIMER1_COMPA_vect) {
     uint32_t t = now();
     take_edges();
     int32_t count = c.count;
-    PORTA &= (uint8_t)~TRIGGER;
+    if (pulse_ends(&c)) PORTA &= (uint8_t)~TRIGGER;
     sei();
     if (on_tick(&c, t, count)) send_pulse();
 }
@@ -142,7 +150,7 @@ static void drive(void) {
 int main(void) {
     wdt_enable(WDTO_120MS); /* after a reset by the watchdog it runs with its shortest time */
     DDRE = 1 << 3, PORTE = 1 << 4 | 1 << 5;
-    DDRA = 1 << 0 | 1 << 1 | TRIGGER, PORTA = 1 << 2;
+    DDRA = 1 << 0 | 1 << 1 | TRIGGER, PORTA = 1 << 2 | 1 << 4;
     UCSR0A = 1 << U2X0, UBRR0 = 3, UCSR0B = 1 << RXCIE0 | 1 << RXEN0 | 1 << TXEN0, UCSR0C = 3 << UCSZ00;
     OCR1A = PER_TICK - 1, TCCR1B = 1 << WGM12 | 1 << CS11, TIMSK1 = 1 << OCIE1A;
     ICR3 = PWM_TOP, TCCR3A = 1 << COM3A1 | 1 << WGM31, TCCR3B = 1 << WGM33 | 1 << WGM32 | 1 << CS30;
@@ -158,6 +166,7 @@ int main(void) {
     sei();
     for (uint8_t ticks = 0;;) {
         c.driver_fault = !(PINA & 1 << 2);
+        c.supply_low = !(PINA & 1 << 4);
         controller_poll(&c, time());
         drive();
         if ((uint8_t)c.ticks != ticks) {

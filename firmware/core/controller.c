@@ -5,12 +5,19 @@
 #define CHECK_US 10000u
 #define STILL_CHECKS 10u /* a prism that swings into a cogging position has not stopped */
 #define FAULT(name) (1u << FAULT_BIT_##name)
-#define STOPPING (FAULT(STALL) | FAULT(OVER_CURRENT) | FAULT(ENCODER_LOST) | FAULT(OVER_SPEED))
+#define STOPPING \
+    (FAULT(STALL) | FAULT(OVER_CURRENT) | FAULT(ENCODER_LOST) | FAULT(OVER_SPEED) | FAULT(SUPPLY_LOST) | FAULT(MAGNET_LOST))
+#define MOST_BAD_ANSWERS 3u /* one after the other */
+#define MOST_BAD_PULSES 3u
+#define NO_MAGNET_MS 20u
+#define RUN_DOWN_US 2000000u
+#define SUPPLY_MS 3u
+#define LEAST_CHANGE_PER_S 4 /* a change of the speed takes a quarter of a second, else it overshoots */
 
 const struct settings default_settings = {
     .counts_per_turn = (uint32_t)COUNTS * RATIO, .encoder = QUADRATURE, .pulses = PULSES_TIMED, .has_index = true,
     .most_rpm = MOST_RPM, .most_ramp = 5000, .stop_ramp = 2000, .stall_ms = 1000,
-    .gains = {.no_load_rpm = 4000, .friction = 600, .kp = 20 * 256, .ki = 100 * 256, .duty_slew = 1500},
+    .gains = {.no_load_rpm = 4000, .friction = 600, .kp = 20 * 256, .ki = 100 * 256, .rise_ms = 150, .duty_slew = 1500},
 };
 
 static int32_t size_of(int32_t x) { return x == INT32_MIN ? INT32_MAX : x < 0 ? -x : x; }
@@ -108,18 +115,52 @@ static bool lasts(uint16_t *counter, bool condition, uint16_t ms) {
     return *counter >= ms;
 }
 
+static void fail_stalled(struct controller *c) {
+    if (!(c->faults & STOPPING)) c->stalled_at = c->last.t;
+    fail(c, FAULT(STALL));
+}
+
+static bool has_just_stalled(const struct controller *c) {
+    return c->faults & FAULT(STALL) && c->last.t - c->stalled_at < RUN_DOWN_US;
+}
+
+/* Stop for a fault that is also the cause of a stall: the guard may have found that first. */
+static void fail_for(struct controller *c, uint32_t fault) {
+    if (has_just_stalled(c)) c->faults &= (uint16_t)~FAULT(STALL);
+    fail(c, fault);
+}
+
+static void guard(struct controller *c) {
+    struct guard_input now = {
+        .count = c->last.count, .speed = c->speed, .reference = c->control.reference,
+        .target = c->control.target,
+        .duty = c->enabled ? c->duty : 0, .lead = c->enabled && c->duty ? speed_lead(&c->control, c->speed) : 0, .limited = c->control.limited,
+    };
+    enum guard_finding found = guard_step(&c->guard, &now);
+    if (found == GUARD_RUNS_AWAY) fail(c, FAULT(OVER_SPEED));
+    else if (found != GUARD_GOOD) fail_stalled(c);
+    c->control.kick = guard_kick(&c->guard);
+}
+
+/* Pulses of the index that are not a turn of counts away from the last one: the encoder does not count. If the motor has
+   just stopped because the counts stand still, one such pulse shows that the shaft does not. */
+static void bad_pulse(struct controller *c, bool bad) {
+    bool stalled = has_just_stalled(c), meant = stalled || size_of(c->control.reference) > RPM(20);
+    if (lasts(&c->bad_turns, bad && meant, stalled ? 1 : MOST_BAD_PULSES)) fail_for(c, FAULT(ENCODER_LOST));
+}
+
 /* Checks of each sample, before the speed control. */
 static void protect(struct controller *c) {
     const struct settings *s = &c->settings;
     int32_t speed = size_of(c->speed), reference = size_of(c->control.reference);
-    bool turning = reference > RPM(20);
-    bool away = speed > reference + reference / 2 + RPM(300)
-        || (turning && speed > RPM(30) && (c->speed < 0) != (c->control.reference < 0));
     if (lasts(&c->over_ms, speed > c->over_speed, 20) || c->too_fast) fail(c, FAULT(OVER_SPEED));
-    if (lasts(&c->runaway_ms, c->enabled && away, 500)) fail(c, FAULT(OVER_SPEED));
-    if (lasts(&c->stalled_ms, turning && speed < reference / 8, s->stall_ms)) fail(c, FAULT(STALL));
+    if (lasts(&c->stalled_ms, reference > RPM(20) && speed < reference / 8, s->stall_ms)) fail_stalled(c);
     if (lasts(&c->current_ms, c->driver_fault, 2)) fail(c, FAULT(OVER_CURRENT));
-    if (c->bad_answers >= 5) fail(c, FAULT(ENCODER_LOST));
+    if (lasts(&c->supply_ms, c->supply_low, SUPPLY_MS)) fail_for(c, FAULT(SUPPLY_LOST));
+    if (c->bad_answers >= MOST_BAD_ANSWERS) fail_for(c, FAULT(ENCODER_LOST));
+    if (c->no_magnet >= NO_MAGNET_MS) fail_for(c, FAULT(MAGNET_LOST));
+    guard(c);
+    for (; c->odd_seen != c->odd_pulses; c->odd_seen++) bad_pulse(c, true);
     /* More than 1 in 16 edges lost within 0.1 s. */
     if (++c->lost_ms >= 100) {
         uint32_t edges;
@@ -142,7 +183,7 @@ static void take_index(struct controller *c, struct stamp at) {
         uint32_t turned = (uint32_t)size_of(step_of(at.count, c->last_index.count)), off = turned % per_turn;
         /* Counts that do not make whole turns, or stand still from pulse to pulse: an encoder's wire is broken. */
         bool whole = turned > 0 && turned >= per_turn / 2 && (off < per_turn / 8 || off > per_turn - per_turn / 8);
-        if (lasts(&c->bad_turns, !whole && size_of(c->control.reference) > RPM(20), 3)) fail(c, FAULT(ENCODER_LOST));
+        bad_pulse(c, !whole);
         /* The pulses also measure the speed without the counts. */
         uint32_t least = 50000000u / (uint32_t)c->settings.most_rpm;
         if (whole && turned < per_turn + per_turn / 8 && at.t - c->last_index.t < least) fail(c, FAULT(OVER_SPEED));
@@ -196,8 +237,10 @@ static uint8_t set_speed(struct controller *c, const uint8_t *payload) {
     if (slope == 0 || slope >= 0x7F800000u) return REFUSED_OUT_OF_RANGE; /* zero, negative, infinite or NaN */
     if (c->faults & STOPPING) return REFUSED_NOT_POSSIBLE_NOW;           /* a stop clears the faults */
     if (!q16_from_f32(slope, &ramp) || ramp > RPM(most)) ramp = RPM(most);
-    ramp /= TICK_HZ;
     if (!c->enabled) speed_catch(&c->control, c->speed);
+    int32_t change = size_of(rpm - c->control.reference);
+    if (ramp / LEAST_CHANGE_PER_S > change) ramp = change * LEAST_CHANGE_PER_S;
+    ramp /= TICK_HZ;
     c->control.target = rpm;
     c->control.ramp = ramp > 0 ? ramp : 1;
     c->target_bits = rpm == 0 ? 0 : bits;
@@ -208,7 +251,9 @@ static uint8_t set_speed(struct controller *c, const uint8_t *payload) {
 
 static uint8_t stop(struct controller *c) {
     c->faults &= (uint16_t)~STOPPING;
-    c->over_ms = c->runaway_ms = c->stalled_ms = c->current_ms = c->bad_turns = 0;
+    c->over_ms = c->stalled_ms = c->current_ms = c->supply_ms = c->bad_turns = 0;
+    c->no_magnet = 0;
+    guard_begin(&c->guard, c->last.count, c->settings.counts_per_turn);
     c->too_fast = false;
     c->commanded = true;
     if (!c->enabled) speed_catch(&c->control, c->speed);
@@ -225,7 +270,8 @@ static uint8_t set_counts(struct controller *c, const uint8_t *payload) {
     if (c->settings.encoder == MAGNETIC || c->state != STATE_STOPPED) return REFUSED_NOT_POSSIBLE_NOW;
     c->settings.counts_per_turn = per_turn;
     tracker_begin(&c->tracker, c->last.count, per_turn);
-    c->indexed = false;
+    guard_begin(&c->guard, c->last.count, per_turn);
+    c->indexed = c->index_known = false;
     c->last_index = c->last;
     return REFUSED_ACCEPTED;
 }
@@ -267,9 +313,12 @@ void controller_begin(struct controller *c, const struct settings *settings, uin
     uint8_t *bytes = (uint8_t *)c;
     for (uint32_t k = 0; k < sizeof *c; k++) bytes[k] = 0;
     c->settings = *settings;
+    frame_begin();
     speed_begin(&c->control, &settings->gains);
     c->over_speed = RPM(settings->most_rpm) / 5 * 6;
+    c->bounce_us = 25000000u / (uint32_t)settings->most_rpm;
     tracker_begin(&c->tracker, 0, settings->counts_per_turn);
+    guard_begin(&c->guard, 0, settings->counts_per_turn);
     c->heard = now;
     c->checked_at = now;
     c->random = now;

@@ -8,6 +8,7 @@
 
 #include "encoder.h"
 #include "frame.h"
+#include "guard.h"
 #include "speed.h"
 
 /* Sizes of the rings, powers of two. A port with little memory defines smaller ones. */
@@ -75,9 +76,16 @@ struct controller {
     volatile int32_t count;
     volatile uint32_t ticks, edges_lost, overruns; /* overruns: samples, pulses or bytes that found their ring full */
     volatile bool too_fast;                        /* more edges than the port counts */
-    volatile uint8_t bad_answers;                  /* of the magnetic encoder, one after the other */
+    volatile uint8_t bad_answers, no_magnet;       /* of the magnetic encoder, one after the other */
+    volatile uint32_t encoder_errors;              /* its answers that were damaged or had the error bit */
+    volatile uint32_t index_bounces;               /* edges of the index nearer than half a turn, in one direction */
+    volatile uint8_t odd_pulses;                   /* those of them that are no bounce by their time */
     uint8_t until_pulse;                           /* ticks until the next pulse to the camera */
     volatile bool interval_used;                   /* whether the main loop shall draw another interval */
+    uint8_t pulse_ticks;                           /* ticks until the pulse to the camera ends */
+    bool diagnosed;                                /* the magnetic encoder's next answer is its diagnosis */
+    bool index_known, index_backwards;             /* the last index: whether there was one, and its direction */
+    struct stamp index_at;
     uint8_t levels;                                /* 2 A + B at the last edge */
     bool backwards;                                /* direction; written by the main loop with a magnetic encoder */
     uint16_t angle;                                /* of the magnetic encoder */
@@ -91,17 +99,23 @@ struct controller {
     RING(uint8_t, TX_BYTES) tx;
     int32_t duty;
     bool enabled;
+    /* Written by the port's main loop. */
+    bool driver_fault, supply_low;
     /* Private. */
     struct frame_decoder decoder;
     struct tracker tracker;
     struct speed_control control;
+    struct guard guard;
     struct stamp batch[BATCH], last, last_index;
     uint32_t random, heard, status_at, checked_at, pulse_number, edges_seen, target_bits, sent_target, sent_counts;
-    uint16_t sequence, stalled_ms, runaway_ms, over_ms, current_ms, bad_turns, lost_ms;
+    uint32_t bounce_us;      /* half a turn at the fastest speed that is no fault */
+    uint32_t stalled_at;     /* time of the fault stall */
+    uint16_t sequence, stalled_ms, over_ms, current_ms, supply_ms, bad_turns, lost_ms;
     uint16_t faults, sent_faults;
     uint8_t batched, state, sent_state, still;
     int32_t speed, over_speed;
-    bool indexed, sampled, told, driver_fault, commanded;
+    uint8_t odd_seen;
+    bool indexed, sampled, told, commanded;
 };
 
 void controller_begin(struct controller *c, const struct settings *settings, uint32_t now);
@@ -147,12 +161,25 @@ static inline bool has_absolute_angle(const struct settings *s) {
     return s->encoder == MAGNETIC && s->counts_per_turn == AS5047_COUNTS;
 }
 
-/* Edge of the index pulse at time t [us] and its count. The edge at lower counts is the index, whichever way the prism turns: the
-   pulse's first edge forwards, its last edge backwards. Returns whether this is the index. */
-static inline bool on_index(struct controller *c, uint32_t t, int32_t count, bool rising) {
+/* Whether an edge of the index pulse at time t [us] and a count is the index: the edge at lower counts, whichever way the
+   prism turns. It is the pulse's first edge forwards, its last edge backwards. One nearer than half a turn to the last index in
+   the same direction is none: the sensor bounces, or the pulse is a disturbance. */
+static inline bool is_index(struct controller *c, uint32_t t, int32_t count, bool rising) {
     if (rising == c->backwards) return false;
+    uint32_t turned = (uint32_t)count - (uint32_t)c->index_at.count;
+    if (turned >> 31) turned = 0u - turned;
+    if (turned >= c->settings.counts_per_turn / 2u || c->index_backwards != c->backwards || !c->index_known) return true;
+    c->index_bounces++;
+    if (t - c->index_at.t >= c->bounce_us) c->odd_pulses++;
+    return false;
+}
+
+/* The index, after is_index(). */
+static inline void on_index(struct controller *c, uint32_t t, int32_t count) {
+    c->index_known = true;
+    c->index_backwards = c->backwards;
+    c->index_at = (struct stamp){t, count};
     PUT(c, c->index, WAITING_PULSES, (struct stamp){t, count});
-    return true;
 }
 
 /* Pulse that the camera receives or sends, at time t [us]. */
@@ -168,10 +195,16 @@ static inline bool on_tick(struct controller *c, uint32_t t, int32_t count) {
     return c->settings.pulses == PULSES_TIMED;
 }
 
-/* Answer of the magnetic encoder, before on_tick(): updates the count. */
+/* The pulse to the camera begins; pulse_ends() is true at the tick that ends it, 1 to 2 ms later. Both with interrupts
+   disabled, or from one interrupt. */
+static inline void pulse_begins(struct controller *c) { c->pulse_ticks = 2; }
+static inline bool pulse_ends(struct controller *c) { return c->pulse_ticks && --c->pulse_ticks == 0; }
+
+/* Answer of the magnetic encoder with its angle, before on_tick(): updates the count. */
 static inline void on_answer(struct controller *c, uint16_t frame) {
     int angle = as5047_angle(frame);
     if (angle < 0) {
+        c->encoder_errors++;
         if (c->bad_answers < UINT8_MAX) c->bad_answers++;
         return;
     }
@@ -184,6 +217,27 @@ static inline void on_answer(struct controller *c, uint16_t frame) {
     }
     c->angle = (uint16_t)angle;
     c->angle_known = true;
+}
+
+/* Answer of the magnetic encoder with its diagnosis. */
+static inline void on_diagnosis(struct controller *c, uint16_t frame) {
+    if (!as5047_has_no_magnet(frame)) c->no_magnet = 0;
+    else if (c->no_magnet < UINT8_MAX) c->no_magnet++;
+}
+
+/* One reading of the magnetic encoder, before on_tick(): the angle is taken at the end of ask_encoder(). `transfer` sends a
+   frame and returns the answer to the frame before. */
+static inline void ask_encoder(struct controller *c, uint16_t (*transfer)(uint16_t)) {
+    uint16_t answer = transfer(AS5047_READ_ANGLE);
+    if (c->diagnosed) on_diagnosis(c, answer);
+}
+static inline void read_encoder(struct controller *c, uint16_t (*transfer)(uint16_t)) {
+    uint16_t answer = transfer(AS5047_READ_DIAGNOSIS);
+    on_answer(c, answer);
+    c->diagnosed = !as5047_failed(answer);
+    if (c->diagnosed) return;
+    transfer(AS5047_READ_ERRORS); /* else each later answer would have the error bit */
+    transfer(AS5047_READ_ANGLE);
 }
 
 #endif

@@ -11,3 +11,7 @@ int as5047_angle(uint16_t frame) {
     parity ^= parity >> 1;
     return (parity & 1u) || (frame & 0x4000u) ? -1 : (int)(frame & 0x3FFFu);
 }
+
+bool as5047_has_no_magnet(uint16_t frame) {
+    return !as5047_failed(frame) && (frame & 0x0B00u) != 0x0100u;
+}

@@ -2,15 +2,17 @@
 
 #define CRC_OF_VALID 0x2144DF1Cu /* CRC-32 of any bytes followed by their CRC-32 */
 
-static uint32_t crc_byte(uint32_t crc, uint8_t byte) {
-    static const uint32_t table[16] = { /* of the reflected polynomial 0xEDB88320, for four bits */
-        0x00000000u, 0x1DB71064u, 0x3B6E20C8u, 0x26D930ACu, 0x76DC4190u, 0x6B6B51F4u, 0x4DB26158u, 0x5005713Cu,
-        0xEDB88320u, 0xF00F9344u, 0xD6D6A3E8u, 0xCB61B38Cu, 0x9B64C2B0u, 0x86D3D2D4u, 0xA00AE278u, 0xBDBDF21Cu,
-    };
-    crc ^= byte;
-    crc = crc >> 4 ^ table[crc & 15u];
-    return crc >> 4 ^ table[crc & 15u];
+static uint32_t crc_table[256]; /* in RAM: four bits at a time took an AVR longer than a byte takes on the line */
+
+void frame_begin(void) {
+    uint32_t crc = 1;
+    for (uint16_t bit = 128; bit; bit >>= 1) { /* the CRC of two bits is that of one, and that of the other */
+        crc = crc & 1u ? crc >> 1 ^ 0xEDB88320u : crc >> 1;
+        for (uint16_t others = 0; others < 256u; others = (uint16_t)(others + 2u * bit)) crc_table[bit + others] = crc ^ crc_table[others];
+    }
 }
+
+static uint32_t crc_byte(uint32_t crc, uint8_t byte) { return crc_table[(uint8_t)crc ^ byte] ^ crc >> 8; }
 
 uint32_t crc32_more(uint32_t crc, const uint8_t *bytes, uint32_t size) {
     crc = ~crc;

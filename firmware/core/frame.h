@@ -16,6 +16,9 @@ static inline void put32(uint8_t *to, uint32_t value) { put16(to, value), put16(
 static inline uint16_t get16(const uint8_t *from) { return (uint16_t)(from[0] | (uint16_t)from[1] << 8); }
 static inline uint32_t get32(const uint8_t *from) { return get16(from) | (uint32_t)get16(from + 2) << 16; }
 
+/* Prepare the table of the CRC, before all other functions. */
+void frame_begin(void);
+
 /* Return the CRC-32 (zlib) of the bytes before and `size` more bytes; 0 is the CRC of no bytes. */
 uint32_t crc32_more(uint32_t crc, const uint8_t *bytes, uint32_t size);
 

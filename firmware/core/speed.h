@@ -29,20 +29,26 @@ struct gains {
     int32_t friction;    /* duty that overcomes friction */
     int32_t kp;          /* duty per rpm, in 1/256 */
     int32_t ki;          /* duty per rpm and second, in 1/256 */
+    int32_t rise_ms;     /* time constant of the motor with its rotor [ms]: feed-forward of the acceleration */
     int32_t duty_slew;   /* largest change of the duty per tick */
 };
 
 struct speed_control {
     int32_t friction, duty_slew;
-    int32_t forward, kp, ki; /* duty per Q16 rpm in 1/2^32: feed-forward, proportional, and per tick in 1/65536 */
+    /* Duty per Q16 rpm in 1/2^32: feed-forward, that per Q16 rpm and tick, proportional, and per tick in 1/65536. */
+    int32_t forward, rise, kp, ki;
     int32_t target, ramp;   /* commanded speed [Q16 rpm] and its change per tick */
     int32_t reference;      /* ramped target [Q16 rpm] */
+    int32_t expected;       /* speed that the tracker shows if the motor follows: it comes later [Q16 rpm] */
     int32_t integral;       /* duty in Q16 */
+    int32_t kick;           /* input: additional duty in the direction of the reference, without sign */
     int32_t duty;           /* output */
+    bool limited;           /* output: the speed is so far behind that the reference waits for it */
 };
 void speed_begin(struct speed_control *c, const struct gains *g);
 void speed_release(struct speed_control *c);                  /* no voltage, reference and target 0 */
 void speed_catch(struct speed_control *c, int32_t speed);     /* begin at the speed at which a released motor turns */
 int32_t speed_step(struct speed_control *c, int32_t speed);   /* returns the duty for the measured speed [Q16 rpm] */
+int32_t speed_lead(const struct speed_control *c, int32_t speed); /* duty in its own direction beyond that of the speed */
 
 #endif

@@ -4,7 +4,7 @@
 
 #include "motor.h"
 
-enum { TIME = VALUES, LATE, SYNC };
+enum { TIME = VALUES, LATE, SYNC, FASTEST, UNFED_US, PULSE_SHORTEST, PULSE_LONGEST, DRIVEN };
 
 struct board {
     struct controller c;
@@ -12,6 +12,13 @@ struct board {
     uint64_t now, booted, ticked; /* simulated time; of the reset; of the last tick [us] */
     double clock_start, rate;     /* controller's clock at the reset [us], and its rate */
     double late_us;               /* largest delay of an index latch [us] */
+    double fastest;               /* largest speed, without sign [rpm] */
+    uint64_t fed, unfed_us;       /* time of the last counts, or without voltage; longest time with voltage, but no counts */
+    uint64_t no_magnet;           /* time of the last angle of a magnet, or without voltage */
+    int32_t fed_count;
+    uint64_t pulsed, shortest_us, longest_us; /* pulse to the camera: begin or 0, and durations */
+    uint16_t answer, angle;       /* magnetic encoder: its next answer, and its latest angle */
+    bool error_flag;              /* of the magnetic encoder */
     struct motor motor;
 };
 
@@ -43,7 +50,16 @@ struct board *board_new(uint32_t counts, int magnetic, int pulses, double drift_
 void board_set(struct board *b, int what, double value) { b->motor.values[what] = value; }
 double board_get(const struct board *b, int what) {
     if (what < VALUES) return motor_get(&b->motor, what);
-    return what == LATE ? b->late_us : what == TIME ? (double)b->now : b->c.pulse_number;
+    const double own[] = {
+        (double)b->now, b->late_us, b->c.pulse_number, b->fastest, (double)b->unfed_us, (double)b->shortest_us,
+        (double)b->longest_us, b->c.enabled,
+    };
+    return own[what - VALUES];
+}
+
+static void begin_pulse(struct board *b) {
+    pulse_begins(&b->c);
+    if (!b->pulsed) b->pulsed = b->now;
 }
 
 static void move(struct board *b, double before) {
@@ -52,21 +68,76 @@ static void move(struct board *b, double before) {
         if (has_absolute_angle(&b->settings) || !motor_index(&b->motor)) continue;
         double late = 0.5 * (uniform(&b->motor) + 1.0); /* delay of the interrupt [us] */
         uint32_t t = clock_at(b, (double)b->now + STEP_US * share + late);
-        if (on_index(&b->c, t, b->c.count, b->motor.in_pulse)) {
+        if (is_index(&b->c, t, b->c.count, b->motor.in_pulse)) {
+            on_index(&b->c, t, b->c.count);
             b->late_us = fmax(b->late_us, late);
-            if (b->settings.pulses == PULSES_INDEX) on_sync(&b->c, t);
+            if (b->settings.pulses == PULSES_INDEX) {
+                begin_pulse(b);
+                on_sync(&b->c, t);
+            }
+        }
+        for (uint32_t k = 1; b->motor.values[BOUNCING_INDEX] != 0 && k < 5; k++) {
+            if (!is_index(&b->c, t + 20 * k, b->c.count, b->motor.in_pulse == (k % 2 == 0))) continue;
+            on_index(&b->c, t + 20 * k, b->c.count);
+            if (b->settings.pulses == PULSES_INDEX) on_sync(&b->c, t + 20 * k);
         }
     }
 }
 
+/* Longest times in which the motor has voltage, but the encoder does not move or has no magnet. */
+static void note_feedback(struct board *b) {
+    bool driven = b->c.enabled && b->c.duty != 0;
+    int32_t least = (int32_t)(b->settings.counts_per_turn / 1024u) + 2;
+    if (!driven || abs(b->c.count - b->fed_count) >= least) {
+        b->fed = b->now;
+        b->fed_count = b->c.count;
+    }
+    if (!driven || b->settings.encoder != MAGNETIC || b->motor.values[NO_MAGNET] == 0) b->no_magnet = b->now;
+    uint64_t since = b->fed < b->no_magnet ? b->fed : b->no_magnet;
+    if (b->now - since > b->unfed_us) b->unfed_us = b->now - since;
+    b->fastest = fmax(b->fastest, fabs(b->motor.rpm));
+}
+
+static uint16_t with_parity(uint16_t frame) {
+    uint16_t parity = frame;
+    for (int k = 8; k; k /= 2) parity ^= (uint16_t)(parity >> k);
+    return (uint16_t)(frame | (parity & 1u) << 15);
+}
+
+static _Thread_local struct board *asked; /* the board whose encoder answers */
+
+/* The magnetic encoder: takes a frame, and returns the answer to the one before. A damaged frame sets its error flag, which
+   is in all answers until the errors have been read. */
+static uint16_t transfer(uint16_t frame) {
+    struct board *b = asked;
+    struct motor *m = &b->motor;
+    uint16_t sent = with_parity((uint16_t)(b->answer | (b->error_flag ? 0x4000u : 0u)));
+    bool no_magnet = m->values[NO_MAGNET] != 0;
+    if (m->values[ERROR_FLAG] != 0) {
+        m->values[ERROR_FLAG] -= 1;
+        b->error_flag = true;
+        b->answer = 0;
+    } else if (frame == AS5047_READ_ANGLE) {
+        double angle = read_turns(m) * b->settings.counts_per_turn - (double)m->unseen + 1.5 * uniform(m);
+        if (no_magnet) angle = 8192 * uniform(m);
+        if (m->values[DEAD_ENCODER] == 0) b->angle = (uint16_t)((int64_t)floor(angle) & 0x3FFF);
+        b->answer = b->angle;
+    } else if (frame == AS5047_READ_DIAGNOSIS) {
+        b->answer = no_magnet ? 0x09FFu : 0x0180u;
+    } else if (frame == AS5047_READ_ERRORS) {
+        b->answer = b->error_flag;
+        b->error_flag = false;
+    } else {
+        b->error_flag = true;
+    }
+    double bad = m->values[BAD_SPI];
+    return bad > 0 && (bad >= 1 || fabs(uniform(m)) < bad) ? sent ^ 1u : sent;
+}
+
 static void magnetic(struct board *b) {
-    double angle = read_turns(&b->motor) * b->settings.counts_per_turn + 1.5 * uniform(&b->motor);
-    uint16_t frame = (uint16_t)((int64_t)floor(angle) & 0x3FFF), parity = frame;
-    for (int k = 8; k; k /= 2) parity ^= parity >> k;
-    frame |= (uint16_t)((parity & 1u) << 15);
-    double bad = b->motor.values[BAD_SPI];
-    if (bad > 0 && (bad >= 1 || fabs(uniform(&b->motor)) < bad)) frame ^= 1u;
-    on_answer(&b->c, frame);
+    asked = b;
+    ask_encoder(&b->c, transfer);
+    read_encoder(&b->c, transfer);
 }
 
 void board_feed(struct board *b, const uint8_t *bytes, uint32_t size) {
@@ -88,12 +159,23 @@ uint32_t board_advance(struct board *b, uint64_t until, uint8_t *out, uint32_t r
         b->now += STEP_US;
         uint32_t t = clock_at(b, (double)b->now);
         b->c.driver_fault = b->motor.values[DRIVER_FAULT] != 0;
+        b->c.supply_low = b->motor.values[NO_SUPPLY] != 0 && b->motor.values[SENSED] != 0;
         if (b->now - b->ticked >= 1000000 / TICK_HZ) {
             b->ticked = b->now;
+            if (pulse_ends(&b->c)) {
+                uint64_t lasted = b->now - b->pulsed;
+                if (!b->shortest_us || lasted < b->shortest_us) b->shortest_us = lasted;
+                if (lasted > b->longest_us) b->longest_us = lasted;
+                b->pulsed = 0;
+            }
             if (b->settings.encoder == MAGNETIC) magnetic(b);
-            if (on_tick(&b->c, t, b->c.count)) on_sync(&b->c, t);
+            if (on_tick(&b->c, t, b->c.count)) {
+                begin_pulse(b);
+                on_sync(&b->c, t);
+            }
         }
         controller_poll(&b->c, t);
+        note_feedback(b);
         for (int byte; written < room && (byte = controller_take(&b->c)) >= 0;) out[written++] = (uint8_t)byte;
     }
     return written;
@@ -106,10 +188,17 @@ void board_tamper(struct board *b, int32_t count) {
 }
 uint32_t board_counter(const struct board *b, int which) {
     const struct frame_decoder *d = &b->c.decoder;
-    return which == 0 ? d->frames : which == 1 ? d->damaged : which == 2 ? d->unknown : which == 3 ? d->lost : b->c.overruns;
+    return which == 0 ? d->frames : which == 1 ? d->damaged : which == 2 ? d->unknown : which == 3 ? d->lost
+        : which == 4 ? b->c.overruns : which == 5 ? b->c.encoder_errors : b->c.index_bounces;
 }
 void board_frame(uint8_t *packet, uint32_t size, uint8_t *frame, uint32_t *written) { *written = frame_encode(packet, size, frame); }
 int board_q16(uint32_t bits, int32_t *q16) { return q16_from_f32(bits, q16); }
 uint32_t board_f32(int32_t q16) { return f32_from_q16(q16); }
 int board_angle(uint16_t frame) { return as5047_angle(frame); }
 int board_step(int levels) { return quadrature_step[levels]; }
+/* Gains of the control loop, from settings of any size. */
+void board_gains(const struct gains *gains, int32_t *out) {
+    struct speed_control c;
+    speed_begin(&c, gains);
+    out[0] = c.forward, out[1] = c.rise, out[2] = c.kp, out[3] = c.ki;
+}

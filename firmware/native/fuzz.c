@@ -48,7 +48,7 @@ int main(int argc, char **argv) {
         valid += whole;
         now += 500;
         if (k % 2) on_tick(c, now, (int32_t)draw() >> draw() % 32);
-        if (k % 64 == 0) on_index(c, now, c->count, draw() % 2);
+        if (k % 64 == 0 && is_index(c, now, c->count, draw() % 2)) on_index(c, now, c->count);
         while (controller_take(c) >= 0) sent++;
         if (c->duty > FULL_DUTY || c->duty < -FULL_DUTY || c->batched > BATCH) return fprintf(stderr, "state\n"), 1;
         if (draw() % 4096 == 0) controller_begin(c, &default_settings, now);

@@ -15,12 +15,26 @@
 #define TAU 6.283185307179586
 
 /* What boards.py sets and gets, in this order. */
-enum value { JAMMED, DRIVER_FAULT, NO_INDEX, DEAD_A, REVERSED_MOTOR, BAD_SPI, RUNAWAY, ANGLE, SPEED, VALUES };
+enum value {
+    JAMMED, DRIVER_FAULT, NO_INDEX, DEAD_A, REVERSED_MOTOR, BAD_SPI, RUNAWAY,
+    DEAD_ENCODER,   /* no edges; the magnetic encoder's angle stands still */
+    LOST_COUNTS,    /* part of the counts that are lost, as by a coupling that slips */
+    NO_MAGNET,      /* the magnetic encoder's angle is noise, and its diagnosis says so */
+    ERROR_FLAG,     /* the magnetic encoder takes the next frame for damaged */
+    BOUNCING_INDEX, /* three edges instead of one */
+    ODD_INDEX,      /* a pulse in the middle of each turn */
+    NO_SUPPLY,      /* the motor has no voltage; sensed by the pin if SENSED is set */
+    SENSED, LOAD,   /* additional friction [rpm/s] */
+    HEAVY,          /* inertia beside the usual one, as a part of it */
+    ANGLE, SPEED, VALUES
+};
 
 struct motor {
     double turns, rpm, values[VALUES];
+    double lost; /* part of a count, of LOST_COUNTS */
     uint32_t per_turn, random;
     int64_t position; /* counts of the disc */
+    int64_t unseen;   /* counts of it that the encoder has lost */
     bool in_pulse;
 };
 
@@ -43,14 +57,23 @@ static void motor_turn(struct motor *m, bool enabled, double drive) {
     double dt = STEP_US * 1e-6;
     if (m->values[REVERSED_MOTOR] != 0) drive = -drive;
     if (m->values[RUNAWAY] != 0) drive = 1.3;
-    double pull = enabled || m->values[RUNAWAY] != 0 ? (4000.0 * drive - m->rpm) / 0.15 : 0; /* rpm per second */
+    bool driven = (enabled || m->values[RUNAWAY] != 0) && m->values[NO_SUPPLY] == 0;
+    double pull = driven ? (4000.0 * drive - m->rpm) / (0.15 * (1 + m->values[HEAVY])) : 0; /* rpm per second */
     pull += 200.0 * sin(12 * TAU * m->turns + 1.0) + 40.0 * sin(TAU * m->turns); /* cogging, unbalance */
     pull += 3000.0 * uniform(m) * fmin(1, fabs(m->rpm) / 50); /* noise, none at rest */
-    double friction = (200.0 + 0.1 * fabs(m->rpm)) * dt;
+    double friction = (200.0 + m->values[LOAD] + 0.1 * fabs(m->rpm)) * dt;
     m->rpm += pull * dt;
     m->rpm = fabs(m->rpm) > friction ? m->rpm - copysign(friction, m->rpm) : 0;
     if (m->values[JAMMED] != 0) m->rpm = 0;
     m->turns += m->rpm / 60.0 * dt;
+}
+
+/* Let the encoder miss the last count of the disc, or not. */
+static void motor_miss(struct motor *m, bool forward) {
+    m->lost += m->values[DEAD_ENCODER] != 0 ? 1 : m->values[LOST_COUNTS];
+    if (m->lost < 1) return;
+    m->lost -= 1;
+    m->unseen += forward ? 1 : -1;
 }
 
 /* Move the disc by one count towards the place that it has after a step, which began at `before` turns. Returns false if
@@ -61,6 +84,7 @@ static bool motor_count(struct motor *m, double before, double *share) {
     if (m->position == to) return false;
     bool forward = to > m->position;
     m->position += forward ? 1 : -1;
+    motor_miss(m, forward);
     double at = (double)(forward ? m->position : m->position + 1);
     *share = fabs(after - from) > 0 ? fmin(fmax((at - from) / (after - from), 0), 1) : 0;
     return true;
@@ -68,7 +92,7 @@ static bool motor_count(struct motor *m, double before, double *share) {
 
 static uint8_t motor_levels(const struct motor *m) { /* 2 A + B, A leads */
     static const uint8_t levels[4] = {0, 2, 3, 1};
-    uint8_t now = levels[m->position & 3];
+    uint8_t now = levels[(m->position - m->unseen) & 3];
     return m->values[DEAD_A] != 0 ? now & 1u : now;
 }
 
@@ -76,7 +100,9 @@ static uint8_t motor_levels(const struct motor *m) { /* 2 A + B, A leads */
 static bool motor_index(struct motor *m) {
     int64_t phase = m->position % (int64_t)m->per_turn;
     if (phase < 0) phase += m->per_turn;
-    bool in_pulse = phase < m->per_turn / 256 + 1, changed = in_pulse != m->in_pulse;
+    bool in_pulse = phase < m->per_turn / 256 + 1;
+    if (m->values[ODD_INDEX] != 0 && phase >= m->per_turn / 3 && phase < m->per_turn / 3 + 4) in_pulse = true;
+    bool changed = in_pulse != m->in_pulse;
     m->in_pulse = in_pulse;
     return changed && m->values[NO_INDEX] == 0;
 }

@@ -59,20 +59,32 @@ void io_interrupt(void) {
     if (ENCODER == QUADRATURE) on_edge(&c, (uint8_t)((in >> (PIN_A - 1) & 2u) | (in >> PIN_B & 1u)));
     if (pending & (EDGE_LOW(PIN_INDEX) | EDGE_HIGH(PIN_INDEX))) {
         bool rising = pending & EDGE_HIGH(PIN_INDEX);
-        if (on_index(&c, t, c.count, rising) && c.settings.pulses == PULSES_INDEX) {
-            REG(GPIO_SET) = BIT(PIN_TRIGGER);
-            on_sync(&c, t);
+        if (is_index(&c, t, c.count, rising)) {
+            if (PULSES == PULSES_INDEX) {
+                REG(GPIO_SET) = BIT(PIN_TRIGGER);
+                pulse_begins(&c);
+                on_sync(&c, t);
+            }
+            on_index(&c, t, c.count);
         }
     }
     if (pending & EDGE_HIGH(PIN_CAMERA_SYNC)) on_sync(&c, t);
 }
 
-static uint16_t transfer(uint16_t word) { /* 16 bits with the encoder selected: 2 us */
+/* The AS5047 needs 350 ns from its selection to the first clock, and between two frames: 48 cycles are 384 ns. */
+static inline void wait_for_encoder(void) {
+    uint32_t turns = 16;
+    __asm__ volatile(".syntax unified\n1: subs %0, #1\n bne 1b" : "+l"(turns) : : "cc");
+}
+
+static uint16_t transfer(uint16_t word) { /* 16 bits with the encoder selected: 3 us */
     REG(GPIO_CLEAR) = BIT(PIN_SPI_CS);
+    wait_for_encoder();
     REG(SPI0 + 0x08u) = word;
     while (!(REG(SPI0 + 0x0Cu) & 4u)) { }
     uint16_t answer = (uint16_t)REG(SPI0 + 0x08u);
     REG(GPIO_SET) = BIT(PIN_SPI_CS);
+    wait_for_encoder();
     return answer;
 }
 
@@ -80,22 +92,22 @@ void tick_interrupt(void) {
     REG(TIMER + 0x34u) = 1u;
     next_tick += 1000000u / TICK_HZ;
     REG(TIMER + 0x10u) = next_tick;
-    REG(GPIO_CLEAR) = BIT(PIN_TRIGGER);
     __asm__ volatile("cpsid i" ::: "memory"); /* time and count of one moment */
+    if (pulse_ends(&c)) REG(GPIO_CLEAR) = BIT(PIN_TRIGGER);
     uint32_t t = REG(TIMERAWL);
     int32_t count = c.count;
     __asm__ volatile("cpsie i" ::: "memory");
     if (ENCODER == MAGNETIC) {
-        transfer(AS5047_READ_ANGLE); /* the angle is taken at the end of this frame and sent in the next */
+        ask_encoder(&c, transfer);
         t = REG(TIMERAWL);
-        for (int k = 0; k < 16; k++) __asm__ volatile("nop"); /* 0.35 us between frames */
-        on_answer(&c, transfer(AS5047_READ_ANGLE));
+        read_encoder(&c, transfer);
         count = c.count;
     }
     if (on_tick(&c, t, count)) {
         __asm__ volatile("cpsid i" ::: "memory");
         REG(GPIO_SET) = BIT(PIN_TRIGGER);
         t = REG(TIMERAWL);
+        pulse_begins(&c);
         __asm__ volatile("cpsie i" ::: "memory");
         on_sync(&c, t);
     }
@@ -150,7 +162,7 @@ static void start_peripherals(void) {
     for (uint32_t pin = 0; pin <= PIN_LED; pin++) if (outputs & BIT(pin)) set_pin(pin, OUTPUT, FUNCTION_SIO);
     set_pin(PIN_A, PULL_UP, FUNCTION_SIO), set_pin(PIN_B, PULL_UP, FUNCTION_SIO);
     set_pin(PIN_INDEX, PULL_DOWN, FUNCTION_SIO), set_pin(PIN_CAMERA_SYNC, PULL_DOWN, FUNCTION_SIO);
-    set_pin(PIN_DRIVER_FAULT, PULL_UP, FUNCTION_SIO);
+    set_pin(PIN_DRIVER_FAULT, PULL_UP, FUNCTION_SIO), set_pin(PIN_SUPPLY, PULL_UP, FUNCTION_SIO);
     set_pin(PIN_UART_TX, OUTPUT, FUNCTION_UART), set_pin(PIN_UART_RX, PULL_UP, FUNCTION_UART);
     set_pin(PIN_SPI_MISO, PULL_UP, FUNCTION_SPI); /* a missing encoder answers 0xFFFF, an error */
     set_pin(PIN_SPI_SCK, OUTPUT, FUNCTION_SPI), set_pin(PIN_SPI_MOSI, OUTPUT, FUNCTION_SPI);
@@ -196,7 +208,9 @@ int main(void) {
     REG(WATCHDOG + 0x04u) = WATCHDOG_TICKS;
     REG(WATCHDOG) = BIT(30);
     for (;;) {
-        c.driver_fault = !(REG(GPIO_IN) & BIT(PIN_DRIVER_FAULT));
+        uint32_t now = REG(GPIO_IN);
+        c.driver_fault = !(now & BIT(PIN_DRIVER_FAULT));
+        c.supply_low = !(now & BIT(PIN_SUPPLY));
         controller_poll(&c, REG(TIMERAWL));
         drive();
         int byte = 0;

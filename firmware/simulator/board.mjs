@@ -11,13 +11,17 @@ const [path, kind, counts] = process.argv.slice(2);
 const image = readFileSync(path);
 const magnetic = kind === 'MAGNETIC';
 const STEP_NS = 50_000, TAU = 2 * Math.PI, BYTE_NS = 10e9 / 460_800;
-const PIN = { a: 2, b: 3, index: 4, sync: 5, trigger: 6, direction: 9, enable: 10, fault: 11, cs: 17 };
+const PIN = { a: 2, b: 3, index: 4, sync: 5, trigger: 6, direction: 9, enable: 10, fault: 11, supply: 12, cs: 17 };
 const perTurn = Number(counts), absolute = magnetic && perTurn === 16384;  // then there is no index pulse
-const faults = { jammed: 0, driver_fault: 0, no_index: 0, dead_a: 0, reversed_motor: 0, bad_spi: 0, runaway: 0 };
+const faults = {
+  jammed: 0, driver_fault: 0, no_index: 0, dead_a: 0, reversed_motor: 0, bad_spi: 0, runaway: 0, dead_encoder: 0,
+  no_magnet: 0, error_flag: 0, bouncing_index: 0, no_supply: 0, sensed: 0,
+};
 
 let mcu, clock, cycleNs = 8, out = [], inbox = [], arrivesNs = 0, resets = 0, watchdogs = 0;
 let turns = 0.3, rpm = 0, position = Math.floor(turns * perTurn), inPulse = false, random = 1;
-let indexNs = [], triggerNs = [], enabledNs = [], fed = { times: 0, last_us: 0 };
+let unseen = 0;  // counts that a dead encoder has missed
+let indexNs = [], triggerNs = [], triggerEndNs = [], enabledNs = [], fed = { times: 0, last_us: 0 };
 const worst = {}, busy = {};  // cycles by number of the exception
 
 const uniform = () => { random = (Math.imul(random, 1664525) + 1013904223) >>> 0; return (random >>> 8) / 8388608 - 1; };
@@ -35,12 +39,29 @@ function boot() {
   mcu.core.PC = 0x10000000;  // the ROM calls the boot stage
   mcu.uart[0].onByte = (byte) => out.push(byte);
   mcu.pwm.channels[4].updateEnable = () => {};  // the duty is read from its register; its edges would take half the time
-  let angle = 0;
-  mcu.spi[0].onTransmit = (word) => {
+  let answer = 0, errorFlag = false, selectedNs = 0, releasedNs = -1e9;
+  mcu.gpio[PIN.cs].addListener((value) => {
+    if (value !== 0) releasedNs = now();
+    else {
+      selectedNs = now();
+      spiNs.between = Math.min(spiNs.between, selectedNs - releasedNs);
+    }
+  });
+  mcu.spi[0].onTransmit = (word) => {  // an AS5047: a damaged frame sets a flag that stays until the errors are read
     if (mcu.gpio[PIN.cs].outputValue) return mcu.spi[0].completeTransmit(0xffff);  // not selected
-    const answer = angle;
-    if (word === 0xffff) angle = frame();
-    mcu.spi[0].completeTransmit(faults.bad_spi ? answer ^ 1 : answer);
+    spiNs.before = Math.min(spiNs.before, now() - selectedNs);
+    const sent = withParity(answer | (errorFlag ? 0x4000 : 0));
+    if (faults.error_flag > 0 || ![0xffff, 0xfffc, 0x4001].includes(word)) {
+      faults.error_flag = Math.max(faults.error_flag - 1, 0);
+      errorFlag = true;
+      answer = 0;
+    } else if (word === 0xffff) answer = faults.no_magnet ? Math.floor(8192 * (1 + uniform())) & 0x3fff : angle();
+    else if (word === 0xfffc) answer = faults.no_magnet ? 0x09ff : 0x0180;
+    else {
+      answer = Number(errorFlag);
+      errorFlag = false;
+    }
+    mcu.spi[0].completeTransmit(faults.bad_spi ? sent ^ 1 : sent);
   };
   const watchdog = mcu.peripherals[0x40058], write = watchdog.writeUint32.bind(watchdog);
   watchdog.onWatchdogTrigger = () => {
@@ -54,7 +75,11 @@ function boot() {
   };
   for (const name of ['a', 'b', 'index', 'sync']) mcu.gpio[PIN[name]].setInputValue(false);
   mcu.gpio[PIN.fault].setInputValue(!faults.driver_fault);
-  mcu.gpio[PIN.trigger].addListener((value) => { if (value === 1) triggerNs.push(now()); });
+  mcu.gpio[PIN.supply].setInputValue(!(faults.no_supply && faults.sensed));
+  mcu.gpio[PIN.trigger].addListener((value) => {
+    if (value === 1) triggerNs.push(now());
+    if (value === 0 && triggerNs.length > triggerEndNs.length) triggerEndNs.push(now());
+  });
   mcu.gpio[PIN.enable].addListener((value) => { if (value === 1) enabledNs.push(now()); });
   const core = mcu.core, enter = core.exceptionEntry.bind(core), leave = core.exceptionReturn.bind(core), stack = [];
   core.exceptionEntry = (number) => { stack.push([number, core.cycles, 0]); enter(number); };
@@ -68,11 +93,12 @@ function boot() {
   levels();
   resets++;
 }
+const spiNs = { before: 1e9, between: 1e9 };  // shortest times from selection to clock, and between two frames [ns]
 let offset = 0;  // time before the last reset [ns]
 const now = () => offset + clock.nanos;
 
 function levels() {
-  const [a, b] = [[0, 0], [1, 0], [1, 1], [0, 1]][position & 3];
+  const [a, b] = [[0, 0], [1, 0], [1, 1], [0, 1]][(position - unseen) & 3];
   const set = (pin, value) => { if (mcu.gpio[pin].rawInputValue !== !!value) mcu.gpio[pin].setInputValue(!!value); };
   set(PIN.a, a && !faults.dead_a && !magnetic);
   set(PIN.b, b && !magnetic);
@@ -82,6 +108,10 @@ function levels() {
     if (!faults.no_index) {
       if (pulse === rpm > 0) indexNs.push(now());
       set(PIN.index, pulse);
+      for (let k = 1; faults.bouncing_index && k < 5; k++) {
+        execute(now() + 3_000);  // less than a count
+        set(PIN.index, pulse === (k % 2 === 0));
+      }
     }
   }
 }
@@ -104,8 +134,14 @@ function hang(where) {  // the main loop or the tick's interrupt never ends, or 
 
 const disc = () => (turns + 2e-4 * Math.sin(TAU * turns)) * perTurn;  // an eccentric disc
 
-function frame() {
-  let word = Math.floor(disc() + 1.5 * uniform()) & 0x3fff, parity = word;
+let lastAngle = 0;
+function angle() {
+  if (!faults.dead_encoder) lastAngle = Math.floor(disc() + 1.5 * uniform()) & 0x3fff;
+  return lastAngle;
+}
+
+function withParity(word) {
+  let parity = word;
   for (const k of [8, 4, 2, 1]) parity ^= parity >> k;
   return word | ((parity & 1) << 15);
 }
@@ -115,7 +151,7 @@ function turn() {  // the same motor as native/board.c
   let drive = enabled ? (mcu.gpio[PIN.direction].outputValue ? duty : -duty) : 0;
   if (faults.reversed_motor) drive = -drive;
   if (faults.runaway) drive = 1.3;
-  let pull = enabled || faults.runaway ? (4000 * drive - rpm) / 0.15 : 0;
+  let pull = (enabled || faults.runaway) && !faults.no_supply ? (4000 * drive - rpm) / 0.15 : 0;
   pull += 200 * Math.sin(12 * TAU * turns + 1) + 40 * Math.sin(TAU * turns);
   pull += 3000 * uniform() * Math.min(1, Math.abs(rpm) / 50);
   const friction = (200 + 0.1 * Math.abs(rpm)) * dt;
@@ -144,6 +180,7 @@ function step() {
   const after = disc(), to = Math.floor(after), forward = to > position;
   if (!absolute) while (position !== to) {
     position += forward ? 1 : -1;
+    if (faults.dead_encoder) unseen += forward ? 1 : -1;
     const at = forward ? position : position + 1;
     execute(from + (STEP_NS * (at - before)) / (after - before));
     levels();
@@ -172,11 +209,13 @@ for await (const line of createInterface({ input: process.stdin })) {
   } else if (what === 'set') {
     faults[rest[0]] = Number(rest[1]);
     if (rest[0] === 'driver_fault') mcu.gpio[PIN.fault].setInputValue(!faults.driver_fault);
+    mcu.gpio[PIN.supply].setInputValue(!(faults.no_supply && faults.sensed));
     if (rest[0] === 'sync') mcu.gpio[PIN.sync].setInputValue(!!faults.sync);
     process.stdout.write('\n');
   } else if (what === 'get') {
     const values = {
       rpm, angle: TAU * turns, index_us: indexNs.map((t) => t / 1000), trigger_us: triggerNs.map((t) => t / 1000),
+      trigger_end_us: triggerEndNs.map((t) => t / 1000), spi_ns: spiNs,
       worst, busy, resets, watchdogs, fed, cycles: mcu.core.cycles, boot_us: offset / 1000,
       enable: mcu.gpio[PIN.enable].value === 1, enabled_us: enabledNs.map((t) => t / 1000),
       watchdog_resets: mcu.peripherals[0x40010].wdsel,

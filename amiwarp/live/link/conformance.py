@@ -24,6 +24,12 @@ from amiwarp.live.link.link import open_port
 
 LISTEN_S, ANSWER_S, PING_S = 2.5, 1.0, 0.25
 """Time for which the first frames are awaited, longest wait for an answer, and interval of pings [s]."""
+FIRST_SEQUENCE, FIRST_PING = 65_400, 0xFFFF_FFC0
+"""First sequence number and first number of a ping: both use all of their bytes, and wrap during the suite."""
+PONG_S, BURST = 0.05, 3
+"""Longest usual round trip of a ping [s], and number of pings sent at once."""
+STATUS_S, CHANGE_S = 1.3, 0.3
+"""Longest time between two statuses, and until a change is in one [s]."""
 LEAST_HZ, LONGEST_GAP_US = 990.0, 20_000
 """Smallest rate of encoder samples [1/s], and longest time between two of them [us]."""
 CLOCK_TOLERANCE = 0.01
@@ -33,15 +39,26 @@ SPEED_TOLERANCE, OVERSHOOT = 0.02, 0.15
 RAMP_S, SETTLE_S, STEADY_S, STOP_S = 1.0, 5.0, 3.0, 8.0
 """Duration of the ramp, longest time from its end to the state "at speed", time at constant speed, and longest time to
 stop [s]."""
+EARLY_SHARE = 0.25, 0.65
+"""Smallest and largest mean speed in the second time of :data:`SLICE_S` of the ramp, as a part of the speed."""
 LATCH_US, LATCH_COUNTS = 2, 2.0
 """Coarsest resolution of the controller's clock [us], and largest distance of an index pulse from the samples [counts].
 """
+INDEX_COUNTS, INDEX_SHARE, PLACE_SHARE = 6.0, 0.001, 0.002
+"""Largest error of the counts between index pulses [counts] or [turns], whichever is more, and largest difference
+[turns] between the places of the index in the two directions."""
+LAG_US, STALE_US = 35_000, 1_000
+"""Longest time for which a sample may wait to be sent, and largest error of the time of a pong or status [us]."""
+JUMP = 4.0
+"""Speed at which counts may change, as a multiple of the largest speed of the suite."""
 SYNC_HZ = (1.5, 30.0)
 """Smallest and largest rate of sync pulses [1/s]."""
 SILENCE_S = 10.0
 """Longest silence of the host until the controller must report it [s]."""
 SLICE_S = 0.3
 """Time at which the speed is measured during the ramp, and for which a stopped motor must stand still [s]."""
+STEEP_RPM_S, STEEP_SLICE_S, STEEP_COUNTS = 1e5, 0.05, 20.0
+"""Ramp that no motor follows [rpm/s], and least time [s] and counts in which its speed is measured."""
 
 
 class Wire(Protocol):
@@ -127,17 +144,19 @@ class _Suite:
     def __init__(self, wire: Wire, rpm: float) -> None:
         self._wire, self._rpm = wire, rpm
         self._decoder, self._clock = protocol.FrameDecoder(), UnwrappedClock()
-        self._sequence, self._numbers = itertools.count(), itertools.count(1)
+        self._sequence, self._numbers = itertools.count(FIRST_SEQUENCE), itertools.count(FIRST_PING)
         self._sent: dict[int, int] = {}
         self._trips: list[tuple[int, int, int]] = []
         self._answers: dict[int, int] = {}
+        self._commands: set[int] = set()  # sequence numbers of the commands without an answer
         self._status: protocol.ControllerStatus | None = None
         self._samples: list[tuple[int, int]] = []
         self._index: list[tuple[int, int]] = []
         self._sync: list[tuple[int, int]] = []
-        self._statuses: list[protocol.ControllerStatus] = []
+        self._statuses: list[tuple[int, protocol.ControllerStatus]] = []
         self._latest = -math.inf  # time of the latest sample or index pulse
-        self._disorder = 0
+        self._newest = -math.inf  # latest time in any message
+        self._disorder, self._apart, self._stray = 0, 0, 0
         self._first: protocol.FrameCounters | None = None  # opening the port cuts the first frame
 
     def checks(self) -> Iterator[Check]:
@@ -158,27 +177,43 @@ class _Suite:
         yield self._check_samples()
         yield self._check_refusals()
         yield from self._check_speed()
-        yield self._check_bad_frames()
+        yield from self._check_bad_frames()
         yield self._check_silence()
+        yield self._check_other_way()
         yield self._check_stop()
+        yield self._check_steep_ramp()
         remedy = "send samples and index pulses in the order of their times, with time and count latched together"
         yield Check("times increase", self._disorder == 0, f"{self._disorder} out of order", remedy)
+        yield self._check_latch()
+        yield self._check_jumps()
+        yield self._check_status_times()
         yield self._check_opening()
         yield self._check_clock()
+        yield self._check_pong_times()
         yield self._check_losses()
 
     # Talking.
 
-    def send(self, message: protocol.Message, *, sequence: int | None = None) -> int:
+    def send(self, message: protocol.Message) -> int:
         """Send a message and return its sequence number."""
-        number = next(self._sequence) & 0xFFFF if sequence is None else sequence
+        number = self._next_sequence()
+        if not isinstance(message, protocol.Ping):
+            self._commands.add(number)
         self._wire.write(protocol.encode(message, number))
         return number
 
+    def _next_sequence(self) -> int:
+        return next(self._sequence) & 0xFFFF
+
     def _ping(self) -> int:
-        number = next(self._numbers)
-        self._sent[number] = self._wire.now_us()
+        number = self._expect_pong()
         self.send(protocol.Ping(number))
+        return number
+
+    def _expect_pong(self) -> int:
+        """Return the number of the next ping, which is sent now."""
+        number = next(self._numbers) & 0xFFFF_FFFF
+        self._sent[number] = self._wire.now_us()
         return number
 
     def _run(self, seconds: float, *, until: Callable[[], bool] = lambda: False, pings: bool = True) -> bool:
@@ -200,23 +235,36 @@ class _Suite:
     def _take(self, message: protocol.Message, host_us: int) -> None:
         if isinstance(message, protocol.Samples):
             for raw, count in zip(message.t_us, message.count, strict=True):
-                t = self._clock(raw)
+                t = self._time(raw, LAG_US)
                 self._disorder += t <= self._latest
                 self._latest = t
                 self._samples.append((t, count))
         elif isinstance(message, protocol.Index):
-            t = self._clock(message.t_us)
+            t = self._time(message.t_us, LAG_US)
             self._disorder += t < self._latest
             self._index.append((t, message.count))
         elif isinstance(message, protocol.Sync):
-            self._sync.append((self._clock(message.t_us), message.number))
+            self._sync.append((self._time(message.t_us, LAG_US), message.number))
         elif isinstance(message, protocol.ControllerStatus):
             self._status = message
-            self._statuses.append(message)
-        elif isinstance(message, protocol.Pong) and message.number in self._sent:
-            self._trips.append((self._sent.pop(message.number), self._clock(message.t_us), host_us))
+            self._statuses.append((self._time(message.t_us, STALE_US), message))
+        elif isinstance(message, protocol.Pong):
+            t = self._time(message.t_us, STALE_US)
+            if message.number in self._sent:
+                self._trips.append((self._sent.pop(message.number), t, host_us))
+            else:
+                self._stray += 1
         elif isinstance(message, protocol.Answer):
+            self._stray += message.sequence not in self._commands
+            self._commands.discard(message.sequence)
             self._answers[message.sequence] = message.refused
+
+    def _time(self, raw: int, late_us: int) -> int:
+        """Return an unwrapped time [us], and count it if it is earlier than the latest one by more than ``late_us``."""
+        t = self._clock(raw)
+        self._apart += t < self._newest - late_us
+        self._newest = max(self._newest, t)
+        return t
 
     def _command(self, message: protocol.Message) -> int | None:
         """Send a command and return the answer's reason for a refusal; None without an answer."""
@@ -258,11 +306,18 @@ class _Suite:
             sent.append(self._ping())
             self._run(ANSWER_S, until=lambda: sent[-1] not in self._sent, pings=False)
         trips = sorted(received - at for at, _, received in self._trips)
+        burst = [self._expect_pong() for _ in range(BURST)]
+        together = b"".join(protocol.encode(protocol.Ping(number), self._next_sequence()) for number in burst)
+        self._wire.write(b"\0" + together)  # two zeros in a row enclose no frame
+        self._run(ANSWER_S, until=lambda: not self._sent.keys() & set(burst), pings=False)
+        sent += burst
         missing = sum(number in self._sent for number in sent)
         what = f"{missing} of {len(sent)} without a pong"
+        median_us = trips[len(trips) // 2] if trips else 0
         if trips:
-            what += f", round trip {trips[len(trips) // 2] / 1000:.1f} ms"
-        return Check("answers pings", missing == 0, what, "check the line to the controller, and send a pong at once")
+            what += f", round trip {median_us / 1000:.1f} ms"
+        good = missing == 0 and median_us <= PONG_S * 1e6
+        return Check("answers pings", good, what, "check the line to the controller, and send a pong at once")
 
     def _check_rest(self) -> Check:
         refused = self._command(protocol.Stop())
@@ -284,21 +339,27 @@ class _Suite:
         return Check("encoder samples at 1 kHz", good, what, remedy)
 
     def _check_refusals(self) -> Check:
-        speeds = (math.nan, 100.0), (1e9, 100.0), (10.0, -1.0)
-        answers = [*(self._command(protocol.SetSpeed(*pair)) for pair in speeds), self._command(protocol.SetCounts(0))]
+        speeds = (math.nan, 100.0), (math.inf, 100.0), (1e9, 100.0), (-1e9, 100.0)
+        ramps = (10.0, -1.0), (10.0, 0.0), (10.0, math.nan), (10.0, math.inf)
+        wrong = [*(protocol.SetSpeed(*pair) for pair in (*speeds, *ramps)), protocol.SetCounts(0)]
+        answers = [*(self._command(message) for message in wrong), self._command(protocol.SetCounts(1 << 24))]
+        same = self._command(protocol.SetCounts(self._now.counts_per_turn))
         target = self._now.target_rpm
-        what = f"answers {', '.join(map(_reason, answers))}; target {target:g} rpm"
-        remedy = "answer 2 to speeds that are not finite or too high, to ramps below 0, and to 0 counts per turn"
-        return Check("refuses what is out of range", set(answers) == {2} and target == 0, what, remedy)
+        what = f"answers {', '.join(map(_reason, answers))}; target {target:g} rpm; same counts: {_reason(same)}"
+        remedy = (
+            "answer 2 to speeds that are not finite or too high, to ramps that are not finite or not above 0, and to 0 "
+            "or more than 16,777,215 counts per turn; answer 0 to the counts that it has"
+        )
+        good = set(answers) == {2} and target == 0 and same == 0
+        return Check("refuses what is out of range", good, what, remedy)
 
     def _check_speed(self) -> Iterator[Check]:
         rpm, start = self._rpm, len(self._samples)
         refused = self._command(protocol.SetSpeed(rpm, abs(rpm) / RAMP_S))
-        self._run(ANSWER_S, until=lambda: math.isclose(self._now.target_rpm, rpm, rel_tol=1e-6))
-        same = math.isclose(self._now.target_rpm, rpm, rel_tol=1e-6)
+        same = self._run(CHANGE_S, until=lambda: math.isclose(self._now.target_rpm, rpm, rel_tol=1e-6))
         what = f"answer {_reason(refused)}, target {self._now.target_rpm:g} rpm"
         yield Check(
-            "accepts a speed", refused == 0 and same, what, "answer 0, and report the same target in the status"
+            "accepts a speed", refused == 0 and same, what, "answer 0, and send a status with the same target at once"
         )
         arrived = self._run(RAMP_S + SETTLE_S, until=lambda: self._now.state == 1)
         self._run(RAMP_S)  # the speed may still overshoot
@@ -312,7 +373,6 @@ class _Suite:
             "keeps its speed", good and self._now.state == 1, what, "check counts per turn and the control loop"
         )
         yield self._check_index(pulses)
-        yield self._check_latch(steady, pulses)
         yield self._check_sync(syncs)
 
     def _check_ramp(self, start: int, arrived: bool) -> Check:
@@ -321,13 +381,17 @@ class _Suite:
         factor = 60.0 / (SLICE_S * max(self._now.counts_per_turn, 1) * self._rpm)
         speed = np.diff(np.interp(at, t, count)) * factor  # of the target
         highest, lowest = (float(speed.max()), float(speed.min())) if len(speed) else (math.nan, math.nan)
-        begun = float(speed[0]) if len(speed) else math.nan
-        what = f"{100 * begun:.0f} % of the speed in the first {SLICE_S:g} s, at most {100 * highest:.0f} %"
+        begun, early = (float(speed[0]), float(speed[1])) if len(speed) > 1 else (math.nan, math.nan)
+        what = (
+            f"{100 * begun:.0f} % of the speed in the first {SLICE_S:g} s, then {100 * early:.0f} %, at most "
+            f"{100 * highest:.0f} %"
+        )
         if lowest < -OVERSHOOT:
             return Check(
                 "follows the ramp", False, what, "the counts run backwards: exchange A and B, or the motor's wires"
             )
-        good = arrived and highest <= 1.0 + OVERSHOOT and begun <= SLICE_S / RAMP_S
+        on_time = begun <= SLICE_S / RAMP_S and EARLY_SHARE[0] <= early <= EARLY_SHARE[1]
+        good = arrived and highest <= 1.0 + OVERSHOOT and on_time
         if not arrived:
             what += f'; no state "at speed" {SETTLE_S:g} s after the ramp'
         return Check("follows the ramp", good, what, "limit the change of the speed; tune the control loop")
@@ -338,25 +402,48 @@ class _Suite:
         expected = STEADY_S * abs(self._rpm) / 60.0
         if len(counts) < max(2, expected / 2.0):
             return Check(name, False, f"{len(counts)} pulses in {expected:.0f} turns", remedy)
+        per_turn = self._now.counts_per_turn
         steps = np.abs(np.diff(counts))
-        error = float(np.abs(steps - self._now.counts_per_turn).max())
+        allowed = max(INDEX_COUNTS, INDEX_SHARE * per_turn)
+        error = float(np.abs(steps - per_turn).max())
+        together = float(abs(steps.sum() - len(steps) * per_turn))
         what = f"{len(counts)} pulses, {steps.min():,} to {steps.max():,} counts apart"
-        return Check(name, error <= 0.01 * self._now.counts_per_turn, what, remedy)
+        return Check(name, error <= 0.01 * per_turn and together <= allowed, what, remedy)
 
-    def _check_latch(self, start: int, pulses: int) -> Check:
+    def _check_latch(self) -> Check:
         name = "latches time and count together"
-        t, count = self._counts_since(start)
-        inside = [(at, c) for at, c in self._index[pulses:] if len(t) and t[0] < at < t[-1]]
+        t, count = self._counts_since(0)
+        inside = [(at, c) for at, c in self._index if len(t) and t[0] < at < t[-1]]
         if len(inside) < 2:
             return Check(name, None, "too few index pulses", "")
         at, latched = np.array(inside, np.int64).T
         off = latched - np.interp(at, t, count)
         off -= (1 << 32) * np.rint(off / (1 << 32))
+        # Pulses of the ramps, too: at a perfectly constant speed all of them are whole milliseconds apart.
         resolution = math.gcd(*np.diff(at).tolist())
         rate = abs(self._rpm) / 60e6 * self._now.counts_per_turn
         what = f"index pulses within {np.abs(off).max():.1f} counts of the samples, clock in steps of {resolution} us"
         good = np.abs(off).max() <= LATCH_COUNTS + LATCH_US * rate + 0.01 * 1000 * rate and resolution <= LATCH_US
         return Check(name, bool(good), what, "read clock and counter together in the interrupt; use a clock of 1 us")
+
+    def _check_jumps(self) -> Check:
+        t, count = self._counts_since(0)
+        fastest = JUMP * abs(self._rpm) / 60e6 * self._now.counts_per_turn  # counts per us
+        jumps = int((np.abs(np.diff(count)) > LATCH_COUNTS + fastest * np.maximum(np.diff(t), 1000)).sum())
+        remedy = "count in 32 bits, over turns and past zero, and lose no edge"
+        return Check("counts continue", jumps == 0, f"{jumps} jumps in {len(count):,} samples", remedy)
+
+    def _check_status_times(self) -> Check:
+        gaps = np.diff([t for t, _ in self._statuses])
+        gap = float(gaps.max()) * 1e-6 if len(gaps) else math.inf
+        early = [
+            m for _, m in self._statuses if m.state == 1 and abs(m.rpm - m.target_rpm) > OVERSHOOT * abs(self._rpm)
+        ]
+        what = (
+            f"{len(self._statuses)} statuses, {gap:.2f} s apart at most, {len(early)} say too early that it is at speed"
+        )
+        remedy = "send a status once per second, and state 1 only at the speed"
+        return Check("keeps sending its status", gap <= STATUS_S and not early, what, remedy)
 
     def _check_sync(self, syncs: int) -> Check:
         name, pulses = "sync pulses", self._sync[syncs:]
@@ -375,33 +462,61 @@ class _Suite:
         remedy = f"send a pulse every {least} to {most} ms, drawn at random for each, and number them from 0"
         return Check(name, good, f"{rate:.1f} per second, {spacing}, {order}", remedy)
 
-    def _check_bad_frames(self) -> Check:
+    def _check_bad_frames(self) -> Iterator[Check]:
         rng = random.Random(0)
-        stop = protocol.encode(protocol.Stop(), next(self._sequence) & 0xFFFF)
-        changed = bytes([*stop[:4], stop[4] ^ 1 or 2, *stop[5:]])
-        other = [
-            b"\2\x82\0\0",
-            b"\1\xf0\0\0",
-            b"\1\xf0\0\0" + bytes(300),
-            b"\1\x82\0\0\7",
-        ]  # another version, types, size
-        frames = [
-            changed,
-            stop[:-3] + b"\0",
+        for frame in [
+            *(self._damaged(protocol.Stop(), byte) for byte in range(2, 8)),
+            *(self._damaged(protocol.SetSpeed(self._rpm / 2.0, 1e3), byte) for byte in (4, 6, 8, 11)),
+            protocol.encode(protocol.Stop(), self._next_sequence())[:-3] + b"\0",
             bytes(rng.randrange(1, 256) for _ in range(300)) + b"\0",
             b"\x55" * 700 + b"\0",
-        ]
-        for frame in [*frames, *(_framed(packet, next(self._sequence)) for packet in other)]:
+        ]:
             self._wire.write(frame)
             self._run(0.05, pings=False)
+        damaged = self._kept_speed()
+        unanswered = [b"\2\x82\0\0", b"\1\xf0\0\0" + b"\1" * 600]  # another version, longer than a frame may be
+        unheard = [self._offer(packet) for packet in unanswered]
+        other = [
+            b"\1\xf0\0\0",
+            b"\1\xf0\0\0" + bytes(300),
+            b"\1\xf0\0\0" + b"\1" * 300,  # more than one full block
+            b"\1\x82\0\0\7",
+            b"\1\x81\0\0" + bytes(12),
+            b"\1\x83\0\0\1",
+        ]
+        answers = [self._answers.pop(self._offer(packet), None) for packet in other]
+        heard = sum(number in self._answers for number in unheard)
+        kept = self._kept_speed()
+        what = f"pong: {'yes' if damaged and kept else 'no'}, target {self._now.target_rpm:g} rpm, {heard} answered"
+        remedy = "drop frames with a wrong CRC, version or length, and synchronise at the next zero byte"
+        yield Check("ignores bad frames", damaged and kept and heard == 0, what, remedy)
+        name, what = "answers unknown commands", f"answers {', '.join(map(_reason, answers))}"
+        if not any(answer is not None for answer in answers):
+            yield Check(name, None, "none: an older controller, which skips them", "")
+            return
+        yield Check(name, set(answers) == {1}, what, "answer 1 to an unknown type, and to a payload of another size")
+
+    def _damaged(self, message: protocol.Message, byte: int) -> bytes:
+        """Return a frame that is whole but for one bit of a byte of the packet or of its CRC."""
+        from cobs import cobs
+
+        packet = bytearray(cobs.decode(protocol.encode(message, self._next_sequence())[:-1]))
+        packet[byte] ^= 0x10
+        return bytes(cobs.encode(bytes(packet))) + b"\0"
+
+    def _offer(self, packet: bytes) -> int:
+        """Send a packet with a sequence number and a valid CRC; return the number."""
+        number = self._next_sequence()
+        self._commands.add(number)
+        self._wire.write(protocol.framed(packet[:2] + number.to_bytes(2, "little") + packet[4:]))
+        self._run(0.05, pings=False)
+        return number
+
+    def _kept_speed(self) -> bool:
+        """Whether a ping is answered, and the speed is the same as before."""
         number = self._ping()
         answered = self._run(ANSWER_S, until=lambda: number not in self._sent, pings=False)
-        kept = math.isclose(self._now.target_rpm, self._rpm, rel_tol=1e-6)
-        what = (
-            f"{len(frames) + len(other)} sent; pong: {'yes' if answered else 'no'}, target {self._now.target_rpm:g} rpm"
-        )
-        remedy = "drop frames with a wrong CRC, version, type or size, and synchronise at the next zero byte"
-        return Check("ignores bad frames", answered and kept, what, remedy)
+        return answered and math.isclose(self._now.target_rpm, self._rpm, rel_tol=1e-6)
 
     def _check_silence(self) -> Check:
         lost = 1 << protocol.FAULTS.index("host lost")
@@ -419,16 +534,60 @@ class _Suite:
         remedy = "set fault bit 4 after a few seconds without a frame, clear it at the next; keep the motor turning"
         return Check("notices a silent host", noticed and turning and cleared, what, remedy)
 
+    def _check_other_way(self) -> Check:
+        """Turn the other way, at a speed that is not a whole number."""
+        rpm, before = -0.75 * self._rpm - math.copysign(0.375, self._rpm), self._index[-1:]
+        refused = self._command(protocol.SetSpeed(rpm, abs(self._rpm) / RAMP_S))
+        arrived = self._run(
+            2.0 * RAMP_S + SETTLE_S, until=lambda: self._now.state == 1 and math.isclose(self._now.target_rpm, rpm)
+        )
+        self._run(RAMP_S)
+        start, pulses = len(self._samples), len(self._index)
+        self._run(STEADY_S)
+        mean, per_turn = self._speed(start), max(self._now.counts_per_turn, 1)
+        what = (
+            f"answer {_reason(refused)}, {mean:.2f} of {rpm:.2f} rpm by the counts, {self._now.rpm:.2f} by the status"
+        )
+        good = abs(mean / rpm - 1.0) <= SPEED_TOLERANCE and abs(self._now.rpm / rpm - 1.0) <= OVERSHOOT
+        if before:
+            away = [math.remainder(count - before[0][1], per_turn) for _, count in self._index[pulses:]]
+            place = max(map(abs, away), default=math.inf)
+            what += f", the index {place:g} counts from its place forwards"
+            good &= place <= LATCH_COUNTS + PLACE_SHARE * per_turn
+        remedy = (
+            "count down backwards; take the same edge of the index pulse in both directions, which is at lower counts"
+        )
+        return Check("turns the other way", refused == 0 and arrived and good, what, remedy)
+
     def _check_stop(self) -> Check:
         refused, start = self._command(protocol.Stop()), self._wire.now_us()
         rests = self._run(STOP_S, until=lambda: self._now.state == 0)
         after, samples = (self._wire.now_us() - start) * 1e-6, len(self._samples)
         self._run(SLICE_S)
         speed = self._speed(samples)
-        still = abs(speed) < max(0.05 * abs(self._rpm), 60.0 / SLICE_S / max(self._now.counts_per_turn, 1) * 2)
+        slow = max(0.05 * abs(self._rpm), 60.0 / SLICE_S / max(self._now.counts_per_turn, 1) * 2)
+        still = abs(speed) < slow and abs(self._now.rpm) < slow
         what = f"answer {_reason(refused)}, state {self._now.state} after {after:.1f} s, {speed:.1f} rpm by the counts"
         good = refused == 0 and rests and still and self._now.target_rpm == 0
         return Check("stops", good, what, "brake to rest and report state 0 and target 0")
+
+    def _check_steep_ramp(self) -> Check:
+        name, rpm, start = "limits its acceleration", self._rpm / 2.0, len(self._samples)
+        refused = self._command(protocol.SetSpeed(rpm, STEEP_RPM_S))
+        if refused == 2:
+            return Check(name, None, f"it refuses a ramp of {STEEP_RPM_S:g} rpm/s", "")
+        self._run(RAMP_S)
+        t, count = self._counts_since(start)
+        self._command(protocol.Stop())
+        self._run(STOP_S, until=lambda: self._now.state == 0)
+        per_us = abs(rpm) / 60e6 * max(self._now.counts_per_turn, 1)
+        slice_us = max(STEEP_SLICE_S * 1e6, STEEP_COUNTS / per_us)
+        at = np.arange(t[0], t[-1], slice_us) if len(t) else np.zeros(0)
+        speed = np.diff(np.interp(at, t, count)) / (slice_us * per_us) * math.copysign(1.0, rpm)
+        highest = float(speed.max()) if len(speed) else math.nan
+        what = f"answer {_reason(refused)}, at most {100 * highest:.0f} % of {rpm:g} rpm"
+        remedy = "limit the ramp to one that the motor can follow, or tune the control loop"
+        return Check(name, refused == 0 and 0.5 < highest <= 1.0 + OVERSHOOT, what, remedy)
 
     def _check_opening(self) -> Check:
         name, before, restarts = "runs on when the port is opened", self._latest, self._decoder.received.restarts
@@ -451,6 +610,17 @@ class _Suite:
         drift = fit_to_round_trips(*np.array(self._trips, np.int64).T).drift
         return Check(name, abs(drift) <= CLOCK_TOLERANCE, f"{1e6 * drift:+.0f} ppm to this computer's", remedy)
 
+    def _check_pong_times(self) -> Check:
+        name, remedy = "pongs carry its time", "put the clock of the samples into each pong and status as it is sent"
+        if len(self._trips) < FEWEST_PAIRS:
+            return Check(name, None, "too few pongs", remedy)
+        sent, at, received = np.array(self._trips, np.int64).T
+        middle = sent + (received - sent) // 2
+        outside = np.abs(at - fit_to_round_trips(sent, at, received)(middle)) - (received - sent) / 2
+        worst = max(float(outside.max()), 0.0)
+        what = f"{worst / 1000:.1f} ms outside the round trip, {self._apart} times apart, {self._stray} not asked for"
+        return Check(name, worst <= STALE_US and self._apart + self._stray == 0, what, remedy)
+
     def _check_losses(self) -> Check:
         now, first = self._decoder.received, self._first
         assert first is not None
@@ -462,8 +632,3 @@ class _Suite:
 
 def _reason(refused: int | None) -> str:
     return "none" if refused is None else str(refused)
-
-
-def _framed(packet: bytes, sequence: int) -> bytes:
-    """Return a packet of four bytes or more as a frame, with a sequence number and a valid CRC."""
-    return protocol.framed(packet[:2] + (sequence & 0xFFFF).to_bytes(2, "little") + packet[4:])

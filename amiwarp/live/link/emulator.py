@@ -171,6 +171,8 @@ BATCH_US = 5_000
 """Longest time for which encoder samples are collected before they are sent [us]."""
 MOST_RPM = 6000.0
 """Largest speed that a command may set [turns/min]; higher speeds are refused."""
+LEAST_RPM = 2.0**-17
+"""Smallest speed that is not taken for 0 [turns/min]: firmware counts in 1/65536 of a turn per minute."""
 HOST_TIMEOUT_US = 3_000_000
 """Time without a frame from the host after which the controller reports that the host is lost [us]."""
 MOST_OUT_BYTES = 1 << 20
@@ -243,7 +245,7 @@ class Controller:
         due = [(edge, fault, on) for fault in faults for edge, on in _edges_of(fault, start_us)]
         self._fault_edges = sorted(due, key=itemgetter(0))
         self._active_faults: list[str] = []
-        self._decoder = protocol.FrameDecoder()
+        self._decoder = protocol.FrameDecoder(lines=False)
         self._heard_us = self._now = start_us
         self._out = bytearray()
         self._boot(clock_start)
@@ -262,7 +264,7 @@ class Controller:
         The next :meth:`advance` returns the answers.
         """
         self._advance_to(now_us)
-        for sequence, message in self._decoder.feed(data) if self.plugged else ():
+        for sequence, message in self._decoder.units(data) if self.plugged else ():
             if sequence is not None:
                 self._heard_us = self._now
                 self._execute(sequence, message)
@@ -374,14 +376,22 @@ class Controller:
                 self.rotor.set_speed(-self.rotor.target_rpm(self._now), STOP_RAMP, self._now)
         self.plugged = "unplug" not in self._active_faults
 
-    def _send_status(self) -> None:
-        """Send the status if it has changed."""
-        self._checked_us = self._now
+    def _state(self) -> tuple[int, float, float]:
+        """Return the state, the speed of the last 20 ms and the commanded speed [turns/min]."""
         early = max(self._now - 20_000, self._boot_us)
         turned = float(self.rotor.angle(self._now)) - float(self.rotor.angle(early))
         rpm = turned / math.tau * 60e6 / max(self._now - early, 1)
         target = self.rotor.target_rpm(self._now)
-        state = 0 if target == 0 and abs(rpm) < 1 else 1 if abs(rpm - target) <= 0.03 * abs(target) + 1 else 2
+        return (
+            0 if target == 0 and abs(rpm) < 1 else 1 if abs(rpm - target) <= 0.03 * abs(target) + 1 else 2,
+            rpm,
+            target,
+        )
+
+    def _send_status(self) -> None:
+        """Send the status if it has changed."""
+        self._checked_us = self._now
+        state, rpm, target = self._state()
         fault_bits = (1 << protocol.FAULTS.index("host lost")) * (self._now - self._heard_us > HOST_TIMEOUT_US)
         sent = state, fault_bits, target, self.counts_per_turn
         if sent != self._sent_status:
@@ -389,7 +399,7 @@ class Controller:
             t = self.clock(self._now) % WRAP
             self._send(protocol.ControllerStatus(t, state, fault_bits, rpm, target, self.counts_per_turn))
 
-    def _execute(self, sequence: int, message: protocol.Message) -> None:
+    def _execute(self, sequence: int, message: protocol.Message | None) -> None:
         refused = 0
         if isinstance(message, protocol.Ping):
             self._send_status()
@@ -397,19 +407,29 @@ class Controller:
             return
         if isinstance(message, protocol.SetSpeed):
             fits = abs(message.rpm) <= MOST_RPM and 0 < message.ramp < math.inf
-            refused = 2 if not fits else 0 if self.rotor.set_speed(message.rpm, message.ramp, self._now) else 3
+            rpm = message.rpm if abs(message.rpm) >= LEAST_RPM else 0.0
+            refused = 2 if not fits else 0 if self.rotor.set_speed(rpm, message.ramp, self._now) else 3
         elif isinstance(message, protocol.Stop):
             refused = 0 if self.rotor.set_speed(0.0, STOP_RAMP, self._now) else 3
         elif isinstance(message, protocol.SetCounts):
-            refused = 0 if 0 < message.per_turn < 1 << 24 else 2
-            if not refused:
-                self._flush()
-                self.counts_per_turn = message.per_turn
-                self._count_offset = math.floor(self._position())
+            refused = self._set_counts(message.per_turn)
         else:
             refused = 1
         self._send(protocol.Answer(sequence, refused))
         self._send_status()
+
+    def _set_counts(self, per_turn: int) -> int:
+        """Change the counts per turn, unless the prism turns; return the reason for a refusal."""
+        if per_turn == self.counts_per_turn:
+            return 0
+        if not 0 < per_turn < 1 << 24:
+            return 2
+        if self._state()[0] != 0:
+            return 3
+        self._flush()
+        self.counts_per_turn = per_turn
+        self._count_offset = math.floor(self._position())
+        return 0
 
     def _flush(self) -> None:
         batch, self._batch = self._batch, []

@@ -21,7 +21,16 @@ PULSE_INTERVAL_MS = 70, 130
 the clocks fits the pulses that a camera has seen."""
 STATES = ("stopped", "at speed", "on the way to its speed", "fault")
 """Meaning of each value of :attr:`ControllerStatus.state`."""
-FAULTS = ("stall", "over-current", "encoder lost", "index missed", "host lost", "over-speed")
+FAULTS = (
+    "stall",
+    "over-current",
+    "encoder lost",
+    "index missed",
+    "host lost",
+    "over-speed",
+    "supply lost",
+    "magnet lost",
+)
 """Meaning of each bit of :attr:`ControllerStatus.faults`, lowest bit first."""
 REFUSALS = ("accepted", "unknown command", "out of range", "not possible now")
 """Meaning of each value of :attr:`Answer.refused`."""
@@ -208,14 +217,15 @@ class FrameDecoder:
     """Decodes bytes into messages: from frames, or from text lines if the first complete unit is a line.
 
     Accepts any bytes without raising, buffers at most :data:`LONGEST` bytes, and resynchronises at the next frame after
-    garbage.
+    garbage. ``lines``: whether text lines are understood; a controller does not.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, lines: bool = True) -> None:
         self.received = FrameCounters()
         self._held = bytearray()
+        self._too_long = False  # bytes are dropped until the next zero or line end
         self._next: int | None = None
-        self._text: bool | None = None
+        self._text: bool | None = None if lines else False
         self._whole = False  # the bytes before the first line end may be the rest of a line
 
     def feed(self, data: bytes) -> list[tuple[int | None, Message]]:
@@ -223,7 +233,11 @@ class FrameDecoder:
 
         The number is None for a message from a text line.
         """
-        out: list[tuple[int | None, Message]] = []
+        return [(sequence, message) for sequence, message in self.units(data) if message is not None]
+
+    def units(self, data: bytes) -> list[tuple[int | None, Message | None]]:
+        """Return the messages like :meth:`feed`, and None for each frame of an unknown type or of a wrong size."""
+        out: list[tuple[int | None, Message | None]] = []
         for byte in data:
             if byte == 0 and self._text is not True:
                 out += self._frame()
@@ -235,13 +249,20 @@ class FrameDecoder:
 
     def _hold(self, byte: int) -> None:
         self._held.append(byte)
-        if len(self._held) > LONGEST:
+        if len(self._held) >= LONGEST:
             self.received.damaged += 1
             self._held.clear()
+            self._too_long = True
 
-    def _frame(self) -> Iterator[tuple[int, Message]]:
-        held = bytes(self._held)
+    def _take_held(self) -> bytes:
+        """Return the bytes since the last end of a frame or line, none if they were too many; and begin anew."""
+        held = b"" if self._too_long else bytes(self._held)
         self._held.clear()
+        self._too_long = False
+        return held
+
+    def _frame(self) -> Iterator[tuple[int, Message | None]]:
+        held = self._take_held()
         if not held:
             return  # two zero bytes in a row enclose no frame
         packet = _checked(held)
@@ -249,7 +270,8 @@ class FrameDecoder:
             self.received.damaged += 1
             return
         version, kind, sequence = _HEADER.unpack_from(packet)
-        message = _message(kind, packet[_HEADER.size :]) if version == VERSION else None
+        known = version == VERSION
+        message = _message(kind, packet[_HEADER.size :]) if known else None
         self._text = False
         gap = 0 if self._next is None else (sequence - self._next) & 0xFFFF
         self.received.restarts += gap >= 1 << 15
@@ -257,11 +279,16 @@ class FrameDecoder:
         self._next = (sequence + 1) & 0xFFFF
         if message is None:
             self.received.unknown += 1
-            return
-        self.received.frames += 1
-        yield sequence, message
+        else:
+            self.received.frames += 1
+        if known:
+            yield sequence, message
 
     def _line(self, byte: int) -> Iterator[tuple[None, Message]]:
+        if self._too_long:
+            self._take_held()
+            self._whole = True
+            return
         match = _LINE.fullmatch(bytes(self._held).lstrip(b"\n")) if self._whole or self._text else None
         t, count = (int(match[1]), int(match[2])) if match else (1 << 32, 0)
         if t < 1 << 32 and -(1 << 31) <= count < 1 << 31:
