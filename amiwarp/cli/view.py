@@ -102,16 +102,27 @@ class LookOptions:
 
         Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
         """
+        from amiwarp.viewer.bookmarks import Bookmarks
         from amiwarp.viewer.drawing import save_screenshot
         from amiwarp.viewer.jobs import estimate_phase
-        from amiwarp.viewer.layout import notes
+        from amiwarp.viewer.layout import apply_state, current_state, load_bookmark, notes
 
         check_ending(path, "pictures are written", [".png"])
         size = self.pixels(PICTURE_PX)
         estimate_phase(inspector)
-        chosen = self._choose_region(inspector)
-        save_screenshot(inspector, path, view=self.view, look=self.look(inspector), size=size)
-        shown = inspector.show()
+        look, view, against = self.look(inspector), self.view, None
+        chosen: list[str] = []
+        if inspector.path is not None and inspector.bookmark:
+            bookmarks, first = Bookmarks(inspector.path), current_state(inspector)
+            state, wrong = load_bookmark(bookmarks, inspector.bookmark, inspector, first)
+            apply_state(inspector, state)
+            look = replace(look, colour=state.colour, axis=state.axis, overlaid=state.overlaid)
+            view, against = state.view, state.against
+            chosen += wrong
+        if self.region is not None or not inspector.bookmark:
+            chosen += self._choose_region(inspector)
+        save_screenshot(inspector, path, view=view, look=look, size=size, against=against)
+        shown = inspector.show(against=against)
         return {
             "file": str(path), "events": shown.span.count, "drawn": len(shown.events),
             "sharpness_before": shown.sharpness_before,
@@ -250,6 +261,13 @@ class StartOptions:
             "its first event. Default: none."
         ),
     ] = None
+    bookmark: Annotated[
+        str | None,
+        typer.Option(
+            help="Name of a view that was saved in the inspector. It is in RECORDING.view.json beside the recording. "
+            "Default: none."
+        ),
+    ] = None
     depth: Annotated[
         Path | None,
         typer.Option(
@@ -287,6 +305,23 @@ class StartOptions:
             inspector.use_depths(DepthMap.load(self.depth))
         return inspector
 
+    def chosen_bookmark(self, recording: Path) -> str:
+        """Return the name of the bookmark to show first; empty for none, also if the file of bookmarks is damaged.
+
+        A damaged or foreign file is said. Raises :class:`AmiwarpError` for a name that the file does not hold.
+        """
+        from amiwarp.viewer.bookmarks import Bookmarks
+
+        try:
+            names = Bookmarks(recording).names()
+        except AmiwarpError as error:
+            say(f"{error}; the recording is shown without bookmarks")
+            return ""
+        if self.bookmark is not None and self.bookmark not in names:
+            known = f"choose among {', '.join(names)}" if names else "save a view in the inspector first"
+            raise AmiwarpError(f"--bookmark {self.bookmark!r}: {Bookmarks(recording).path} does not hold it; {known}")
+        return self.bookmark or ""
+
 
 def run_view(
     recording: Annotated[
@@ -313,12 +348,17 @@ def run_view(
         raise AmiwarpError("--host and --port apply to the page; give --web too")
     if stream.live and layout.given():
         raise AmiwarpError("--live shows a stream, to which the options for the layout of a file do not apply")
+    if stream.live and start.bookmark is not None:
+        raise AmiwarpError("--bookmark is kept beside a file; leave it out with --live")
+    bookmark = "" if stream.live else start.chosen_bookmark(recording)
     device = cli.choose_device(common.device)
     with stream.follow(str(recording)) as latest:
 
         def new_inspector() -> Inspector:
             opened = open_recording(recording, **layout.given()) if latest is None else latest()
-            return start.build(cli.complete(opened, camera, prism), device, latest, None if page.web else WINDOW_POINTS)
+            made = start.build(cli.complete(opened, camera, prism), device, latest, None if page.web else WINDOW_POINTS)
+            made.path, made.bookmark = None if stream.live else recording, bookmark
+            return made
 
         waiting = [new_inspector()]  # created before the page opens, so that bad input is reported at once
         if look.screenshot is not None:

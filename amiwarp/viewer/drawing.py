@@ -1032,12 +1032,18 @@ def draw_depth(plotter: pyvista.Plotter, first: int, depth: DepthMap, font_px: i
 
 
 def save_screenshot(
-    inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
+    inspector: Inspector,
+    path: Path,
+    *,
+    view: View = View.FREE,
+    look: Look | None = None,
+    size: tuple[int, int],
+    against: Knobs | None = None,
 ) -> None:
-    """Write a picture of both event clouds as PNG; ``size`` is its width and height [px]."""
+    """Write a picture of both event clouds as PNG, as :func:`draw_picture` returns it."""
     check_output(path)
     with interrupts_later():  # VTK crashes if an exception leaves it half-drawn
-        save_png(path, draw_picture(inspector, view, look or Look(), size))
+        save_png(path, draw_picture(inspector, view, look or Look(), size, against))
 
 
 def draw_picture(

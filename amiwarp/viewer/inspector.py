@@ -359,6 +359,10 @@ class Inspector:
         """Start and length of the time window [us]; None: that of :meth:`first_window`."""
         self.fixed_count: int | None = None
         """Number of events of each time window that is opened, from its start on; None: windows have their length."""
+        self.path: Path | None = None
+        """File of the recording, beside which its bookmarks are; None if it is not a file."""
+        self.bookmark = ""
+        """Name of the bookmark that page and window show first; empty for none."""
         self.selection = Selection()
         self.most_points = most_points or MOST_POINTS
         """Largest number of points in each event cloud."""
@@ -1064,4 +1068,6 @@ class Library:
         """Open a file of the folder. Raises :class:`AmiwarpError` for any other name, or if it is no recording."""
         if name not in [file for file, _ in self.files()]:
             raise AmiwarpError(f"{name!r}: is no recording in {self.folder}; choose one from the list")
-        return self._open_file(self.folder / name)
+        made = self._open_file(self.folder / name)
+        made.path = self.folder / name
+        return made

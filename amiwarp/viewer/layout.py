@@ -1,5 +1,7 @@
 """Contents of the inspector's page: its state and history, names, units, keys and texts, and its template."""
 
+from __future__ import annotations
+
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -13,6 +15,7 @@ from amiwarp.calib.result import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS, alternatives, size_names
+from amiwarp.viewer.bookmarks import Bookmarks
 from amiwarp.viewer.drawing import AGAINST, DECAY_US, ImageKind, Look
 from amiwarp.viewer.filters import Selection
 from amiwarp.viewer.inspector import (
@@ -195,9 +198,9 @@ GIVEN = {"fov_deg": ("field of view", "°", (1.0, 170.0)), "prism_index": ("refr
 _Field: TypeAlias = tuple[str, Callable[[Any], str], Callable[[str], Any]]
 
 
-def encode_state(state: ViewState, default: ViewState) -> str:
-    """Return what differs from the ``default`` as the query of an address, without a question mark."""
-    now, usual = _texts(state), _texts(default)
+def encode_state(state: ViewState, default: ViewState | None = None) -> str:
+    """Return what differs from the ``default``, or all, as the query of an address, without a question mark."""
+    now, usual = _texts(state), {} if default is None else _texts(default)
     return urlencode({key: value for key, value in now.items() if value != usual.get(key)}, safe=",:")
 
 
@@ -225,6 +228,20 @@ def decode_state(
         except (ValueError, KeyError, OverflowError):
             wrong.append(f"the address gives {key[:20]!r} = {text[:40]!r}, which this recording cannot show")
     return state, tuple(wrong)
+
+
+def load_bookmark(
+    bookmarks: Bookmarks, name: str, inspector: Inspector, first: ViewState
+) -> tuple[ViewState, tuple[str, ...]]:
+    """Return the state of a bookmark, and what is wrong with it, one sentence each.
+
+    ``first``: state of which values stay that are wrong or missing. Raises :class:`AmiwarpError` as
+    :meth:`Bookmarks.load`.
+    """
+    source = inspector.recording.events
+    duration_us = int(source.t_last - source.t_first + 1)
+    state, wrong = decode_state(bookmarks.load(name), first, size=source.size, duration_us=duration_us)
+    return state, tuple(f"{bookmarks.path.name}: {name!r}: {text}" for text in wrong)
 
 
 def _fields(size: tuple[int, int], duration_us: int) -> dict[str, _Field]:
@@ -375,7 +392,7 @@ CALLS = (
     "key", "released", "choose", "slide", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline", "undo", "redo",
     "reset", "restore", "answer", "keep_b", "swap_b", "export", "open_file", "use_card", "end_film",
-    "list_hot", "record",
+    "list_hot", "record", "save_view", "open_view", "delete_view",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {
@@ -390,17 +407,17 @@ SETTABLE: dict[str, Check] = {
 }  # fmt: skip
 """State variables that the page may set directly, with the check of their values. The page changes all others through
 :data:`CALLS`."""
-CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice", "sliced", "marked", "picture_scale")
+CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice", "sliced", "marked", "picture_scale", "view_name")
 """State variables that the browser keeps to itself."""
 EMPTY: tuple[tuple[Any, str], ...] = (
     ("", "trame_error_report_msg stream_note hover measured address events drawn sharpness message rate_note "
-         "picked_text image_note against_title after_title b_text busy found"),
+         "picked_text image_note against_title after_title b_text busy found view_name views_file"),
     (b"", "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off orbit "
           "column"),
     (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
             "difference has_b calibrating same_scale recording"),
     (None, "overview before after surface image_scale after_scale marked hot_rows"),
-    ((), "live_rows updating titles against_choices old steps beside_rows"),
+    ((), "live_rows updating titles against_choices old steps beside_rows views"),
     (0, "fixed_count"),
 )  # fmt: skip
 """Values of state variables before the first update, and their names."""
@@ -426,6 +443,8 @@ class Actions:
     """Show a text as a message."""
     steps: tuple[Callable[[History], ViewState], ...] = ()
     """Steps through the history that are to be made after the changes which were requested before them."""
+    bookmarks: Bookmarks | None = None
+    """Named views of the recording; None if it is no file."""
     listener: Callable[[ViewState], None] | None = None
     """Called with what is shown after each update; None for nobody."""
 
@@ -564,6 +583,25 @@ class Actions:
             return True
         self.move(self.inspector.recording.events.t_first if loop else start_us)
         return loop
+
+    # Bookmarks
+
+    def save_view(self, name: str) -> None:
+        """Save what is shown as a bookmark."""
+        if self.bookmarks is not None:
+            with self.errors_shown("bookmark"):
+                self.bookmarks.save(name, encode_state(self.state_now()))
+                self.say(f"saved {name.strip()!r} in {self.bookmarks.path.name}")
+
+    def open_view(self, name: str) -> None:
+        """Show a bookmark."""
+        if self.bookmarks is None:
+            return
+        with self.errors_shown("bookmark"):
+            state, wrong = load_bookmark(self.bookmarks, name, self.inspector, self.state_now())
+            self.travel(lambda _: state)
+            if wrong:
+                self.say("; ".join(wrong))
 
     # History
 

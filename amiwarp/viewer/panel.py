@@ -28,6 +28,7 @@ from amiwarp.live.stream.session import LiveSource
 from amiwarp.plotting.colours import Scale, count_scale
 from amiwarp.tasks import Progress
 from amiwarp.viewer import drawing, jobs, layout
+from amiwarp.viewer.bookmarks import Bookmarks
 from amiwarp.viewer.drawing import ImageKind, Look
 from amiwarp.viewer.filters import Selection, step_rows
 from amiwarp.viewer.inspector import WINDOW_POINTS, DisplayedWindow, Inspector, Knobs, Library
@@ -119,6 +120,10 @@ class Panel(layout.Actions):
             self.play()
         if isinstance(inspector.latest, LiveSource):
             self.start_job(self._watch(inspector.latest))
+        self.bookmarks = None if inspector.path is None else Bookmarks(inspector.path)
+        self._list_views()
+        if inspector.bookmark:
+            self.open_view(inspector.bookmark)
 
     def close(self) -> None:
         """Stop all work of the browser tab, and remove its downloads. A thread ends when its current work is done."""
@@ -420,6 +425,30 @@ class Panel(layout.Actions):
             await self.until_drawn()
             self.start(inspector)
         self.state.flush()
+
+    # Bookmarks
+
+    def save_view(self, name: str) -> None:
+        """Save what is shown as a bookmark."""
+        super().save_view(name)
+        self._list_views()
+
+    def delete_view(self, name: str) -> None:
+        """Delete a bookmark."""
+        if self.bookmarks is not None:
+            with self.errors_shown("bookmark"):
+                self.bookmarks.delete(name)
+            self._list_views()
+
+    def _list_views(self) -> None:
+        """Show the names of the bookmarks."""
+        names: list[str] = []
+        if self.bookmarks is not None:
+            with self.errors_shown("bookmarks"):
+                names = self.bookmarks.names()
+        self.state.update({
+            "views": names, "views_file": "" if self.bookmarks is None else self.bookmarks.path.name,
+        })  # fmt: skip
 
     # Region of the image
 

@@ -14,6 +14,7 @@ from amiwarp.io.event_rates import EventRates
 from amiwarp.live.stream.session import LiveSource
 from amiwarp.tasks import interrupts_later, no_garbage_collection
 from amiwarp.viewer import drawing, jobs, layout
+from amiwarp.viewer.bookmarks import Bookmarks
 from amiwarp.viewer.drawing import Look, Scene
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.window_actions import FINE, SPEED
@@ -58,6 +59,7 @@ class Window(WindowContents):
         if size is None and not off_screen:
             self.plotter.window_size = first_size(tuple(self.plotter.render_window.GetScreenSize()))
         self.inspector, self.view = inspector, view
+        self.bookmarks = None if inspector.path is None else Bookmarks(inspector.path)
         self.look = look or Look(axis=Axis.ANGLE if self.compensates else Axis.TIME)
         self.statistics_shown = not self.compensates  # in place of the charts of the sharpness
         self.knob, self.message = inspector.orbit_names[0], ""
@@ -239,6 +241,8 @@ class Window(WindowContents):
         self._rates = EventRates(self.inspector.recording.events)
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.update()
+        if self.inspector.bookmark:
+            self.open_view(self.inspector.bookmark)
         self.scene.look_from(self.view, self._look)
         if not self.plotter.off_screen:  # not before there is something to show
             self.plotter.iren.initialize()

@@ -50,6 +50,7 @@ class WindowActions(layout.Actions):
     _slow: Iterator[None]  # what takes long, in steps
     _slow_steps: Callable[[], Iterator[None]]
     _show_progress: Callable[[str, float], None]
+    _view_name = ""  # the bookmark that was shown last
     _picked = -1  # the event whose orbit is shown
     _played_s = 0.0  # when the time window was moved last by playing
     _progress = _film_ends = False  # whether a calibration or film runs, and whether a film ends now
@@ -251,6 +252,37 @@ class WindowActions(layout.Actions):
             else:
                 self.inspector.as_calibration().save(path)
             self.say(f"saved {path}")
+
+    def save_next_view(self) -> None:
+        """Save what is shown as a bookmark, under the first free number."""
+        names = self._views()
+        if names is not None:
+            self.save_view(next(name for k in itertools.count(1) if (name := f"view {k}") not in names))
+
+    def open_view(self, name: str) -> None:
+        """Show a bookmark, and its name or what is wrong with it."""
+        self.message, self._view_name = f"bookmark {name}", name
+        super().open_view(name)
+        told = self.message
+        self.update()
+        self.say(self.message or told)
+
+    def open_next_view(self) -> None:
+        """Show the bookmark after the one that was shown last."""
+        names = self._views()
+        if names:
+            self.open_view(_following(names, self._view_name))
+        elif names is not None:
+            self.say("there are no bookmarks; u saves one")
+
+    def _views(self) -> list[str] | None:
+        """Return the names of the bookmarks; None, with a message, if there can be none."""
+        if self.bookmarks is None:
+            self.say("bookmarks are kept beside a file; this recording is none")
+            return None
+        with self.errors_shown("bookmark"):
+            return self.bookmarks.names()
+        return None
 
     def _new_name(self, what: str) -> Path:
         name = Path(jobs.download_name(self.inspector.recording.name, what))
