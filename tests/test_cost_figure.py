@@ -84,3 +84,12 @@ def test_a_result_that_nothing_moved_has_one_mark(calibration: Calibration, stag
     assert "found" in legend
     assert "sharpest" not in legend
     assert "photometric" not in axes.get_title()
+
+
+def test_the_legend_covers_nothing_of_the_map(calibration: Calibration) -> None:
+    axes, legend = drawn(replace(calibration, photometric=STAGE))
+    map_box, legend_box = axes.get_window_extent(), axes.get_legend().get_window_extent()
+    assert not map_box.overlaps(legend_box)
+    numbers = axes.xaxis.get_tightbbox()
+    assert legend_box.y1 <= numbers.y0  # below the numbers and the title of the axis
+    assert legend["global search"].get_markersize() >= 4.0

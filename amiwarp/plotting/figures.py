@@ -48,6 +48,8 @@ MOST_NUMBERS = 9
 """Largest number of numbers on a logarithmic axis."""
 FOUND, TRUTH, LOCAL, SHARPEST = VERMILION, BLACK, ORANGE, BLUE
 """Colours of the calibrated parameters, of the true parameters, of the local search, and of the sharpest parameters."""
+LEGEND = "#dddddd"
+"""Background of the legend, on which white and orange marks can be seen."""
 HATCHES = "#999999"
 """Colour of the hatches where nothing was sampled."""
 
@@ -69,7 +71,7 @@ class Images:
 
 def draw_calibration(path: Path, recording: Recording, calibration: Calibration, *, device: Any) -> None:
     """Draw the images before and after compensation, and the cost surface with the samples of all stages."""
-    figure = blank((14.0, 4.2), layout="compressed")
+    figure = blank((14.0, 4.8), layout="compressed")
     axes = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 0.8))
     draw_images(axes[:2], images(thin(recording, EVENTS), recording, calibration, device=device))
     draw_cost(figure, axes[2], calibration)
@@ -113,10 +115,10 @@ def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float
     if coarse.sum() >= 10 and np.ptp(x[coarse]) > 0 and np.ptp(y[coarse]) > 0:
         surface = ax.tricontourf(x[coarse], y[coarse], samples[coarse, 2], levels=24, cmap="cividis")
         figure.colorbar(surface, ax=ax, label=f"sharpness ({calibration.sharpness_name}, coarse image)", shrink=0.85)
-        dots = {"color": "white", "markersize": 3.0, "markeredgecolor": "black", "markeredgewidth": 0.3}
-        ax.plot(x[coarse], y[coarse], ".", label="global search", **dots)
+        dots = {"color": "white", "markersize": 4.0, "markeredgecolor": "black", "markeredgewidth": 0.7}
+        ax.plot(x[coarse], y[coarse], "o", label="global search", **dots)
         _hatch_the_unsampled(ax)
-    ax.plot(x[~coarse], y[~coarse], "+", color=LOCAL, markersize=5, label="local search")
+    ax.plot(x[~coarse], y[~coarse], "+", color=LOCAL, markersize=7, markeredgewidth=1.4, label="local search")
     found = _polar(calibration.parameters[size], calibration.parameters["phase"])
     moved = _draw_sharpest(ax, calibration, size)
     ax.plot(*found, "o", markersize=13, fillstyle="none", color=FOUND, markeredgewidth=2.2, label="found")
@@ -126,7 +128,8 @@ def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float
     ax.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1.0)
     ax.set(xlabel=f"{size} · cos phase [deg]", ylabel=f"{size} · sin phase [deg]")
     ax.set_title(f"cost surface and its samples{moved}")
-    ax.legend(loc="lower left", fontsize=8, framealpha=1.0, facecolor="#9a9a9a", markerscale=0.7)
+    below = 0.5, -0.15  # below the axes, where it covers nothing of the map
+    ax.legend(loc="upper center", bbox_to_anchor=below, ncols=3, fontsize=9, facecolor=LEGEND, framealpha=1.0)
 
 
 def _hatch_the_unsampled(ax: Any) -> None:
