@@ -282,6 +282,8 @@ def test_no_command_writes_over_what_it_reads(place: Path, line: str, read: str,
         "live a.h5 --fast --calibration cal.json --out {}.h5",
         "live a.h5 --fast --calibration cal.json --record {}.h5",
         "view a.h5 --screenshot {}.png",
+        "view a.h5 --screenshot {}.pdf",
+        "view a.h5 --screenshot {}.vtp",
     ],
 )
 def test_what_exists_is_replaced_by_force_alone(place: Path, line: str) -> None:
@@ -331,7 +333,7 @@ NAMES: dict[tuple[str, str], tuple[str, tuple[str, ...]]] = {
     ("simulate", "out"): ("simulate {} --picture pic.png --duration 0.01", ("npz", "txt", *NOT_WRITTEN)),
     ("simulate", "preview"): ("simulate new.h5 --world room --duration 0.01 --preview {}", ("h5", *NOT_WRITTEN)),
     ("translate", "out"): ("translate v.npy {} --fps 100", ("npz", "txt", *NOT_WRITTEN)),
-    ("view", "screenshot"): ("view a.h5 --screenshot {}", ("h5", "svg", *NOT_WRITTEN)),
+    ("view", "screenshot"): ("view a.h5 --screenshot {}", ("h5", "gif", *NOT_WRITTEN)),
     ("chart", "out"): ("chart --quick --out {}", FOLDER),
     ("dataset", "out"): ("dataset spec.toml {}", FOLDER),
     ("demo", "out"): ("demo --size 64x48 --duration 0.1 --picture pic.png --out {}", FOLDER),

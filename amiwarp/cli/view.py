@@ -25,10 +25,15 @@ from amiwarp.viewer.serve import is_local
 if TYPE_CHECKING:
     from amiwarp.viewer.drawing import Look
     from amiwarp.viewer.inspector import Inspector, Library
+    from amiwarp.viewer.publish import Page
 
 _LOOK, _SERVER = "Window and picture", "Server"
 LEAST_PX, MOST_PX = 100, 8000
 """Smallest and largest width or height of a window or a screenshot [px]."""
+LEAST_MM, MOST_MM, LEAST_DPI, MOST_DPI = 40, 1000, 50, 1200
+"""Smallest and largest width or height of a figure [mm], and smallest and largest resolution [1/inch]."""
+LARGEST_OFFSET_S = 1e6
+"""Largest distance in time between two recordings on one axis [s]."""
 PICTURE_PX = 1400, 620
 """Width and height of a screenshot [px]."""
 LEAST_MOTION = 0.05
@@ -42,7 +47,11 @@ class LookOptions:
 
     screenshot: Annotated[
         Path | None,
-        typer.Option(help="Write a picture of both event clouds (.png) and exit.", rich_help_panel=_LOOK),
+        typer.Option(
+            help="Write a picture of both event clouds (.png), a figure for print (.svg, .pdf, or .png with --dpi or a "
+            "size in mm) or both clouds for ParaView (.vtp), and exit.",
+            rich_help_panel=_LOOK,
+        ),
         cli.OUTPUT,
     ] = None
     region: Annotated[
@@ -77,11 +86,19 @@ class LookOptions:
     size: Annotated[
         str | None,
         typer.Option(
-            help="Size of the window or the picture (px). Default: 1500x950 or the largest that fits the screen; "
-            "1400x620 for a picture.",
-            metavar="WIDTHxHEIGHT", rich_help_panel=_LOOK,
+            help="Size of the window or the picture (px), or of a figure (px, or mm if it ends in mm). Default: "
+            "1500x950 or the largest that fits the screen, 1400x620 for a picture, and 180x130mm for a figure.",
+            metavar="WIDTHxHEIGHT[mm]",
+            rich_help_panel=_LOOK,
         ),
-    ] = None  # fmt: skip
+    ] = None
+    dpi: Annotated[
+        int | None,
+        typer.Option(
+            help=f"Pixels per inch of a figure for print, {LEAST_DPI} to {MOST_DPI}. Default: 300.",
+            rich_help_panel=_LOOK,
+        ),
+    ] = None
 
     def look(self, inspector: Inspector) -> Look:
         """Return the style in which the clouds are drawn."""
@@ -97,18 +114,46 @@ class LookOptions:
             raise AmiwarpError(f"--size {self.size!r}: width and height must be {LEAST_PX} to {MOST_PX} px")
         return width, height
 
+    def is_figure(self, path: Path) -> bool:
+        """Return whether a figure for print is wanted."""
+        in_mm = self.size is not None and self.size.endswith("mm")
+        return path.suffix.lower() in (".svg", ".pdf") or self.dpi is not None or in_mm
+
+    def page(self) -> Page:
+        """Return size and resolution of a figure. Raises :class:`AmiwarpError` for values out of range."""
+        from amiwarp.viewer.publish import DPI, Page
+
+        dpi = DPI if self.dpi is None else self.dpi
+        if not LEAST_DPI <= dpi <= MOST_DPI:
+            raise AmiwarpError(f"--dpi {dpi}: give {LEAST_DPI} to {MOST_DPI} pixels per inch")
+        if self.size is None:
+            return Page(dpi=dpi)
+        if not self.size.endswith("mm"):
+            return Page.of_pixels(*self.pixels(PICTURE_PX), dpi)
+        width, height = cli.parse_size(self.size.removesuffix("mm"), example="180x130mm")
+        if min(width, height) < LEAST_MM or max(width, height) > MOST_MM:
+            raise AmiwarpError(f"--size {self.size!r}: width and height must be {LEAST_MM} to {MOST_MM} mm")
+        return Page(width, height, dpi)
+
     def write(self, inspector: Inspector, path: Path) -> dict[str, Any]:
         """Write the picture; return a description of its content for ``--json``. An unknown phase is estimated first.
 
-        Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
+        Raises :class:`AmiwarpError` for an unknown format, or a size out of range.
         """
         from amiwarp.viewer.bookmarks import Bookmarks
         from amiwarp.viewer.drawing import save_screenshot
         from amiwarp.viewer.jobs import estimate_phase
         from amiwarp.viewer.layout import apply_state, current_state, load_bookmark, notes
+        from amiwarp.viewer.publish import FIGURE_ENDINGS, save_clouds, save_figure
 
-        check_ending(path, "pictures are written", [".png"])
-        size = self.pixels(PICTURE_PX)
+        ending = check_ending(path, "pictures are written", [*FIGURE_ENDINGS, ".vtp"])
+        if ending == ".vtp" and (self.size, self.dpi) != (None, None):
+            raise AmiwarpError(f"{path}: a .vtp holds points, which have no size; leave --size and --dpi out")
+        figure = self.is_figure(path)
+        if figure and self.dark:
+            raise AmiwarpError(f"{path}: a figure for print has a light background; leave --dark out")
+        page = self.page() if figure else None
+        size = PICTURE_PX if figure else self.pixels(PICTURE_PX)
         estimate_phase(inspector)
         look, view, against = self.look(inspector), self.view, None
         chosen: list[str] = []
@@ -121,10 +166,16 @@ class LookOptions:
             chosen += wrong
         if self.region is not None or not inspector.bookmark:
             chosen += self._choose_region(inspector)
-        save_screenshot(inspector, path, view=view, look=look, size=size, against=against)
         shown = inspector.show(against=against)
+        drawn = len(shown.events)
+        if ending == ".vtp":
+            drawn = save_clouds(inspector, path)
+        elif page is not None:
+            drawn = save_figure(inspector, path, page, view=view, look=look, against=against)
+        else:
+            save_screenshot(inspector, path, view=view, look=look, size=size, against=against)
         return {
-            "file": str(path), "events": shown.span.count, "drawn": len(shown.events),
+            "file": str(path), "events": shown.span.count, "drawn": drawn,
             "sharpness_before": shown.sharpness_before,
             "sharpness_after": shown.sharpness_after if math.isfinite(inspector.turn_us) else None,
             "region": list(shown.region), "notes": [*(notes(inspector) if inspector.has_optic else []), *chosen],
@@ -255,10 +306,18 @@ class StartOptions:
         ),
     ] = None
     beside: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
-            help="Another recording with as many pixels. The left cloud shows it, as recorded, at the same time after "
-            "its first event. Default: none."
+            help="Another recording with as many pixels, on the same time axis. The left cloud shows it, as recorded. "
+            "Can be given several times: then page and window choose among them. Default: none.",
+            metavar="<path>",
+        ),
+    ] = None
+    beside_offset: Annotated[
+        list[float] | None,
+        typer.Option(
+            help="Time of the first event of a --beside recording after this recording's first event (s). Give it once "
+            "for each --beside, in their order. Default: 0, both start together.",
         ),
     ] = None
     bookmark: Annotated[
@@ -299,11 +358,24 @@ class StartOptions:
             events = inspector.recording.events
             low, high = cli.span(self.window, events.t_first, events.t_last)
             inspector.window = low, high - low
-        if self.beside is not None:
-            inspector.put_beside(open_recording(self.beside))
+        for path, offset_s in zip(self.beside or (), self._offsets(), strict=True):
+            inspector.put_beside(open_recording(path), round(offset_s * 1e6))
         if self.depth is not None:
             inspector.use_depths(DepthMap.load(self.depth))
         return inspector
+
+    def _offsets(self) -> list[float]:
+        """Return the offset of each recording beside [s]. Raises :class:`AmiwarpError` if there are more or fewer."""
+        others, offsets = len(self.beside or ()), self.beside_offset
+        if offsets is None:
+            return [0.0] * others
+        if len(offsets) != others or not all(abs(offset) <= LARGEST_OFFSET_S for offset in offsets):
+            given = ", ".join(f"{offset:g}" for offset in offsets)
+            raise AmiwarpError(
+                f"--beside-offset {given}: give one for each of the {others} --beside recordings, "
+                f"-{LARGEST_OFFSET_S:g} to {LARGEST_OFFSET_S:g} s"
+            )
+        return offsets
 
     def chosen_bookmark(self, recording: Path) -> str:
         """Return the name of the bookmark to show first; empty for none, also if the file of bookmarks is damaged.
@@ -344,6 +416,8 @@ def run_view(
         raise AmiwarpError("--screenshot and --web are both given; give one of them")
     if look.screenshot is None and look.region is not None:
         raise AmiwarpError("--region applies to a picture; give --screenshot too, or draw the region in the window")
+    if look.screenshot is None and (look.dpi is not None or (look.size or "").endswith("mm")):
+        raise AmiwarpError("--dpi and a size in mm apply to a figure; give --screenshot too")
     if not page.web and page != PageOptions():
         raise AmiwarpError("--host and --port apply to the page; give --web too")
     if stream.live and layout.given():

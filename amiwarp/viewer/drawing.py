@@ -373,14 +373,15 @@ def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:
     """Return each point's third coordinate, shape ``(n,)``: prism angle [deg], or time [ms]."""
     if axis is Axis.ANGLE:
         return np.asarray(np.degrees(shown.theta), np.float64)
-    return np.asarray((shown.events.t - shown.span.first_us) * 1e-3, np.float64)
+    return np.asarray((shown.events.t - shown.span.first_us + shown.offset_us) * 1e-3, np.float64)
 
 
 def axis_range(shown: DisplayedWindow, axis: Axis) -> tuple[float, float]:
     """Return the ends of the third axis: prism angle [deg], or time after the recording's first event [ms]."""
     if axis is Axis.ANGLE:
         return 0.0, 360.0
-    return shown.span.start_ms, shown.span.start_ms + shown.span.length_us * 1e-3
+    start_ms = shown.span.start_ms + shown.offset_us * 1e-3
+    return start_ms, start_ms + shown.span.length_us * 1e-3
 
 
 def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np.uint8]:
@@ -539,6 +540,12 @@ def cloud_titles(inspector: Inspector, against: str, axis: Axis | None = None) -
     return against_title(inspector, against) + lent, f"{name}, {right if turns else 'as recorded'}"
 
 
+def beside_text(other: Inspector) -> str:
+    """Return the name of a recording beside another one, and when it starts, if it does not start with that one."""
+    start = f", which starts at {other.offset_us * 1e-3:.3f} ms" if other.offset_us else ""
+    return f"{other.recording.name}{start}"
+
+
 def caption(inspector: Inspector, shown: DisplayedWindow, stride: int = 1) -> str:
     """Return what a picture of the clouds shows: recording, time, region, numbers of events and sharpness.
 
@@ -560,7 +567,7 @@ def beside_rows(inspector: Inspector, shown: DisplayedWindow) -> list[list[str]]
         return []
     both = (inspector.beside, shown.beside, shown.sharpness_before), (inspector, shown, shown.sharpness_after)
     return [
-        [each.recording.name, chosen_text(part), rate_text(1e6 * part.selected / part.read_us),
+        [beside_text(each), chosen_text(part), rate_text(1e6 * part.selected / part.read_us),
          f"sharpness {_certain(part, sharpness)}"]
         for each, part, sharpness in both
     ]  # fmt: skip

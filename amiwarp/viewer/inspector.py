@@ -267,6 +267,8 @@ class DisplayedWindow(DrawnWindow):
     """The same time of another recording, whose events, as recorded, the first cloud and image show instead."""
     is_beside: bool = False
     """Whether this is another recording, of which less may be known."""
+    offset_us: int = 0
+    """Time of its first event after the first event of the recording whose time axis it shares [us]."""
 
     @property
     def first(self) -> DisplayedWindow:
@@ -366,10 +368,13 @@ class Inspector:
         self.selection = Selection()
         self.most_points = most_points or MOST_POINTS
         """Largest number of points in each event cloud."""
+        self.besides: tuple[Inspector, ...] = ()
+        """Other recordings on the time axis of this one, see :meth:`put_beside`."""
         self.beside: Inspector | None = None
-        """Another recording that is shown beside this one, see :meth:`put_beside`."""
-        self.angles_lent = False
-        """Whether the recording beside has no encoder of its own, and is shown at this recording's prism angles."""
+        """The one of them that is shown beside this one."""
+        self.offset_us = 0
+        """Of a recording beside another one: time of its first event after that one's first event [us]."""
+        self._angles_are_lent = False  # of a recording beside another one, whose encoder it uses
         self.depth: DepthMap | None = None
         """Depths of what the pixels see through a plate, see :meth:`use_depths`."""
         self._is_beside = False
@@ -391,7 +396,9 @@ class Inspector:
         made.lock, made._votes, made.sources = Lock(), {}, dict(self.sources)
         made._imager = RegionSharpness(size, self.device)
         made._window = made._span = None
-        made.beside = None if self.beside is None else self.beside.copy()
+        made.besides, made.beside = tuple(each.copy() for each in self.besides), None
+        if self.beside is not None:
+            made.beside = made.besides[self.besides.index(self.beside)]
         return made
 
     def snapshot(self) -> Inspector:
@@ -729,12 +736,12 @@ class Inspector:
         """Largest displacement of a scene point by the optic, in x or in y, at the image's border [px]."""
         return float(np.abs(border_displacements(self.model)).max(initial=0.0))
 
-    def put_beside(self, recording: Recording) -> None:
-        """Show another recording beside this one: its events, as recorded, at the same time after its first event.
+    def put_beside(self, recording: Recording, offset_us: int = 0) -> None:
+        """Put another recording on the time axis of this one. The first one is shown beside it: its events as recorded.
 
-        Without an encoder it gets the prism's angles of this recording at these times, with the speed and the clock
-        offset that are set for this one: :attr:`angles_lent` says so. Raises :class:`AmiwarpError` if
-        it has no events, or another number of pixels.
+        ``offset_us``: time of its first event after this recording's first event [us]. Without an encoder it gets the
+        prism's angles of this recording at these times, with the speed and the clock offset that are set for this one:
+        :attr:`angles_lent` says so. Raises :class:`AmiwarpError` if it has no events, or another number of pixels.
         """
         source, size = recording.events, self.recording.events.size
         if source.size != size:
@@ -743,13 +750,27 @@ class Inspector:
                 f"{size[0]}x{size[1]}; give two recordings of one size"
             )
         own = self.recording.encoder
-        self.angles_lent = recording.encoder is None
+        lent = recording.encoder is None
         if recording.encoder is None and own is not None and len(source):
-            shift = source.t_first - self.recording.events.t_first
+            shift = source.t_first - self.recording.events.t_first - offset_us
             recording = replace(recording, encoder=Encoder(own.t + shift, own.angle, own.clock_offset_us))
-        self.beside = Inspector(recording, device=self.device, most_points=self.most_points)
-        self.beside._is_beside = True
-        self.beside.zero_us = source.t_first + self.zero_us - self.recording.events.t_first
+        made = Inspector(recording, device=self.device, most_points=self.most_points)
+        made._is_beside, made.offset_us, made._angles_are_lent = True, offset_us, lent
+        made.zero_us = source.t_first + self.zero_us - self.recording.events.t_first - offset_us
+        self.besides = (*self.besides, made)
+        self.beside = self.beside or made
+
+    @property
+    def angles_lent(self) -> bool:
+        """Whether the recording beside has no encoder of its own, and is shown at this recording's prism angles."""
+        return self.beside is not None and self.beside._angles_are_lent
+
+    def time_of(self, t_us: int) -> int:
+        """Return the time on the clock of this recording beside another one, by the time after that one's first event.
+
+        Both are in us.
+        """
+        return self.recording.events.t_first + t_us - self.offset_us
 
     def _beside(
         self, span: Span, selection: Selection, image_after: NDArray[np.float32], lent: Knobs | None
@@ -761,7 +782,7 @@ class Inspector:
         """
         if lent is not None:
             self.knobs = replace(self.knobs, rpm=lent.rpm, clock_offset=lent.clock_offset)
-        window = span.start_us - span.first_us + self.recording.events.t_first, span.length_us
+        window = self.time_of(span.start_us - span.first_us), span.length_us
         if (window, selection) != (self.window, self.selection):
             self.open(*window, selection)
         w = self.loaded
@@ -769,6 +790,7 @@ class Inspector:
         return DisplayedWindow(
             w.span, w.region, w.selected, w.events, w.truth, w.before, w.steps, w.before,
             self._wrapped(w, self.knobs), image, image_after, sharpness, sharpness, is_beside=True,
+            offset_us=self.offset_us,
         )  # fmt: skip
 
     def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:

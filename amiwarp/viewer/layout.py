@@ -16,7 +16,7 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS, alternatives, size_names
 from amiwarp.viewer.bookmarks import Bookmarks
-from amiwarp.viewer.drawing import AGAINST, DECAY_US, ImageKind, Look
+from amiwarp.viewer.drawing import AGAINST, DECAY_US, ImageKind, Look, beside_text
 from amiwarp.viewer.filters import Selection
 from amiwarp.viewer.inspector import (
     OTHERS,
@@ -392,7 +392,7 @@ CALLS = (
     "key", "released", "choose", "slide", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline", "undo", "redo",
     "reset", "restore", "answer", "keep_b", "swap_b", "export", "open_file", "use_card", "end_film",
-    "list_hot", "record", "save_view", "open_view", "delete_view",
+    "list_hot", "record", "save_view", "open_view", "delete_view", "choose_beside",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {
@@ -417,7 +417,7 @@ EMPTY: tuple[tuple[Any, str], ...] = (
     (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
             "difference has_b calibrating same_scale recording"),
     (None, "overview before after surface image_scale after_scale marked hot_rows"),
-    ((), "live_rows updating titles against_choices old steps beside_rows views"),
+    ((), "live_rows updating titles against_choices old steps beside_rows views rate_rows"),
     (0, "fixed_count"),
 )  # fmt: skip
 """Values of state variables before the first update, and their names."""
@@ -519,6 +519,13 @@ class Actions:
         """Change fields of the look."""
         self.look = replace(self.look, **changes)
         self.request("look")
+
+    def choose_beside(self, k: int) -> None:
+        """Show the recording with the number ``k`` of those that are on the same time axis."""
+        others = self.inspector.besides
+        if 0 <= k < len(others):
+            self.inspector.beside = others[k]
+            self.request("knobs")
 
     def take_truth(self) -> None:
         """Set the parameters to the known truth of a simulated recording."""
@@ -666,6 +673,8 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "size": list(size), "optic": inspector.has_optic, "count": 0, "live": inspector.latest is not None,
         "models": list(alternatives(inspector.knobs.model)),
         "has_truth": inspector.truth is not None, "beside": inspector.beside is not None,
+        "besides": [beside_text(each) for each in inspector.besides],
+        "beside_chosen": 0 if inspector.beside is None else inspector.besides.index(inspector.beside),
         "exports": [[name, text, name in FILMS, name in OF_OPTICS] for name, (text, _) in EXPORTS.items()],
         "keys": [[key, words] for key, _, words in KEYS], "scope": SCOPES[0], "scopes": list(SCOPES),
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],

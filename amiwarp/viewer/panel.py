@@ -91,7 +91,7 @@ class Panel(layout.Actions):
         self._scales_of: ImageKind | None = None
         self._made_for: dict[str, Any] = {}  # window and selection of which the slow parts of the page are, by name
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
-        self._rates: EventRates
+        self._rates: list[EventRates] = []  # of the recording, and of those on its time axis
         self._rates_first_us = 0
         self._progress = JobProgress(self._show_progress)  # of the latest calibration or film
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
@@ -450,6 +450,12 @@ class Panel(layout.Actions):
             "views": names, "views_file": "" if self.bookmarks is None else self.bookmarks.path.name,
         })  # fmt: skip
 
+    def choose_beside(self, k: int) -> None:
+        """Show the recording with the number ``k`` of those that are on the same time axis."""
+        super().choose_beside(k)
+        if self.inspector.beside is not None:
+            self.state.beside_chosen = self.inspector.besides.index(self.inspector.beside)
+
     # Region of the image
 
     def draw(self, left: float, top: float, right: float, bottom: float) -> None:
@@ -550,24 +556,30 @@ class Panel(layout.Actions):
 
     async def _count_events(self) -> None:
         """Count the recording's events in the background, for the timeline."""
-        source = self.inspector.recording.events
-        rates, finished = EventRates(source), False
-        self._rates, self._rates_first_us = rates, source.t_first
-        while not finished and rates is self._rates:
-            finished = await self.in_thread(rates.fill, STEP_S)
-            with self.state:
-                self._show_rates()
+        inspectors = (self.inspector, *self.inspector.besides)
+        rates = self._rates = [EventRates(each.recording.events) for each in inspectors]
+        self._rates_first_us = self.inspector.recording.events.t_first
+        for each in rates:
+            finished = False
+            while not finished and rates is self._rates:
+                finished = await self.in_thread(each.fill, STEP_S)
+                with self.state:
+                    self._show_rates()
 
     def _show_rates(self) -> None:
-        start_ms, end_ms = self.state.rate_span
-        first_us = (
-            self._rates_first_us
-        )  # of a live stream, the counted events may be a second older than the shown ones
-        ends_us = (first_us + round(1e3 * each) for each in (start_ms, end_ms))
-        _, rates = self._rates.curve(*ends_us, BINS)
-        off, on, share = *map(drawing.float_bytes, rates), self._rates.share
+        # Of a live stream, the counted events may be a second older than the shown ones.
+        first_us = self._rates_first_us
+        span_us = [round(1e3 * each) for each in self.state.rate_span]
+        own, *others = self._rates
+        _, rates = own.curve(*(first_us + each for each in span_us), BINS)
+        off, on, share = *map(drawing.float_bytes, rates), own.share
+        rows = []
+        for each, counted in zip(self.inspector.besides, others, strict=True):
+            _, rates = counted.curve(*map(each.time_of, span_us), BINS)
+            rows.append({"name": drawing.beside_text(each), "on": drawing.float_bytes(rates[1]),
+                         "off": drawing.float_bytes(rates[0])})  # fmt: skip
         note = "" if share >= 1.0 else f"counting events: {100.0 * share:.0f} %"
-        self.state.update({"rate_on": on, "rate_off": off, "rate_note": note})
+        self.state.update({"rate_on": on, "rate_off": off, "rate_note": note, "rate_rows": rows})
 
     # Parameters of the prism, and those to compare with
 

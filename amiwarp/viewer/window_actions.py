@@ -253,6 +253,14 @@ class WindowActions(layout.Actions):
                 self.inspector.as_calibration().save(path)
             self.say(f"saved {path}")
 
+    def choose_next_beside(self) -> None:
+        """Show the next of the recordings that are on the same time axis."""
+        others, now = self.inspector.besides, self.inspector.beside
+        if now is None:
+            self.say("there is no other recording; start with --beside FILE")
+            return
+        self.choose_beside((others.index(now) + 1) % len(others))
+
     def save_next_view(self) -> None:
         """Save what is shown as a bookmark, under the first free number."""
         names = self._views()

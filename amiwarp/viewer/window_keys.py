@@ -39,6 +39,7 @@ MORE_KEYS = (
     ("x", ("toggle", "optic_shown"), "controls of a prism, for a recording without one"),
     ("+", ("resize_points", 1.0), "larger points"),
     ("-", ("resize_points", -1.0), "smaller points"),
+    ("g", ("choose_next_beside",), "next of several recordings given with --beside"),
     ("u", ("save_next_view",), "save what is shown as a bookmark, beside the recording"),
     ("j", ("open_next_view",), "show the next bookmark"),
     ("f", ("film",), "film from here on, at a tenth of real time; f ends it, c cancels it"),
