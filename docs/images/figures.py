@@ -2,7 +2,8 @@
 
     python docs/images/figures.py DEMO [NAME ...]
 
-``DEMO`` is the folder of ``amiwarp demo --size 160x120 --duration 0.5``. Without names, all pictures are drawn.
+``DEMO`` is the folder of ``amiwarp demo --size 160x120 --duration 0.5``; for the pictures of the inspector, of
+``amiwarp demo --size 320x240``. Without names, all pictures are drawn, but those of the inspector.
 """
 
 import math
@@ -15,11 +16,14 @@ import matplotlib
 
 matplotlib.use("agg")
 
+import inspector_pictures
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
+from pyvista.examples import mapfile
 
 import amiwarp
+from amiwarp.plotting.figures import draw_calibration
 
 ON, OFF = "#e0761b", "#3c8fd0"
 
@@ -119,6 +123,22 @@ def no_encoder(demo: Path) -> Figure:
     return figure
 
 
+def calibration(demo: Path, out: Path) -> None:
+    """Draw the figure of ``amiwarp calibrate --figure``, for the recording that the page describes."""
+    camera = amiwarp.Camera.from_fov(640, 480, math.radians(60))
+    recording = amiwarp.simulate(
+        mapfile, camera, amiwarp.Prism(math.radians(1.5)), duration_s=0.5, motion=720.0,
+        nominal_prism=amiwarp.Prism(math.radians(1.7)), seed=1,
+    )  # fmt: skip
+    found = amiwarp.calibrate(recording)
+    print(f"{len(recording.events):,} events", found)
+    out.unlink(missing_ok=True)
+    draw_calibration(out, recording, found, device="cpu")
+    inspector_pictures.quantised(out, out)
+
+
+FILES = {"calibration.png": calibration, **inspector_pictures.PICTURES}
+"""Pictures that are files: their name, and the function that writes it."""
 PICTURES = {
     "orbits": optics, "notebook": before_and_after, "noise": noise, "pixels": pixels, "no_encoder": no_encoder,
 }  # fmt: skip
@@ -128,6 +148,9 @@ def main(demo: str, *names: str) -> None:
     """Draw the pictures that are named, or all."""
     matplotlib.rcParams.update({"font.size": 9})
     for name in names or PICTURES:
+        if name in FILES:
+            FILES[name](Path(demo).resolve(), Path(__file__).with_name(name))
+            continue
         PICTURES[name](Path(demo)).savefig(
             Path(__file__).with_name(f"{name}.png"), dpi=110, bbox_inches="tight", pad_inches=0.05
         )
