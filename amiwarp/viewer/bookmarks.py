@@ -70,8 +70,8 @@ class Bookmarks:
             return {}
         data = read_json(self.path, "bookmarks", most_bytes=MOST_BYTES, noted=False)
         views = data.get("views")
-        good = data.get("format") == FORMAT and data.get("version") == VERSION and isinstance(views, dict)
-        if not good or not all(isinstance(text, str) for text in views.values()):
+        known = data.get("format") == FORMAT and data.get("version") == VERSION
+        if not (known and isinstance(views, dict) and all(isinstance(text, str) for text in views.values())):
             raise AmiwarpError(
                 f"{self.path}: holds no bookmarks of amiwarp (format {FORMAT!r}, version {VERSION}); rename it to save "
                 "views of this recording"

@@ -76,7 +76,9 @@ def with_values(inspector: Inspector, state: ViewState, values: dict[str, Any]) 
         if name in values:
             low, high = (end * layout.UNITS[name] for end in layout.LIMITS[name])
             knobs[name] = real(values[name], name, low, high)
-    events, selection, other = inspector.recording.events, {}, {}
+    events = inspector.recording.events
+    selection: dict[str, Any] = {}
+    other: dict[str, Any] = {}
     if "start_us" in values:
         clock = " us: from the first event of the recording to its last one"
         start_us = whole(values["start_us"], "start_us", events.t_first, events.t_last, clock)
