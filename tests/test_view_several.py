@@ -123,8 +123,16 @@ def test_the_page_has_a_row_of_rates_for_each_recording(inspector: Inspector, br
     with served(build, layout.SETTABLE) as (url, _):
         page.goto(url)
         page.wait_for_function("document.querySelectorAll('#timeline canvas').length === 3")
+        page.wait_for_function("document.querySelector('#timeline .row-name').innerText.includes('events')")
         names = page.locator("#timeline .row-name").all_inner_texts()
-        assert names == ["early, which starts at -40.000 ms", "late, which starts at 25.000 ms"]
+        assert panels[0].shown is not None
+        span = panels[0].shown.span
+        texts = ("early, which starts at -40.000 ms", "late, which starts at 25.000 ms")
+        for name, text, other in zip(names, texts, inspector.besides, strict=True):
+            t = other.recording.events.slice(0, 30_000).t - other.recording.events.t_first + other.offset_us
+            start_us = span.start_us - 5_000_000
+            count = np.count_nonzero((t >= start_us) & (t < start_us + span.length_us))
+            assert name == f"{text}: {count:,} events in the window"
         until(lambda: np.isfinite(np.frombuffer(panels[0].state.rate_rows[1]["on"], np.float32)).all())
         for row, other in zip(panels[0].state.rate_rows, inspector.besides, strict=True):
             events = other.recording.events.slice(0, 30_000)

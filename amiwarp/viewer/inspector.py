@@ -772,6 +772,13 @@ class Inspector:
         """
         return self.recording.events.t_first + t_us - self.offset_us
 
+    def counts_beside(self, span: Span) -> list[int]:
+        """Return how many events each recording on this time axis has in the time of a span, whatever is selected."""
+        start_us = span.start_us - span.first_us
+        ends = [[each.time_of(t_us) for t_us in (start_us, start_us + span.length_us)] for each in self.besides]
+        sources = [each.recording.events for each in self.besides]
+        return [source.find(stop) - source.find(start) for source, (start, stop) in zip(sources, ends, strict=True)]
+
     def _beside(
         self, span: Span, selection: Selection, image_after: NDArray[np.float32], lent: Knobs | None
     ) -> DisplayedWindow:

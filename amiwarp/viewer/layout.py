@@ -417,7 +417,7 @@ EMPTY: tuple[tuple[Any, str], ...] = (
     (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
             "difference has_b calibrating same_scale recording"),
     (None, "overview before after surface image_scale after_scale marked hot_rows"),
-    ((), "live_rows updating titles against_choices old steps beside_rows views rate_rows"),
+    ((), "live_rows updating titles against_choices old steps beside_rows views rate_rows beside_counts"),
     (0, "fixed_count"),
 )  # fmt: skip
 """Values of state variables before the first update, and their names."""

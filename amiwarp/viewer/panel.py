@@ -910,6 +910,7 @@ class Panel(layout.Actions):
         if before is None or shown.span is not before.span:
             counts = iwe(shown.span.events, *self.inspector.recording.events.size, vote=Vote.NEAREST)
             values["overview"] = drawing.picture_state(counts, count_scale([counts]))
+            values["beside_counts"] = self.inspector.counts_beside(shown.span)
         left = "recorded" if against is None else s.against
         titles = drawing.cloud_titles(self.inspector, left, Axis(s.axis))
         return shown, {

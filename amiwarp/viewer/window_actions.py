@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from amiwarp.choices import Axis, View
+from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.regions import Region
 from amiwarp.optics.models import alternatives
@@ -288,9 +289,11 @@ class WindowActions(layout.Actions):
         if self.bookmarks is None:
             self.say("bookmarks are kept beside a file; this recording is none")
             return None
-        with self.errors_shown("bookmark"):
+        try:
             return self.bookmarks.names()
-        return None
+        except AmiwarpError as error:
+            self.say(str(error))
+            return None
 
     def _new_name(self, what: str) -> Path:
         name = Path(jobs.download_name(self.inspector.recording.name, what))
