@@ -674,6 +674,15 @@ def test_a_live_stream_is_followed(recording: Recording) -> None:
     window.scene.close()
 
 
+def test_a_live_stream_may_have_gone_on_while_the_window_was_made(recording: Recording) -> None:
+    half, size = len(recording.events) // 2, recording.events.size
+    early = replace(recording, events=MemoryEvents(recording.events.slice(0, half), *size))
+    late = replace(recording, events=MemoryEvents(recording.events.slice(half, 2 * half), *size))
+    window = Window(Inspector(early, latest=lambda: late), size=SIZE, off_screen=True)
+    assert window.shown.events.t.min() >= late.events.t_first
+    window.scene.close()
+
+
 def test_an_empty_window_at_the_start_is_an_error(recording: Recording) -> None:
     inspector = Inspector(recording)
     inspector.window = recording.events.t_last + 1_000, 1_000

@@ -237,6 +237,8 @@ class Window(WindowContents):
 
     def _start(self) -> None:
         self.inspector.renew()
+        # a live stream may have lost the events of its first window while this one was made
+        self.time_window = self.inspector.window or self.inspector.first_window()
         self.plays = self.inspector.latest is not None
         self._rates = EventRates(self.inspector.recording.events)
         self.request("window", *(["suggestion"] if self.compensates else []))
