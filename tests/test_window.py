@@ -674,12 +674,23 @@ def test_a_live_stream_is_followed(recording: Recording) -> None:
     window.scene.close()
 
 
-def test_a_live_stream_may_have_gone_on_while_the_window_was_made(recording: Recording) -> None:
+def test_a_live_stream_may_have_gone_on_while_the_window_was_made(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
     half, size = len(recording.events) // 2, recording.events.size
     early = replace(recording, events=MemoryEvents(recording.events.slice(0, half), *size))
     late = replace(recording, events=MemoryEvents(recording.events.slice(half, 2 * half), *size))
     window = Window(Inspector(early, latest=lambda: late), size=SIZE, off_screen=True)
     assert window.shown.events.t.min() >= late.events.t_first
+    settle(window, monkeypatch)
+    whole, seconds = late.events.slice(0, half), np.diff(window.sheets.timeline.edges) * 1e-6
+    np.testing.assert_allclose((window.sheets.timeline.rates * seconds).sum(), len(whole))
+    window._counted_stop_us = (late.events.t_first + late.events.t_last) // 2
+    window._rates_shown = ()
+    window._show_timeline()
+    known = np.isfinite(window.sheets.timeline.rates).all(axis=0)
+    assert 0.4 < known.mean() < 0.6  # what came later has no rate of 0
+    assert known[0]
     window.scene.close()
 
 

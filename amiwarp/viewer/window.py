@@ -10,7 +10,6 @@ from typing import Any
 from amiwarp.choices import Axis, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.event_rates import EventRates
 from amiwarp.live.stream.session import LiveSource
 from amiwarp.tasks import interrupts_later, no_garbage_collection
 from amiwarp.viewer import drawing, jobs, layout
@@ -197,9 +196,12 @@ class Window(WindowContents):
                 self.inspector.renew()
             self.move(self.inspector.recording.events.t_last)
             if now - self._counted_s > COUNTED_S:
-                self._rates, self._counted_s = EventRates(self.inspector.recording.events), now
+                self._counted_s = now
+                self._count_anew()
                 self._rates.fill(COUNT_S)
         else:
+            if self._counted is not self.inspector.recording.events:
+                self._count_anew()
             self.sheets_changed()
 
     def _count_events(self) -> bool:
@@ -240,7 +242,7 @@ class Window(WindowContents):
         # a live stream may have lost the events of its first window while this one was made
         self.time_window = self.inspector.window or self.inspector.first_window()
         self.plays = self.inspector.latest is not None
-        self._rates = EventRates(self.inspector.recording.events)
+        self._count_anew()
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.update()
         if self.inspector.bookmark:

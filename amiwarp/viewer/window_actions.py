@@ -129,7 +129,6 @@ class WindowActions(layout.Actions):
         elif what == "image":
             self.image, self.difference = _following(self._image_kinds(), (self.image, self.difference))
             self.request("knobs")
-            self.say(f"images: {self._image_name}")
         else:
             self._select(polarity=_following([None, 1, 0], inspector.selection.polarity))
 

@@ -31,9 +31,15 @@ class WindowContents(WindowActions):
         self._curves_of: dict[str, Any] = {}  # window and selection of which the curves are
         self._images: tuple[str, ShownImages] | None = None  # with their name
         self._scale_held = False  # whether the images have the scale of before a slider moved
-        self._rates = EventRates(self.inspector.recording.events)
+        self._count_anew()
         self._rates_shown: tuple[Any, ...] = ()
         self._stream: list[str] = []  # figures of a live stream
+
+    def _count_anew(self) -> None:
+        """Begin to count the events for the timeline; those of a live stream change."""
+        self._counted = self.inspector.recording.events
+        self._counted_stop_us = self._counted.t_last + 1
+        self._rates = EventRates(self._counted)
 
     def _fields(self) -> list[Slider]:
         """Return the sliders of the parameters that matter, and of the time window."""
@@ -74,13 +80,15 @@ class WindowContents(WindowActions):
             line.show_all()
         if line.window != before:  # else the mouse may have moved the timeline away from it
             line.follow()
-        wanted = line.span, self._rates, self._rates.share
+        wanted = line.span, source.t_first, self._rates, self._rates.share
         if wanted != self._rates_shown:
             self._rates_shown = wanted
             low, high = (source.t_first + round(each) for each in line.span)
             edges, line.rates = self._rates.curve(low, high, BINS)
+            line.rates[:, edges[1:] > self._counted_stop_us] = np.nan  # which a live stream has received since
             line.edges = np.asarray(edges - source.t_first, np.float64)
-            line.note = "" if self._rates.share >= 1.0 else f"counting events: {100.0 * self._rates.share:.0f} %"
+            counted = self._rates.share >= 1.0 or self.inspector.latest is not None
+            line.note = "" if counted else f"counting events: {100.0 * self._rates.share:.0f} %"
 
     def _make_images(self) -> None:
         """Make the images of what is shown. While a slider moves they keep their brightness.
