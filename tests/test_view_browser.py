@@ -1515,7 +1515,7 @@ def test_another_recording_is_shown_on_the_left(
         figures = page.locator("#recordings dd").all_inner_texts()
         for part, figure, counts in zip((shown.beside, shown), figures[::2], figures[1::2], strict=True):
             seconds = 1e-6 * part.span.length_us
-            rate = float(figure.split(" ")[0]) * {"ev/s,": 1.0, "kev/s,": 1e3, "Mev/s,": 1e6}[figure.split(" ")[1]]
+            rate = float(figure.split(" ")[0]) * {"ev/s": 1.0, "kev/s": 1e3, "Mev/s": 1e6}[figure.split(" ")[1]]
             assert rate == pytest.approx(part.selected / seconds, rel=0.01)
             assert f"{part.span.count:,} events" in counts
         before, after = (tabs.panels[-1].state[name]["high"] for name in ("before", "after"))
