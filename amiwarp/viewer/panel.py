@@ -569,13 +569,13 @@ class Panel(layout.Actions):
     def _show_rates(self) -> None:
         # Of a live stream, the counted events may be a second older than the shown ones.
         first_us = self._rates_first_us
-        span_us = [round(1e3 * each) for each in self.state.rate_span]
+        start_us, end_us = (round(1e3 * each) for each in self.state.rate_span)
         own, *others = self._rates
-        _, rates = own.curve(*(first_us + each for each in span_us), BINS)
+        _, rates = own.curve(first_us + start_us, first_us + end_us, BINS)
         off, on, share = *map(drawing.float_bytes, rates), own.share
         rows = []
         for each, counted in zip(self.inspector.besides, others, strict=True):
-            _, rates = counted.curve(*map(each.time_of, span_us), BINS)
+            _, rates = counted.curve(each.time_of(start_us), each.time_of(end_us), BINS)
             rows.append({"name": drawing.beside_text(each), "on": drawing.float_bytes(rates[1]),
                          "off": drawing.float_bytes(rates[0])})  # fmt: skip
         note = "" if share >= 1.0 else f"counting events: {100.0 * share:.0f} %"

@@ -48,6 +48,8 @@ class WindowActions(layout.Actions):
     plays = loop = closed = help_shown = statistics_shown = depth_shown = False
     optic_shown = False
     """Whether a recording shows the controls of a prism though nothing says that there is one."""
+    update: Callable[[], None]
+    """Compute what was requested, and give it to VTK."""
     _slow: Iterator[None]  # what takes long, in steps
     _slow_steps: Callable[[], Iterator[None]]
     _show_progress: Callable[[str, float], None]
