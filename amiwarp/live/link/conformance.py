@@ -341,7 +341,8 @@ class _Suite:
     def _check_refusals(self) -> Check:
         speeds = (math.nan, 100.0), (math.inf, 100.0), (1e9, 100.0), (-1e9, 100.0)
         ramps = (10.0, -1.0), (10.0, 0.0), (10.0, math.nan), (10.0, math.inf)
-        wrong: list[protocol.Message] = [*(protocol.SetSpeed(*pair) for pair in (*speeds, *ramps)), protocol.SetCounts(0)]
+        wrong: list[protocol.Message] = [protocol.SetSpeed(*pair) for pair in (*speeds, *ramps)]
+        wrong.append(protocol.SetCounts(0))
         answers = [*(self._command(message) for message in wrong), self._command(protocol.SetCounts(1 << 24))]
         same = self._command(protocol.SetCounts(self._now.counts_per_turn))
         target = self._now.target_rpm
