@@ -180,6 +180,7 @@ class SimulatedCamera:
         self._about, self._rng = about, rng
         self._drift = float(rng.uniform(-50e-6, 50e-6))
         self._origin = int(rng.integers(0, 1 << 50))
+        self._arrived_origin = self._origin  # of the events that have arrived
         self._packets = Delayed(about.camera_delay_us, about.stalls)
 
     def _return(self) -> None:
@@ -192,8 +193,8 @@ class SimulatedCamera:
         return self._origin + round(world_us * (1.0 + self._drift))
 
     def world_time(self, camera_us: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the simulated times of the camera's times [us], same shape."""
-        return (camera_us - self._origin) / (1.0 + self._drift)
+        """Return the simulated times of events that have arrived, by the camera's times [us], same shape."""
+        return (camera_us - self._arrived_origin) / (1.0 + self._drift)
 
     def advance(self, now_us: int, pulses: Sequence[int]) -> list[Packet]:
         """Record the events of a step and the pulses in it; return the packets that have arrived by its end."""
@@ -207,10 +208,11 @@ class SimulatedCamera:
         times = self.time(now_us) - np.array([STEP_US // 2, 1], np.int64)
         events = Events.from_arrays([1, 1], [1, 1], times, [1, 1])
         self._packets.put(now_us, (events, triggers, returned))
-        return [
-            replace(make_packet(HOST_US + now_us, given, edges), returned=back)
-            for given, edges, back in self._packets.arrived(now_us)
-        ]
+        found = []
+        for given, edges, back in self._packets.arrived(now_us):
+            found.append(replace(make_packet(HOST_US + now_us, given, edges), returned=back))
+            self._arrived_origin = self._origin if back else self._arrived_origin
+        return found
 
 
 class Judge:
@@ -218,27 +220,29 @@ class Judge:
 
     def __init__(self, encoder: EncoderStream, camera: SimulatedCamera, motor: Motor) -> None:
         self._encoder, self._camera, self._motor = encoder, camera, motor
-        self._judged_until: int | None = None
+        self._arrived_until = self._judged_until = -(2**62)
         self.measured = self.wrong = 0
         """Number of times [ms] with a measured angle, and with a wrong one."""
         self.worst_us = 0.0
         """Largest error of the time of a measured angle [us]."""
 
-    def restart(self, now_us: int) -> None:
-        """Follow another clock of the camera, from its packet before now on."""
-        self._judged_until = self._camera.time(now_us - STEP_US)
+    def arrived(self, packet: Packet) -> None:
+        """Take the times of a packet's events; after the camera's return, forget those of its clock before."""
+        first, last = packet.events.t[[0, -1]].tolist()
+        if packet.returned or self._judged_until < first - HELD_US:
+            self._judged_until = first - STEP_US // 2
+        self._arrived_until = last
 
-    def judge(self, now_us: int) -> None:
-        """Compare the angles of all times up to now that have got one since the last call."""
+    def judge(self) -> None:
+        """Compare the angles of all events that have arrived and have got one since the last call."""
         encoder, last = self._encoder, self._encoder.last
         if last is None or encoder.first is None:
             return
-        since = self._camera.time(now_us) - HELD_US
-        begin = max(since, encoder.first) if self._judged_until is None else max(since, self._judged_until + 1)
-        times = np.arange(begin, min(last, self._camera.time(now_us)) + 1, 1000)
+        begin = max(self._judged_until + 1, self._arrived_until - HELD_US)
+        times = np.arange(begin, min(last, self._arrived_until) + 1, 1000)
         if not len(times):
             return
-        self._judged_until = int(times[-1])
+        self._judged_until = min(last, self._arrived_until)
         times = times[~encoder.guessed(times)]
         if not len(times):
             return
@@ -279,15 +283,15 @@ def run(seed: int, troubles: Troubles | None = None) -> Outcome:
         sent_until = max([sent_until, *pulses])
         for packet in camera.advance(now, pulses):
             feed.take(packet)
-        if about.camera_returns_us // STEP_US == now // STEP_US:
-            judge.restart(now)
+            judge.arrived(packet)
         for _ in range(3):  # an update for each restart that waits
             feed.poll()
-        judge.judge(now)
+        judge.judge()
         if feed.clock is not None and feed.clock_source is ClockSource.PULSES:
             paired_s = now * 1e-6 if paired_s is None else paired_s
             world_us = float(controller.time_at(feed.clock.at_us))
-            errors.append(abs(int(feed.clock(feed.clock.at_us)) - camera.time(world_us)))
+            error_us = int(feed.clock(feed.clock.at_us)) - camera.time(world_us)
+            errors.append(abs((error_us + WRAP // 2) % WRAP - WRAP // 2))  # the controller's clock wraps
     return Outcome(
         seed=seed,
         wrong=judge.wrong,

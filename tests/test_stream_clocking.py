@@ -214,8 +214,13 @@ def test_a_pulled_trigger_cable_keeps_the_map_and_the_pulses_after_it_match_agai
     assert found.pairs >= 90
 
 
-@pytest.mark.parametrize(("with_triggers", "patience_us"), [(False, 3_000_000), (True, 10_000_000)])
-def test_arrival_times_are_used_only_after_pulses_were_waited_for(with_triggers: bool, patience_us: int) -> None:
+@pytest.mark.parametrize(
+    ("with_sync", "with_triggers", "patience_us"),
+    [(False, False, 3_000_000), (True, False, 6_500_000), (True, True, 10_000_000)],
+)
+def test_arrival_times_are_used_only_after_pulses_were_waited_for(
+    with_sync: bool, with_triggers: bool, patience_us: int
+) -> None:
     sent = np.arange(20) * 50_000
     host, clock = fit_to_round_trips(sent, sent + 150, sent + 300), CameraClock()
     rng = np.random.default_rng(0)
@@ -223,6 +228,7 @@ def test_arrival_times_are_used_only_after_pulses_were_waited_for(with_triggers:
         clock.packet(camera_time(t), t + 2000)
         if with_triggers:
             clock.triggers([camera_time(t)], t + 2000)
+        if with_sync:
             clock.sync(int(rng.integers(t, t + 40_000)), t)  # at other intervals
         known = clock.clock(host) is not None
         assert known == (t >= patience_us)

@@ -38,8 +38,9 @@ DOUBTFUL = 1e-3
 JUDGED, FEWEST_MET = 16, 5
 """Number of latest pulses in the time of known triggers, and smallest number of them that must meet one. Below it, the
 map is discarded: one of the clocks has jumped."""
-NO_PULSES_US = 3_000_000
-"""Time without a pulse of one of both sides after which arrival times are used [us]."""
+NO_PULSES_US, NO_TRIGGERS_US = 3_000_000, 6_500_000
+"""Time without a pulse of the controller, and time with pulses but without a trigger of the camera, whose reports may
+be late, after which arrival times are used [us]."""
 NO_SHIFT_US = 10_000_000
 """Time with pulses of both sides, but without a shift between them, after which arrival times are used [us]."""
 FEWEST_REGULAR, REGULAR_US = 7, 200.0
@@ -171,7 +172,9 @@ class CameraClock:
             return True
         if self._since_us is None:
             return False
-        patience = NO_SHIFT_US if self._sync and self._trigger else NO_PULSES_US
+        patience = NO_PULSES_US
+        if self._sync:
+            patience = NO_SHIFT_US if self._trigger else NO_TRIGGERS_US
         return self._now_us - self._since_us >= patience
 
     def _forget_map(self) -> None:

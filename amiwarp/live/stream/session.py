@@ -414,6 +414,8 @@ class WindowSharpness:
         self._start_us, self._wanted = None, True
 
 
+CLOCKS_US = 8_000_000
+"""Longest wait of the first events for the relation between the clocks of controller and camera [us]."""
 PATIENCE_S = 1.0
 """Longest wait at the end of a session for the source's thread and for encoder samples of the last events [s]."""
 DRAIN_S = 10.0
@@ -479,7 +481,8 @@ class Session:
         self._sharpness: WindowSharpness | None = None
         self._phase_check: PhaseCheck | None = None
         if calibration is not None:
-            self._compensator = Compensator(calibration.model, self.encoder, wait_us=wait_us, device=device)
+            start = {} if link is None else {"start_us": CLOCKS_US}
+            self._compensator = Compensator(calibration.model, self.encoder, wait_us=wait_us, device=device, **start)
             self._sharpness = WindowSharpness(self._compensator, source.size, device)
             self._phase_check = None if watch_s is None else PhaseCheck(calibration, watch_s, say)
         self._last_us = -(2**62)
@@ -783,7 +786,10 @@ class EncoderFeed:
         """Process a source's packet: its arrival time and triggers with a link, else its own encoder samples."""
         if packet.returned:
             self._camera_clock.returned()
-            self._encoder.restart()
+            if self._link is None:
+                self._encoder.restart()
+            else:  # its samples are on the clock that the camera had before, and may be later than the new events
+                self._encoder.clear()
             self._has_related = False
             self._shortest_us = None
         if len(packet.events):
