@@ -32,9 +32,9 @@ REST_S = 0.3
 """Time without a change after which all points are drawn, and the sharpness curves computed [s]."""
 IDLE_S, FOLLOW_S = 0.005, 0.25
 """Interval between two looks for input, and between two pictures of a live stream [s]."""
-COUNT_S, COUNTED_S = 0.02, 1.0
-"""Time for which events are counted for the timeline between two looks for input, and shortest interval between two
-counts of a live stream [s]."""
+COUNT_S, TELL_S, COUNTED_S = 0.02, 0.2, 1.0
+"""Time for which events are counted for the timeline between two looks for input, and shortest intervals between two
+drawings of what is counted, and between two counts of a live stream [s]."""
 
 
 class Window(WindowContents):
@@ -75,7 +75,7 @@ class Window(WindowContents):
         self._progress_due_s = 0.0
         self._built: tuple[Any, ...] = ()
         self._exposed, self._sheets_old = True, False
-        self._changed_s = self._counted_s = 0.0
+        self._changed_s = self._counted_s = self._told_s = 0.0
         self._coarse = 1
         self._slow: Iterator[None] = iter(())
         self._listen()
@@ -198,7 +198,7 @@ class Window(WindowContents):
             if now - self._counted_s > COUNTED_S:
                 self._counted_s = now
                 self._count_anew()
-                self._rates.fill(COUNT_S)
+                self._rates.fill(TELL_S)  # of two seconds: there is no rest in which to go on
         else:
             if self._counted is not self.inspector.recording.events:
                 self._count_anew()
@@ -208,8 +208,9 @@ class Window(WindowContents):
         """Count events for the timeline for a short time; return whether some were left."""
         if self._rates.share >= 1.0:
             return False
-        self._rates.fill(COUNT_S)
-        self._sheets_old = True
+        finished, now = self._rates.fill(COUNT_S), time.perf_counter()
+        if finished or now - self._told_s > TELL_S:
+            self._told_s, self._sheets_old = now, True
         return True
 
     def _show_progress(self, what: str, share: float) -> None:
