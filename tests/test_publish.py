@@ -241,3 +241,33 @@ def test_what_no_figure_can_have_is_said(
     assert (code, said) == (1, "")
     assert says in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_each_of_two_recordings_has_its_own_scale_and_bar(inspector: Inspector) -> None:
+    events = inspector.recording.events
+    few = MemoryEvents(events.slice(0, len(events))[::20], *events.size)
+    alone = blank((6.0, 3.0))
+    titles = drawing.cloud_titles(inspector, "recorded", Axis.ANGLE)
+    publish._draw_charts(alone, inspector, inspector.show(), titles, None, compensates=True)
+    assert text_of(alone).count("events per pixel") == 1
+    inspector.put_beside(Recording(few, inspector.camera, name="few"))
+    figure, shown = blank((6.0, 3.0)), inspector.show()
+    titles = drawing.cloud_titles(inspector, "recorded", Axis.ANGLE)
+    publish._draw_charts(figure, inspector, shown, titles, None, compensates=True)
+    pair = drawing.make_images(inspector, drawing.ImageKind.COUNT, shown=shown)
+    assert pair.after_scale is not None
+    assert pair.scale.high < pair.after_scale.high
+    tops = {
+        ax.get_title().replace("\n", " "): ax.images[0].norm.vmax for ax in figure.axes if ax.images and ax.get_title()
+    }
+    assert tops == dict(zip(titles, (pair.scale.high, pair.after_scale.high), strict=True))
+    assert text_of(figure).count("events per pixel") == 2
+
+
+def test_a_figure_says_whose_angles_are_shown(inspector: Inspector, tmp_path: Path, drawn: list[Any]) -> None:
+    few = MemoryEvents(inspector.recording.events.slice(0, 5000), 120, 90)
+    inspector.put_beside(Recording(few, inspector.camera, name="few"))
+    inspector.open(inspector.recording.events.t_first, 5000)
+    page = publish.Page(dpi=60)
+    publish.save_figure(inspector, tmp_path / "a.png", page, view=View.FREE, look=Look(Colour.POLARITY, Axis.ANGLE))
+    assert "few, as recorded, at the prism angles of recording" in text_of(drawn[0]).replace("\n", " ")

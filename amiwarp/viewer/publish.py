@@ -37,6 +37,8 @@ POINT_AREA = 0.35
 """Area of a point of a cloud [pt²]."""
 LEGEND_ROWS = 8
 """Largest number of rows of a legend."""
+CLOUD_LETTERS, IMAGE_LETTERS = 44, 20
+"""Largest length of a line of the title of a cloud and of an image [characters]."""
 LETTERS_PER_MM = 0.8
 """Letters of the caption that fit on a line, per width of the figure."""
 RATE_BINS = 100
@@ -75,7 +77,7 @@ def save_figure(
     shown = inspector.show(against=against)
     stride = max(1, -(-len(shown.events) // MOST_POINTS))
     compensates = math.isfinite(inspector.turn_us)
-    titles = drawing.cloud_titles(inspector, "recorded" if against is None else "B")
+    titles = drawing.cloud_titles(inspector, "recorded" if against is None else "B", look.axis)
     with mpl.rc_context({"font.size": TEXT_PT, "axes.titlesize": TITLE_PT, "pdf.fonttype": 42, "svg.hashsalt": "a"}):
         figure = blank((page.width_mm / MM_PER_INCH, page.height_mm / MM_PER_INCH), dpi=page.dpi)
         figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.03)
@@ -86,7 +88,7 @@ def save_figure(
             place = 1, len(titles), k + 1
             after = window is shown and k == len(titles) - 1
             ax = _draw_cloud(clouds, place, xy, window, look, view, stride=stride, after=after)
-            ax.set_title(title)
+            ax.set_title(textwrap.fill(title, CLOUD_LETTERS))
             axes.append(ax)
         _explain_colours(clouds, axes, shown, look)
         _draw_charts(charts, inspector, shown, titles, against, compensates=compensates)
@@ -153,17 +155,19 @@ def _draw_charts(
     *,
     compensates: bool,
 ) -> None:
-    """Draw the images with one scale, and the sharpness over two parameters."""
+    """Draw the images with one scale, or of two recordings each with its own, and the sharpness over two parameters."""
     pair = drawing.make_images(inspector, drawing.ImageKind.COUNT, against=against, shown=shown)
     images = [pair.before, pair.after][-len(titles) :]
     names = [*inspector.orbit_names] if compensates else []
     axes = figure.subplots(1, len(images) + max(1, len(names)))
     left, top, right, bottom = shown.region
-    for ax, image, title in zip(axes, images, titles, strict=False):
-        drawn = ax.imshow(image, interpolation="nearest", extent=(left - 0.5, right - 0.5, bottom - 0.5, top - 0.5),
-                          **_mapped(pair.scale))  # fmt: skip
-        ax.set(title=title, xlabel="x [px]", ylabel="y [px]")
-    figure.colorbar(drawn, ax=axes[len(images) - 1], label=pair.scale.label, shrink=0.75)
+    scales = [pair.scale, pair.after_scale or pair.scale][-len(titles) :]
+    extent = left - 0.5, right - 0.5, bottom - 0.5, top - 0.5
+    for k, (ax, image, title, scale) in enumerate(zip(axes, images, titles, scales, strict=False)):
+        drawn = ax.imshow(image, interpolation="nearest", extent=extent, **_mapped(scale))
+        ax.set(title=textwrap.fill(title, IMAGE_LETTERS), xlabel="x [px]", ylabel="y [px]")
+        if pair.after_scale is not None or k == len(images) - 1:
+            figure.colorbar(drawn, ax=ax, label=scale.label, shrink=0.75)
     for ax, name in zip(axes[len(images) :], names, strict=False):
         _draw_curve(ax, inspector, name)
     if not names:
