@@ -66,6 +66,17 @@ def test_values_are_read_and_set_in_radians(handle: InspectorHandle, recording: 
     assert handle.values == start
 
 
+def test_filters_and_images_are_set_as_on_the_page(handle: InspectorHandle) -> None:
+    given = {"refractory_us": 700, "most_per_s": 2e5, "every": 3, "decay_us": 4000, "difference": True}
+    handle.set(**given, image="decay", same_scale=True)
+    assert {name: handle.values[name] for name in given} == given
+    window = window_of(handle)
+    selection = window.inspector.selection
+    assert (selection.refractory_us, selection.most_per_s, selection.every) == (700, 2e5, 3)
+    assert (window.image.value, window.decay_us, window.difference, window.same_scale) == ("decay", 4000, True, True)
+    assert [step.name for step in window.shown.steps][-3:] == ["refractory period", "rate", "every n-th"]
+
+
 def test_the_time_window_moves_on_the_events_clock(handle: InspectorHandle, recording: Recording) -> None:
     first = recording.events.t_first
     length_us = handle.values["length_us"]
@@ -97,6 +108,11 @@ def test_the_time_window_moves_on_the_events_clock(handle: InspectorHandle, reco
         ({"view": "z"}, "view is 'z'"),
         ({"overlaid": 1}, "overlaid is 1; expected a bool"),
         ({"phase": 1.0, "noise_us": -1}, "noise_us = -1"),
+        ({"refractory_us": -1}, "refractory_us = -1"),
+        ({"most_per_s": -1.0}, "most_per_s = -1.0"),
+        ({"every": 0}, "every = 0"),
+        ({"decay_us": 0}, "decay_us = 0"),
+        ({"difference": 1}, "difference is 1; expected a bool"),
     ],
 )
 def test_what_cannot_be_set_is_said_and_changes_nothing(

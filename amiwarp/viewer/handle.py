@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 TIME = ("start_us", "length_us")
 """Names of the values of the time window [us]. The start is on the events' clock."""
-SELECTION = ("region", "polarity", "hide_hot", "noise_us")
+SELECTION = ("region", "polarity", "hide_hot", "noise_us", "refractory_us", "most_per_s", "every")
 """Names of the values that select events."""
-STYLE = ("image", "colour", "axis", "view", "overlaid")
+STYLE = ("image", "decay_us", "difference", "same_scale", "colour", "axis", "view", "overlaid")
 """Names of the values of how the events are shown."""
 PICTURE_PX = (1400, 620)
 """Default width and height of a picture [px]."""
@@ -95,14 +95,23 @@ def with_values(inspector: Inspector, state: ViewState, values: dict[str, Any]) 
     if "noise_us" in values:
         given = values["noise_us"]
         selection["noise_us"] = None if given is None else whole(given, "noise_us", 1, layout.LONGEST_NOISE_US)
+    if "refractory_us" in values:
+        selection["refractory_us"] = whole(values["refractory_us"], "refractory_us", 0, layout.LONGEST_NOISE_US)
+    if "most_per_s" in values:
+        selection["most_per_s"] = real(values["most_per_s"], "most_per_s", *layout.RATE_LIMITS)
+    if "every" in values:
+        selection["every"] = whole(values["every"], "every", 1, layout.MOST_EVERY)
+    if "decay_us" in values:
+        other["decay_us"] = whole(values["decay_us"], "decay_us", 1, layout.LONGEST_NOISE_US)
     for name, kind in (("image", ImageKind), ("axis", Axis), ("view", View)):
         if name in values:
             other[name] = choice(kind, values[name], name)
     if "colour" in values:
         offered = [each.value for each in colours_on_offer(inspector.recording.truth)]
         other["colour"] = Colour(one_of(values["colour"], offered, "colour"))
-    if "overlaid" in values:
-        other["overlaid"] = instance(values["overlaid"], bool, "overlaid")
+    for name in ("overlaid", "difference", "same_scale"):
+        if name in values:
+            other[name] = instance(values[name], bool, name)
     now = replace(state.knobs.with_values(knobs), model=model)
     sources = tuple(
         (name, source if name in ("camera", "prism") or now.value(name) == state.knobs.value(name) else Source.HAND)
@@ -133,7 +142,8 @@ class InspectorHandle:
     Values have names: ``model``, the parameters of the optical model (``apex``, ``phase`` [rad], ``clock_offset`` [us]
     or, without an encoder, ``rpm`` [1/min], …), the time window ``start_us`` on the events' clock and ``length_us``
     [us], the selection ``region`` (left, top, right, bottom [px]; None for the whole image), ``polarity`` (1, 0 or
-    None), ``hide_hot`` and ``noise_us`` [us], and the style ``colour``, ``axis``, ``view``, ``overlaid``, ``image``.
+    None), ``hide_hot``, ``noise_us`` and ``refractory_us`` [us], ``most_per_s`` [events/s] and ``every``, and the style
+    ``colour``, ``axis``, ``view``, ``overlaid``, ``image``, ``decay_us`` [us], ``difference`` and ``same_scale``.
 
     Parameters
     ----------
