@@ -30,17 +30,22 @@ def planted(text: str, fault: dict[str, Any]) -> str:
     return text
 
 
-def failures(fault: dict[str, Any], folder: Path, rpm: float = 240.0) -> list[str]:
-    """Build the core with a fault in a folder, and return the names of the checks that fail."""
-    from amiwarp.live.link.conformance import check_controller
-
+def built(fault: dict[str, Any], folder: Path) -> Path:
+    """Build the core with a fault in a folder, and return the library."""
     for part in ("core", "native"):
         shutil.copytree(HERE / part, folder / part)
     file = folder / fault["file"]
     file.write_text(planted(file.read_text(), fault))
     sources = sorted(str(path.relative_to(folder)) for path in (folder / "core").glob("*.c"))
     subprocess.run([*COMPILE, *sources, "-lm"], cwd=folder, check=True, capture_output=True)
-    board = boards.NativeBoard(library=folder / "libboard.so")
+    return folder / "libboard.so"
+
+
+def failures(fault: dict[str, Any], folder: Path, rpm: float = 240.0) -> list[str]:
+    """Build the core with a fault in a folder, and return the names of the checks that fail."""
+    from amiwarp.live.link.conformance import check_controller
+
+    board = boards.NativeBoard(library=built(fault, folder))
     return [c.name for c in check_controller(boards.SimulatedWire(board), rpm) if c.passed is False]
 
 

@@ -177,6 +177,19 @@ def test_an_encoder_that_suddenly_loses_counts_stops_the_motor(turning: Callable
     assert host.board.get("fastest_rpm") < MOST_RPM
 
 
+@pytest.mark.parametrize("settings", [{}, {"magnetic": True}])
+def test_counts_lost_from_the_start_are_found_by_the_voltage(library: Path, settings: dict[str, Any]) -> None:
+    """Without an index, 0.56 of them are seen only by the voltage that a speed takes."""
+    host = Host(load("boards").NativeBoard(library=library, **settings))
+    host.board.set("no_index")
+    host.board.set("lost_counts", 0.56)
+    host.run(0.1)
+    host.command(SetSpeed(1440.0, 500.0))
+    host.run(4.0)
+    assert (host.status.state, host.status.faults, host.board.get("driven")) == (3, FAULT["stall"], 0.0)
+    assert host.board.get("fastest_rpm") < MOST_RPM
+
+
 def test_exchanged_wires_of_the_motor_are_found_at_low_speed(library: Path) -> None:
     host = Host(load("boards").NativeBoard(library=library))
     host.board.set("reversed_motor")

@@ -697,7 +697,7 @@ def run_motor(
 ) -> None:
     """Set the speed of the prism's motor, stop it, print the controller's status, or check the controller.
 
-    The motor keeps its last commanded speed after this command exits. A check takes about 35 s, ends with a stop, and
+    The motor keeps its last commanded speed after this command exits. A check takes about 25 s, ends with a stop, and
     fails (status 1) if a part of the serial protocol is violated.
     """
     if action is Action.CHECK:

@@ -151,13 +151,13 @@ int main(void) {
     wdt_enable(WDTO_120MS); /* after a reset by the watchdog it runs with its shortest time */
     DDRE = 1 << 3, PORTE = 1 << 4 | 1 << 5;
     DDRA = 1 << 0 | 1 << 1 | TRIGGER, PORTA = 1 << 2 | 1 << 4;
-    UCSR0A = 1 << U2X0, UBRR0 = 3, UCSR0B = 1 << RXCIE0 | 1 << RXEN0 | 1 << TXEN0, UCSR0C = 3 << UCSZ00;
-    OCR1A = PER_TICK - 1, TCCR1B = 1 << WGM12 | 1 << CS11, TIMSK1 = 1 << OCIE1A;
     ICR3 = PWM_TOP, TCCR3A = 1 << COM3A1 | 1 << WGM31, TCCR3B = 1 << WGM33 | 1 << WGM32 | 1 << CS30;
     struct settings settings = default_settings;
     settings.pulses = PULSES;
-    controller_begin(&c, &settings, 0);
+    controller_begin(&c, &settings, 0); /* takes half a tick */
     begin_edges();
+    UCSR0A = 1 << U2X0, UBRR0 = 3, UCSR0B = 1 << RXCIE0 | 1 << RXEN0 | 1 << TXEN0, UCSR0C = 3 << UCSZ00;
+    OCR1A = PER_TICK - 1, TCCR1B = 1 << WGM12 | 1 << CS11, TIMSK1 = 1 << OCIE1A;
     TCCR4B = (uint8_t)((PINL & 1 ? 0 : 1 << ICES4) | 1 << CS41), TIMSK4 = 1 << ICIE4;
     TCCR5B = 1 << ICES5 | 1 << CS51, TIMSK5 = PULSES == PULSES_CAMERA ? 1 << ICIE5 : 0;
     EICRB = 1 << ISC40 | 1 << ISC50, EIFR = EIMSK = 1 << 4 | 1 << 5; /* both edges */

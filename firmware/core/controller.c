@@ -181,8 +181,9 @@ static void take_index(struct controller *c, struct stamp at) {
     uint32_t per_turn = c->settings.counts_per_turn;
     if (c->indexed && !has_absolute_angle(&c->settings)) {
         uint32_t turned = (uint32_t)size_of(step_of(at.count, c->last_index.count)), off = turned % per_turn;
+        uint32_t slack = per_turn / 32u + 2u; /* less: else two pulses with 0.47 of their counts are taken for one turn */
         /* Counts that do not make whole turns, or stand still from pulse to pulse: an encoder's wire is broken. */
-        bool whole = turned > 0 && turned >= per_turn / 2 && (off < per_turn / 8 || off > per_turn - per_turn / 8);
+        bool whole = turned > 0 && turned >= per_turn / 2 && (off <= slack || off >= per_turn - slack);
         bad_pulse(c, !whole);
         /* The pulses also measure the speed without the counts. */
         uint32_t least = 50000000u / (uint32_t)c->settings.most_rpm;

@@ -2,11 +2,11 @@
 
 #include "speed.h"
 
-#define START_MS 90u                     /* time under voltage in which a shaft at rest must move */
+#define START_MS 80u                     /* time under voltage in which a shaft at rest must move */
 #define STANDS_MS 25u                    /* time in which one that turns must */
 #define TURNS RPM(200)                   /* speed from which this holds */
 #define MOST_DRIVEN ((uint32_t)100 * FULL_DUTY)   /* duty times time without movement: 0.1 s of full voltage */
-#define KICK_PER_MS 160                  /* at most two fifths of the voltage, at the end of START_MS */
+#define KICK_PER_MS 180                  /* at most two fifths of the voltage, at the end of START_MS */
 #define AWAY_MS 60u
 #define BEHIND_MS 150u
 #define DROPPED_MS 5u
@@ -24,7 +24,7 @@ static void moved(struct guard *g, int32_t count, int32_t speed) {
 void guard_begin(struct guard *g, int32_t count, uint32_t counts_per_turn) {
     g->least_counts = (int32_t)(counts_per_turn / 1024u) + 2;
     g->enough = (120000u * (uint32_t)g->least_counts / counts_per_turn + 1u) << 4; /* twice the least movement */
-    g->away_ms = g->behind_ms = g->dropped_ms = 0;
+    g->away_ms = g->behind_ms = g->lead_ms = g->dropped_ms = 0;
     g->usual = 0;
     moved(g, count, 0);
 }
@@ -76,11 +76,13 @@ static bool runs_away(struct guard *g, const struct guard_input *now) {
     return g->away_ms >= AWAY_MS;
 }
 
-/* Whether much voltage does not make the shaft faster: no supply, a brake, an encoder that loses counts. */
+/* Whether the shaft takes too much voltage for its speed, or does not get faster although the reference waits for it: no
+   supply, a brake, an encoder that loses counts. */
 static bool falls_behind(struct guard *g, const struct guard_input *now) {
     int32_t speed = now->reference < 0 ? -now->speed : now->speed;
-    bool meant = (now->duty < 0) == (now->reference < 0); /* no brake */
-    if (now->duty == 0 || !meant || !(now->limited || now->lead > MOST_LEAD)) {
+    bool meant = now->duty != 0 && (now->duty < 0) == (now->reference < 0); /* no brake */
+    g->lead_ms = meant && now->lead > MOST_LEAD ? (uint16_t)(g->lead_ms + 1u) : 0;
+    if (!meant || !now->limited) {
         g->behind_ms = 0;
     } else if (g->behind_ms == 0 || speed > g->behind_speed + RPM(8)) {
         g->behind_speed = speed;
@@ -88,7 +90,7 @@ static bool falls_behind(struct guard *g, const struct guard_input *now) {
     } else {
         g->behind_ms++;
     }
-    return g->behind_ms >= BEHIND_MS;
+    return g->behind_ms >= BEHIND_MS || g->lead_ms >= BEHIND_MS;
 }
 
 enum guard_finding guard_step(struct guard *g, const struct guard_input *now) {

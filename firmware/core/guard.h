@@ -12,7 +12,7 @@ struct guard_input {
     int32_t count;
     int32_t speed, reference, target; /* [Q16 rpm] */
     int32_t duty;             /* 0 if the driver is off */
-    int32_t lead;             /* duty in its own direction, beyond that which the speed needs */
+    int32_t lead;             /* duty in its own direction, beyond that which speed and acceleration need */
     bool limited;             /* the speed is so far behind that the reference waits */
 };
 
@@ -23,7 +23,7 @@ struct guard {
     int32_t moved_at;      /* speed at it, without sign [Q16 rpm] */
     uint32_t asked;        /* sum of the reference since then [rpm ms / 16] */
     uint32_t driven;       /* sum of the duty since then [duty ms] */
-    uint16_t standing_ms, kick_ms, away_ms, behind_ms, dropped_ms;
+    uint16_t standing_ms, kick_ms, away_ms, behind_ms, lead_ms, dropped_ms;
     int32_t away_speed, behind_speed; /* at the beginning of these times [Q16 rpm] */
     int32_t usual;                    /* mean speed of the last 32 ms [Q16 rpm] */
 };

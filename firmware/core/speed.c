@@ -70,7 +70,7 @@ void speed_begin(struct speed_control *c, const struct gains *g) {
 void speed_release(struct speed_control *c) {
     c->target = c->reference = c->expected = 0;
     c->integral = 0;
-    c->duty = 0;
+    c->duty = c->accelerating = 0;
     c->limited = false;
 }
 
@@ -82,7 +82,8 @@ void speed_catch(struct speed_control *c, int32_t speed) {
 }
 
 int32_t speed_lead(const struct speed_control *c, int32_t speed) {
-    return c->duty < 0 ? times(speed, c->forward) - c->duty : c->duty - times(speed, c->forward);
+    int32_t needed = times(speed, c->forward) + c->accelerating;
+    return c->duty < 0 ? needed - c->duty : c->duty - needed;
 }
 
 int32_t speed_step(struct speed_control *c, int32_t speed) {
@@ -90,7 +91,7 @@ int32_t speed_step(struct speed_control *c, int32_t speed) {
     c->reference += change;
     if ((before < 0) != (c->reference < 0)) c->integral = 0; /* it is mostly friction, which changes its sign here */
     if (c->target == 0 && c->reference == 0 && speed < CREEP && speed > -CREEP) {
-        c->integral = c->expected = 0;
+        c->integral = c->expected = c->accelerating = 0;
         c->limited = false;
         return c->duty = 0;
     }
@@ -105,7 +106,8 @@ int32_t speed_step(struct speed_control *c, int32_t speed) {
     }
     c->expected += (c->reference - c->expected) >> TRACKER_SHIFT;
     int32_t error = c->expected - speed;
-    int32_t forward = feed_forward(c, c->reference) + (change ? times(change, c->rise) : 0) + c->kick * sign;
+    c->accelerating = change ? times(change, c->rise) : 0;
+    int32_t forward = feed_forward(c, c->reference) + c->accelerating + c->kick * sign;
     int32_t wanted = forward + times(error, c->kp) + (c->integral >> 16);
     int32_t duty = c->duty + clamp(clamp(wanted, FULL_DUTY) - c->duty, c->duty_slew);
     /* The integral stands still while a limit acts in its direction. */

@@ -43,12 +43,13 @@ struct speed_control {
     int32_t integral;       /* duty in Q16 */
     int32_t kick;           /* input: additional duty in the direction of the reference, without sign */
     int32_t duty;           /* output */
+    int32_t accelerating;   /* part of it for the acceleration */
     bool limited;           /* output: the speed is so far behind that the reference waits for it */
 };
 void speed_begin(struct speed_control *c, const struct gains *g);
 void speed_release(struct speed_control *c);                  /* no voltage, reference and target 0 */
 void speed_catch(struct speed_control *c, int32_t speed);     /* begin at the speed at which a released motor turns */
 int32_t speed_step(struct speed_control *c, int32_t speed);   /* returns the duty for the measured speed [Q16 rpm] */
-int32_t speed_lead(const struct speed_control *c, int32_t speed); /* duty in its own direction beyond that of the speed */
+int32_t speed_lead(const struct speed_control *c, int32_t speed); /* duty in its own direction beyond what speed and acceleration need */
 
 #endif
