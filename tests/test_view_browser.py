@@ -652,6 +652,7 @@ def test_downloads_leave_no_file_on_the_server(
             pictures = np.array([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], np.int16)
         width, height = jobs.FILM_SIZE
         strip = round(width * strip_share(["ON: brighter"], width))  # the legend is on the left, the caption below
+        strip += (width - strip) % 2
         half = (width - strip) // 2
         for part in (pictures[0, : height // 3, :strip], pictures[0, height - FOOT_PX :]):  # have words
             assert (part.max(axis=2) < 120).mean() > 0.005
@@ -663,7 +664,7 @@ def test_downloads_leave_no_file_on_the_server(
     assert np.abs(pictures[0] - pictures[2]).mean() > 1.0
     page.locator("#do-keep").click()  # both clouds show the same parameters
     page.locator("#against-title").filter(has_text="compensated with B").wait_for()
-    assert film()[1] < 0.3 * apart
+    assert film()[1] < 0.15 * apart
     page.locator("#speed").select_option("0.001")
     with page.expect_download() as waiting:  # thousands of pictures to the end of the recording
         page.locator("#do-film").click()

@@ -960,7 +960,10 @@ class Scene:
         if look.overlaid and len(look.titles) > 1:
             rows = (*rows, (GREY, look.titles[0]))
         title = [] if bar is None else [bar.label]
-        strip = strip_share([*title, *(text for _, text in rows)], width, self.font_px)
+        strip_px = round(width * strip_share([*title, *(text for _, text in rows)], width, self.font_px))
+        # Both clouds get a whole number of pixels, and so the same ones.
+        strip_px += (round(width * (self._area[2] - self._area[0])) - strip_px) % 2
+        strip = strip_px / width
         foot = FOOT_PX * self.font_px / FONT_PX / whole_px[1] * bool(caption)
         if (strip, foot) != (self._strip, self._foot):
             whole = self._area[2] - self._area[0]
