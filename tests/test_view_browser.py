@@ -396,6 +396,12 @@ def test_what_calibration_found_is_compared_accepted_and_saved(
     assert (sharpness(page), field(page, "apex")) == (before, NOMINAL_DEG)  # the result is not accepted yet
     page.locator("#surface .cross.result, #surface .cross").first.wait_for()
     page.locator("#busy").wait_for(state="detached")
+    now = page.locator("#surface .cross").first  # the circle of the current parameters follows them
+    place = now.get_attribute("style") or now.get_attribute("transform") or str(now.bounding_box())
+    enter(page, "apex", 0.7 * NOMINAL_DEG)
+    until(lambda: (now.get_attribute("style") or now.get_attribute("transform") or str(now.bounding_box())) != place)
+    enter(page, "apex", NOMINAL_DEG)
+    ready(page)
     page.locator("#do-compare-found").click()
     page.locator("#against-title").filter(has_text="compensated with the result").wait_for()
     until(lambda: sharpness(page)[0] > 1.1 * sharpness(page)[1])

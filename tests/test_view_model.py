@@ -59,6 +59,7 @@ from amiwarp.viewer.jobs import (
     cost_surface,
     estimate_phase,
     find_calibration,
+    surface_marks,
     write_events,
 )
 from amiwarp.viewer.layout import (
@@ -168,7 +169,7 @@ def test_calibration_is_that_of_the_shown_optic(shown: str, calibrated: str, mon
     monkeypatch.setattr(jobs, "calibrate", refusing)
     with pytest.raises(AmiwarpError, match="enough"):
         find_calibration(inspector)
-    assert given == [calibrated]
+    assert given == [calibrated] * 2  # the second time by sharpness alone
 
 
 def test_a_recording_that_names_its_optic_is_shown_with_its_model() -> None:
@@ -884,6 +885,35 @@ def test_a_calibration_uses_what_is_selected(
     assert (shown.sharpness_before, shown.sharpness_after) == pytest.approx((before, after), rel=0.03)
 
 
+def test_a_selection_that_the_photometric_stage_refuses_is_calibrated_by_sharpness_and_says_so(
+    inspector: Inspector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the demo in the view with which the inspector starts. The whole recording is refused as it is."""
+    asked: list[tuple[str, ...]] = []
+    calibrate = jobs.calibrate
+
+    def refusing(recording: Recording, settings: Settings, **options: Any) -> Any:
+        asked.append(settings.stages)
+        if "photometric" in settings.stages:
+            raise AmiwarpError(f"{recording.name}: photometric stage: the camera shakes by 0.1 px; mount it; or not")
+        return calibrate(recording, settings, **options)
+
+    monkeypatch.setattr(jobs, "calibrate", refusing)
+    truth = inspector.truth
+    assert truth is not None
+    found, text = find_calibration(inspector)
+    assert asked == [("sharpness", "photometric"), ("sharpness",)]
+    assert inspector.knobs_of(found).apex == pytest.approx(truth.apex, abs=math.radians(0.12))
+    assert "by sharpness alone, as the photometric stage refused so few events (the camera shakes by 0.1 px)" in text
+    assert "calibrate on the whole recording" in text
+    assert "mount it" not in text
+    with pytest.raises(AmiwarpError, match="the camera shakes"):
+        find_calibration(inspector, whole=True)
+    asked.clear()
+    find_calibration(inspector, Settings(stages=("sharpness",)))
+    assert asked == [("sharpness",)]
+
+
 def test_a_selection_that_determines_nothing_is_refused(inspector: Inspector) -> None:
     start, length = inspector.first_window()
     inspector.open(start, length // 10, Selection(1, (20, 10, 140, 110), noise_us=3000))
@@ -920,6 +950,16 @@ def test_the_cost_surface_has_its_top_at_the_truth(inspector: Inspector) -> None
     for mark, (x, y) in zip((now, at_truth), places, strict=True):
         assert mark["x"] == pytest.approx(math.degrees(x))
         assert mark["y"] == pytest.approx(math.degrees(y))
+
+
+def test_the_marks_of_a_map_follow_the_parameters(inspector: Inspector) -> None:
+    about = inspector.knobs
+    inspector.set(replace(about, apex=1.5 * about.apex, phase=about.phase + math.tau - 0.3))
+    now, at_truth = surface_marks(inspector, ("apex", "phase"), about, None)
+    assert (now["sign"], at_truth["sign"]) == ("○", "◇")
+    assert now["x"] == pytest.approx(math.degrees(1.5 * about.apex))
+    assert now["y"] == pytest.approx(math.degrees(about.phase - 0.3))  # on the map, which has one turn
+    assert at_truth["x"] == pytest.approx(math.degrees(about.apex))
 
 
 def test_the_cost_surface_without_encoder_is_over_the_speed(recording: Recording, inspector: Inspector) -> None:

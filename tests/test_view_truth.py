@@ -177,7 +177,18 @@ def test_a_clicked_event_is_described_with_its_truth(inspector: Inspector) -> No
     shown = inspector.show()
     k = int(np.flatnonzero(shown.events.t % 12 == 2)[0])
     expected = f"; cause leak; instance red ball; depth {shown.events.t[k] * 1e-3:.3f} m"
-    assert event_text(shown, k).endswith(f" px{expected}")
+    assert event_text(shown, k, compensated=True).endswith(f" px{expected}")
+
+
+def test_a_clicked_event_of_a_plain_recording_has_no_angle(inspector: Inspector) -> None:
+    shown = inspector.show()
+    events = shown.events
+    said = event_text(shown, 5, compensated=False)
+    first = inspector.recording.events.t_first
+    assert said.startswith(f"x {events.x[5]}, y {events.y[5]} px; {(events.t[5] - first) * 1e-3:.3f} ms ")
+    assert f"(t = {events.t[5]} µs); {'ON' if events.p[5] else 'OFF'}" in said  # the time as in the recording
+    assert "θ" not in said
+    assert "compensated" not in said
 
 
 def test_the_legend_has_its_strip_next_to_the_clouds(scene: Scene, inspector: Inspector) -> None:

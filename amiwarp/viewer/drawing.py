@@ -1184,14 +1184,18 @@ def shown_lines(
     return (orbit if against is None and shown.beside is None else column, column)
 
 
-def event_text(shown: DisplayedWindow, k: int) -> str:
-    """Return the description of point ``k``: pixel, time, angle, polarity, compensated position and ground truth."""
+def event_text(shown: DisplayedWindow, k: int, *, compensated: bool) -> str:
+    """Return the description of point ``k``: pixel, time, polarity and ground truth.
+
+    The time is given after the first event [ms], and as the recording holds it [us]. ``compensated``: whether there is
+    a prism, so that the point has an angle and a compensated position.
+    """
     e, (x, y), truth = shown.events, shown.after[k], shown.truth.text(k)
     time_ms = (e.t[k] - shown.span.first_us) * 1e-3
-    return (
-        f"x {e.x[k]}, y {e.y[k]} px; {time_ms:.3f} ms; θ {math.degrees(shown.theta[k]):.2f}°; "
-        f"{'ON' if e.p[k] else 'OFF'}; compensated {x:.2f}, {y:.2f} px{truth and f'; {truth}'}"
-    )
+    parts = [f"x {e.x[k]}, y {e.y[k]} px", f"{time_ms:.3f} ms (t = {e.t[k]} µs)", "ON" if e.p[k] else "OFF"]
+    if compensated:
+        parts += [f"θ {math.degrees(shown.theta[k]):.2f}°", f"compensated {x:.2f}, {y:.2f} px"]
+    return "; ".join([*parts, *([truth] if truth else [])])
 
 
 def float_bytes(values: NDArray[Any]) -> bytes:

@@ -6,7 +6,7 @@ import itertools
 import math
 import re
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -119,6 +119,8 @@ def estimate_phase(inspector: Inspector) -> bool:
 
 # Calibration on what the inspector shows, and the sharpness over two parameters.
 
+SHARPNESS_ONLY = ("sharpness",)
+"""Stages of a calibration without the photometric one."""
 SURFACE_POINTS = (21, 37)
 """Number of values of the first and the second parameter of a cost surface."""
 
@@ -156,7 +158,18 @@ def find_calibration(
     settings = settings or Settings(model=AUTO if wedge else inspector.knobs.model)
     if rpm and not inspector.has_encoder:
         settings = replace(settings, start={"rpm": rpm, **settings.start})
-    found = calibrate(recording, settings, device=inspector.device, progress=progress)
+    try:
+        found = calibrate(recording, settings, device=inspector.device, progress=progress)
+    except AmiwarpError as error:
+        if whole or settings.stages == SHARPNESS_ONLY:
+            raise
+        # Some thousand events of a small region can mislead the checks of the photometric stage.
+        settings = replace(settings, stages=SHARPNESS_ONLY)
+        found = calibrate(recording, settings, device=inspector.device, progress=progress)
+        reason = str(error).partition(";")[0].removeprefix(f"{recording.name}: ").removeprefix("photometric stage: ")
+        doubt = f"by sharpness alone, as the photometric stage refused so few events ({reason}); to be sure, calibrate "
+        doubt += "on the whole recording"
+        found = replace(found, warnings=(*found.warnings, doubt))
     if not whole:
         found = replace(found, camera=inspector.camera)
     sharpness = inspector.sharpness_meter()
@@ -193,18 +206,32 @@ def cost_surface(
     for row, other in enumerate(others.tolist()):
         progress(f"sharpness over {size} and {second}", row / len(out))
         out[row] = [sharpness(current.with_values({size: each, second: other})) for each in sizes.tolist()]
-    marks, (x_title, y_title) = [], (f"{SLIDERS[name][0]} ({SLIDERS[name][1]})" for name in names)
+    x_title, y_title = (f"{SLIDERS[name][0]} ({SLIDERS[name][1]})" for name in names)
+    marks = surface_marks(inspector, names, current, found)
+    scale = Scale("sharpness", "1", float(out.min()), max(float(out.max()), float(out.min()) + 1e-9), "cividis")
+    return {"x": (sizes / scales[0]).tolist(), "y": (others / scales[1]).tolist(), "marks": marks, "x_title": x_title,
+            "y_title": y_title, "names": list(names),
+            "picture": picture_state(out[::-1], scale)}  # fmt: skip
+
+
+def surface_marks(
+    inspector: Inspector, names: Sequence[str], about: Knobs, found: Calibration | None
+) -> list[dict[str, Any]]:
+    """Return the marks of the current, the true and the ``found`` parameters on a map over two parameters.
+
+    ``names``: of these parameters; ``about``: those in the middle of the map, about which the phase has one turn.
+    """
+    marks = []
     known = (("○", "now", inspector.knobs), ("◇", "truth", inspector.truth),
              ("✕", "result", None if found is None else inspector.knobs_of(found)))  # fmt: skip
+    scales = [UNITS[name] for name in names]
     for sign, title, knobs in known:
         if knobs is not None:
             x, y = ((knobs.value(name) or 0.0) / scale for name, scale in zip(names, scales, strict=True))
-            if second == "phase":
-                y += 360.0 * round((inspector.knobs.phase / scales[1] - y) / 360.0)
+            if names[1] == "phase":
+                y += 360.0 * round((about.phase / scales[1] - y) / 360.0)
             marks.append({"x": x, "y": y, "sign": sign, "title": title})
-    scale = Scale("sharpness", "1", float(out.min()), max(float(out.max()), float(out.min()) + 1e-9), "cividis")
-    return {"x": (sizes / scales[0]).tolist(), "y": (others / scales[1]).tolist(), "marks": marks, "x_title": x_title,
-            "y_title": y_title, "picture": picture_state(out[::-1], scale)}  # fmt: skip
+    return marks
 
 
 # Files that the page offers as downloads: images, events and films.

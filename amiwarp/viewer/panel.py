@@ -89,6 +89,7 @@ class Panel(layout.Actions):
         """Whether a change lasts, such as a drag: meanwhile the brightness of images does not follow it."""
         self._scales: tuple[Scale, Scale] | None = None
         self._scales_of: ImageKind | None = None
+        self._surface_about: Knobs | None = None  # parameters in the middle of the map of sharpness
         self._made_for: dict[str, Any] = {}  # window and selection of which the slow parts of the page are, by name
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._rates: list[EventRates] = []  # of the recording, and of those on its time axis
@@ -668,6 +669,7 @@ class Panel(layout.Actions):
                 state.update({"found": text, "against_choices": self._against_choices()})
             async with self.device_lock:
                 draw = partial(jobs.cost_surface, found=self.found)
+                self._surface_about = inspector.knobs
                 surface = await self.in_thread(_guarded, draw, weakref.ref(inspector), progress)
             if not isinstance(surface, str) and self.inspector is inspector:
                 with state:
@@ -829,6 +831,11 @@ class Panel(layout.Actions):
                 self.request("look")
             mark = layout.knob_values(self.inspector)[state.knob]
             self._show_old()
+            if state.surface:  # the parameters may have moved on its map
+                marks = jobs.surface_marks(
+                    self.inspector, state.surface["names"], self._surface_about or self.inspector.knobs, self.found
+                )
+                state.surface = {**state.surface, "marks": marks}
             state.optic = bool(state.optic or self.inspector.has_optic)  # a live stream may have got its encoder
             state.update({**values, "turn_ms": layout.turn_ms(self.inspector), "curve_mark": mark})
             if not state.playing:
@@ -918,7 +925,9 @@ class Panel(layout.Actions):
             "steps": step_rows(shown.steps, shown.read_us), "beside_rows": drawing.beside_rows(self.inspector, shown),
             "drawn": drawing.drawn_text(shown), "count": shown.span.count,
             "sharpness": drawing.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
-            "picked_text": "" if self._picked < 0 else drawing.event_text(shown, self._picked),
+            "picked_text": "" if self._picked < 0 else drawing.event_text(
+                shown, self._picked, compensated=self.compensates
+            ),
             "after_title": self._after_title(shown),
             "against_title": drawing.against_title(self.inspector, left), "against_choices": self._against_choices(),
         }  # fmt: skip

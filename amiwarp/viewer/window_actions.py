@@ -189,7 +189,8 @@ class WindowActions(layout.Actions):
         """Describe the event that is drawn at a place, and show its orbit. ``place``: pixels from left and bottom."""
         if not self.depth_shown:
             self._picked = self.scene.event_at(place, self.shown, self._look)
-            self.say("" if self._picked < 0 else drawing.event_text(self.shown, self._picked))
+            compensated = self.compensates
+            self.say("" if self._picked < 0 else drawing.event_text(self.shown, self._picked, compensated=compensated))
 
     def whole(self) -> None:
         """Show the whole image."""
