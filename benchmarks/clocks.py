@@ -114,8 +114,8 @@ class Outcome:
     paired_s: float | None
     """Time until the pulses were paired first [s]; None if they never were."""
     error_us: float | None
-    """Median distance of the map from the truth at its pulses, while pulses were paired [us]. None if never, and in runs
-    whose controller's clock jumps, because the emulator does not tell the time before the jump."""
+    """Median distance of the map from the truth at its pulses, while pulses were paired [us]. None if never, and in
+    runs whose controller's clock jumps, because the emulator does not tell the time before the jump."""
     messages: tuple[str, ...]
 
 
