@@ -649,6 +649,10 @@ def test_downloads_leave_no_file_on_the_server(
     monkeypatch.setattr(jobs, "FRAMES", 4)
     with Image.open(download(page, "picture", tmp_path)) as picture:
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
+    assert download(page, "pdf", tmp_path).read_bytes().startswith(b"%PDF")
+    figure = download(page, "svg", tmp_path).read_text()
+    assert "<svg" in figure
+    assert "sharpness" in figure
     plain, moved = (open_recording(download(page, name, tmp_path)).events for name in ("events", "compensated"))
     assert 0.5 * len(plain) < len(moved) <= len(plain)
 

@@ -49,7 +49,7 @@ ROS1, SQLITE, MCAP = b"#ROSBAG V2.0\n", b"SQLite format 3\0", b"\x89MCAP0\r\n"
 @contextlib.contextmanager
 def opened_bag(path: str) -> Iterator[tuple[Any, bool]]:
     """Open a bag by its content, not its ending. Return the library's reader, and whether the bag is of ROS 1."""
-    optional_module("rosbags", "ros", "is a ROS bag, which needs rosbags")
+    optional_module("rosbags", "ros", "needs rosbags")
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2.reader import DirectoryReader
     from rosbags.rosbag2.storage_mcap import McapReader

@@ -377,7 +377,8 @@ KEYS = (
 )
 """Keys of the page: name of the key, method of the panel with its arguments, and help text."""
 EXPORTS = {
-    "picture": ("picture", ".png"), "image": ("images", ".png"), "values": ("image values", ".tif"),
+    "picture": ("picture", ".png"), "image": ("images", ".png"), "pdf": ("figure, PDF", ".pdf"),
+    "svg": ("figure, SVG", ".svg"), "values": ("image values", ".tif"),
     "events": ("events", ".h5"), "compensated": ("compensated events", ".h5"), "csv": ("events, CSV", ".csv"),
     "npz": ("events, NPZ", ".npz"), "vtp": ("cloud, VTP", ".vtp"), "vtp_after": ("compensated cloud, VTP", ".vtp"),
     "calibration": ("calibration", ".json"), "turntable": ("film, turning", ".mp4"),

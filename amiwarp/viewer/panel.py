@@ -702,8 +702,12 @@ class Panel(layout.Actions):
             self.start_job(self._film(what) if what in layout.FILMS else self._write(what))
 
     async def _write(self, what: str) -> None:
+        from amiwarp.viewer.publish import Page, save_figure
+
         inspector = self.inspector
+        figure = partial(save_figure, inspector, page=Page(), view=self.view, look=self.look, against=self.against)
         write: dict[str, Callable[[Path], object]] = {
+            **dict.fromkeys(("pdf", "svg"), figure),
             "values": lambda path: save_values(path, self._pair().after),
             **dict.fromkeys(("csv", "npz"), partial(jobs.write_table, inspector)),
             "events": partial(jobs.write_events, inspector, compensated=False),
