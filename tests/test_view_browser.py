@@ -53,7 +53,7 @@ pytest.importorskip("trame_client")
 APEX_DEG, NOMINAL_DEG, RPM, PHASE = 1.0, 1.2, 720.0, 2.0
 TURN_MS = 60e3 / RPM
 PICKED = (
-    r"x (?P<x>\d+), y (?P<y>\d+) px; (?P<t>[\d.]+) ms; θ (?P<theta>[\d.]+)°; (?P<p>ON|OFF); "
+    r"x (?P<x>\d+), y (?P<y>\d+) px; (?P<t>[\d.]+) ms \(t = (?P<own>\d+) µs\); (?P<p>ON|OFF); θ (?P<theta>[\d.]+)°; "
     r"compensated (?P<cx>-?[\d.]+), (?P<cy>-?[\d.]+) px"
 )
 SIZES = ((1366, 768), (800, 600), (2560, 1440))
@@ -926,6 +926,7 @@ def test_a_click_on_an_event_tells_all_about_it(page: Any, kept: Any, recording:
         assert match is not None
         x, y, p = int(match["x"]), int(match["y"]), int(match["p"] == "ON")
         t = recording.events.t_first + round(float(match["t"]) * 1e3)
+        assert int(match["own"]) == t
         assert ((events.x == x) & (events.y == y) & (events.t == t) & (events.p == p)).sum() == 1
         theta = encoder.angle_at(np.array([t]))
         assert float(match["theta"]) == pytest.approx(math.degrees(theta[0] % math.tau), abs=0.006)
