@@ -3,7 +3,12 @@
 import gc
 import itertools
 import math
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
+from ctypes.util import find_library
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +20,19 @@ import pyvista
 from pyvista.plotting.utilities.regression import image_from_window
 from scipy.spatial import ConvexHull
 
-from amiwarp import AmiwarpError, Camera, DepthMap, Encoder, Events, MemoryEvents, Plate, Prism, Recording, simulate
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    DepthMap,
+    Encoder,
+    Events,
+    MemoryEvents,
+    Plate,
+    Prism,
+    Recording,
+    save_recording,
+    simulate,
+)
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
 from amiwarp.plotting.colours import GREY, depth_image, ticks
@@ -536,7 +553,9 @@ def test_a_film_of_the_window_is_ended_or_cancelled(
         shares.append(share)
         if len(shares) == 3:
             window.key(key)
+        window._progress_due_s = 0.0
         show(what, share)
+        assert "(f ends it, c cancels it)" in " ".join(said(window).split())
 
     monkeypatch.setattr(window, "_show_progress", progress)
     window.key("f")
@@ -545,6 +564,73 @@ def test_a_film_of_the_window_is_ended_or_cancelled(
     assert ("saved" if films else "film cancelled") in said(window)
     assert len(shares) == 3
     assert not window._progress
+
+
+FILM_OF_A_WINDOW = """
+import sys
+import numpy as np
+from amiwarp import open_recording
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.window import Window
+
+def seen():
+    with open(sys.argv[2], "rb") as screen:
+        return np.frombuffer(screen.read(), "<u4")[-640 * 480:].reshape(480, 640) & 0xffffff
+
+window = Window(Inspector(open_recording(sys.argv[1])), size=(640, 480))
+while window.turn():
+    pass
+before, show, pictures = seen(), window._show_progress, []
+
+def progress(what, share):
+    window._progress_due_s = 0.0
+    show(what, share)
+    pictures.append(seen())
+    if len(pictures) == 4:
+        window.key("f")
+
+window._show_progress = progress
+window.key("f")
+while window.turn():
+    pass
+for after in (*pictures, seen()):
+    differs = after != before
+    print(differs.mean(), differs[:, 200:].mean(), (differs.any(axis=1)).sum())
+print(window.message)
+"""
+"""A window on a display that makes a film: prints how much of the screen changes, with and without its column."""
+
+
+@pytest.mark.skipif(find_library("X11") is None or shutil.which("Xvfb") is None, reason="needs Xvfb, an X server")
+def test_a_film_leaves_the_window_on_a_display_as_it_was(recording: Recording, tmp_path: Path) -> None:
+    """Only the message changes, on the screen of the X server, while the film is made and afterwards."""
+    save_recording(tmp_path / "r.h5", recording)
+    read, write = os.pipe()
+    screen = tmp_path / "Xvfb_screen0"
+    server = subprocess.Popen(["Xvfb", "-displayfd", str(write), "-screen", "0", "640x480x24", "-fbdir", tmp_path],
+                              pass_fds=[write], stderr=subprocess.DEVNULL)  # fmt: skip
+    os.close(write)
+    with server, os.fdopen(read) as number:
+        plain = {key: value for key, value in os.environ.items() if key != "VTK_DEFAULT_OPENGL_WINDOW"}
+        done = subprocess.run(
+            [sys.executable, "-c", FILM_OF_A_WINDOW, tmp_path / "r.h5", screen],
+            env={**plain, "DISPLAY": f":{number.readline().strip()}"},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=120.0,
+            check=False,
+        )
+        server.terminate()
+    assert done.returncode == 0, done.stderr
+    *rows, message = [line for line in done.stdout.splitlines() if not line.startswith("Warp")]
+    shares = np.array([row.split() for row in rows], float)
+    assert message == "saved r.film.mp4"
+    assert len(film_of(tmp_path / "r.film.mp4")) == 4
+    assert len(shares) == 5
+    assert (shares[:, 0] > 0.0).all()
+    assert (shares[:, 0] < 0.03).all()
+    assert (shares[:, 1] == 0.0).all()
 
 
 def test_b_is_compared_with(window: Window) -> None:
@@ -970,6 +1056,104 @@ def test_the_timeline_follows_a_window_that_leaves_it(window: Window) -> None:
     assert high - low == 50_000.0
 
 
+# The camera
+
+
+def seen_depths(window: Window) -> list[np.ndarray]:
+    """Return where the drawn points and the corners of the box lie between near (0) and far end (1) of each view."""
+    box, depths = window.scene.box, []
+    corners = np.array(list(itertools.product((box.left, box.right), (-box.bottom, -box.top), (0.0, box.axis_height))))
+    for renderer in window.scene.views:
+        if not renderer.GetDraw():
+            continue
+        window.plotter.render_window.Render()
+        for cloud in window.scene._clouds:
+            if renderer.HasViewProp(cloud):
+                drawn = np.concatenate([corners, np.asarray(cloud.mapper.dataset.points)])
+                depths.append(projected(drawn, view_matrix(renderer), renderer.GetSize())[1])
+    return depths
+
+
+def test_no_change_of_the_view_cuts_the_clouds_off(recording: Recording) -> None:
+    """A real sequence: overlaid, zoomed, side by side, overlaid, and back to the first state."""
+    window = Window(Inspector(recording), look=Look(dark=True, overlaid=True), size=SIZE, off_screen=True)
+    place = nine_places(window)[4]
+    for action in ("o", "wheel", "wheel", "wheel", "wheel", "wheel", "wheel", "o", "o", "r", "o", "2", "1", "w", "k"):
+        if action == "wheel":
+            mouse(window, "MouseWheelForward", place)
+        else:
+            window.key(action)
+        assert window.turn()
+        depths = seen_depths(window)
+        assert len(depths) == 2
+        for depth in depths:
+            assert action == "wheel" or depth.min() >= 0.0, action  # zoomed, the camera may be in the box
+            assert depth.max() <= 1.0, action
+    window.scene.close()
+
+
+def test_a_new_region_does_not_turn_the_camera(window: Window) -> None:
+    window.whole()
+    window.turn()
+    pull(window, nine_places(window)[4], "Left")
+    assert window.turn()
+    camera = window.scene._views[0].camera
+    direction, up, place = camera.direction, camera.up, camera.position
+    frame = window.sheets.images.frames[0]
+    strike(window, (frame.left + 10, frame.top - 10), (frame.left + 60, frame.top - 50))
+    assert window.shown.region != (0, 0, 120, 90)
+    np.testing.assert_allclose(camera.direction, direction, atol=1e-9)
+    assert np.dot(camera.up, up) > 0.9
+    assert math.dist(camera.position, place) > 10.0
+    box, renderer = window.scene.box, window.scene._views[0]
+    corners = np.array(list(itertools.product((box.left, box.right), (-box.bottom, -box.top), (0.0, box.axis_height))))
+    places_of, _ = projected(corners, view_matrix(renderer), renderer.GetSize())
+    assert (places_of > 0.0).all()
+    assert (places_of < renderer.GetSize()).all()
+    assert (np.ptp(places_of, axis=0) / renderer.GetSize()).max() > 0.5
+    window.plotter.window_size = (1000, 700)
+    assert window.turn()
+    np.testing.assert_allclose(camera.direction, direction, atol=1e-9)
+    window.key("1")
+    window.turn()
+    assert math.dist(camera.direction, direction) > 0.05
+
+
+def test_labels_are_readable_in_front_of_events_and_not_cut(window: Window) -> None:
+    """Events lie behind the numbers, as a wrong apex angle moves them; a line is between zoomed clouds, which touch."""
+    window.draw_region((40, 30, 80, 60))
+    window.turn()
+    drag(window, "apex", 2.2)
+    window.key("3")
+    window.turn()
+    covered = 0
+    for _ in range(4):
+        mouse(window, "MouseWheelForward", nine_places(window)[4])
+        assert window.turn()
+        picture, height = window.scene.picture(), window.plotter.window_size[1]
+        for k, renderer in enumerate(window.scene._views):
+            x, y = renderer.GetOrigin()
+            size = renderer.GetSize()
+            drawn, _ = projected(np.asarray(window.scene._clouds[k].mapper.dataset.points), view_matrix(renderer), size)
+            for label in window.scene._axes[k].labels():
+                half = 0.4 * text_width(label.text, 10), 3.0
+                behind = (np.abs(drawn - label.place) < half).all(axis=1)
+                covered += behind.any()
+                left, low = (round(at - reach) for at, reach in zip(label.place, half, strict=True))
+                right, top = (round(at + reach) for at, reach in zip(label.place, half, strict=True))
+                part = picture[height - y - top : height - y - low, x + left : x + right].astype(int)
+                assert np.ptp(part, axis=2).max() < 30, label  # grey letters on white
+        for text, (left, right, low, top), (wide, high) in texts_of(window):
+            assert left >= -1, text
+            assert right <= wide + 1, text
+            assert low >= -2, text
+            assert top <= high + 2, text
+        second = window.scene._views[1]
+        column = picture[height - second.GetOrigin()[1] - second.GetSize()[1] // 2, :, :]
+        assert (column[second.GetOrigin()[0]] < 100).all()
+    assert covered > 0
+
+
 # Layout, texts and axes
 
 
@@ -1060,7 +1244,7 @@ def test_labels_of_the_axes_are_outside_of_the_box(elevation: int) -> None:
     box, camera = Box(20, 30, 140, 120, 0.0, 360.0), plotter.renderer.camera
     plotter.add_mesh(pyvista.Box((20, 140, -120, -30, 0, box.axis_height)), render=False, reset_camera=False)
     axes, middle = CloudAxes(plotter.renderer), np.array([80.0, -75.0, 0.5 * box.axis_height])
-    axes.label(box, ("x", "y", "θ"), "black", 12)
+    axes.label(box, ("x", "y", "θ"), ("white", "black"), 12)
     camera.focal_point, camera.up, camera.view_angle = middle, (0.0, 0.0, 1.0), 30.0
     ends = np.array([(20, 140), (-120, -30), (0, box.axis_height)])
     for azimuth in range(0, 360, 24):

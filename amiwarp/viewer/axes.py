@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from amiwarp.plotting.colours import ticks
 from amiwarp.plotting.meshes import Box
-from amiwarp.viewer.texts import label_actor, text_width
+from amiwarp.viewer.texts import label_actor, on_paper, text_width
 
 CORNERS = np.array(list(product((0, 1), repeat=3)))
 """The corners of a box, shape ``(8, 3)``: 0 for the lower end of an axis, 1 for the upper one."""
@@ -153,46 +153,51 @@ def _overlap(one: Label, other: Label, font_px: int) -> bool:
     return abs(one.place[0] - other.place[0]) < wide and abs(one.place[1] - other.place[1]) < 1.1 * font_px
 
 
+def _is_whole(label: Label, size: Sequence[int], font_px: int) -> bool:
+    """Return whether a label is inside of a renderer of a size [px]."""
+    half = 0.5 * text_width(label.text, font_px), 0.5 * font_px
+    return all(reach <= at <= end - reach for at, reach, end in zip(label.place, half, size, strict=True))
+
+
 class CloudAxes:
     """Labels of the axes of a renderer's cloud. They are placed anew before each drawing, as the camera may move."""
 
     def __init__(self, renderer: Any) -> None:
         self._renderer = renderer
         self._actors: list[Any] = []
-        self._box, self._titles, self._ink, self._font_px = Box(0, 0, 1, 1, 0.0, 1.0), ("", "", ""), "black", 12
+        self._box, self._titles = Box(0, 0, 1, 1, 0.0, 1.0), ("", "", "")
+        self._colours, self._font_px = ("white", "black"), 12
         self._shown = False
         renderer.AddObserver("StartEvent", lambda *_: self._place())
 
-    def label(self, box: Box, titles: tuple[str, str, str], ink: str, font_px: int) -> None:
-        """Label the axes of a box. ``titles``: of the axes; ``ink``: colour."""
-        if (ink, font_px) != (self._ink, self._font_px):
+    def label(self, box: Box, titles: tuple[str, str, str], colours: tuple[str, str], font_px: int) -> None:
+        """Label the axes of a box. ``titles``: of the axes; ``colours``: of the paper behind the labels, and of ink."""
+        if (colours, font_px) != (self._colours, self._font_px):
             for actor in self._actors:
                 self._renderer.RemoveActor(actor)
             self._actors = []
-        self._box, self._titles, self._ink, self._font_px, self._shown = box, titles, ink, font_px, True
+        self._box, self._titles, self._colours, self._font_px, self._shown = box, titles, colours, font_px, True
 
     def hide(self) -> None:
         """Show no labels."""
         self._shown = False
 
     def labels(self) -> list[Label]:
-        """Return the labels as the camera is now."""
+        """Return the labels as the camera is now, without those that the sides of the renderer would cut."""
         renderer = self._renderer
         if not (self._shown and renderer.GetDraw() and min(renderer.GetSize()) > 1):
             return []
-        return axis_labels(
-            self._box,
-            self._titles,
-            renderer.GetActiveCamera(),
-            view_matrix(renderer),
-            renderer.GetSize(),
-            self._font_px,
-        )
+        size = renderer.GetSize()
+        camera, matrix = renderer.GetActiveCamera(), view_matrix(renderer)
+        found = axis_labels(self._box, self._titles, camera, matrix, size, self._font_px)
+        return [label for label in found if _is_whole(label, size, self._font_px)]
 
     def _place(self) -> None:
         labels = self.labels()
         while len(self._actors) < len(labels):
-            actor = label_actor(self._ink, self._font_px)
+            paper, ink = self._colours
+            actor = label_actor(ink, self._font_px)
+            on_paper(actor, paper)
             actor.SetPickable(False)
             self._renderer.AddActor(actor)
             self._actors.append(actor)

@@ -50,7 +50,16 @@ from amiwarp.validation import choice
 from amiwarp.viewer.axes import CloudAxes, projected, view_matrix
 from amiwarp.viewer.filters import rate_text
 from amiwarp.viewer.inspector import DisplayedWindow, DrawnTruth, Inspector, Knobs, LoadedWindow, colours_on_offer
-from amiwarp.viewer.texts import FONT_PX, VTK_FONT_FILE, fitting_font, font, label_actor, text_actor, text_width
+from amiwarp.viewer.texts import (
+    FONT_PX,
+    VTK_FONT_FILE,
+    fitting_font,
+    font,
+    label_actor,
+    on_paper,
+    text_actor,
+    text_width,
+)
 
 if TYPE_CHECKING:
     import pyvista
@@ -694,6 +703,21 @@ class Look:
         return replace(self, titles=tuple(titles), overlaid=self.overlaid or len(titles) == 1)
 
 
+def side_line() -> Any:
+    """Return a line at the left side of a renderer."""
+    import pyvista
+    from vtkmodules.vtkRenderingCore import vtkActor2D, vtkCoordinate, vtkPolyDataMapper2D
+
+    shares, mapper, actor = vtkCoordinate(), vtkPolyDataMapper2D(), vtkActor2D()
+    shares.SetCoordinateSystemToNormalizedViewport()
+    mapper.SetTransformCoordinate(shares)
+    mapper.SetInputData(pyvista.Line((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    mapper.ScalarVisibilityOff()  # PyVista's line has numbers along it
+    actor.SetMapper(mapper)
+    actor.GetProperty().SetLineWidth(2.0)  # of which the right half is inside
+    return actor
+
+
 def place_renderer(renderer: Any, place: tuple[float, ...], *, shown: bool) -> None:
     """Draw a renderer at a place (left, bottom, right and top, in shares of the picture's size), or hide it.
 
@@ -707,6 +731,10 @@ def place_renderer(renderer: Any, place: tuple[float, ...], *, shown: bool) -> N
 class Scene:
     """Event clouds before and after compensation, with one camera for both, their legend and a caption."""
 
+    on_display = False
+    """Whether this process has opened a window. Films of it are then drawn with OpenGL of its display, too: contexts of
+    EGL beside it spoil what the window shows."""
+
     def __init__(
         self, size: tuple[int, int] = (1000, 420), *, more: int = 0, off_screen: bool = True
     ) -> None:  # fmt: skip
@@ -715,7 +743,7 @@ class Scene:
         ``more``: number of renderers for other parts; they follow the :data:`OWN_RENDERERS` of the scene. Without
         ``off_screen``, a window shows the scene. Raises :class:`AmiwarpError` if VTK cannot draw on this machine.
         """
-        if off_screen and sys.platform.startswith("linux"):
+        if off_screen and not Scene.on_display and sys.platform.startswith("linux"):
             if find_library("EGL") is None:  # VTK would end the process
                 raise AmiwarpError("VTK needs OpenGL (EGL); on Debian run: apt-get install libegl1 libgl1-mesa-dri")
             os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"  # needs neither a display nor libX11
@@ -723,6 +751,7 @@ class Scene:
 
         parts = 1, OWN_RENDERERS + more
         self.plotter = pyvista.Plotter(off_screen=off_screen, shape=parts, border=False, window_size=list(size))
+        Scene.on_display = Scene.on_display or not off_screen
         self.plotter.render_window.SetMultiSamples(0)  # doubles the speed of a software renderer
         self.plotter.link_views((0, 1))
         self._views = list(self.plotter.renderers)[:2]  # of the clouds
@@ -743,6 +772,8 @@ class Scene:
         for renderer, title in zip(self._views, self._titles, strict=True):
             renderer.add_actor(title, render=False, pickable=False, reset_camera=False)
             renderer.AddObserver("StartEvent", lambda caller, _: self._before_drawing(caller))
+        self._border = side_line()  # left of the second cloud, as zoomed clouds would touch each other
+        self._views[1].AddActor(self._border)
         self._lines: list[Any] = []
         self._explained: tuple[Any, ...] = ()
         self._caption = text_actor("", "black", (0.01, 0.9))
@@ -757,7 +788,7 @@ class Scene:
         return self._views
 
     def show(self, shown: DisplayedWindow, look: Look, lines: Sequence[NDArray[Any]] = (), caption: str = "") -> None:
-        """Draw the events of a window. The camera moves only if the region of the image has changed.
+        """Draw the events of a window. If the region of the image has changed, the camera moves, but does not turn.
 
         ``lines``: a line for each cloud, points x, y [px] and on the third axis, shape ``(n, 3)``. ``caption``: text
         below the clouds.
@@ -770,15 +801,21 @@ class Scene:
         self._draw_lines(lines, look)
         self._draw_legend(shown, look, caption)
         if replace(before, low=self.box.low, high=self.box.high) != self.box:  # the region has changed
-            self.look_from(self.view, look)
+            self._fit(look)
 
     def look_from(self, view: View, look: Look) -> None:
         """Move the camera to a view direction from which both clouds fit into the picture."""
         self.view = view
+        camera, (away, up) = self.plotter.renderers[0].camera, CAMERA_DIRECTIONS[view]
+        camera.parallel_projection, camera.view_angle = view is not View.FREE, VIEW_ANGLE
+        camera.position, camera.focal_point, camera.up = away, (0.0, 0.0, 0.0), up
+        self._fit(look)
+
+    def _fit(self, look: Look) -> None:
+        """Move the camera, without turning it, to where both clouds fit into the picture."""
         self._draw_frame(look)
-        b = self.box
-        away, up = (np.array(v) for v in CAMERA_DIRECTIONS[view])
-        away = away / np.linalg.norm(away)
+        b, camera = self.box, self.plotter.renderers[0].camera
+        away, up = -np.array(camera.direction), np.array(camera.up)
         right = np.cross(up, away) / np.linalg.norm(np.cross(up, away))
         up = np.cross(away, right)
         margin = MARGIN * b.width
@@ -792,14 +829,11 @@ class Scene:
         wide *= width_px / max(width_px - across_px, 0.4 * width_px)
         aspect = width_px / height_px
         half = math.tan(math.radians(VIEW_ANGLE / 2.0))
-        camera = self.plotter.renderers[0].camera
-        camera.parallel_projection, camera.view_angle = view is not View.FREE, VIEW_ANGLE
         camera.parallel_scale = float(np.maximum(tall, wide / aspect).max())
         away = away * float((near + np.maximum(tall, wide / aspect) / half).max())
         camera.position, camera.focal_point, camera.up = tuple(middle + away), tuple(middle), tuple(up)
         for renderer in self._views:
             renderer.camera = camera
-            renderer.reset_camera_clipping_range()
 
     def _cloud_size(self, look: Look) -> tuple[float, float]:
         """Return width and height of what shows a cloud [px]."""
@@ -817,7 +851,7 @@ class Scene:
         self._explained, self._framed = (), None
         self._divide(self._strip, overlaid=self._overlaid)
         if self._clouds:
-            self.look_from(self.view, look)
+            self._fit(look)
 
     def event_at(self, place: tuple[int, int], shown: DisplayedWindow, look: Look) -> int:
         """Return the index of the front event within :data:`PICK_PX` of a place in the picture; -1 if there is none.
@@ -829,6 +863,7 @@ class Scene:
                 continue
             xy = shown.after if k == 1 or self._overlaid else shown.before
             points = self.box.positions(xy, third_axis(shown, look.axis))
+            renderer.ResetCameraClippingRange()  # which is that of the cloud that was drawn last
             places, depth = projected(points, view_matrix(renderer), renderer.GetSize())
             away = np.hypot(*(places + renderer.GetOrigin() - place).T)
             near = np.flatnonzero((away <= max(PICK_PX, 0.5 * self._clouds[k].prop.point_size)) & (depth >= 0.0))
@@ -893,7 +928,11 @@ class Scene:
         self._clouds[k].prop.opacity = look.opacity
 
     def _before_drawing(self, renderer: Any) -> None:
-        """Size the points, and place the title: a window may have changed its size, and the mouse the camera."""
+        """Size the points, and place the title: a window may have changed its size, and the mouse the camera.
+
+        Both clouds have one camera, so that each needs its own clipping range, from what it shows now.
+        """
+        renderer.ResetCameraClippingRange()
         look, (width, height) = self._look, renderer.GetSize()
         k = self._views.index(renderer)
         self._titles[k].SetPosition(0.5 * width, height - 0.5 * self.font_px)
@@ -925,6 +964,7 @@ class Scene:
             renderer.set_background(background)
         for renderer in self._views:
             renderer.remove_actor(self._frame, render=False)
+        self._border.GetProperty().SetColor(pyvista.Color(ink).float_rgb)
         titles = (" and ".join(look.titles),) if look.overlaid else look.titles
         third = "θ [°]" if look.axis is Axis.ANGLE else "t [ms]"
         for title, axes in zip(self._titles, self._axes, strict=True):
@@ -934,9 +974,10 @@ class Scene:
         for k, text in enumerate(titles):
             outline = pyvista.Box((b.left, b.right, -b.bottom, -b.top, 0, b.axis_height)).outline()
             self._frame.append(self._add(k, outline, color=ink, line_width=1.0))
-            self._axes[k].label(b, ("x [px]", "y [px]", third), ink, self.font_px)
+            self._axes[k].label(b, ("x [px]", "y [px]", third), (background, ink), self.font_px)
             self._titles[k].input = text
             self._titles[k].prop.color, self._titles[k].prop.font_size = ink, round(1.2 * self.font_px)
+            on_paper(self._titles[k], background)
 
     def _draw_lines(self, lines: Sequence[NDArray[Any]], look: Look) -> None:
         """Draw a line in each cloud, instead of those drawn before."""
@@ -972,7 +1013,6 @@ class Scene:
             self._divide(strip, overlaid=look.overlaid)
             camera.Dolly(1.0 / grows)
             camera.parallel_scale *= grows
-            self._views[0].reset_camera_clipping_range()
         room_px = 0.98 * whole_px[0] * (self._area[2] - self._area[0])
         self._caption.input, self._caption.prop.color = caption, ink
         self._caption.prop.font_size = fitting_font(caption, room_px, self.font_px)

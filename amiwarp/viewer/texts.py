@@ -77,6 +77,12 @@ def text_actor(text: str, colour: str, place: tuple[float, float], font_px: int 
     return actor
 
 
+def on_paper(actor: Any, colour: str) -> None:
+    """Give a text a background, so that it can be read before events."""
+    actor.prop.background_color = colour
+    actor.prop.background_opacity = 1.0
+
+
 def label_actor(colour: str, font_px: int, across: str = "center", up: str = "center") -> Any:
     """Return an empty text actor that is placed in pixels of its renderer.
 

@@ -218,7 +218,7 @@ class Window(WindowContents):
         if not self._progress or self._interrupts or self.closed or self.plotter.iren.interactor.GetDone():
             raise jobs.JobCancelled
         if (now := time.perf_counter()) >= self._progress_due_s:
-            self.message = f"{what}: {100.0 * min(share, 1.0):.0f} % (c cancels)"
+            self.message = f"{what}: {100.0 * min(share, 1.0):.0f} % ({self._progress})"
             self.request("look")
             self.turn()
             after = time.perf_counter()

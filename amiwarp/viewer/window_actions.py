@@ -56,7 +56,8 @@ class WindowActions(layout.Actions):
     _view_name = ""  # the bookmark that was shown last
     _picked = -1  # the event whose orbit is shown
     _played_s = 0.0  # when the time window was moved last by playing
-    _progress = _film_ends = False  # whether a calibration or film runs, and whether a film ends now
+    _progress = ""  # of a calibration or film that runs: the keys that stop it
+    _film_ends = False  # whether a film ends now
 
     def close(self) -> None:
         """Close the window after the current picture."""
@@ -208,18 +209,18 @@ class WindowActions(layout.Actions):
     def calibrate(self) -> None:
         """Calibrate on the shown events, or cancel the running calibration. The window goes on meanwhile."""
         if self._progress:
-            self._progress = False
+            self._progress = ""
             return
-        with self._job("calibration"):
+        with self._job("calibration", "c cancels it"):
             self.found, text = jobs.find_calibration(self.inspector, progress=self._show_progress)
             self.message = f"{text}. Press a to accept"
 
     def film(self) -> None:
         """Save a film from here on under a new name in the current folder, or end it. The window goes on meanwhile."""
-        self._film_ends = self._progress
+        self._film_ends = bool(self._progress)
         if self._progress:
             return
-        with self._job("film"):
+        with self._job("film", "f ends it, c cancels it"):
             path = self._new_name("film")
             jobs.write_film(
                 path,
@@ -235,15 +236,15 @@ class WindowActions(layout.Actions):
             self.message = f"saved {path}"
 
     @contextlib.contextmanager
-    def _job(self, what: str) -> Iterator[None]:
-        """Run a long job, which :meth:`calibrate` cancels."""
-        self._progress = True
+    def _job(self, what: str, keys: str) -> Iterator[None]:
+        """Run a long job, which :meth:`calibrate` cancels. ``keys``: those that stop it, in words."""
+        self._progress = keys
         with self.errors_shown("window"):
             try:
                 yield
             except jobs.JobCancelled:
                 self.message = f"{what} cancelled"
-        self._progress = False
+        self._progress = ""
         self.request("look")
 
     def export(self, what: str) -> None:
