@@ -34,6 +34,7 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.choices import Axis, Colour, View
+from amiwarp.imaging.palette import OFF_COLOUR
 from amiwarp.optics.models import MODELS
 from amiwarp.plotting.colours import GREY, depth_image, ticks
 from amiwarp.plotting.meshes import Box
@@ -514,6 +515,36 @@ def test_statistics_of_the_region_are_those_of_the_page(window: Window, monkeypa
     assert not window.sheets.side.renderer.GetDraw()
 
 
+def test_statistics_of_the_window_before_are_marked(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the recording is played, and after a change, until the new ones are there."""
+    window.key("i")
+    settle(window, monkeypatch)
+
+    def title() -> tuple[str, str]:
+        texts = [text for text, _, _ in texts_of(window) if text.startswith("Statistics of ")]
+        assert len(texts) == 1
+        return texts[0], chart(window, "intervals").curves[0].colour
+
+    new, old = ("Statistics of the selected events", OFF_COLOUR), ("Statistics of the former window", GREY)
+    assert title() == new
+    window.key("space")
+    for _ in range(2):
+        window._played_s -= 0.1
+        window.turn()
+        assert title() == old
+    window.key("space")
+    settle(window, monkeypatch)
+    assert title() == new
+    for change in ("n", "w"):
+        window.key(change)
+        window.turn()
+        assert title() == old, change
+        settle(window, monkeypatch)
+        assert title() == new, change
+    drag(window, "apex", 0.9)  # of which the statistics of recorded events know nothing
+    assert title() == new
+
+
 def film_of(path: Path) -> np.ndarray:
     with av.open(str(path)) as container:
         return np.array([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], np.int16)
@@ -625,7 +656,7 @@ def test_a_film_leaves_the_window_on_a_display_as_it_was(recording: Recording, t
     assert done.returncode == 0, done.stderr
     *rows, message = [line for line in done.stdout.splitlines() if not line.startswith("Warp")]
     shares = np.array([row.split() for row in rows], float)
-    assert message == "saved r.film.mp4"
+    assert message == f"saved r.film.mp4 in {tmp_path}"
     assert len(film_of(tmp_path / "r.film.mp4")) == 4
     assert len(shares) == 5
     assert (shares[:, 0] > 0.0).all()
@@ -665,6 +696,42 @@ def test_playing_moves_the_window_to_the_end(window: Window, recording: Recordin
     window.turn()
     assert not window.plays
     assert sum(window.inspector.window) == recording.events.t_last + 1
+
+
+def test_playing_is_said_and_does_not_start_again_when_it_was_to_stop(
+    window: Window, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "playing" not in said(window)
+    window.key("space")
+    window.turn()
+    assert "playing at 0.1 × real time" in said(window)
+    window.key("space")
+    window.turn()
+    assert "playing" not in said(window)
+    assert "stopped" in said(window)
+    assert "end of the recording" not in said(window)
+    window.key("space")
+    window.turn()
+    assert window.plays
+    assert "stopped" not in said(window)
+    window._played_s -= 100.0
+    window.turn()
+    assert "stopped at the end of the recording" in said(window)
+    end = window.time_window
+    window.key("space")  # of a user who saw the window move until just now
+    window.turn()
+    assert not window.plays
+    assert window.time_window == end
+    window._ended_s -= 1.1
+    window.key("space")
+    window.turn()
+    assert window.plays
+    assert window.time_window[0] < end[0]
+    assert "stopped" not in said(window)
+    window.key("space")
+    window.key("Left")
+    window.turn()
+    assert "end of the recording" not in said(window)
 
 
 def test_a_file_without_a_prism_has_one_large_cloud(recording: Recording) -> None:
@@ -718,6 +785,27 @@ def test_the_calibration_and_a_picture_are_saved_under_new_names(
     assert len(names) == 3
     assert [name.rpartition(".")[2] for name in names] == ["json", "png", "png"]
     assert "saved" in said(window)
+
+
+def test_the_message_of_a_file_names_the_folder(
+    window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for key, name in (("p", "simulation.picture.png"), ("s", "simulation.calibration.json")):
+        window.key(key)
+        assert window.message == f"saved {name} in {tmp_path}"
+    assert ("p", "save a picture of the window") in window.sheets.help_rows
+
+
+def test_the_first_state_is_also_that_of_light_and_dark(window: Window) -> None:
+    for first in (False, True):
+        window.look = replace(window.look, dark=first)
+        window.first_dark = first
+        for keys in ("do", "ddo", "do"):
+            for key in (*keys, "r"):
+                window.key(key)
+                window.turn()
+            assert (window.look.dark, window.look.overlaid) == (first, False)
 
 
 def test_calibrate_shows_its_progress_and_is_accepted(window: Window) -> None:
@@ -910,6 +998,54 @@ def test_the_mouse_reads_the_values_of_both_images(window: Window) -> None:
         mouse(window, "MouseMove", beside)
         assert window.turn()
         assert row._under == ""
+
+
+def test_the_values_below_the_images_are_always_under_the_mouse(window: Window) -> None:
+    """Also after a region was drawn, while nothing moves, and after the parameters have changed."""
+    window.whole()
+    window.turn()
+    row = window.sheets.images
+
+    def check_at(place: tuple[int, int]) -> None:
+        found = row.pixel_at(place)
+        assert found is not None
+        _, (x, y) = found
+        before, after = window.shown.image_before[y, x], window.shown.image_after[y, x]
+        expected = f"x {x}, y {y} px: {before:g} events → {after:g} events"
+        assert row._under == expected
+        assert expected in {text for text, _, _ in texts_of(window)}
+
+    frame = row.frames[0]
+    start, end = (round(frame.left + 10), round(frame.top - 10)), (round(frame.left + 60), round(frame.top - 50))
+    mouse(window, "MouseMove", start)
+    window.turn()
+    check_at(start)
+    strike(window, start, end)
+    check_at(end)
+    drag(window, "apex", 0.5)
+    check_at(end)
+    window.key("w")
+    window.turn()
+    check_at(end)
+
+
+def test_each_colour_bar_has_its_label_beside_it(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Written upwards, right of the image; it says that the numbers are at square roots, if they are."""
+    for key, label in (("", "events per pixel (square root)"), ("6", "events per pixel (square root)"), ("6", "time")):
+        if key:
+            window.key(key)
+        settle(window, monkeypatch)
+        row = window.sheets.images
+        frame = row.frames[-1]
+        found = [(text, box) for text, box, _ in texts_of(window) if text.startswith(label)]
+        assert len(found) == 1, label
+        text, (left, right, low, top) = found[0]
+        x, y = window.places.strip.left, window.places.strip.low
+        assert x + left > frame.right
+        assert right - left < 2.0 * window.places.font_px < top - low
+        assert y + low >= frame.low - 2
+        assert y + top <= frame.top + 2
+        assert text.endswith("(square root)") == (row.panels[-1].scale.gamma == 0.5)
 
 
 def test_the_images_are_those_of_the_page(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1150,7 +1286,7 @@ def test_labels_are_readable_in_front_of_events_and_not_cut(window: Window) -> N
             assert top <= high + 2, text
         second = window.scene._views[1]
         column = picture[height - second.GetOrigin()[1] - second.GetSize()[1] // 2, :, :]
-        assert (column[second.GetOrigin()[0]] < 100).all()
+        assert tuple(column[second.GetOrigin()[0]]) == pyvista.Color(GREY).int_rgb
     assert covered > 0
 
 
@@ -1436,6 +1572,7 @@ def test_filters_say_the_rates_before_and_after_them(plain: Window) -> None:
     plain.turn()
     assert plain.inspector.selection.noise_us is None
     assert plain.inspector.selection.hide_hot
+    assert "1 hot pixel hidden; x 73, y 28: 84 events/s" in said(plain)
     plain.key("bracketleft")
     plain.turn()
     assert plain.image is ImageKind.DECAY
@@ -1443,6 +1580,33 @@ def test_filters_say_the_rates_before_and_after_them(plain: Window) -> None:
     plain.key("bracketright")
     plain.turn()
     assert plain.decay_us == DECAY_US
+
+
+def test_hot_pixels_are_named_when_they_are_hidden(recording: Recording) -> None:
+    events, size = recording.events.slice(0, len(recording.events)), recording.events.size
+    rng = np.random.default_rng(1)
+    places_of = {(7, 5): 4_000, (100, 80): 5_000, (60, 20): 3_000, (30, 70): 2_500}
+    parts = [events]
+    for (x, y), count in places_of.items():
+        t = np.sort(rng.integers(events.t[0], events.t[-1], count))
+        parts.append(Events(np.full(count, x, np.uint16), np.full(count, y, np.uint16), t, np.ones(count, np.uint8)))
+    together = Events.concatenate(parts)
+    noisy = MemoryEvents(together[np.argsort(together.t, kind="stable")], *size)
+    window = Window(Inspector(replace(recording, events=noisy, encoder=None, prism=None, truth=None)), size=SIZE,
+                    off_screen=True)  # fmt: skip
+    window.key("7")
+    window.turn()
+    found = window.inspector.hot_pixels
+    assert [(each.x, each.y) for each in found[:3]] == [(100, 80), (7, 5), (60, 20)]
+    words = " ".join(said(window).split())
+    assert f"{len(found)} hot pixels hidden; with the highest rates: x 100, y 80: {found[0].rate:,.0f} ev" in words
+    assert f"x 60, y 20: {found[2].rate:,.0f} events/s" in words
+    assert "x 30, y 70" not in words
+    assert found[0].rate == pytest.approx(5_000 / 0.25, rel=0.05)
+    window.key("7")
+    window.turn()
+    assert "hot pixels hidden" not in said(window)
+    window.scene.close()
 
 
 def test_a_plain_recording_has_the_whole_image_beside_a_region(plain: Window, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -704,7 +704,7 @@ class Look:
 
 
 def side_line() -> Any:
-    """Return a line at the left side of a renderer."""
+    """Return a grey line at the left side of a renderer."""
     import pyvista
     from vtkmodules.vtkRenderingCore import vtkActor2D, vtkCoordinate, vtkPolyDataMapper2D
 
@@ -714,6 +714,7 @@ def side_line() -> Any:
     mapper.SetInputData(pyvista.Line((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     mapper.ScalarVisibilityOff()  # PyVista's line has numbers along it
     actor.SetMapper(mapper)
+    actor.GetProperty().SetColor(pyvista.Color(GREY).float_rgb)
     actor.GetProperty().SetLineWidth(2.0)  # of which the right half is inside
     return actor
 
@@ -772,8 +773,7 @@ class Scene:
         for renderer, title in zip(self._views, self._titles, strict=True):
             renderer.add_actor(title, render=False, pickable=False, reset_camera=False)
             renderer.AddObserver("StartEvent", lambda caller, _: self._before_drawing(caller))
-        self._border = side_line()  # left of the second cloud, as zoomed clouds would touch each other
-        self._views[1].AddActor(self._border)
+        self._views[1].AddActor(side_line())  # as zoomed clouds would touch each other
         self._lines: list[Any] = []
         self._explained: tuple[Any, ...] = ()
         self._caption = text_actor("", "black", (0.01, 0.9))
@@ -964,7 +964,6 @@ class Scene:
             renderer.set_background(background)
         for renderer in self._views:
             renderer.remove_actor(self._frame, render=False)
-        self._border.GetProperty().SetColor(pyvista.Color(ink).float_rgb)
         titles = (" and ".join(look.titles),) if look.overlaid else look.titles
         third = "θ [°]" if look.axis is Axis.ANGLE else "t [ms]"
         for title, axes in zip(self._titles, self._axes, strict=True):

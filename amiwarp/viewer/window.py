@@ -60,6 +60,7 @@ class Window(WindowContents):
         self.inspector, self.view = inspector, view
         self.bookmarks = None if inspector.path is None else Bookmarks(inspector.path)
         self.look = look or Look(axis=Axis.ANGLE if self.compensates else Axis.TIME)
+        self.first_dark = self.look.dark
         self.statistics_shown = not self.compensates  # in place of the charts of the sharpness
         self.knob, self.message = inspector.orbit_names[0], ""
         self.sheets = Sheets(list(self.plotter.renderers)[-RENDERERS:], self)
@@ -182,6 +183,7 @@ class Window(WindowContents):
         elif self.plays:
             self.plays = self.advance(1e6 * SPEED * (now - self._played_s), loop=self.loop)
             self._played_s = now
+            self._ended_s = -math.inf if self.plays else now
 
     def _follow(self, latest: Callable[[], Recording], now: float) -> None:
         """Show the figures of a live stream, and its last events if it is followed."""

@@ -2,8 +2,9 @@
 
 import contextlib
 import itertools
+import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from amiwarp.imaging.regions import Region
 from amiwarp.optics.models import alternatives
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look, Scene
+from amiwarp.viewer.filters import HotPixel
 from amiwarp.viewer.inspector import DisplayedWindow, colours_on_offer
 from amiwarp.viewer.window_controls import Slider
 from amiwarp.viewer.window_keys import KEYS, OF_OPTICS, X_KEYS
@@ -24,6 +26,10 @@ SPEED = 0.1
 """Speed of playing, relative to real time."""
 FINE = ("start_ms", "length_ms")
 """Sliders of the time window."""
+STOP_S = 1.0
+"""Time after the end of playing in which the key for it still means to stop [s]."""
+NAMED_HOT = 3
+"""Number of hot pixels that the message names."""
 NOISE_US = 2_000
 """Time of the noise filter [us]."""
 DECAY_ENDS = (10, 10_000_000)
@@ -41,6 +47,8 @@ class WindowActions(layout.Actions):
     sheets: Sheets
     shown: DisplayedWindow
     """What the window shows."""
+    first_dark: bool
+    """Whether the window was dark at first."""
     knob: str
     """Parameter that the arrow keys move, and over which the first curve is."""
     message: str
@@ -56,6 +64,7 @@ class WindowActions(layout.Actions):
     _view_name = ""  # the bookmark that was shown last
     _picked = -1  # the event whose orbit is shown
     _played_s = 0.0  # when the time window was moved last by playing
+    _ended_s = -math.inf  # when playing came to the end of the recording
     _progress = ""  # of a calibration or film that runs: the keys that stop it
     _film_ends = False  # whether a film ends now
 
@@ -140,6 +149,9 @@ class WindowActions(layout.Actions):
         selection = self.inspector.selection
         if name == "hide_hot":
             self._select(hide_hot=not selection.hide_hot)
+            if self.inspector.selection.hide_hot:
+                self.update()  # which clears the message before
+                self.say(self.message or _hot_text(self.inspector.hot_pixels))
         else:
             self._select(noise_us=NOISE_US if selection.noise_us is None else None)
 
@@ -193,6 +205,11 @@ class WindowActions(layout.Actions):
             compensated = self.compensates
             self.say("" if self._picked < 0 else drawing.event_text(self.shown, self._picked, compensated=compensated))
 
+    def reset(self) -> None:
+        """Show the first state again, also light or dark, which the history does not hold."""
+        super().reset()
+        self.restyle(dark=self.first_dark)
+
     def whole(self) -> None:
         """Show the whole image."""
         self._select(region=None)
@@ -203,8 +220,18 @@ class WindowActions(layout.Actions):
         self.request("knobs")
 
     def play(self) -> None:
-        """Play the recording from the current window, or follow a live stream; stop if already playing."""
-        self.plays, self._played_s = not self.plays and self.can_play(), time.perf_counter()
+        """Play the recording from the current window, or follow a live stream; stop if already playing.
+
+        Who wants to stop just when playing ends does not start it again.
+        """
+        now = time.perf_counter()
+        if now - self._ended_s < STOP_S:
+            return
+        was, self.plays, self._played_s = self.plays, not self.plays and self.can_play(), now
+        if was:
+            self.say("stopped")
+        elif self.plays:
+            self.say("")
 
     def calibrate(self) -> None:
         """Calibrate on the shown events, or cancel the running calibration. The window goes on meanwhile."""
@@ -233,7 +260,7 @@ class WindowActions(layout.Actions):
                 speed=SPEED,
                 ended=lambda: self._film_ends,
             )
-            self.message = f"saved {path}"
+            self.message = f"saved {path} in {path.parent.resolve()}"
 
     @contextlib.contextmanager
     def _job(self, what: str, keys: str) -> Iterator[None]:
@@ -255,7 +282,7 @@ class WindowActions(layout.Actions):
                 save_png(path, self.scene.picture())
             else:
                 self.inspector.as_calibration().save(path)
-            self.say(f"saved {path}")
+            self.say(f"saved {path} in {path.parent.resolve()}")
 
     def choose_next_beside(self) -> None:
         """Show the next of the recordings that are on the same time axis."""
@@ -334,6 +361,15 @@ class WindowActions(layout.Actions):
     @property
     def _image_name(self) -> str:
         return "difference" if self.difference else self.image.value
+
+
+def _hot_text(hot: Sequence[HotPixel]) -> str:
+    """Return how many hot pixels there are, and the places and rates of the busiest ones."""
+    if not hot:
+        return "no hot pixels found"
+    busiest = "; ".join(f"x {each.x}, y {each.y}: {each.rate:,.0f} events/s" for each in hot[:NAMED_HOT])
+    most = "with the highest rates: " if len(hot) > NAMED_HOT else ""
+    return f"{len(hot):,} hot pixel{'s' if len(hot) > 1 else ''} hidden; {most}{busiest}"
 
 
 def _following(choices: list[Any], now: Any) -> Any:

@@ -1,5 +1,6 @@
 """What the parts of the window show: sliders, texts, timeline, images and curves, as the inspector computes them."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -14,7 +15,7 @@ from amiwarp.plotting.colours import count_scale
 from amiwarp.viewer import drawing, layout
 from amiwarp.viewer.drawing import ImageKind, ShownImages
 from amiwarp.viewer.filters import step_rows
-from amiwarp.viewer.window_actions import WindowActions
+from amiwarp.viewer.window_actions import SPEED, WindowActions
 from amiwarp.viewer.window_controls import Slider
 from amiwarp.viewer.window_images import Panel, panels_of
 from amiwarp.viewer.window_keys import help_rows
@@ -29,6 +30,7 @@ class WindowContents(WindowActions):
         self.curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         """Values and sharpness of the curves by parameter, in the units of the sliders."""
         self._curves_of: dict[str, Any] = {}  # window and selection of which the curves are
+        self._statistics_of: Any = None  # window and selection of which the statistics are
         self._images: tuple[str, ShownImages] | None = None  # with their name
         self._scale_held = False  # whether the images have the scale of before a slider moved
         self._count_anew()
@@ -67,9 +69,18 @@ class WindowContents(WindowActions):
             rate, notes = f"model {self.inspector.knobs.model}, {rate}", layout.notes(self.inspector)
         steps = [f"{name}: {rates}" for name, rates, _ in step_rows(shown.steps, shown.read_us)]
         both = [", ".join(row) for row in drawing.beside_rows(self.inspector, shown)]
-        self.sheets.controls.texts = [rate, *steps, *both, "h: help", "", self.message, *notes]
+        self.sheets.controls.texts = [rate, *steps, *both, "h: help", "", *self._playing, self.message, *notes]
         self.sheets.controls.rows = self._stream
+        self.sheets.statistics_old = self._statistics_of not in (None, self.inspector.chosen)
         self.sheets.help_rows = help_rows(optic=self._has_controls, depth=self.inspector.depth is not None)
+
+    @property
+    def _playing(self) -> list[str]:
+        """Say that a recording is played, or that this has ended; a live stream has figures of its own."""
+        if self.plays and self.inspector.latest is None:
+            return [f"playing at {SPEED:g} × real time; space stops"]
+        at_end = sum(self.time_window) > self.inspector.recording.events.t_last
+        return ["stopped at the end of the recording"] if at_end and math.isfinite(self._ended_s) else []
 
     def _show_timeline(self) -> None:
         """Give the time window and the rates to the timeline."""
@@ -148,6 +159,7 @@ class WindowContents(WindowActions):
         """Compute statistics, a log intensity and sharpness curves in steps, so that the window follows its user."""
         if self.statistics_shown:
             self.sheets.show_statistics(self.inspector.statistics())
+            self._statistics_of = self.inspector.chosen
             self.sheets_changed()
             yield
         if self.image is ImageKind.LOG_INTENSITY:

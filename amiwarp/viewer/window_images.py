@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from amiwarp.imaging.regions import Region
 from amiwarp.plotting.colours import Scale
 from amiwarp.viewer.drawing import ORBIT_COLOUR, ShownImages
-from amiwarp.viewer.texts import LINE, text_width
+from amiwarp.viewer.texts import LINE, fitting_font, text_width
 from amiwarp.viewer.window_layout import Rect
 from amiwarp.viewer.window_paper import LINES, Paper
 
-BAR_EM = 1.0
-"""Width of a colour bar, in sizes of the font."""
+BAR_EM, LABEL_EM = 1.0, 1.0
+"""Width of a colour bar, and of its label, which is written upwards, in sizes of the font."""
 SQUARE = 32
 """Width and height of the legend of two polarities [colours]."""
 LEAST_REGION_PX = 4
@@ -38,6 +38,11 @@ def value_text(value: NDArray[np.float32], scale: Scale) -> str:
     if not math.isfinite(float(value)):
         return scale.missing_text
     return f"{float(value):g} events" if scale.counts else f"{float(value):.4g} {scale.unit}"
+
+
+def bar_label(scale: Scale) -> str:
+    """Return the label of a colour bar, which says if its numbers are not at equal distances."""
+    return f"{scale.label} (square root)" if scale.gamma == 0.5 else scale.label
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +82,7 @@ class ImageRow:
         self._drawn_on = 0  # the image on which a region is drawn
         self._start: tuple[int, int] | None = None
         self._end: tuple[int, int] = (0, 0)
+        self._mouse = -1, -1  # where the mouse was last
         self._under = ""  # what is under the mouse
 
     def pixel_at(self, place: tuple[int, int]) -> tuple[int, tuple[int, int]] | None:
@@ -98,12 +104,13 @@ class ImageRow:
         found = self.pixel_at(place)
         if found is None:
             return False
-        self._drawn_on, self._start = found
+        self._mouse, (self._drawn_on, self._start) = place, found
         self._end = self._start
         return True
 
     def drag(self, place: tuple[int, int]) -> None:
         """Follow the mouse with the other corner of the region."""
+        self._mouse = place
         self._end = self._pixel(self._drawn_on, place)
         self._changed()
 
@@ -128,14 +135,19 @@ class ImageRow:
 
     def hover(self, place: tuple[int, int]) -> bool:
         """Describe the pixel under the mouse; return whether the description has changed."""
-        before, self._under, found = self._under, "", self.pixel_at(place)
+        before, self._mouse = self._under, place
+        self._read()
+        return self._under != before
+
+    def _read(self) -> None:
+        """Describe the pixel that is under the mouse now: the images may have changed since it moved."""
+        self._under, found = "", self.pixel_at(self._mouse)
         if found is not None:
             k, (x, y) = found
             left, top, *_ = self.panels[k].region
             same = [each for each in self.panels if each.region == self.panels[k].region]
             values = [(each.values[..., y - top, x - left], each.scale) for each in same if each.values is not None]
             self._under = f"x {x}, y {y} px: {' → '.join(value_text(*each) for each in values)}"
-        return self._under != before
 
     def draw(self, paper: Paper, rect: Rect) -> None:
         """Draw the images into a part of the window."""
@@ -161,9 +173,12 @@ class ImageRow:
             if self._has_bar(k):
                 self._draw_bar(paper, Rect(x, frame.low, x + BAR_EM * em, frame.top), panel.scale)
                 x += BAR_EM * em + self._bar_space(panel.scale, em)
+                label = bar_label(panel.scale)
+                size = fitting_font(label, frame.height, em)
+                paper.text(label, x - LABEL_EM * em, frame.low, font_px=size, upwards=True)
         self._draw_regions(paper)
-        label = self.panels[-1].scale.label if self.panels else ""
-        words = self._region_text() or self._under or self.note or label
+        self._read()
+        words = self._region_text() or self._under or self.note
         paper.text(words, rect.left + em, low - 0.4 * em, up="top")
 
     def _has_bar(self, k: int) -> bool:
@@ -187,11 +202,11 @@ class ImageRow:
         return self._drawn[k][3]
 
     def _bar_space(self, scale: Scale, em: int) -> float:
-        """Return the width of the numbers of a colour bar, and of the gaps beside them [px]."""
+        """Return the width of the numbers and the label of a colour bar, and of the gaps beside them [px]."""
         return (
-            1.4 * em
+            (1.4 + LABEL_EM) * em
             + max((text_width(text, em) for _, text in scale.ticks()), default=0.0)
-            + (2.0 * em if scale.colours == "polarity" else 0.0)
+            + (3.5 * em if scale.colours == "polarity" else 0.0)
         )
 
     def _draw_bar(self, paper: Paper, bar: Rect, scale: Scale) -> None:

@@ -46,7 +46,9 @@ MORE_KEYS = (
     ("q", ("close",), "close the window"),
 )
 """Keys that only the window has, as :data:`amiwarp.viewer.layout.KEYS`."""
-KEYS = layout.KEYS + MORE_KEYS
+WINDOW_WORDS = {"p": "save a picture of the window"}
+"""Help of keys that do something else in the window than on the page."""
+KEYS = tuple((key, action, WINDOW_WORDS.get(key, words)) for key, action, words in layout.KEYS) + MORE_KEYS
 """All keys of the window."""
 OF_OPTICS = {"t", "o", "b", "c", "a", "s", "Up", "Down", "Tab", "m", "v", "e"}
 """Keys that act on a prism or on compensated events."""

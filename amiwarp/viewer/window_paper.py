@@ -71,12 +71,17 @@ class Paper:
         across: str = "left",
         up: str = "middle",
         font_px: int = 0,
+        upwards: bool = False,
     ) -> None:
-        """Write a text. ``across`` and ``up``: which of its sides are at the place; ``font_px``: another size [px]."""
+        """Write a text. ``across`` and ``up``: which of its sides are at the place; ``font_px``: another size [px].
+
+        ``upwards``: turned by a quarter to the left, as are its sides.
+        """
         actor = self._next(TEXTS, _text_actor)
         prop = actor.GetTextProperty()
         prop.SetColor(_rgb(colour or self.ink))
         prop.SetFontSize(font_px or self.font_px)
+        prop.SetOrientation(90.0 if upwards else 0.0)
         prop.SetJustification(JUSTIFY[across])
         prop.SetVerticalJustification(JUSTIFY[up])
         actor.SetInput(text)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from amiwarp.imaging.palette import OFF_COLOUR
 from amiwarp.imaging.regions import Region
 from amiwarp.plotting.colours import GREY
 from amiwarp.viewer import drawing, layout
@@ -43,6 +44,8 @@ class Sheets:
         self.charts: dict[str, Chart] = {}
         """Charts by the name of the parameter, or "orbit" and "intervals"."""
         self.statistics: list[str] = []
+        self.statistics_old = False
+        """Whether the statistics are of the window or selection before; they are then grey."""
         self.help_rows: list[tuple[str, str]] = []
         """Keys, and what they do."""
 
@@ -138,13 +141,17 @@ class Sheets:
         paper, em = self.side, places.font_px
         paper.clear(places.side, places.size, em, PANEL_COLOURS[dark])
         inner = places.side.inset(em, em, em, em)
-        for k, row in enumerate(["Statistics of the selected events", *self.statistics]):
-            paper.text(row, inner.left, inner.top - k * LINE * em, up="top")
+        ink = GREY if self.statistics_old else ""
+        title = f"Statistics of the {'former window' if self.statistics_old else 'selected events'}"
+        for k, row in enumerate([title, *self.statistics]):
+            paper.text(row, inner.left, inner.top - k * LINE * em, colour=ink, up="top")
         if inner.width > 1.5 * inner.height:  # the chart beside the rows, or below them
             chart = Rect(0.5 * (inner.left + inner.right), inner.low, inner.right, inner.top)
         else:
             top = inner.top - (len(self.statistics) + 2) * LINE * em
             chart = Rect(inner.left, max(inner.low, top - 20 * em), inner.right, top)
+        histogram, _ = self.charts["intervals"].curves
+        histogram.colour = ink or OFF_COLOUR
         self.charts["intervals"].draw(paper, chart)
         paper.end()
 
