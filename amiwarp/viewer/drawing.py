@@ -773,7 +773,8 @@ class Scene:
         for renderer, title in zip(self._views, self._titles, strict=True):
             renderer.add_actor(title, render=False, pickable=False, reset_camera=False)
             renderer.AddObserver("StartEvent", lambda caller, _: self._before_drawing(caller))
-        self._views[1].AddActor(side_line())  # as zoomed clouds would touch each other
+        if more:  # a window, in which zoomed clouds would touch each other
+            self._views[1].AddActor(side_line())
         self._lines: list[Any] = []
         self._explained: tuple[Any, ...] = ()
         self._caption = text_actor("", "black", (0.01, 0.9))
