@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -1040,12 +1041,231 @@ def test_ticks_stay_at_every_zoom_and_points_leave_title_and_ticks_alone(page: A
         assert (left.max(axis=2) - left.min(axis=2)).max() < 40
 
 
-def test_a_message_does_not_cover_the_axes(page: Any) -> None:
+FRAMES = """async (views) => {
+    const page = [...document.scripts].find((each) => each.src.endsWith('/page.js')).src;
+    const { Camera, seenPart } = await import(page.replace('page.js', 'camera.js'));
+    const { drawFrame } = await import(page.replace('page.js', 'frame.js'));
+    const context = document.createElement('canvas').getContext('2d');
+    return views.map(({ azimuth, elevation, zoom, at, size, region, third }) => {
+        const [left, top, right, bottom] = region;
+        const half = [(right - left) / 2, (bottom - top) / 2, 0.375 * Math.max(right - left, bottom - top)];
+        const camera = new Camera('free');
+        Object.assign(camera, { azimuth, elevation });
+        camera.scale(zoom, ...at);
+        const projection = camera.project(half, ...size);
+        const box = seenPart(half, projection);
+        const all = [[left, right], [bottom, top], third];
+        const axes = all.map(([low, high], k) => ({
+            title: ['x (px)', 'y (px)', 'θ (°)'][k],
+            ends: box.map((end) => low + ((end[k] + half[k]) / (2 * half[k])) * (high - low)),
+        }));
+        const labels = drawFrame(context, projection, box, axes, ['#000000', '#ffffff'], 12, size);
+        const corners = [0, 1, 2, 3, 4, 5, 6, 7].map(
+            (n) => projection.at([0, 1, 2].map((k) => box[(n >> k) & 1][k])).slice(0, 2),
+        );
+        const place = (label) => { // where its value is on the four edges of the whole box
+            return [0, 1, 2, 3].map((n) => projection.at([0, 1, 2].map((k) => {
+                const [low, high] = all[k];
+                if (k === label.axis) return -half[k] + ((label.value - low) / (high - low)) * 2 * half[k];
+                const other = [0, 1, 2].filter((each) => each !== label.axis).indexOf(k);
+                return ((n >> other) & 1 ? 1 : -1) * half[k];
+            })).slice(0, 2));
+        };
+        return { corners, labels: labels.map((label) => ({ ...label, edges: label.title ? [] : place(label) })) };
+    });
+}"""
+
+
+def frames(page: Any, views: list[dict[str, Any]]) -> list[tuple[dict[str, Any], np.ndarray, list[dict[str, Any]]]]:
+    """Return views, the corners of their boxes, shape ``(8, 2)``, and their labels [px]."""
+    found = page.evaluate(FRAMES, views)
+    return [(view, np.array(each["corners"]), each["labels"]) for view, each in zip(views, found, strict=True)]
+
+
+def overlapping(labels: list[dict[str, Any]]) -> bool:
+    boxes = [label["box"] for label in labels]
+    return any(
+        a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3] for k, a in enumerate(boxes) for b in boxes[:k]
+    )
+
+
+def inside_hull(corners: np.ndarray, place: list[float], margin: float) -> bool:
+    """Return whether a place is in the outline of the corners, by more than a margin [px]."""
+    around = np.array([[math.cos(angle), math.sin(angle)] for angle in np.linspace(0.0, math.tau, 180, endpoint=False)])
+    return bool(((around @ corners.T).max(axis=1) - around @ np.array(place) > margin).all())
+
+
+SHEETS = ([532, 360], [1064, 360], [764, 590], [390, 300])
+REGIONS = ([208, 154, 314, 234], [0, 0, 320, 240], [0, 0, 1280, 720], [40, 10, 60, 90])
+
+
+@pytest.mark.parametrize("third", [[0, 360], [38.349, 57.523]])
+def test_each_axis_has_two_numbers_at_the_outline_of_the_box(page: Any, third: list[float]) -> None:
+    views = [
+        {"azimuth": azimuth, "elevation": elevation, "zoom": 1.0, "at": [0, 0], "size": size, "region": box,
+         "third": third}
+        for azimuth in [math.atan2(-1.35, 1), *np.arange(-3.0, 3.2, 0.55).tolist()] for elevation in (0.42, -0.3, 0.9)
+        for size in SHEETS for box in REGIONS
+    ]  # fmt: skip
+    for view, corners, labels in frames(page, views):
+        assert not overlapping(labels), view
+        for axis in range(3):
+            numbers = [label for label in labels if label["axis"] == axis and not label.get("title")]
+            assert len(numbers) >= 2, (view, axis)
+            for label in numbers:
+                assert float(label["text"]) == pytest.approx(label["value"], rel=1e-5, abs=1e-9)
+                assert min(math.dist(label["from"], edge) for edge in label["edges"]) < 0.5, (view, label)
+                assert not inside_hull(corners, label["middle"], 2.0), (view, label)
+        assert {label["axis"] for label in labels if label.get("title")} == {0, 1, 2}, view
+
+
+def test_at_the_first_view_the_full_turn_has_both_ends(page: Any) -> None:
+    first = {"azimuth": math.atan2(-1.35, 1), "elevation": 0.42, "zoom": 1.0, "at": [0, 0], "third": [0, 360]}
+    for view, _, labels in frames(page, [{**first, "size": size, "region": box} for size in SHEETS for box in REGIONS]):
+        assert {"0", "360"} <= {label["text"] for label in labels if label["axis"] == 2}, view
+
+
+def test_close_to_the_cloud_the_box_stays_whole_and_numbers_are_at_the_border_or_its_outline(page: Any) -> None:
+    rng = np.random.default_rng(5)
+    first = {"third": [0, 360]}
+    total = inside = 0
+    views = [
+        {**first, "azimuth": azimuth, "elevation": elevation, "zoom": zoom, "size": size, "region": box,
+         "at": (min(size) * rng.uniform(-0.15, 0.15, 2)).tolist()}
+        for zoom in (1.5, 2.5, 6.0, 30.0) for azimuth in (math.atan2(-1.35, 1), 0.6, 2.4) for elevation in (0.42, 0.15)
+        for size in SHEETS for box in REGIONS[:3]
+    ]  # fmt: skip
+    for view, corners, labels in frames(page, views):
+        width, height = view["size"]
+        spread = np.ptp(corners, axis=0)
+        assert max(spread / np.array(view["size"])) > 0.55 * view["zoom"], view  # the box grows with the points
+        assert not overlapping(labels), view
+        for label in labels:
+            left, top, right, bottom = label["box"]
+            assert min(left, top - 24) >= 0, (view, label)
+            assert min(width - right, height - bottom) >= 0, (view, label)
+        for axis in range(3):
+            numbers = [label for label in labels if label["axis"] == axis and not label.get("title")]
+            assert len(numbers) >= 2, (view, axis)
+            for label in numbers:
+                x, y = label["from"]
+                at_edge = min(math.dist(label["from"], edge) for edge in label["edges"]) < 0.5
+                at_border = min(x, width - x, y - 26, height - y) < 0.5
+                total += 1
+                inside += not (at_edge or at_border)
+    assert total > 0
+    assert inside < 0.01 * total  # where no face with the axis is in the picture
+
+
+SAID_MS = 6000
+
+
+def test_a_message_moves_no_cloud_and_only_what_was_saved_is_said_for_a_short_time(
+    page: Any, kept: Any, tabs: Tabs
+) -> None:
+    canvas = page.locator(".clouds canvas").bounding_box()
     page.evaluate("trame.trigger('typed', ['apex', 'x'])")
     message(page, "is not a number")
-    canvas, text = (page.locator(name).bounding_box() for name in (".clouds canvas", "#message"))
-    assert text["y"] + text["height"] <= canvas["y"]
-    page.locator("#message button").click()
+    assert page.locator(".clouds canvas").bounding_box() == canvas
+    text = page.locator("#message").bounding_box()
+    assert text["y"] >= canvas["y"]
+    assert text["y"] + text["height"] <= canvas["y"] + 40  # above the box, where the title is
+    page.wait_for_timeout(SAID_MS + 500)
+    assert page.locator("#message").is_visible()
+    for severity in ("info", "success"):  # of a bookmark and of a file
+        tabs.loop.call_soon_threadsafe(kept[1].say, "saved 'from above'", severity)
+        message(page, "from above")
+        page.wait_for_timeout(SAID_MS / 2)
+        assert page.locator("#message").is_visible()
+        page.locator("#message").wait_for(state="detached", timeout=SAID_MS)
+
+
+def test_the_viewpoint_is_marked_until_the_cloud_is_turned(page: Any) -> None:
+    def marked() -> list[str]:
+        found: list[str] = page.locator("[id^=view-][aria-pressed=true]").evaluate_all("all => all.map(one => one.id)")
+        return found
+
+    x, y = middle(page, ".clouds canvas")
+    for view in ("free", "x-θ"):
+        page.locator(f"#view-{view}").click()
+        until(lambda view=view: marked() == [f"view-{view}"])
+        page.mouse.move(x, y)
+        page.mouse.wheel(0, -100)  # closer, from the same side
+        page.wait_for_timeout(100)
+        assert marked() == [f"view-{view}"]
+        page.mouse.down()
+        page.mouse.move(x + 40, y + 10, steps=3)
+        page.mouse.up()
+        until(lambda: marked() == [])
+    page.locator("#view-x-θ").click()
+    until(lambda: marked() == ["view-x-θ"])
+    page.locator(".clouds canvas").focus()
+    page.keyboard.press("Shift+ArrowLeft")
+    until(lambda: marked() == [])
+
+
+def test_a_zoomed_timeline_goes_on_with_the_window_that_is_played(page: Any, kept: Any) -> None:
+    state = kept[1].state
+    page.evaluate("trame.trigger('zoom_timeline', [0, 150])")
+    until(lambda: state.rate_span == [0, 150])
+    enter(page, "start_ms", 200)
+    ready(page)
+    assert state.rate_span == [0, 150]  # somebody may look at another part of the recording
+    enter(page, "start_ms", 40)
+    ready(page)
+    page.locator("#speed").select_option("0.3")
+    page.locator("#do-play").click()
+    until(lambda: state.rate_span[0] > 10.0)
+    page.locator("#do-play").click()
+    ready(page)
+    low, high = state.rate_span
+    assert high - low == pytest.approx(150.0)
+    assert low <= state.start_ms
+    assert state.start_ms + state.length_ms <= high
+
+
+NARROW = 15  # width of the scrollbar [px], which a browser without a screen does not show
+
+
+@pytest.mark.parametrize("size", [(1366, 768), (1920, 1080), (1024, 700)])
+def test_texts_of_the_controls_are_whole_and_apart(page: Any, size: tuple[int, int]) -> None:
+    try:
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        page.add_style_tag(content=f".side {{ border-right: {NARROW}px solid }}")
+        page.wait_for_timeout(150)
+        rows = "all => all.map((one) => [one.textContent, one.getClientRects().length])"
+        parts = page.locator("#steps dd").first.locator(".part").evaluate_all(rows)
+        assert [re.sub(r"[\d.]+", "1", text) for text, _ in parts] in (["1 →", "1 Mev/s"], ["1 →", "1 kev/s"])
+        assert {lines for _, lines in page.locator("#steps .part").evaluate_all(rows)} == {1}
+        hint = page.locator(".side .hint").first
+        words = hint.inner_text()
+        hint.evaluate("(one, name) => { one.textContent = name; }", f"in {'long_name_' * 8}.aedat4.view.json")
+        assert hint.evaluate("one => one.scrollWidth <= one.clientWidth")
+        hint.evaluate("(one, words) => { one.textContent = words; }", words)
+        for alone in (False, True):  # without a prism, the page has other columns
+            page.evaluate("alone => document.querySelector('.page').classList.toggle('alone', alone)", alone)
+            spans = page.locator(".filters label").evaluate_all("""all => all.map((one) => {
+                const range = document.createRange();
+                range.setStart(one, 0);
+                range.setEndBefore(one.querySelector('.number'));
+                const box = range.getBoundingClientRect();
+                return [box.left, box.right];
+            })""")
+            assert all(right + 1 < left for (_, right), (left, _) in pairwise(spans)), spans
+            assert spans[-1][1] <= page.locator(".filters").evaluate("one => one.getBoundingClientRect().right")
+            page.locator("#field-start_ms").evaluate("one => { one.value = '208.309'; }")
+            assert page.locator("#field-start_ms").evaluate("one => one.scrollWidth <= one.clientWidth")
+        wide = page.locator(".side *").evaluate_all("""all => {
+            const side = document.querySelector('.side');
+            const edge = side.getBoundingClientRect().left + side.clientWidth;
+            const wide = all.filter((one) => one.getBoundingClientRect().right > edge + 1);
+            return wide.map((one) => one.outerHTML.slice(0, 120));
+        }""")
+        assert wide == []
+    finally:
+        page.evaluate("document.querySelector('.page').classList.remove('alone')")
+        page.evaluate("document.head.lastElementChild.remove()")
+        page.set_viewport_size({"width": SIZES[0][0], "height": SIZES[0][1]})
 
 
 def test_control_z_undoes_and_the_look_is_kept_on_reload(opened: Open) -> None:

@@ -408,7 +408,7 @@ SETTABLE: dict[str, Check] = {
 }  # fmt: skip
 """State variables that the page may set directly, with the check of their values. The page changes all others through
 :data:`CALLS`."""
-CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice", "sliced", "marked", "picture_scale", "view_name")
+CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice", "sliced", "turned", "marked", "picture_scale", "view_name")
 """State variables that the browser keeps to itself."""
 EMPTY: tuple[tuple[Any, str], ...] = (
     ("", "trame_error_report_msg stream_note hover measured address events drawn sharpness message rate_note "
@@ -684,7 +684,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "kinds": [each.value for each in ImageKind if each is not ImageKind.DEPTH or inspector.depth is not None],
         "speed": 0.1, "noise_ms": 2.0, "region_kind": "whole", "region_wanted": [0, 0, *size],
         "region": [0, 0, *size], "knob": inspector.orbit_names[0], "point_size": 2, "opacity": 1.0, "orbit_shown": True,
-        "view": [View.FREE.value, 0], "tool": "region", "late": 0, "slice": [0.0, 1.0], "sliced": "",
+        "view": [View.FREE.value, 0], "tool": "region", "late": 0, "slice": [0.0, 1.0], "sliced": "", "turned": False,
         "severity": "info", "picked": -1, "picture_scale": 2, **filter_state(inspector.selection),
         "decay_ms": DECAY_US * 1e-3, "against": "recorded", "progress": 0, "calibrate_on": ["", ""],
         "curve_mark": 0.0, "third_axis": {"low": 0.0, "high": 1.0, "title": ""},

@@ -55,7 +55,7 @@ export class Camera {
     const x = MARGIN.left + free[0] / 2 + this.right;
     const y = MARGIN.top + free[1] / 2 + this.up;
     return {
-      away, right, up, depth, reach, scale, x, y, along, free, zoom: this.zoom, shift: [this.right, this.up],
+      away, right, up, depth, reach, scale, x, y, along, free, shift: [this.right, this.up],
       at(point) {
         const w = 1 - depth * dot(away, point);
         return [x + (scale * dot(right, point)) / w, y - (scale * dot(up, point)) / w, dot(away, point)];
@@ -64,14 +64,21 @@ export class Camera {
   }
 }
 
-// Return the corners [low, high] of the part of a box that is seen: its axes get the ticks at every zoom.
-export function seenPart(half, { right, up, along, free, scale, zoom, shift }) {
+// Return the place in the box that is seen in the middle of the picture, in the plane through the middle of the box.
+export function seenMiddle({ right, up, scale, shift }) {
+  return [0, 1, 2].map((k) => (up[k] * shift[1] - right[k] * shift[0]) / scale);
+}
+
+// Return the corners [low, high] of the part of a box that gets a frame. In a view along an axis it is the part that is
+// seen, so that numbers are next to it at every zoom; else it is all of the box, whose points are seen in depth.
+export function seenPart(half, projection) {
+  const { right, up, along, free, scale } = projection;
+  if (!along) return [half.map((each) => -each), [...half]];
   const reach = [0, 1, 2].map((k) => {
-    if (!along) return half[k] / Math.max(zoom, 1);
     const wide = Math.abs(right[k]) > 0.5 ? free[0] : Math.abs(up[k]) > 0.5 ? free[1] : Infinity;
     return wide / (2 * scale);
   });
-  const middle = [0, 1, 2].map((k) => (up[k] * shift[1] - right[k] * shift[0]) / scale);
+  const middle = seenMiddle(projection);
   const low = middle.map((at, k) => Math.max(-half[k], Math.min(at - reach[k], half[k] - 1e-3)));
   return [low, middle.map((at, k) => Math.min(half[k], Math.max(at + reach[k], low[k] + 1e-3)))];
 }

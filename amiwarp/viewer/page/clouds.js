@@ -20,7 +20,7 @@ export const EventClouds = {
     box: Array, axis: Object, titles: Array, view: Array, dot: Number, opacity: Number, overlaid: Boolean,
     dark: Boolean, picked: Number, slice: Array, beside: Boolean,
   },
-  emits: ['pick', 'card', 'sliced'],
+  emits: ['pick', 'card', 'sliced', 'turned'],
   template: `<div class="clouds"><canvas ref="canvas" tabindex="0" role="img" :aria-label="label" @pointerdown="pressed"
     @contextmenu.prevent @keydown="typed" @wheel.prevent="wheeled"></canvas></div>`,
   setup(props, { emit }) {
@@ -160,8 +160,7 @@ export const EventClouds = {
         { low: left, high: right, title: 'x (px)' }, { low: bottom, high: top, title: 'y (px)' }, props.axis,
       ].map(({ low, high, title }, k) => {
         const at = (place) => low + ((place + frame.value.half[k]) / (2 * frame.value.half[k])) * (high - low);
-        const [from, to] = part.map((corner) => at(corner[k]));
-        return { low: Math.min(from, to), high: Math.max(from, to), title, flipped: from > to };
+        return { ends: part.map((corner) => at(corner[k])), title };
       });
       drawFrame(context, projection, part, axes, [ink, paper], size, [pane.width, pane.height]);
       context.strokeStyle = ORBIT;
@@ -209,6 +208,11 @@ export const EventClouds = {
       return [pane, x - pane.left, y - pane.top];
     }
 
+    function turn(x, y) {
+      camera.turn(x, y);
+      emit('turned', true);
+    }
+
     function pressed(event) {
       const start = [event.clientX, event.clientY];
       let last = start;
@@ -219,7 +223,7 @@ export const EventClouds = {
         if (!moved) return;
         last = [now.clientX, now.clientY];
         if (event.button > 0 || event.shiftKey) camera.move(...by);
-        else camera.turn(...by);
+        else turn(...by);
         ask();
       }, (end) => {
         const [pane, x, y] = under(end);
@@ -236,10 +240,10 @@ export const EventClouds = {
     }
 
     function typed(event) {
-      const turn = (x, y) => () => camera.turn(12 * x, 12 * y);
+      const by = (x, y) => () => turn(12 * x, 12 * y);
       act(event, {
         '+': () => camera.scale(1.25), '-': () => camera.scale(0.8),
-        ...(event.shiftKey && { ArrowLeft: turn(-1, 0), ArrowRight: turn(1, 0), ArrowUp: turn(0, -1), ArrowDown: turn(0, 1) }),
+        ...(event.shiftKey && { ArrowLeft: by(-1, 0), ArrowRight: by(1, 0), ArrowUp: by(0, -1), ArrowDown: by(0, 1) }),
       });
       ask();
     }
@@ -253,6 +257,7 @@ export const EventClouds = {
     watch(sliced, (text) => emit('sliced', text));
     watch(() => props.view, ([view]) => {
       camera.look(view);
+      emit('turned', false);
       ask();
     });
     return { canvas, label, pressed, typed, wheeled };

@@ -13,6 +13,7 @@ const LOOK = 'amiwarp-look';
 const RETRY_MS = 1500;
 const ASK_MS = 250; // interval between questions that the server answers at once, if it runs and is connected
 const LATE_MS = 750; // age of an unanswered question from which the page is marked
+const SAID_MS = 6000; // how long it is said that something was saved; errors stay
 const ADDRESS_MS = 300; // a change of the address costs the browser more than a drawn cloud: once, after a drag
 
 // Save a file of the server by its address, or a Blob of the page.
@@ -26,14 +27,14 @@ function download(name, content) {
 
 // Element around the page: keys, the state in the address, downloads, and the loss of the connection.
 const PageFrame = {
-  props: { address: String, lost: String, look: Object },
-  emits: ['late'],
+  props: { address: String, lost: String, look: Object, said: String },
+  emits: ['late', 'forget'],
   template: `<div @click="released($event, 'button, summary, input[type=checkbox], input[type=radio]')"
     @change="released($event, 'select')"><slot/></div>`,
   setup(props, { emit }) {
     const trame = inject('trame');
     const gone = new AbortController(); // ends the page's own listeners
-    let [retrying, changed, asking] = [0, 0, 0];
+    let [retrying, changed, asking, saying] = [0, 0, 0, 0];
     let asked = 0; // time of the question that is not answered yet
 
     // Calls are answered in their order: an answer tells that the server has taken all changes before the question.
@@ -98,6 +99,10 @@ const PageFrame = {
       window.clearTimeout(changed);
       if (address) changed = window.setTimeout(() => window.history.replaceState(null, '', `#${address}`), ADDRESS_MS);
     });
+    watch(() => props.said, (said) => {
+      window.clearTimeout(saying);
+      if (said) saying = window.setTimeout(() => emit('forget'), SAID_MS);
+    });
     watch(() => props.lost, (lost) => {
       window.clearInterval(retrying);
       if (lost) retrying = window.setInterval(retry, RETRY_MS);
@@ -114,7 +119,7 @@ const PageFrame = {
     });
     onBeforeUnmount(() => {
       gone.abort();
-      [retrying, asking, changed].forEach((timer) => window.clearTimeout(timer));
+      [retrying, asking, changed, saying].forEach((timer) => window.clearTimeout(timer));
     });
     return { released };
   },

@@ -6,9 +6,10 @@ const { computed, watch } = window.Vue;
 const GRIP_PX = 7; // distance within which an end of the window can be dragged
 const LEFT = 62; // space for the ticks of the rate [px]
 const BOTTOM = 17;
+const MARGIN = 0.1; // share of the timeline before the window, after it went on
 
 export const RateTimeline = {
-  props: { on: null, off: null, span: Array, whole: Number, start: Number, length: Number, dark: Boolean, label: String },
+  props: { on: null, off: null, span: Array, whole: Number, start: Number, length: Number, dark: Boolean, label: String, follow: Boolean },
   emits: ['move', 'resize', 'zoom', 'release'],
   template: `<canvas ref="canvas" class="timeline" tabindex="0" role="slider" :aria-label="label"
     aria-valuemin="0" :aria-valuemax="whole" :aria-valuenow="start" :aria-valuetext="text" @pointerdown="pressed"
@@ -112,6 +113,17 @@ export const RateTimeline = {
       });
     }
 
+    // While the recording is played, a zoomed timeline goes on when the window leaves it.
+    function scroll() {
+      const [low, high] = props.span;
+      const length = high - low;
+      const shown = Math.min(props.length, length);
+      if (!props.follow || (props.start >= low - 1e-3 && props.start + shown <= high + 1e-3)) return;
+      const start = Math.max(0, Math.min(props.start - Math.min(MARGIN * length, length - shown), props.whole - length));
+      emit('zoom', [start, start + length]);
+    }
+
+    watch(() => [props.follow, props.start, props.length], scroll);
     watch(props, () => setTimeout(draw)); // then the page has the colours of dark mode
     return { canvas, text: text_, pressed, time, typed, zoom };
   },
