@@ -684,14 +684,14 @@ def test_events_wait_for_the_clocks_and_are_flagged_if_these_are_not_sure(
     now_us = 0
     monkeypatch.setattr(session_module, "monotonic_us", lambda: now_us)
     monkeypatch.setattr(session_module.time, "monotonic", lambda: now_us * 1e-6)
-    times = np.cumsum(np.random.default_rng(3).integers(*intervals_ms, 110)) * 1000
+    times = np.cumsum(np.random.default_rng(3).integers(*intervals_ms, 160)) * 1000
     link = Pulses(times.tolist(), late_us=late_us, now_us=lambda: now_us)
     messages: list[str] = []
     out: list[Compensated] = []
     session = Session(Made([]), KNOWN, link=link, sinks=(out.append,), say=messages.append)  # type: ignore[arg-type]
     rng = np.random.default_rng(0)
     sent = []
-    for now_us in range(0, 9_000_000, 20_000):
+    for now_us in range(0, 13_000_000, 20_000):
         t = np.sort(rng.integers(now_us, now_us + 20_000, 50)) + 3_000_000 - 20_000
         events = Events.from_arrays(rng.integers(0, 64, 50), rng.integers(0, 48, 50), t, np.ones(50, int))
         sent.append(events)
@@ -702,14 +702,14 @@ def test_events_wait_for_the_clocks_and_are_flagged_if_these_are_not_sure(
     done = Events.concatenate([packet.events for packet in out])
     flags = np.concatenate([packet.flags for packet in out])
     given = Events.concatenate(sent)[: len(done)]
-    assert len(done) > 50 * 40  # those that waited longest, of eight seconds, at least
+    assert len(done) > 50 * 40  # those that waited longest, of twelve seconds, at least
     # of the events of the first sample on, which nothing can be known about before
     since = given.t >= 3_000_000
     assert set((flags[since] & ~np.uint8(OUTSIDE if not flag & NO_ANGLE else 0)).tolist()) == {flag}
     if flag & NO_ANGLE:
         assert np.isnan(done.x).all()
         return
-    encoder = Encoder.constant_speed(720.0, 0, 12_000_000)
+    encoder = Encoder.constant_speed(720.0, 0, 14_000_000)
     moved = Events.from_arrays(given.x, given.y, given.t - 3_000_000, given.p)
     truth = compensate_events(moved[np.flatnonzero(since)[0] :], MODEL, encoder)
     apart = np.hypot(truth[:, 0] - done.x[since], truth[:, 1] - done.y[since])

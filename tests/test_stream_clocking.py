@@ -206,8 +206,13 @@ def test_a_pulled_trigger_cable_keeps_the_map_and_the_pulses_after_it_match_agai
         if not 50 <= k < 1200:
             clock.triggers([camera_time(t)], t + 4000)
         if k >= 10:
-            assert clock.clock(None) is not None
-            assert clock.source is ClockSource.PULSES
+            known = clock.clock(None)
+            assert known is not None
+            gone_us = t - int(times[49]) if 50 <= k < 1200 else 0
+            # 2e-6 of the time since the last pulse that was seen
+            assert clock.source is (ClockSource.OLD if gone_us > 100_000_000 else ClockSource.PULSES)
+            assert known.offset_std_us >= 2e-6 * gone_us
+            assert clock.relation == 1
     found = clock.clock(None)
     assert found is not None
     assert abs(int(found(int(times[-1]))) - camera_time(int(times[-1]))) <= 2
@@ -296,6 +301,13 @@ def test_a_camera_that_returns_has_no_delay_of_its_former_clock() -> None:
     found = clock.clock(host)
     assert found is not None
     assert int(found(50_005_000)) == 5000
+
+
+def test_a_map_between_clocks_far_apart_is_inverted() -> None:
+    clock = follow(irregular(60)).clock(None)
+    assert clock is not None
+    for own in (0, 5_000_000, 3_600_000_000):
+        assert clock.inverse(int(clock(own))) == pytest.approx(own, abs=1.0)
 
 
 def test_nothing_is_known_at_first() -> None:

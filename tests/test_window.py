@@ -954,7 +954,7 @@ def test_a_region_is_drawn_on_the_first_image(window: Window) -> None:
     mouse(window, "LeftButtonPress", tuple(map(round, place(20.5, 10.5))))
     mouse(window, "MouseMove", tuple(map(round, place(60.5, 50.5))))
     assert window.turn()
-    assert window.sheets.images._region_text() == "x 20 to 60, y 10 to 50 px"
+    assert window.sheets.images._region_text() == "x 20 to 61, y 10 to 51 px"
     assert changed(window, picture, frame) > 0.02  # the region is drawn while the mouse moves
     assert changed(window, picture, places.clouds) == 0.0
     mouse(window, "MouseMove", tuple(map(round, place(80.5, 70.5))))

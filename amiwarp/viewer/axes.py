@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from itertools import product
 from typing import Any
 
@@ -27,7 +27,7 @@ SHORTEST_PX = 20.0
 FEWEST_TICKS, MOST_TICKS = 4, 6
 """Smallest and largest number of numbers on an axis, of which those that would lie on others are left out."""
 
-_ticks = cache(ticks)
+_ticks = lru_cache(maxsize=64)(ticks)
 
 
 @dataclass(frozen=True)

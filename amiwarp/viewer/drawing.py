@@ -263,7 +263,7 @@ def make_images(
     pair = (first, first.loaded, against), (inspector, window, knobs)
     if kind is ImageKind.TIME_SURFACE:
         before, after = (_time_surface(*each)[top:bottom, left:right] for each in pair)
-        scale = Scale("latest event after the window's start", "ms", 0.0, window.span.length_us * 1e-3, ON_BLACK)
+        scale = Scale("time after the window's start", "ms", 0.0, window.span.length_us * 1e-3, ON_BLACK)
         return ShownImages(before, after, scale)
     if kind is ImageKind.DECAY:
         before, after = (_decayed(*each, decay_us)[top:bottom, left:right] for each in pair)

@@ -111,11 +111,16 @@ class ImageRow:
     def drag(self, place: tuple[int, int]) -> None:
         """Follow the mouse with the other corner of the region."""
         self._mouse = place
+        if self._start is None or self._drawn_on >= len(self.frames):  # the images have changed meanwhile
+            self._start = None
+            return
         self._end = self._pixel(self._drawn_on, place)
         self._changed()
 
     def release(self) -> None:
         """Show the drawn region, unless it is too small."""
+        if self._start is None:
+            return
         (left, top, right, bottom), self._start = self._drawn_region(), None
         if min(right - left, bottom - top) >= LEAST_REGION_PX:
             self._choose((left, top, right, bottom))
@@ -126,7 +131,7 @@ class ImageRow:
         if self._start is None:
             return ""
         left, top, right, bottom = self._drawn_region()
-        return f"x {left} to {right - 1}, y {top} to {bottom - 1} px"
+        return f"x {left} to {right}, y {top} to {bottom} px"
 
     def _drawn_region(self) -> Region:
         assert self._start is not None
@@ -243,7 +248,11 @@ class ImageRow:
         for frame, panel in zip(self.frames, self.panels, strict=True):
             if panel.region != self.region:
                 paper.frame(self._on_image(frame, panel.region, self.region), ORBIT_COLOUR, 2.0)
-            if self._start is not None and panel.region == self.panels[self._drawn_on].region:
+            if (
+                self._start is not None
+                and self._drawn_on < len(self.panels)
+                and panel.region == self.panels[self._drawn_on].region
+            ):
                 drawn = self._on_image(frame, panel.region, self._drawn_region())
                 paper.area(drawn, ORBIT_COLOUR, 0.3, LINES)
                 paper.frame(drawn, ORBIT_COLOUR, 2.0)

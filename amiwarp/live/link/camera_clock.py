@@ -27,6 +27,8 @@ MATCH_US = 300.0
 clocks drift by 1e-4 per second."""
 UNSTEADY = 2e-6
 """Change of the drift between two clocks that is expected while no pulse is seen, as of quartzes that warm up."""
+LARGEST_DRIFT_US = 200.0
+"""Change of the map since the last pulse that met a trigger [us], beyond which it no longer counts as sure."""
 LARGEST_MATCH_US = 20_000.0
 """Largest difference between a pulse and the time at which the map expects it [us], after a long time without one."""
 FEWEST_FOUND = 6
@@ -59,6 +61,8 @@ class ClockSource(enum.StrEnum):
     """Not yet."""
     PULSES = "pulses"
     """By pulses at irregular intervals, under the only shift that is possible."""
+    OLD = "old pulses"
+    """By pulses, the last of which was so long ago that the clocks may have drifted apart since."""
     REGULAR = "regular pulses"
     """By pulses at regular intervals, as of older controllers. Arrival times choose among the possible shifts, so the
     map may be wrong by whole intervals."""
@@ -86,6 +90,9 @@ class CameraClock:
         self._now_us = 0
         self._settled = False
         self._regular = False
+        self._newest_sync_us = 0
+        self.relation = 0
+        """Number of the relation between the clocks: another one begins when a map is found anew or discarded."""
         self.source = ClockSource.UNKNOWN
         """How :meth:`clock` knew the relation when it was called last."""
 
@@ -113,6 +120,7 @@ class CameraClock:
     def sync(self, t_us: int, host_us: int) -> None:
         """Add a sync pulse that the controller sent at its time ``t_us`` and reported at host time ``host_us`` [us]."""
         self._saw(host_us)
+        self._newest_sync_us = t_us
         self._sync.append((t_us, host_us))
         self._match()
 
@@ -143,7 +151,11 @@ class CameraClock:
 
     def _known(self, host: ClockMap | None) -> tuple[ClockMap | None, ClockSource]:
         if self._map is not None:
-            return self._map, ClockSource.REGULAR if self._regular else ClockSource.PULSES
+            drift_us = UNSTEADY * abs(self._newest_sync_us - self._pairs[-1][0])
+            now = replace(self._map, offset_std_us=math.hypot(self._map.offset_std_us, drift_us))
+            if self._regular:
+                return now, ClockSource.REGULAR
+            return now, ClockSource.OLD if drift_us > LARGEST_DRIFT_US else ClockSource.PULSES
         if not self._may_guess():
             return None, ClockSource.UNKNOWN
         if host is None or len(self._delays) < FEWEST_PAIRS:
@@ -178,6 +190,7 @@ class CameraClock:
         return self._now_us - self._since_us >= patience
 
     def _forget_map(self) -> None:
+        self.relation += self._map is not None
         self._pairs.clear()
         self._met.clear()
         self._map = None
@@ -201,6 +214,7 @@ class CameraClock:
             found = fit_to_pulses(own, other)
             if self._regular:  # the shift may be wrong by whole intervals
                 found = replace(found, offset_std_us=max(found.offset_std_us, float(np.diff(own).min())))
+            self.relation += self._map is None
             self._map = found
 
     def _first_pairs(self, trigger: NDArray[np.int64], sync: NDArray[np.int64]) -> NDArray[np.int64]:

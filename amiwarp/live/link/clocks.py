@@ -70,6 +70,10 @@ class ClockMap:
         own = np.asarray(own_us, np.int64)
         return own + np.rint(self.offset_us + self.drift * (own - self.at_us)).astype(np.int64)
 
+    def inverse(self, other_us: float) -> float:
+        """Return the own clock's time for a time of the other clock [us]."""
+        return self.at_us + (other_us - self.offset_us - self.at_us) / (1.0 + self.drift)
+
 
 def fit_to_pulses(own_us: ArrayLike, other_us: ArrayLike, sigma_us: float = 1.0) -> ClockMap:
     """Fit a clock map to pulses that both clocks recorded.

@@ -46,8 +46,12 @@ class StreamRecorder:
             if self._writer is not None:
                 raise AmiwarpError(f"{self._writer.path}: is being recorded; stop it first")
             self._writer, self.problem = self._open.enter_context(self._make(path)), ""
-            for second, (t_us, angle) in samples:
-                self._writer.append_encoder(t_us, angle, second=second)
+            try:
+                for second, (t_us, angle) in samples:
+                    self._writer.append_encoder(t_us, angle, second=second)
+            except (AmiwarpError, OSError) as error:
+                self._finish(str(error))
+                raise
 
     def stop(self, problem: str = "") -> str:
         """Finish the file, and return a text about it; empty if nothing is recorded. ``problem``: why it ends."""

@@ -27,7 +27,7 @@ from amiwarp.events.recording import OVERHEAD, Events, MemoryEvents, Recording, 
 from amiwarp.imaging.iwe import CanvasShape
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.io.native_format import LiveWriter
-from amiwarp.live.link.camera_clock import CameraClock, ClockSource
+from amiwarp.live.link.camera_clock import NO_SHIFT_US, CameraClock, ClockSource
 from amiwarp.live.link.clocks import ClockMap, monotonic_us
 from amiwarp.live.link.link import Link, LinkUpdate
 from amiwarp.live.queues import BackgroundWorker, EventSorter, PacketQueue, Policy
@@ -121,6 +121,11 @@ class PhaseCheck:
         ``sure``: whether the clocks of controller and camera are known. A wrong one turns the phase, too.
         """
         changed, phase = estimate.offset - first.offset, estimate.name.replace("_", " ")
+        wrong_clock = ""
+        if not sure:
+            wrong_clock = (
+                "the clocks of controller and camera are probably wrong: connect the sync pulses, or calibrate again"
+            )
         reported = self._reported.pop(estimate.name, None)
         if reported is not None and abs(estimate.offset - reported) < CHANGE_RAD:
             self._reported[estimate.name] = reported
@@ -128,16 +133,12 @@ class PhaseCheck:
             self._reported[estimate.name] = estimate.offset
             least = "at least " if abs(estimate.offset) > 0.99 * SEARCH_RAD else ""
             offset = f"{least}{math.degrees(estimate.offset):+.1f} deg"
-            remedy = "calibrate again"
-            if not sure:
-                remedy = f"the clocks of controller and camera are probably wrong: connect the sync pulses, or {remedy}"
-            self._say(f"the {phase} differs from the calibrated one by {offset}: {remedy}")
+            self._say(f"the {phase} differs from the calibrated one by {offset}: {wrong_clock or 'calibrate again'}")
         elif abs(changed) > max(CHANGE_RAD, 4.0 * math.hypot(estimate.std, first.std)):
             self._reported[estimate.name] = estimate.offset
             since = f"since the first check, to {math.degrees(estimate.offset):+.1f} deg from the calibrated one"
-            self._say(
-                f"the {phase} has moved by {math.degrees(changed):+.1f} deg {since}: has the index pulse slipped?"
-            )
+            why = wrong_clock or "has the index pulse slipped?"
+            self._say(f"the {phase} has moved by {math.degrees(changed):+.1f} deg {since}: {why}")
 
     def put(self, events: Events) -> None:
         """Add events of the sensor, from which the next estimate is made."""
@@ -414,7 +415,7 @@ class WindowSharpness:
         self._start_us, self._wanted = None, True
 
 
-CLOCKS_US = 8_000_000
+CLOCKS_US = NO_SHIFT_US + 2_000_000
 """Longest wait of the first events for the relation between the clocks of controller and camera [us]."""
 PATIENCE_S = 1.0
 """Longest wait at the end of a session for the source's thread and for encoder samples of the last events [s]."""
@@ -709,6 +710,7 @@ class EncoderFeed:
         self._camera_clock = CameraClock()
         self._unknown_since = time.monotonic()
         self._has_related = False
+        self._relation = 0
         self._shortest_us: int | None = None
         self._waiting: deque[LinkUpdate] = deque()
         self._waiting_samples = 0
@@ -748,8 +750,7 @@ class EncoderFeed:
         """Return the host's time of an event [us]: by the clocks, else the earliest that its arrival allows."""
         host = None if self._link is None else self._link.clock()
         if host is not None and self.clock is not None and self._encoder.sure:
-            controller = event_us - self.clock.offset_us - self.clock.drift * (event_us - self.clock.at_us)
-            return controller - host.offset_us - host.drift * (controller - host.at_us - host.offset_us)
+            return host.inverse(self.clock.inverse(event_us))
         return float(event_us + (self._shortest_us or 0))
 
     def _follow_clock(self, clock: ClockMap | None, source: ClockSource) -> None:
@@ -766,14 +767,19 @@ class EncoderFeed:
                     "camera's trigger input, and those that wait too long have no angle (flag 4)"
                 )
             return
-        if source is before or clock is None:
+        if clock is None:
             return
         self._encoder.sure = source.sure
-        if self._has_related:  # the samples so far may be at wrong times
+        relation = self._camera_clock.relation
+        if self._has_related and relation != self._relation:  # the samples so far may be at wrong times
             self._encoder.clear()
-        self._has_related = True
+        self._has_related, self._relation = True, relation
+        if source is before:
+            return
         known = {
             ClockSource.PULSES: f"by {clock.pairs} pulses, within {max(clock.offset_std_us, 0.1):.1f} µs",
+            ClockSource.OLD: "by pulses that were seen long ago, and may have drifted apart since: all angles count as "
+            "guessed (flag 2) until the camera sees sync pulses again",
             ClockSource.REGULAR: "by pulses at regular intervals, as an older controller sends them: arrival times "
             f"chose among shifts of {clock.offset_std_us * 1e-3:.0f} ms, so all angles count as guessed (flag 2); "
             "install newer firmware",
@@ -937,11 +943,12 @@ class RecentEvents:
 
         The angles already include the index pulses.
         """
+        pulses = NO_TIMES if index_t_us is None else index_t_us
+        if len(t_us) or len(pulses):
+            self.recorder.append_encoder(t_us, angle, pulses, second=second)
         if len(t_us):
             with self._lock:
                 self._sampled_s = time.monotonic()
-                pulses = NO_TIMES if index_t_us is None else index_t_us
-                self.recorder.append_encoder(t_us, angle, pulses, second=second)
                 samples = self._samples[second]
                 samples.append((t_us, angle))
                 self.sample_bytes += OVERHEAD + t_us.nbytes + angle.nbytes
