@@ -26,9 +26,11 @@ QUIET = Troubles(
     ("changes", "paired_by_s", "least_measured"),
     [
         pytest.param({}, 1.0, 0.99, id="nothing"),
-        pytest.param({"camera_delay_us": 4_900_000}, 5.8, 0.55, id="camera late"),
+        pytest.param({"camera_delay_us": 4_900_000}, 5.8, 0.55, id="camera late", marks=pytest.mark.slow),
         pytest.param({"serial_delay_us": 4_900_000}, 5.8, 0.55, id="controller late", marks=pytest.mark.slow),
-        pytest.param({"lost": 0.3, "faults": ("reset@5",)}, 3.0, 0.8, id="lost pulses and a reset"),
+        pytest.param(
+            {"lost": 0.3, "faults": ("reset@5",)}, 3.0, 0.8, id="lost pulses and a reset", marks=pytest.mark.slow
+        ),
         pytest.param(
             {"trigger_cable": (4_000_000, 9_000_000), "camera_delay_us": 300_000}, 1.5, 0.9, id="pulled cable",
             marks=pytest.mark.slow,

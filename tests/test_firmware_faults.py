@@ -52,6 +52,7 @@ def test_the_cases_hold_every_kind_alone_and_in_pairs() -> None:
     assert any(case.reversed_motor for case in cases)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault",
     [

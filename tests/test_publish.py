@@ -76,6 +76,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return figures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options", "head"),
     [

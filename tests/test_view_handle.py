@@ -285,6 +285,7 @@ def until(met: Any) -> None:
     raise AssertionError("not met within a minute")
 
 
+@pytest.mark.slow
 def test_a_notebook_that_a_program_runs_keeps_page_and_pictures(recording: Recording, tmp_path: Path) -> None:
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
