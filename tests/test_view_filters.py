@@ -310,3 +310,13 @@ def test_a_calibration_says_which_filters_its_events_passed(plain: Recording) ->
         "without background activity (3 ms), refractory period 0.5 ms, at most 10 kev/s, one of 2 events"
     )
     assert "events" in events_text(made.show())
+
+
+@pytest.mark.parametrize(
+    ("rate", "said"), [(999_600.0, "1 Mev/s"), (999_400.0, "999 kev/s"), (999.6, "1 kev/s"), (12.0, "12 ev/s")]
+)
+def test_rates_have_at_most_three_digits_before_the_point(rate: float, said: str) -> None:
+    assert rate_text(rate) == said
+    step = FilterStep("rate", round(rate * 10), round(rate * 10))
+    number, unit = said.split(" ")
+    assert step_rows((step,), 1e7)[0][1] == f"{number} → {number} {unit}"

@@ -149,9 +149,14 @@ PREFIXES = ((1e6, "M"), (1e3, "k"), (1.0, ""))
 """Sizes and prefixes of the units of rates, the largest first."""
 
 
+def unit_of(rate: float) -> tuple[float, str]:
+    """Return size and prefix of the unit in which a rate has at most three digits before the point."""
+    return next((each for each in PREFIXES if rate >= 0.9995 * each[0]), PREFIXES[-1])
+
+
 def rate_text(events_per_s: float) -> str:
     """Return a rate as text, such as ``1.2 Mev/s``."""
-    size, prefix = next((each for each in PREFIXES if events_per_s >= 0.9995 * each[0]), PREFIXES[-1])
+    size, prefix = unit_of(events_per_s)
     return f"{events_per_s / size:.3g} {prefix}ev/s"
 
 
@@ -163,7 +168,7 @@ def step_rows(steps: tuple[FilterStep, ...], read_us: float) -> list[list[str]]:
     rows = []
     for step in steps:
         before, after = (1e6 * count / read_us for count in (step.before, step.after))
-        size, prefix = next((each for each in PREFIXES if before >= each[0]), PREFIXES[-1])
+        size, prefix = unit_of(before)
         rates = f"{before / size:.3g} → {after / size:.3g} {prefix}ev/s"
         share = 100.0 * (1.0 - step.after / max(step.before, 1))
         rows.append([step.name, rates, f"{step.before:,} → {step.after:,} events (−{share:.3g} %)"])

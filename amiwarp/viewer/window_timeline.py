@@ -12,6 +12,7 @@ from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.plotting.colours import ticks
 from amiwarp.viewer.axes import tick_texts
 from amiwarp.viewer.drawing import ORBIT_COLOUR
+from amiwarp.viewer.filters import unit_of
 from amiwarp.viewer.texts import text_width
 from amiwarp.viewer.window_layout import NOWHERE, Rect
 from amiwarp.viewer.window_paper import Paper
@@ -169,7 +170,7 @@ class Timeline:
 
 def _short(rate: float) -> str:
     """Return a rate [1/s] with three digits, in thousands or millions."""
-    for scale, name in ((1e6, "M"), (1e3, "k")):
-        if rate >= scale:
-            return f"{rate / scale:.3g} {name}"
-    return f"{rate:.3g}" if rate and math.isfinite(rate) else ""
+    if not (rate and math.isfinite(rate)):
+        return ""
+    size, prefix = unit_of(rate)
+    return f"{rate / size:.3g} {prefix}".rstrip()
