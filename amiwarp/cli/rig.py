@@ -587,7 +587,7 @@ def _live_lines(d: dict[str, Any]) -> list[str]:
 
 
 def _clock_lines(clock: dict[str, Any] | None) -> list[str]:
-    """Return what is said at the end about the clocks of controller and camera."""
+    """Return the line of the result about the clocks of controller and camera."""
     if clock is None:
         return []
     if clock["uncertainty_us"] is None:

@@ -34,7 +34,7 @@ class Chip:
     width: int
     height: int
     davis: bool
-    """Whether the addresses are those of a DAVIS camera, else those of the DVS128."""
+    """Whether the camera is a DAVIS, not a DVS128, whose addresses have another layout."""
 
 
 CHIPS = {

@@ -28,7 +28,7 @@ class Camera:
     """Layout of a camera's addresses."""
 
     davis: int
-    """Whether the addresses are those of a DAVIS camera, else those of the DVS128."""
+    """Whether the camera is a DAVIS, not a DVS128, whose addresses have another layout."""
     width: int
     height: int
 

@@ -1172,9 +1172,17 @@ def scale_state(scale: Scale) -> dict[str, Any]:
     title, ticks = scale.label, [list(tick) for tick in scale.ticks()]
     if scale.colours != "polarity":
         return {"bar": gradient(scale.colours), "ticks": ticks, "title": title, "square": None}
-    values = scale.low + np.linspace(0.0, 1.0, SQUARE) ** (1.0 / scale.gamma) * (scale.high - scale.low)
-    square = picture_state(np.stack(np.broadcast_arrays(values, values[::-1, None])), replace(scale, unit=""))
+    square = picture_state(polarity_square(scale), replace(scale, unit=""))
     return {"bar": "", "ticks": ticks, "title": title, "square": square}
+
+
+def polarity_square(scale: Scale) -> NDArray[np.floating[Any]]:
+    """Return the numbers of OFF and ON events of a square legend, OFF to the right and ON upwards, shape ``(2, n, n)``.
+
+    The numbers are those of evenly spaced colours.
+    """
+    values = scale.low + np.linspace(0.0, 1.0, SQUARE) ** (1.0 / scale.gamma) * (scale.high - scale.low)
+    return np.stack(np.broadcast_arrays(values, values[::-1, None]))
 
 
 def picture_state(values: NDArray[Any], scale: Scale) -> dict[str, Any]:

@@ -376,6 +376,8 @@ KEYS = (
     ("?", ("toggle", "help_shown"), "show or hide this help"),
 )
 """Keys of the page: name of the key, method of the panel with its arguments, and help text."""
+BINS = 400
+"""Number of points of the drawn event rates."""
 EXPORTS = {
     "picture": ("picture", ".png"), "image": ("images", ".png"), "pdf": ("figure, PDF", ".pdf"),
     "svg": ("figure, SVG", ".svg"), "values": ("image values", ".tif"),

@@ -35,8 +35,6 @@ from amiwarp.viewer.inspector import WINDOW_POINTS, DisplayedWindow, Inspector, 
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
 from amiwarp.viewer.serve import finite, serve, use_page
 
-BINS = 400
-"""Number of points of the drawn event rates."""
 STEP_S = 0.2
 """Duration of counting events after which the timeline shows what is counted [s]."""
 MOST_IN_FLIGHT = 8
@@ -572,11 +570,11 @@ class Panel(layout.Actions):
         first_us = self._rates_first_us
         start_us, end_us = (round(1e3 * each) for each in self.state.rate_span)
         own, *others = self._rates
-        _, rates = own.curve(first_us + start_us, first_us + end_us, BINS)
+        _, rates = own.curve(first_us + start_us, first_us + end_us, layout.BINS)
         off, on, share = *map(drawing.float_bytes, rates), own.share
         rows = []
         for each, counted in zip(self.inspector.besides, others, strict=True):
-            _, rates = counted.curve(each.time_of(start_us), each.time_of(end_us), BINS)
+            _, rates = counted.curve(each.time_of(start_us), each.time_of(end_us), layout.BINS)
             rows.append({"name": drawing.beside_text(each), "on": drawing.float_bytes(rates[1]),
                          "off": drawing.float_bytes(rates[0])})  # fmt: skip
         note = "" if share >= 1.0 else f"counting events: {100.0 * share:.0f} %"

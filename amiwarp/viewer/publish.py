@@ -35,8 +35,6 @@ TEXT_PT, TITLE_PT = 6.5, 7.5
 """Sizes of text and titles [pt]."""
 POINT_AREA = 0.35
 """Area of a point of a cloud [pt²]."""
-LEGEND_ROWS = 8
-"""Largest number of rows of a legend."""
 CLOUD_LETTERS, IMAGE_LETTERS = 44, 20
 """Largest length of a line of the title of a cloud and of an image [characters]."""
 LETTERS_PER_MM = 0.8
@@ -218,7 +216,10 @@ def _explain_colours(figure: Any, axes: list[Any], shown: DisplayedWindow, look:
     if bar is not None:
         figure.colorbar(ScalarMappable(**_mapped(bar)), ax=axes, location="bottom", label=bar.label, shrink=0.4,
                         aspect=40)  # fmt: skip
-    rows = (*drawing.legend_of(shown.truth, look.colour, LEGEND_ROWS), *drawing.unknown_rows(shown, look.colour))
+    rows = (
+        *drawing.legend_of(shown.truth, look.colour, drawing.LEGEND_ROWS),
+        *drawing.unknown_rows(shown, look.colour),
+    )
     marks = [Line2D([], [], marker="s", linestyle="", markersize=4, color=colour or "none", label=text)
              for colour, text in rows]  # fmt: skip
     if marks:

@@ -60,18 +60,25 @@ def wrapped(text: str, width_px: float, font_px: int) -> list[str]:
     return lines
 
 
+def _text_property(colour: str, font_px: int, across: str, up: str) -> Any:
+    """Return how a text is drawn: in the viewer's font, with the given sides at its place."""
+    import pyvista
+
+    return pyvista.TextProperty(
+        color=colour,
+        font_size=font_px,
+        font_file=str(font()),
+        justification_horizontal=across,
+        justification_vertical=up,
+    )
+
+
 def text_actor(text: str, colour: str, place: tuple[float, float], font_px: int = FONT_PX) -> Any:
     """Return an actor that shows a text below and to the right of a place, in shares of its renderer's size."""
     import pyvista
 
     actor = pyvista.Text(text)
-    actor.prop = pyvista.TextProperty(
-        color=colour,
-        font_size=font_px,
-        font_file=str(font()),
-        justification_horizontal="left",
-        justification_vertical="top",
-    )
+    actor.prop = _text_property(colour, font_px, "left", "top")
     actor.GetPositionCoordinate().SetCoordinateSystemToNormalizedViewport()
     actor.position = place
     return actor
@@ -91,12 +98,6 @@ def label_actor(colour: str, font_px: int, across: str = "center", up: str = "ce
     import pyvista
 
     actor = pyvista.Text("")
-    actor.prop = pyvista.TextProperty(
-        color=colour,
-        font_size=font_px,
-        font_file=str(font()),
-        justification_horizontal=across,
-        justification_vertical=up,
-    )
+    actor.prop = _text_property(colour, font_px, across, up)
     actor.GetPositionCoordinate().SetCoordinateSystemToViewport()
     return actor

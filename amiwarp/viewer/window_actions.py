@@ -326,9 +326,7 @@ class WindowActions(layout.Actions):
             return None
 
     def _new_name(self, what: str) -> Path:
-        name = Path(jobs.download_name(self.inspector.recording.name, what))
-        names = (name.with_stem(f"{name.stem}-{k}") if k else name for k in itertools.count())
-        return next(each for each in names if not each.exists())
+        return jobs.unused_path(jobs.download_name(self.inspector.recording.name, what))
 
     @property
     def _look(self) -> Look:

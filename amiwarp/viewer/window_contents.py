@@ -19,7 +19,6 @@ from amiwarp.viewer.window_actions import SPEED, WindowActions
 from amiwarp.viewer.window_controls import Slider
 from amiwarp.viewer.window_images import Panel, panels_of
 from amiwarp.viewer.window_keys import help_rows
-from amiwarp.viewer.window_timeline import BINS
 
 
 class WindowContents(WindowActions):
@@ -95,7 +94,7 @@ class WindowContents(WindowActions):
         if wanted != self._rates_shown:
             self._rates_shown = wanted
             low, high = (source.t_first + round(each) for each in line.span)
-            edges, line.rates = self._rates.curve(low, high, BINS)
+            edges, line.rates = self._rates.curve(low, high, layout.BINS)
             line.rates[:, edges[1:] > self._counted_stop_us] = np.nan  # which a live stream has received since
             line.edges = np.asarray(edges - source.t_first, np.float64)
             counted = self._rates.share >= 1.0 or self.inspector.latest is not None

@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 from amiwarp.imaging.regions import Region
 from amiwarp.plotting.colours import Scale
-from amiwarp.viewer.drawing import ORBIT_COLOUR, ShownImages
+from amiwarp.viewer.drawing import ORBIT_COLOUR, ShownImages, polarity_square
 from amiwarp.viewer.texts import LINE, fitting_font, text_width
 from amiwarp.viewer.window_layout import Rect
 from amiwarp.viewer.window_paper import LINES, Paper
 
 BAR_EM, LABEL_EM = 1.0, 1.0
 """Width of a colour bar, and of its label, which is written upwards, in sizes of the font."""
-SQUARE = 32
-"""Width and height of the legend of two polarities [colours]."""
 LEAST_REGION_PX = 4
 """Smallest width and height of a drawn region [px of the sensor]."""
 
@@ -218,8 +216,7 @@ class ImageRow:
         """Draw a colour bar with its numbers; for two polarities a square, OFF to the right and ON upwards."""
         em = paper.font_px
         if scale.colours == "polarity":
-            values = scale.low + np.linspace(0.0, 1.0, SQUARE) ** (1.0 / scale.gamma) * (scale.high - scale.low)
-            both = np.stack(np.broadcast_arrays(values, values[::-1, None])).astype(np.float32)
+            both = polarity_square(scale).astype(np.float32)
             square = Rect(bar.left, bar.top - 3.0 * em, bar.left + 3.0 * em, bar.top)
             paper.picture(self._bar_rgb(scale, both), square)
             paper.frame(square)

@@ -17,8 +17,6 @@ from amiwarp.viewer.texts import text_width
 from amiwarp.viewer.window_layout import NOWHERE, Rect
 from amiwarp.viewer.window_paper import Paper
 
-BINS = 400
-"""Number of points of the drawn rates."""
 GRIP_PX = 7.0
 """Distance within which the mouse takes an end of the time window [px]."""
 ZOOM = 1.25
