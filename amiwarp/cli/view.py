@@ -380,7 +380,8 @@ class StartOptions:
     def chosen_bookmark(self, recording: Path) -> str:
         """Return the name of the bookmark to show first; empty for none, also if the file of bookmarks is damaged.
 
-        A damaged or foreign file is named in a message. Raises :class:`AmiwarpError` for a name that the file does not hold.
+        A damaged or foreign file is named in a message. Raises :class:`AmiwarpError` for a name that the file does not
+        hold.
         """
         from amiwarp.viewer.bookmarks import Bookmarks
 
