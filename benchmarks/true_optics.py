@@ -1,7 +1,7 @@
 """Errors of calibrations on recordings of a second simulator, with troubles drawn by seed, and what was stated of them.
 
     python -m benchmarks.true_optics drawn|fresh --out FILE.json [--seeds 12] [--only OPTIC …] [--processes 1]
-        [--events FOLDER]
+        [--events FOLDER] [--device cuda:0]
 
 ``drawn``: for each of five optics, recordings whose optic, scene, sensor and trouble are drawn by seed. ``fresh``:
 twenty troubles that no code was chosen with. ``--events`` keeps the simulated events for the next run.
@@ -530,7 +530,7 @@ def deviation_px(found: amiwarp.Calibration) -> float:
     return math.sqrt(total)
 
 
-def measure(optic: str, trouble: str, seed: int, folder: Path | None = None) -> dict[str, Any]:
+def measure(optic: str, trouble: str, seed: int, folder: Path | None = None, device: str = "cpu") -> dict[str, Any]:
     """Return the row of a recording. ``folder`` keeps its events."""
     rng = np.random.default_rng([seed, [*OPTICS].index(optic)])
     rig = OPTICS[optic](rng, trouble)
@@ -543,7 +543,7 @@ def measure(optic: str, trouble: str, seed: int, folder: Path | None = None) -> 
     photometric = known_timing(rig)
     began = time.perf_counter()
     try:
-        found = amiwarp.calibrate(recording, model=rig.model, photometric=photometric)
+        found = amiwarp.calibrate(recording, model=rig.model, photometric=photometric, device=device)
     except amiwarp.AmiwarpError as refusal:
         said = [str(refusal)]
         row |= {"refused": True, "error_px": None}
@@ -595,6 +595,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, help="recordings of each optic (12), or of each fresh trouble (1)")
     parser.add_argument("--only", nargs="+", choices=[*OPTICS], default=[*OPTICS])
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--events", type=Path, help="folder that keeps the simulated events")
     options = parser.parse_args()
     if options.events is not None:
@@ -602,7 +603,7 @@ def main() -> None:
     calls = (
         drawn(options.seeds or 12, options.only) if options.what == "drawn" else fresh(options.seeds or 1, options.only)
     )
-    rows = rows_of(measure, [(*call, options.events) for call in calls], options.processes)
+    rows = rows_of(measure, [(*call, options.events, options.device) for call in calls], options.processes)
     report = {"protocol": __doc__, "summary": summary(rows), "rows": rows}
     print(json.dumps(report["summary"], indent=1))
     options.out.write_text(json.dumps(report, indent=1) + "\n")
