@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -10,13 +11,11 @@ from pathlib import Path
 import numpy as np
 
 import amiwarp
-from rig import numbers, parts
-from rig.numbers import OVERSPEED, SPEEDS, Tolerance
+from rig import limits, numbers, parts
+from rig.numbers import OVERSPEED, SPEEDS, Tolerance, View
 from rig.parts import Part, Rig
 
 APEXES = (0.5, 1.0, 2.0)
-FASTEST, BALANCED = max(SPEEDS), 2.5
-"""Speed of the prism [turns/min], and balance quality G of ISO 21940-11 [mm/s] of a rotor that is called balanced."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -169,10 +168,10 @@ def simulated_rows() -> list[tuple[str, ...]]:
     return rows
 
 
-def checked(rig: Rig) -> Sequence[Part]:
+def checked(rig: Rig, view: View | None = None, rpm: float = max(SPEEDS)) -> Sequence[Part]:
     """Return the rig's parts, or end with what is wrong with them."""
-    if refused := parts.impossible(rig):
-        sys.exit(f"{rig.name}: " + "; ".join(refused))
+    if refused := limits.refusals(rig, view, rpm):
+        sys.exit("\n".join(f"{rig.name}: {line}" for line in refused))
     made = parts.assembly(rig)
     wrong = parts.problems(rig, made)
     wrong += [f"{part.name} is not watertight" for part in made if not numbers.in_file(part).is_watertight]
@@ -243,51 +242,165 @@ def report() -> str:
 def balance_text(rig: Rig) -> str:
     """Return the set screws, and the unbalance that they leave."""
     screws, body = numbers.balance(rig, numbers.rotating(rig))
-    left, grade = float(np.hypot(*numbers.unbalance(body))), numbers.grade(body, FASTEST)
-    text = f"set screws M{rig.screw[1]:g}, angles from the thick edge: {words(screws)}; they leave {left:.2f} g mm"
-    if grade <= BALANCED:
-        return text
-    return (
-        f"{text}\nNOT BALANCED: G {grade:.0f} at {FASTEST:g} rpm, more than G {BALANCED:g}; take a smaller apex or "
-        "wedge, or turn more slowly"
+    left = float(np.hypot(*numbers.unbalance(body)))
+    return f"set screws M{rig.screw[1]:g}, angles from the thick edge: {words(screws)}; they leave {left:.2f} g mm"
+
+
+def view_text(rig: Rig, view: View | None) -> str:
+    """Return what the lens may see through the wedge, and whether this was checked for a given view."""
+    if view is not None:
+        return f"view: {view.fov_deg:g}° at f/{view.number:g} passes the wedge"
+    name, sensor = next(iter(numbers.SENSORS.items()))
+    shortest = numbers.shortest_focal(rig, sensor)
+    if not math.isfinite(shortest):
+        return "view: not checked (--fov-deg); no view of 640×480 pixels of 9 µm passes the wedge at f/2"
+    widest = math.floor(10.0 * View(sensor, 1.0, 2.0).degrees(shortest)) / 10.0
+    return f"view: not checked (--fov-deg); at most {widest:g}° for {name} at f/2 (--size, --pitch-um, --f-number)"
+
+
+def arguments_of(given: Sequence[str] | None) -> argparse.Namespace:
+    """Return the parsed command line."""
+    parser = argparse.ArgumentParser(prog="python -m rig", description=__doc__)
+    parser.add_argument("out", type=Path, help="folder for the files")
+    parser.add_argument("--rig", choices=[rig.name for rig in parts.RIGS], help="only this rig")
+    parser.add_argument("--pictures", action="store_true", help="write drawing and pictures, too")
+    parser.add_argument("--numbers", type=Path, help="page of numbers to write; takes some minutes")
+
+    def sizes(group: argparse._ArgumentGroup, name: str, text: str, *values: str) -> None:
+        count = {"nargs": len(values), "metavar": values} if len(values) > 1 else {"metavar": values[0]}
+        group.add_argument(name, type=float, help=text, **count)
+
+    wedge = parser.add_argument_group("wedge")
+    sizes(wedge, "--wedge-mm", "diameter [mm]; default: 25.4 for one-inch, 50.8 for two-inch", "DIAMETER")
+    sizes(wedge, "--thickness-mm", "thickness on the axis [mm]", "THICKNESS")
+    sizes(wedge, "--apex-deg", "apex angle [deg]; default 1", "ANGLE")
+    sizes(wedge, "--edges-mm", "thin and thick edge [mm], instead of thickness and apex", "THIN", "THICK")
+    sizes(wedge, "--rpm", "fastest speed of the prism, at which it must be balanced; default 1440", "RPM")
+    lens = parser.add_argument_group("lens and camera")
+    sizes(lens, "--lens-mm", "lens: diameter, and length before its ring [mm]", "DIAMETER", "LENGTH")
+    sizes(lens, "--pupil-mm", "entrance pupil of the lens: distance behind its front [mm]", "DEPTH")
+    sizes(lens, "--grip-mm", "ring that the holder grips: diameter and width [mm]", "DIAMETER", "WIDTH")
+    sizes(lens, "--camera-mm", "camera's body [mm]", "WIDTH", "HEIGHT", "LENGTH")
+    threads = ("c", "cs", "m12")
+    lens.add_argument("--camera-thread", choices=threads, help="thread of the camera; default cs")
+    lens.add_argument("--lens-thread", choices=threads, help="thread of the lens")
+    sizes(lens, "--flange-mm", "distance from flange to sensor; default 12.526 (cs), 17.526 (c)", "DISTANCE")
+    view = parser.add_argument_group("view, to check that the wedge is wide enough")
+    sizes(view, "--fov-deg", "horizontal field of view [deg]; without it no view is checked", "ANGLE")
+    view.add_argument("--size", default="640x480", help="columns x rows of the sensor; default 640x480")
+    view.add_argument("--pitch-um", type=float, default=9.0, help="pixel pitch [µm]; default 9")
+    view.add_argument("--f-number", type=float, default=2.0, help="f-number of the lens; default 2")
+    motor = parser.add_argument_group("motor and belt")
+    sizes(motor, "--motor-mm", "motor: diameter, length, and diameter of the shaft [mm]", "DIAMETER", "LENGTH", "SHAFT")
+    sizes(motor, "--motor-screws-mm", "distance of its two M3 threads, and its boss [mm]", "DISTANCE", "BOSS")
+    motor.add_argument("--teeth", type=int, nargs=2, metavar=("ROTOR", "MOTOR"), help="teeth of both pulleys")
+    sizes(motor, "--belt-mm", "length of the belt [mm]", "LENGTH")
+    return parser.parse_args(given)
+
+
+def wedge_of(rig: Rig, given: argparse.Namespace) -> Rig:
+    """Return a rig with the wedge, the pulleys and the belt of the command line."""
+    thickness = rig.thickness if given.thickness_mm is None else given.thickness_mm
+    apex = rig.apex_deg if given.apex_deg is None else given.apex_deg
+    diameter = rig.wedge if given.wedge_mm is None else given.wedge_mm
+    if given.edges_mm is not None:
+        if given.thickness_mm is not None or given.apex_deg is not None:
+            sys.exit("--edges-mm: thickness and apex follow from the edges; leave out --thickness-mm and --apex-deg")
+        thin, thick = given.edges_mm
+        if not thick > thin:
+            sys.exit(f"--edges-mm {thin:g} {thick:g}: the thick edge comes second, and is the thicker one")
+        thickness = (thin + thick) / 2.0
+        apex = math.degrees(math.atan2(thick - thin, diameter))
+    teeth = None if given.teeth is None else tuple(given.teeth)
+    own = replace(rig, thickness=thickness, apex_deg=apex)
+    if not (math.isfinite(diameter) and diameter > 0.0):
+        sys.exit(f"--wedge-mm {diameter:g}: give a number above 0")
+    if refused := list(limits.bearings(replace(own, wedge=diameter))):
+        sys.exit(f"{rig.name}: " + refused[0])
+    return parts.for_wedge(own, diameter, teeth=teeth, belt=given.belt_mm)
+
+
+def optics_of(rig: Rig, given: argparse.Namespace) -> Rig:
+    """Return a rig with the lens and the camera of the command line."""
+    lens, reach = given.lens_mm or (rig.lens, rig.reach)
+    of_camera = given.camera_thread or rig.threads[0]
+    of_lens = given.lens_thread or rig.threads[1]
+    if given.lens_mm is not None and given.lens_thread is None:
+        # a lens with M12 thread is slimmer than the thread of C-mount
+        of_lens = "m12" if lens < limits.THREAD else "c"
+    flange = given.flange_mm or limits.FLANGES.get(of_camera, rig.flange)
+    return replace(
+        rig,
+        lens=lens,
+        reach=reach,
+        pupil=rig.pupil if given.pupil_mm is None else given.pupil_mm,
+        grip=tuple(given.grip_mm or rig.grip),
+        camera=tuple(given.camera_mm or rig.camera),
+        threads=(of_camera, of_lens),
+        flange=flange,
     )
+
+
+def rig_of(rig: Rig, given: argparse.Namespace) -> Rig:
+    """Return a rig with the dimensions of the command line."""
+    own = replace(
+        rig,
+        motor=tuple(given.motor_mm or rig.motor),
+        motor_screws=tuple(given.motor_screws_mm or rig.motor_screws),
+    )
+    return wedge_of(optics_of(own, given), given)
+
+
+def view_of(given: argparse.Namespace) -> View | None:
+    """Return the view of the command line, or None if its field of view is not given."""
+    if given.fov_deg is None:
+        return None
+    size = re.fullmatch(r"(\d+)x(\d+)", given.size)
+    if size is None or not (int(size[1]) and int(size[2])):
+        sys.exit(f"--size {given.size}: give COLUMNSxROWS, for example 640x480")
+    for name, value, most in (
+        ("--fov-deg", given.fov_deg, 170.0),
+        ("--pitch-um", given.pitch_um, 1e3),
+        ("--f-number", given.f_number, 1e3),
+    ):
+        if not 0.0 < value <= most:
+            sys.exit(f"{name} {value:g}: give a number above 0, at most {most:g}")
+    return View((int(size[1]), int(size[2]), given.pitch_um * 1e-3), given.fov_deg, given.f_number)
+
+
+def said(rig: Rig, given: argparse.Namespace) -> list[str]:
+    """Return lines about what was chosen without an option."""
+    lines = []
+    if rig.belt != given.belt_mm or given.teeth is None:
+        large, small = rig.teeth
+        lines.append(f"belt {rig.belt:g} mm (--belt-mm), pulleys of {large} and {small} teeth (--teeth)")
+    of_camera, of_lens = (name.upper() for name in rig.threads)
+    lines.append(
+        f"lens: its front is {rig.seat_z - rig.lens_z:.1f} mm from the wedge; {of_lens} on a camera with {of_camera} "
+        f"(--lens-thread, --camera-thread), sensor {rig.flange:g} mm behind its flange (--flange-mm), pupil "
+        f"{rig.pupil:g} mm behind the lens's front (--pupil-mm)"
+    )
+    return lines
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Write the files."""
-    parser = argparse.ArgumentParser(prog="python -m rig", description=__doc__)
-    parser.add_argument("out", type=Path, help="folder for the files")
-    parser.add_argument("--rig", choices=[rig.name for rig in parts.RIGS], help="only this rig")
-    parser.add_argument("--apex-deg", type=float, default=1.0, help="apex angle of the wedge [deg]")
-    parser.add_argument("--thickness-mm", type=float, help="thickness of the wedge on the axis [mm]")
-    parser.add_argument(
-        "--lens-mm",
-        type=float,
-        nargs=2,
-        metavar=("WIDTH", "REACH"),
-        help="lens: diameter, and length before its ring [mm]",
-    )
-    parser.add_argument(
-        "--grip-mm", type=float, nargs=2, metavar=("DIAMETER", "WIDTH"), help="ring that the holder grips [mm]"
-    )
-    parser.add_argument("--pictures", action="store_true", help="write drawing and pictures, too")
-    parser.add_argument("--numbers", type=Path, help="page of numbers to write; takes some minutes")
-    given = parser.parse_args(arguments)
+    given = arguments_of(arguments)
+    view = view_of(given)
+    rpm = max(SPEEDS) if given.rpm is None else given.rpm
     for rig in parts.RIGS:
         if given.rig not in (None, rig.name):
             continue
-        lens, reach = given.lens_mm or (rig.lens, rig.reach)
-        thickness, grip = given.thickness_mm or rig.thickness, tuple(given.grip_mm or rig.grip)
-        own = replace(rig, apex_deg=given.apex_deg, thickness=thickness, lens=lens, reach=reach, grip=grip)
-        made = checked(own)
+        own = rig_of(rig, given)
+        made = checked(own, view, rpm)
         folder = given.out / own.name
         folder.mkdir(parents=True, exist_ok=True)
         for part in made:
             if part.kind == "printed":
                 numbers.to_mesh(part).export(folder / f"{part.name.replace(' ', '_')}.stl")
         print(f"{folder}: {sum(part.kind == 'printed' for part in made)} parts to print, all watertight, none overlaps")
-        print(f"lens: its front is {own.seat_z - own.lens_z:.1f} mm from the wedge")
-        print(balance_text(own))
+        for line in (*said(own, given), view_text(own, view), balance_text(own)):
+            print(line)
         if given.pictures:
             from rig import drawings
 
@@ -295,7 +408,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             drawings.exploded(made, folder / "exploded.png")
             drawings.exploded(made, folder / "whole.png", apart=0.0)
     if given.numbers:
-        given.numbers.write_text(report())
+        given.numbers.write_text(report(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -155,18 +155,18 @@ def holder(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     solid = solids["holder"]
     fill(axes, solid.project().mirror((1, 0)), COLOURS["holder"])
     fill(axes, solid.slice(rig.grip_z - 0.4).mirror((1, 0)), COLOURS["holder"])
-    shift = max(rig.bearing.outer / 2, parts.holder_screws(rig)[0][0]) + 24.0 - rig.grip_z
+    shift = max(rig.barrel, parts.holder_screws(rig)[0][0]) + 24.0 - rig.grip_z
     fill(axes, section(solid).translate((shift, 0.0)), COLOURS["holder"])
-    at = max(rig.grip[0], rig.lens + 2.0) / 2 + 4.0
+    at = parts.clamp_radius(rig)
     axes.set_title(f"4 holder, from the camera, and cut at the height of the axis; plate {number(parts.HOLDER)}")
     x, _ = parts.holder_screws(rig)[0]
-    low = -max(rig.bearing.outer / 2 + 4.0, x + 4.0)
+    low = -max(rig.barrel + 4.0, x + 4.0)
     dimension(axes, (-x, low), (x, low), f"{number(2 * x)} square, 4 × ⌀ 2.9", -6)
     dimension(axes, (-rig.grip[0] / 2, 0), (rig.grip[0] / 2, 0), f"clamp ⌀ {number(rig.grip[0] + 0.2)}")
     rear = rig.grip_z - rig.grip[1] + 0.1
     dimension(axes, (rear + shift, low), (shift, low), number(-rear), -6)
     dimension(axes, (shift, low), (shift + 1.5, low), "1.5", -13)
-    spigot = rig.bearing.outside - 0.05
+    spigot = rig.centring - 0.05
     dimension(axes, (shift + 1.5, -spigot), (shift + 1.5, spigot), f"spigot ⌀ {number(2 * spigot)}", 7)
     dimension(axes, (rear + shift, -at), (rear + shift, at), f"⌀ {number(2 * at)}", -6)
 
@@ -186,7 +186,7 @@ def rotor(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
             (rig.clear, rig.front_z + 2, number(2 * rig.clear)),
             (rig.wedge / 2 + rig.seat, rig.seat_z + 2, number(rig.wedge + 2 * rig.seat)),
             (tip, rig.front_z - 3, f"{number(2 * tip)} teeth"),
-            (rig.flange, rig.front_z, number(2 * rig.flange)),
+            (rig.pulley_flange, rig.front_z, number(2 * rig.pulley_flange)),
         ],
         rig.front_z + 8,
     )
@@ -198,7 +198,9 @@ def rotor(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     start = rig.bearing_z[0] + 0.2
     dimension(axes, (start, y), (rig.shoulder_z, y), number(rig.shoulder_z - start), -5)
     dimension(axes, (rig.pulley_z, y), (rig.front_z, y), number(rig.front_z - rig.pulley_z), -5)
-    dimension(axes, (rig.seat_z, -rig.flange), (rig.front_z, -rig.flange), number(rig.front_z - rig.seat_z), 5)
+    dimension(
+        axes, (rig.seat_z, -rig.pulley_flange), (rig.front_z, -rig.pulley_flange), number(rig.front_z - rig.seat_z), 5
+    )
     dimension(axes, (rig.bearing_z[0], 0), (rig.bearing_z[0], y), f"flag {number(rig.flag)}", -18)
 
 

@@ -198,7 +198,7 @@ def stress(rig: Rig, rpm: float) -> dict[str, float]:
     """Return stresses [MPa], forces [N], rim speed [m/s] and energy [J] of the rotor at a speed."""
     w, radius = omega(rpm), rig.wedge / 2e3
     body = rotating(rig)
-    outer = rig.flange / 1e3
+    outer = rig.pulley_flange / 1e3
     offset = wedge_unbalance(rig) + rig.seat * glass_mass(rig)
     return {
         "glass": (3 + 0.21) / 8 * GLASS * 1e6 * w**2 * radius**2 / 1e6,
@@ -226,14 +226,47 @@ SENSORS = {
 """Sensors: columns, rows, pixel pitch [mm]."""
 
 
+@dataclass(frozen=True)
+class View:
+    """What a camera sees: sensor, horizontal field of view [deg], and f-number of the lens."""
+
+    sensor: tuple[int, int, float]
+    """Columns, rows, pixel pitch [mm]."""
+    fov_deg: float
+    number: float
+
+    @property
+    def focal(self) -> float:
+        """Focal length [mm]."""
+        columns, _, pitch = self.sensor
+        return columns * pitch / (2.0 * math.tan(math.radians(self.fov_deg) / 2.0))
+
+    def degrees(self, focal: float) -> float:
+        """Return the horizontal field of view with another focal length [deg]."""
+        columns, _, pitch = self.sensor
+        return math.degrees(2.0 * math.atan(columns * pitch / (2.0 * focal)))
+
+
+def to_hull(point: tuple[float, float], circles: Sequence[tuple[float, float, float]]) -> float:
+    """Return the distance of a point from the hull of circles [mm]: x, y and radius of each.
+
+    The support function of the hull is the largest of the circles': x cos φ + y sin φ + r. The point is outside by the
+    largest excess over it.
+    """
+    angles = np.arange(7200) * math.tau / 7200
+    along, up = np.cos(angles), np.sin(angles)
+    support = np.max([x * along + y * up + radius for x, y, radius in circles], axis=0)
+    return float(np.max(point[0] * along + point[1] * up - support))
+
+
 def lenses(rig: Rig) -> dict[str, Rig]:
     """Return a rig with different lenses, by their names.
 
     A lens with M12 thread ends about 22 mm before the sensor. On a camera with CS-mount, that is 10 mm before the
     camera, and 5 mm before the adapter.
     """
-    slim = replace(rig, lens=17.0, reach=5.0, pupil=4.0)
-    short, long = (replace(rig, lens=34.0, reach=reach, pupil=10.0) for reach in (30.0, 40.0))
+    slim = replace(rig, lens=17.0, reach=5.0, pupil=4.0, threads=("cs", "m12"))
+    short, long = (replace(rig, lens=34.0, reach=reach, pupil=10.0, threads=("cs", "c")) for reach in (30.0, 40.0))
     found = {"M12, 17 mm wide, 5 mm before its CS adapter": slim}
     if short.enters:
         return {**found, "C-mount, 34 mm wide, 30 mm long": short, "C-mount, 34 mm wide, 40 mm long": long}

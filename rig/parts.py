@@ -7,7 +7,7 @@ the camera. The thick edge of the wedge points to +x.
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from manifold3d import CrossSection, Manifold, OpType
@@ -35,6 +35,8 @@ CORD, SQUEEZED = 1.0, 0.75
 HEADS = {2.0: (3.8, 2.0, 1.6), 2.5: (4.5, 2.5, 2.05), 3.0: (5.5, 3.0, 2.5), 4.0: (7.0, 4.0, 3.3)}
 """Screws by thread [mm]: diameter and height of a cylinder head (ISO 4762), and core hole. Countersunk heads (ISO 7046)
 have the same diameter to within 0.3 mm."""
+ROUNDED = 2e-3
+"""How far the surfaces of printed parts may be moved when short edges are removed [mm]."""
 FORK_WIDTH, FORK_DEPTH, FORK_SLOT, FORK_SLOT_DEPTH, FORK_LENGTH = 14.0, 10.0, 5.0, 7.0, 6.0
 """Fork barrier [mm]: width along its beam, depth, width and depth of its slot, and length along the flag's path."""
 
@@ -128,6 +130,10 @@ class Rig:
     grip: tuple[float, float] = (30.0, 5.0)
     """What the holder grips: diameter, and width. By default the ring of 5 mm between a camera with CS-mount (12.526 mm
     from flange to sensor) and a lens with C-mount (17.526 mm), which is of metal and does not turn when one focuses."""
+    threads: tuple[str, str] = ("cs", "c")
+    """Threads of camera and lens: 'c', 'cs' or 'm12'."""
+    flange: float = 12.526
+    """Distance from the sensor to the flange of the camera's thread."""
     screw: tuple[float, float] = (1.6, 2.0)
     """Set screws that balance the rotor: core hole, and thread."""
     seat: float = 0.1
@@ -147,6 +153,21 @@ class Rig:
         least = self.wedge + 2 * (self.seat + self.wall)
         made = (bearing for bearing in BEARINGS if bearing.name.startswith(self.series))
         return next(bearing for bearing in made if bearing.bore >= least - 1e-9)
+
+    @property
+    def barrel(self) -> float:
+        """Radius of the housing's bore."""
+        return self.bearing.outer / 2
+
+    @property
+    def centring(self) -> float:
+        """Radius of the opening in the housing's rear, which centres the holder's spigot."""
+        return self.bearing.outside
+
+    @property
+    def spigot(self) -> float:
+        """Radius within the holder's spigot, which leaves room to what turns."""
+        return self.bearing.inner + self.clearance + 0.05
 
     @property
     def clear(self) -> float:
@@ -218,7 +239,7 @@ class Rig:
     @property
     def outline(self) -> float:
         """Radius of plate and cover about the axis: room for the cap's screws, and for the fork beside the pulley."""
-        return max(self.bearing.outer / 2 + 10.0, self.pitch(self.teeth[0]) + 13.4)
+        return max(self.barrel + 10.0, self.pitch(self.teeth[0]) + 13.4)
 
     @property
     def height(self) -> float:
@@ -231,7 +252,7 @@ class Rig:
         return self.outline - 4.0
 
     @property
-    def flange(self) -> float:
+    def pulley_flange(self) -> float:
         """Radius of the flanges of the rotor's pulley."""
         return self.pitch(self.teeth[0]) + 1.4
 
@@ -275,7 +296,21 @@ class Rig:
         return self.clear + 1.0 * (self.cover_z - self.front_z)
 
 
-ONE_INCH = Rig("one-inch", 25.4, 3.5, 1.0, (60, 30), 180.0, "67", 17.0, 5.0, 4.0, (28.0, 40.0, 4.0), (17.0, 7.0))
+ONE_INCH = Rig(
+    "one-inch",
+    25.4,
+    3.5,
+    1.0,
+    (60, 30),
+    180.0,
+    "67",
+    17.0,
+    5.0,
+    4.0,
+    (28.0, 40.0, 4.0),
+    (17.0, 7.0),
+    threads=("cs", "m12"),
+)
 TWO_INCH = Rig(
     "two-inch",
     50.8,
@@ -292,6 +327,32 @@ TWO_INCH = Rig(
     screw=(2.5, 3.0),
 )
 RIGS = (ONE_INCH, TWO_INCH)
+
+
+BELTS = tuple(float(length) for length in range(160, 401, 20))
+"""Lengths of closed GT2 belts among which :func:`for_wedge` chooses [mm]."""
+
+
+def for_wedge(rig: Rig, wedge: float, *, teeth: tuple[int, int] | None, belt: float | None) -> Rig:
+    """Return a rig for a wedge of another diameter [mm], with teeth and belt chosen if they are not given.
+
+    The belt is the shortest of :data:`BELTS` that keeps the motor beside the barrel.
+    """
+    if teeth is None:
+        large = max(least_teeth(wedge, rig.seat, rig.screw[0]), 40)
+        teeth = large, large // 2
+        if wedge == rig.wedge:
+            teeth = rig.teeth
+    own = replace(rig, wedge=wedge, teeth=teeth)
+    if belt is not None:
+        return replace(own, belt=belt)
+    if own == rig:
+        return rig
+    for length in BELTS:
+        own = replace(own, belt=length)
+        if length > 2 * BELT_PITCH * max(teeth) / 1.5 and own.distance > own.barrel + 8.0 + SLIDE + own.motor[0] / 2:
+            break
+    return own
 
 
 @dataclass(frozen=True)
@@ -417,35 +478,47 @@ def ring_screws(rig: Rig) -> tuple[float, list[tuple[float, float]]]:
     return radius, around(radius, (45, 135, 225, 315))
 
 
-LEAST_EDGE = 0.5
-"""Smallest thickness of the wedge at its thin edge [mm]. Thinner glass chips."""
+BALANCE_STEP = 15.0
+"""Angle between neighbouring set screws [deg]."""
 
 
-def impossible(rig: Rig) -> list[str]:
-    """Return what is wrong with the sizes of the wedge, and the remedy; nothing if it can be made."""
-    if not 0.0 < rig.apex_deg < 90.0:
-        return [
-            f"apex {rig.apex_deg:g}°: give an angle above 0; the thick edge is at 0° of the rotor, whatever the sign"
-        ]
-    if rig.thin_edge < LEAST_EDGE:
-        least = math.ceil(10.0 * (rig.thickness - rig.thin_edge + LEAST_EDGE)) / 10.0
-        return [
-            f"thickness {rig.thickness:g} mm: with an apex of {rig.apex_deg:g}° the thin edge is "
-            f"{rig.thin_edge:.2f} mm; give {least:.1f} mm or more on the axis, or a smaller apex"
-        ]
-    return []
+LEAST_WALL = 1.2
+"""Thinnest printed wall: three lines of a nozzle of 0.4 mm [mm]."""
+
+
+def least_teeth(wedge: float, seat: float, hole: float) -> int:
+    """Return the smallest even number of teeth of a rotor's pulley that leaves walls beside and between the screws.
+
+    Parameters
+    ----------
+    wedge, seat : float
+        Diameter of the wedge, and radial gap of its seat [mm].
+    hole : float
+        Diameter of the set screws' holes [mm].
+    """
+    inner = wedge / 2 + seat
+    beside = inner + hole + 2 * LEAST_WALL
+    # the screws' circle lies in the middle: (inner + root) / 2 = radius
+    between = (hole + LEAST_WALL) / math.sin(math.radians(BALANCE_STEP / 2)) - inner
+    root = max(beside, between)
+    teeth = math.ceil((root + PITCH_LINE + TOOTH_DEPTH) * 2 * math.pi / BELT_PITCH - 1e-9)
+    return teeth + teeth % 2
+
+
+def thickest_edge(rig: Rig) -> float:
+    """Return the largest thick edge of a wedge: behind its seat, 1.2 mm remain before the rear ring's threads."""
+    return rig.front_z - 1.3 - (rig.bearing_z[0] + 8.0 + LEAST_WALL)
 
 
 def balance_holes(rig: Rig) -> tuple[float, list[float]]:
     """Return the radius and the angles [deg] of the twelve threads for set screws that balance the rotor."""
-    step = 15.0
-    angles = [k * step for k in range(24) if (k * step) % 90 not in (30.0, 45.0, 60.0)]
+    angles = [k * BALANCE_STEP for k in range(24) if (k * BALANCE_STEP) % 90 not in (30.0, 45.0, 60.0)]
     return ring_screws(rig)[0], angles
 
 
 def rotor(rig: Rig) -> Manifold:
     """Return the rotor: tube, shoulder, pulley, seat of the wedge, index flag, threads of M2 screws."""
-    bearing, low, high, flange = rig.bearing, rig.pulley_z, rig.front_z, rig.flange
+    bearing, low, high, flange = rig.bearing, rig.pulley_z, rig.front_z, rig.pulley_flange
     out = ring(0, bearing.bore / 2 - 0.01, rig.bearing_z[0] + 0.2, high)
     out += ring(0, bearing.inner, rig.shoulder_z, low + 0.1)
     out += pulley(rig.teeth[0]).extrude(high - low).translate((0, 0, low))
@@ -487,7 +560,7 @@ def lugs(rig: Rig) -> list[tuple[float, float]]:
 
 def cap_screws(rig: Rig) -> list[tuple[float, float]]:
     """Return the points of the M3 screws that hold the bearing cap. Their heads lie beside the rotor's flange."""
-    beside = rig.flange + rig.clearance + HEADS[3.0][0] / 2 + 0.1
+    beside = rig.pulley_flange + rig.clearance + HEADS[3.0][0] / 2 + 0.1
     return around(max(rig.bearing.outer / 2 + 3.5, beside), (70, 180, 290))
 
 
@@ -520,8 +593,15 @@ def with_lugs(rig: Rig) -> CrossSection:
 
 def housing(rig: Rig) -> Manifold:
     """Return the housing: barrel of the bearings, plate with a slot for the motor's shaft, foot."""
-    bearing, face = rig.bearing, rig.face_z
-    barrel = bearing.outer / 2 + 4.0
+    out = housing_body(rig) - rod(rig.barrel + 0.025, 2.0, rig.face_z + 1, sides=SEGMENTS)
+    out -= rod(rig.centring, -1, 3, sides=SEGMENTS)
+    return out - holes(cap_screws(rig), 2.5, rig.face_z - PLATE - 1, rig.face_z + 1)
+
+
+def housing_body(rig: Rig) -> Manifold:
+    """Return the housing without its bores: barrel, plate with a slot for the motor's shaft, foot."""
+    face = rig.face_z
+    barrel = rig.barrel + 4.0
     circle = CrossSection.circle(barrel, SEGMENTS)
     eyes = [(circle + CrossSection.circle(3.2, 48).translate(point)).hull() for point in holder_screws(rig)]
     out = with_lugs(rig).extrude(PLATE).translate((0, 0, face - PLATE))
@@ -530,17 +610,15 @@ def housing(rig: Rig) -> Manifold:
     out += box((-barrel, barrel), (-rig.height, -rig.height + PLATE), (0, face + 20))
     for x in (-barrel, barrel - 4):
         out += box((x, x + 4), (-rig.height, -barrel * 0.5), (0, face))
-    out -= rod(bearing.outer / 2 + 0.025, 2.0, face + 1, sides=SEGMENTS)
-    out -= rod(bearing.outside, -1, 3, sides=SEGMENTS)
     out -= slots([(rig.distance, 0)], rig.motor[2] + 2.0, SLIDE, face - PLATE - 1, face + 1)
-    out -= holes([*cap_screws(rig), *lugs(rig), *plate_screws(rig)], 2.5, face - PLATE - 1, face + 1)
+    out -= holes([*lugs(rig), *plate_screws(rig)], 2.5, face - PLATE - 1, face + 1)
     out -= holes(holder_screws(rig), HEADS[2.5][2], -1, 8)
     return out - upright_holes(rig, foot_holes(rig), 3.3)
 
 
 def foot_holes(rig: Rig) -> list[tuple[float, float]]:
     """Return x and z of the M4 screws between housing and base."""
-    x = rig.bearing.outer / 2 - 4.0
+    x = rig.barrel - 4.0
     return [(side, z) for side in (-x, x) for z in (4.0, rig.face_z + 15.0)]
 
 
@@ -596,7 +674,8 @@ def beyond(rig: Rig, solid: Manifold, distance: float) -> Manifold:
 
 def o_ring(rig: Rig) -> Manifold:
     """Return the squeezed O-ring."""
-    out = beyond(rig, ring(rig.o_ring, rig.wedge / 2 + rig.seat, rig.seat_z, rig.front_z + 1.0), 0.0)
+    outer = rig.wedge / 2 + rig.seat - ROUNDED
+    out = beyond(rig, ring(rig.o_ring, outer, rig.seat_z, rig.front_z + 1.0), 0.0)
     return out - beyond(rig, out, SQUEEZED)
 
 
@@ -661,7 +740,7 @@ def magnet_z(rig: Rig) -> float:
 
 def holder_screws(rig: Rig) -> list[tuple[float, float]]:
     """Return the points of the M2.5 screws that hold the holder on the housing. A key passes beside the camera."""
-    x = max(rig.camera[0] / 2 + HEADS[2.5][0] / 2 + 0.1, (rig.bearing.outer / 2 + 2.0) / math.sqrt(2))
+    x = max(rig.camera[0] / 2 + HEADS[2.5][0] / 2 + 0.1, (rig.barrel + 2.0) / math.sqrt(2))
     return [(i * x, j * x) for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
 
 
@@ -670,17 +749,17 @@ def holder(rig: Rig) -> Manifold:
 
     The clamp grips the ring between camera and lens. If the lens is slimmer than the ring, the ring lies on a lip.
     """
-    bearing, (wide, _), front = rig.bearing, rig.grip, rig.grip_z
-    rear, outer = front - rig.grip[1] + 0.1, max(rig.grip[0], rig.lens + 2.0) / 2 + 4.0
+    (wide, _), front = rig.grip, rig.grip_z
+    rear, outer = front - rig.grip[1] + 0.1, clamp_radius(rig)
     eyes = [CrossSection.circle(4.0, 48).translate(point) for point in holder_screws(rig)]
-    plate = CrossSection.batch_boolean([CrossSection.circle(bearing.outer / 2 + 4.0, SEGMENTS), *eyes], ADD).hull()
+    plate = CrossSection.batch_boolean([CrossSection.circle(rig.barrel + 4.0, SEGMENTS), *eyes], ADD).hull()
     out = plate.extrude(HOLDER).translate((0, 0, -HOLDER)) + ring(0, outer, rear, -HOLDER)
-    out += ring(0, bearing.outside - 0.05, -0.1, 1.5)
+    out += ring(0, rig.centring - 0.05, -0.1, 1.5)
     y = clamp_y(rig)
     out += box((-CLAMP, CLAMP), (outer - 3.0, y + 3.5), (rear, front + LIP))
     out -= box((-50, 50), (-0.35 * outer, 100), (front + LIP, front + LIP + SLIT))
     out -= box((-1, 1), (0, 100), (rear - 1, front + LIP + SLIT))
-    spigot = bearing.inner + rig.clearance + 0.05
+    spigot = rig.spigot
     out -= rod(rig.lens / 2 + 1.0, front - 0.1, 2.0 if rig.enters else -1.0, sides=SEGMENTS)
     out -= rod(spigot, 0.0, 2.0, sides=SEGMENTS) + rod(min(spigot, rig.lens / 2 + 1.0), -1.1, 2.0, sides=SEGMENTS)
     out -= rod(wide / 2 + 0.1, rear - 1, front, sides=SEGMENTS)
@@ -693,9 +772,14 @@ CLAMP = 6.0
 """Distance of the clamp's outer faces from the middle [mm]."""
 
 
+def clamp_radius(rig: Rig) -> float:
+    """Return the outer radius of the clamp: walls of 4 mm around the ring, or the lens that passes through it."""
+    return max(rig.grip[0], rig.lens + 2.0) / 2 + 4.0
+
+
 def clamp_y(rig: Rig) -> float:
     """Return the height of the clamp's M2.5 screw above the axis."""
-    return max(rig.grip[0], rig.lens + 2.0) / 2 + 4.0 + 3.5
+    return clamp_radius(rig) + 3.5
 
 
 def clamp_z(rig: Rig) -> float:
@@ -711,7 +795,7 @@ def camera_z(rig: Rig) -> tuple[float, float]:
 
 def base(rig: Rig) -> Manifold:
     """Return the base plate."""
-    x, low = rig.bearing.outer / 2 + 8.0, camera_z(rig)[0]
+    x, low = rig.barrel + 8.0, camera_z(rig)[0]
     y = (-rig.height - 6.0, -rig.height)
     out = box((-x, x), y, (low - 12, rig.face_z + 32))
     out -= upright_holes(rig, foot_holes(rig), 4.4)
@@ -827,7 +911,7 @@ def assembly(rig: Rig) -> tuple[Part, ...]:
     """Return all parts in their places."""
 
     def printed(name: str, solid: Manifold, moves: str, apart: tuple[float, float, float]) -> Part:
-        solid = solid.simplify(2e-3)  # the files have float32 numbers: no edge may be shorter than they resolve
+        solid = solid.simplify(ROUNDED)  # the files have float32 numbers: no edge may be shorter than they resolve
         return Part(name, solid, "printed", moves, solid.volume() * PETG, apart)
 
     glass = wedge(rig)

@@ -350,33 +350,3 @@ def test_page_states_what_is_computed() -> None:
     for row in [*command.balance_rows([ONE_INCH], [1.0]), *command.speed_rows(), *command.lens_rows([TWO_INCH])]:
         assert "| " + " | ".join(row) + " |" in PAGE
     assert TWO_INCH.bearing.name in PAGE
-
-
-@pytest.mark.parametrize(
-    ("own", "says"),
-    [
-        (replace(ONE_INCH, apex_deg=-1.0), "one-inch: apex -1°: give an angle above 0"),
-        (replace(ONE_INCH, apex_deg=0.0), "apex 0°: give an angle above 0"),
-        (replace(ONE_INCH, apex_deg=math.nan), "apex nan°"),
-        (replace(ONE_INCH, apex_deg=1.0, thickness=0.2), "the thin edge is -0.02 mm; give 0.8 mm or more on the axis"),
-    ],
-)
-def test_a_wedge_that_cannot_be_made_is_refused(own: Rig, says: str) -> None:
-    with pytest.raises(SystemExit, match=re.escape(says)):
-        command.checked(own)
-
-
-def test_the_least_thickness_that_is_named_is_accepted() -> None:
-    assert parts.impossible(replace(ONE_INCH, apex_deg=1.0, thickness=0.8)) == []
-    assert parts.impossible(replace(ONE_INCH, apex_deg=1.0, thickness=0.73)) == []
-    assert parts.impossible(replace(ONE_INCH, apex_deg=1.0, thickness=0.72)) != []
-
-
-@pytest.mark.parametrize(("apex", "balanced"), [(1.0, True), (2.0, True), (4.0, False)])
-def test_a_rotor_is_called_balanced_only_if_it_is(apex: float, balanced: bool) -> None:
-    own = replace(TWO_INCH, apex_deg=apex)
-    text = command.balance_text(own)
-    _, body = numbers.balance(own, numbers.rotating(own))
-    assert ("NOT BALANCED" in text) is not balanced
-    assert f"they leave {np.hypot(*numbers.unbalance(body)):.2f} g mm" in text
-    assert (numbers.grade(body, 1440.0) <= 2.5) is balanced
