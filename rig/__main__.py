@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import amiwarp
-from rig import limits, numbers, parts
+from rig import files, limits, numbers, parts
 from rig.numbers import OVERSPEED, SPEEDS, Tolerance, View
 from rig.parts import Part, Rig
 
@@ -264,6 +264,9 @@ def arguments_of(given: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("out", type=Path, help="folder for the files")
     parser.add_argument("--rig", choices=[rig.name for rig in parts.RIGS], help="only this rig")
     parser.add_argument("--pictures", action="store_true", help="write drawing and pictures, too")
+    parser.add_argument(
+        "--format", nargs="+", choices=("stl", "3mf", "step"), default=["stl"], help="formats of the parts; default stl"
+    )
     parser.add_argument("--numbers", type=Path, help="page of numbers to write; takes some minutes")
 
     def sizes(group: argparse._ArgumentGroup, name: str, text: str, *values: str) -> None:
@@ -383,6 +386,17 @@ def said(rig: Rig, given: argparse.Namespace) -> list[str]:
     return lines
 
 
+def write_part(part: Part, folder: Path, formats: Sequence[str]) -> None:
+    """Write a part in each format."""
+    out = folder / part.name.replace(" ", "_")
+    if "stl" in formats:
+        files.write_stl(part.solid, out.with_suffix(".stl"))
+    if "3mf" in formats:
+        files.write_3mf([(part.name, part.solid)], out.with_suffix(".3mf"))
+    if "step" in formats:
+        files.write_step(part.name, [(part.name, part.solid)], out.with_suffix(".step"))
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Write the files."""
     given = arguments_of(arguments)
@@ -395,10 +409,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         made = checked(own, view, rpm)
         folder = given.out / own.name
         folder.mkdir(parents=True, exist_ok=True)
-        for part in made:
-            if part.kind == "printed":
-                numbers.to_mesh(part).export(folder / f"{part.name.replace(' ', '_')}.stl")
-        print(f"{folder}: {sum(part.kind == 'printed' for part in made)} parts to print, all watertight, none overlaps")
+        printed = [part for part in made if part.kind == "printed"]
+        for part in printed:
+            write_part(part, folder, given.format)
+        print(f"{folder}: {len(printed)} parts to print, all watertight, none overlaps; {', '.join(given.format)}")
         for line in (*said(own, given), view_text(own, view), balance_text(own)):
             print(line)
         if given.pictures:
