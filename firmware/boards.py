@@ -6,15 +6,22 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import ctypes
 import json
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))  # also if a test loads this file by its path
+
+import release  # noqa: E402
+
 BUILD = HERE / "build"
 COUNTS = (4096, 16384)
 """Counts per turn of the quadrature encoder, and of the magnetic one if it turns with the prism."""
@@ -39,6 +46,18 @@ FAULTS = (
 )
 """Faults of the simulated motor and encoder, explained by ``enum value`` in ``native/motor.h``, in its order."""
 MOTOR = (*FAULTS, "angle", "rpm")
+
+
+@contextlib.contextmanager
+def flash_of(image: Path) -> Iterator[Path]:
+    """Give a file that a simulator loads: the image, or the content of the flash that a .uf2 or .hex describes."""
+    if image.suffix not in (".uf2", ".hex"):
+        yield image
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        flash = Path(folder) / "flash.bin"
+        flash.write_bytes(release.read(image))
+        yield flash
 
 
 class NativeBoard:
@@ -108,7 +127,8 @@ class NativeBoard:
 class SimulatedBoard:
     """The image for the RP2040 on rp2040js (needs Node.js and ``npm install`` in ``simulator``), in simulated time.
 
-    ``image``: flash image (``.bin``); ``counts_per_turn`` of the prism is that for which it was built. Times are in us.
+    ``image``: flash image (``.bin`` or ``.uf2``); ``counts_per_turn`` of the prism is that for which it was built.
+    Times are in us.
     """
 
     MHZ = 125
@@ -116,12 +136,18 @@ class SimulatedBoard:
 
     def __init__(self, image: Path, *, magnetic: bool = False, counts_per_turn: int | None = None) -> None:
         kind, counts = "MAGNETIC" if magnetic else "QUADRATURE", counts_per_turn or COUNTS[magnetic]
-        self._process = subprocess.Popen(
-            ["node", str(HERE / "simulator" / "board.mjs"), str(image), kind, str(counts)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
-        )  # fmt: skip
+        with flash_of(image) as flash:
+            self._start(flash, kind, counts)
         self._inbox = b""
         self.now = 0
+
+    def _start(self, flash: Path, kind: str, counts: int) -> None:
+        """Start the simulator, and wait until it has read the flash."""
+        self._process = subprocess.Popen(
+            ["node", str(HERE / "simulator" / "board.mjs"), str(flash), kind, str(counts)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
+        )  # fmt: skip
+        self.get("resets")
 
     def _ask(self, line: str) -> str:
         assert self._process.stdin is not None
@@ -183,7 +209,8 @@ class AvrBoard(NativeBoard):
 
     def __init__(self, image: Path, *, counts_per_turn: int | None = None, library: Path = BUILD / "libavr.so") -> None:
         self._load(library)
-        self._board = ctypes.c_void_p(self.library.board_new(str(image).encode(), counts_per_turn or COUNTS[0]))
+        with flash_of(image) as flash:
+            self._board = ctypes.c_void_p(self.library.board_new(str(flash).encode(), counts_per_turn or COUNTS[0]))
         if not self._board:
             raise FileNotFoundError(f"{image} cannot be read: run make -C firmware avr")
 
@@ -235,10 +262,10 @@ class SimulatedWire:
 
 
 def make(name: str, counts_per_turn: int | None = None) -> Any:
-    """Return the board ``native``, ``native-magnetic``, or the one that runs an image (``.bin`` or ``.elf``)."""
+    """Return the board ``native``, ``native-magnetic``, or one for an image: .bin, .uf2 (RP2040), .elf, .hex (AVR)."""
     if name.startswith("native"):
         return NativeBoard(magnetic=name.endswith("magnetic"), counts_per_turn=counts_per_turn)
-    if name.endswith(".elf"):
+    if name.endswith((".elf", ".hex")):
         return AvrBoard(Path(name), counts_per_turn=counts_per_turn)
     return SimulatedBoard(Path(name), magnetic="MAGNETIC" in name, counts_per_turn=counts_per_turn)
 
@@ -265,7 +292,7 @@ def main() -> int:
     from amiwarp.live.link.conformance import check_controller
 
     options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("board", help="native, native-magnetic, or an image (.bin for the RP2040, .elf for the AVR)")
+    options.add_argument("board", help="native, native-magnetic, or an image (.bin, .uf2: RP2040; .elf, .hex: AVR)")
     options.add_argument("--link", type=Path, help="symbolic link for the serial port")
     options.add_argument("--counts-per-turn", type=int, help="of the prism, for which the image was built")
     options.add_argument("--seconds", type=float, default=3600.0)

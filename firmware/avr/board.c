@@ -147,15 +147,28 @@ static void log_errors(struct avr_t *avr, const int level, const char *format, v
     if (level <= LOG_ERROR) vfprintf(stderr, format, values);
 }
 
+static bool load_flash(avr_t *avr, const char *path) { /* the content of the flash, from address 0 */
+    FILE *file = fopen(path, "rb");
+    if (!file) return false;
+    memset(avr->flash, 0xFF, avr->flashend + 1);
+    size_t size = fread(avr->flash, 1, avr->flashend + 1, file);
+    fclose(file);
+    avr->codeend = avr->flashend;
+    return size > 0;
+}
+
 struct board *board_new(const char *image, uint32_t counts) {
     struct board *b = calloc(1, sizeof *b);
     elf_firmware_t firmware = {0};
     avr_global_logger_set(log_errors);
-    if (!b || elf_read_firmware(image, &firmware)) return 0;
+    size_t length = strlen(image);
+    bool is_flash = length > 4 && strcmp(image + length - 4, ".bin") == 0;
+    if (!b || (!is_flash && elf_read_firmware(image, &firmware))) return 0;
     avr_t *avr = b->avr = avr_make_mcu_by_name("atmega2560");
     if (!avr) return 0;
     avr_init(avr);
-    avr_load_firmware(avr, &firmware);
+    if (!is_flash) avr_load_firmware(avr, &firmware);
+    else if (!load_flash(avr, image)) return 0;
     avr->frequency = HZ;
     avr->sleep = on_sleep;
     b->run = avr->run;
