@@ -43,6 +43,9 @@ FAULTS = (
     "sensed",
     "load",
     "heavy",
+    "volts",
+    "divider",
+    "bad_store",
 )
 """Faults of the simulated motor and encoder, explained by ``enum value`` in ``native/motor.h``, in its order."""
 MOTOR = (*FAULTS, "angle", "rpm")

@@ -3,6 +3,7 @@
 ``python generate.py`` writes the file; ``python generate.py --check`` ends with status 1 if it is out of date.
 """
 
+import re
 import struct
 import sys
 from dataclasses import fields
@@ -37,17 +38,23 @@ def described() -> str:
         f"#define SAMPLES_TYPE 0x{protocol.Samples.KIND:02X}",
         "#define SAMPLE_BYTES 8",
     ]
-    for message in (
-        protocol.Index, protocol.Sync, protocol.ControllerStatus, protocol.Pong, protocol.Answer, protocol.SetSpeed,
-        protocol.Stop, protocol.SetCounts, protocol.Ping,
-    ):  # fmt: skip
+    for message in protocol.PLAIN:
         prefix = name(message.__name__)
         lines += ["", f"#define {prefix}_TYPE 0x{message.KIND:02X}", f"#define {prefix}_BYTES {message.LAYOUT.size}"]
-        layout = message.LAYOUT.format.removeprefix("<")
+        layout = re.findall(r"\d*[A-Za-z]", message.LAYOUT.format)
         for k, field in enumerate(fields(message)):
-            lines.append(f"#define {prefix}_{name(field.name)} {struct.calcsize('<' + layout[:k])} /* {layout[k]} */")
-    for prefix, names in (("STATE", protocol.STATES), ("FAULT_BIT", protocol.FAULTS), ("REFUSED", protocol.REFUSALS)):
+            offset = struct.calcsize("<" + "".join(layout[:k]))
+            lines.append(f"#define {prefix}_{name(field.name)} {offset} /* {layout[k]} */")
+    settings = tuple(setting.name for setting in protocol.SETTINGS)
+    for prefix, names in (
+        ("STATE", protocol.STATES), ("FAULT_BIT", protocol.FAULTS), ("REFUSED", protocol.REFUSALS),
+        ("SETTING", settings),
+    ):  # fmt: skip
         lines += ["", *(f"#define {prefix}_{name(text)} {k}" for k, text in enumerate(names))]
+    lines += ["", "/* Smallest and largest value of each setting, and whether 0 is allowed too. */"]
+    ranges = (f"    {{{setting.least}, {setting.most}, {int(setting.off)}}}," for setting in protocol.SETTINGS)
+    lines += [" \\\n".join(["#define SETTING_RANGES", *ranges]), f"#define SETTINGS {len(settings)}"]
+    lines += ["", f"#define UNKNOWN_MV {protocol.UNKNOWN_MV}u", f"#define BOARD_BYTES {protocol.BOARD_BYTES}"]
     return "\n".join([*lines, "", "#endif", ""])
 
 

@@ -1,4 +1,4 @@
-"""Build the core with each fault of ``planted.toml`` and check that the conformance suite catches it.
+"""Build the firmware with each fault of ``planted.toml`` and check that the conformance suite, or a test, catches it.
 
 ``python planted.py [TEXT]`` runs all faults, or those whose description contains the text; it ends with status 1 if one
 was not caught.
@@ -6,6 +6,7 @@ was not caught.
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -49,6 +50,34 @@ def failures(fault: dict[str, Any], folder: Path, rpm: float = 240.0) -> list[st
     return [c.name for c in check_controller(boards.SimulatedWire(board), rpm) if c.passed is False]
 
 
+def fails(fault: dict[str, Any], folder: Path) -> bool:
+    """Copy the firmware with a fault to a folder, and return whether the fault's test fails there and only there.
+
+    Raises RuntimeError if the test is skipped or not found, as it then shows nothing.
+    """
+    copy = folder / "firmware"
+    shutil.copytree(HERE, copy, ignore=shutil.ignore_patterns("build", "node_modules", "__pycache__"))
+    modules = HERE / "simulator" / "node_modules"
+    if modules.is_dir():
+        (copy / "simulator" / "node_modules").symlink_to(modules)
+    file = copy / fault["file"]
+    file.write_text(planted(file.read_text(), fault))
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider", f"tests/{fault['test']}"]
+    environment = os.environ | {"AMIWARP_FIRMWARE": str(copy)}
+    done = subprocess.run(command, cwd=HERE.parent, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode not in (0, 1) or "skipped" in done.stdout:
+        raise RuntimeError(f"{fault['test']}: {done.stdout[-500:]}{done.stderr[-500:]}")
+    return done.returncode == 1
+
+
+def caught(fault: dict[str, Any], folder: Path) -> tuple[bool, str]:
+    """Return whether a fault is caught, and by what; its check of the suite, or its test."""
+    if "test" in fault:
+        return fails(fault, folder), str(fault["test"])
+    found = failures(fault, folder)
+    return fault["caught"] in found, ", ".join(found) or "all checks pass"
+
+
 def main() -> int:
     """Run the faults and print what failed for each."""
     wanted = sys.argv[1] if len(sys.argv) > 1 else ""
@@ -56,12 +85,9 @@ def main() -> int:
     chosen = [fault for fault in FAULTS if wanted in fault["wrong"]]
     for fault in chosen:
         with tempfile.TemporaryDirectory() as folder:
-            found = failures(fault, Path(folder))
-        caught = fault["caught"] in found
-        missed += not caught
-        print(
-            f"{'caught' if caught else 'MISSED'}: {fault['wrong']}: {', '.join(found) or 'all checks pass'}", flush=True
-        )
+            found, what = caught(fault, Path(folder))
+        missed += not found
+        print(f"{'caught' if found else 'MISSED'}: {fault['wrong']}: {what}", flush=True)
     print(f"{len(chosen) - missed} of {len(chosen)} planted faults were caught")
     return int(missed > 0)
 

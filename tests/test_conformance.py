@@ -64,7 +64,7 @@ def test_the_emulator_passes(rpm: float, at_first: float) -> None:
     controller = emulated(rpm=at_first, drift_ppm=80.0, clock_start=(1 << 32) - 9_000_000)
     checks = check_controller(VirtualWire(controller), rpm)
     assert [check.name for check in checks if not check.passed] == []
-    assert len(checks) == 25
+    assert len(checks) == 28
     assert controller.rotor.target_rpm(10**9) == 0.0
 
 
@@ -80,13 +80,32 @@ def test_an_older_controller_is_named_and_passes() -> None:
         """Skips unknown commands, as the emulator of amiwarp 0.1 did."""
 
         def _execute(self, sequence: int, message: protocol.Message | None) -> None:
-            if message is not None:
+            known = protocol.Ping | protocol.SetSpeed | protocol.Stop | protocol.SetCounts
+            if isinstance(message, known):
                 super()._execute(sequence, message)
 
     checks = check_controller(VirtualWire(Older(Motor(0.0))), 240.0)
-    unsure = [check for check in checks if not check.passed]
-    assert [(check.name, check.passed) for check in unsure] == [("answers unknown commands", None)]
-    assert "an older controller" in unsure[0].measured
+    assert [check.name for check in checks if check.passed is False] == []
+    unsure = {check.name: check.measured for check in checks if check.passed is None}
+    assert list(unsure) == [
+        "says what it is", "keeps settings within their ranges", "answers unknown commands",
+        "stops for a lost host, if told so",
+    ]  # fmt: skip
+    assert "an older controller" in unsure["answers unknown commands"]
+    assert unsure["says what it is"] == "answer none: older than firmware 1.1"
+
+
+def test_firmware_1_0_is_named_and_passes() -> None:
+    class Older(Controller):
+        """Answers 1 to what it does not know, as firmware 1.0."""
+
+        def _execute(self, sequence: int, message: protocol.Message | None) -> None:
+            known = protocol.Ping | protocol.SetSpeed | protocol.Stop | protocol.SetCounts
+            super()._execute(sequence, message if isinstance(message, known) else None)
+
+    checks = check_controller(VirtualWire(Older(Motor(0.0))), 240.0)
+    unsure = {check.name: check.measured for check in checks if not check.passed}
+    assert set(unsure.values()) == {"answer 1: older than firmware 1.1", "older than firmware 1.1"}
 
 
 @pytest.mark.parametrize(
@@ -191,10 +210,10 @@ def test_the_command_prints_a_table_and_ends_with_status_1_for_a_failure(monkeyp
     controllers = [emulated(), emulated(sync_hz=100.0)]
     monkeypatch.setattr(conformance, "SerialWire", lambda port: VirtualWire(controllers.pop(0)))
     data = json.loads(motor("check", "--port", "p", "--yes", "--rpm", -120, "--json").stdout)
-    assert (data["passed"], data["rpm"], len(data["checks"])) == (True, -120.0, 25)
+    assert (data["passed"], data["rpm"], len(data["checks"])) == (True, -120.0, 28)
     done = motor("check", "--port", "p", "--yes")
     assert done.exit_code == 1
-    assert "1 of 25 checks failed" in done.stdout
+    assert "1 of 28 checks failed" in done.stdout
     assert "sync pulses: send a pulse every 70 to 130 ms, drawn at random for each" in done.stdout
 
 

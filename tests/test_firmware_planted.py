@@ -27,8 +27,8 @@ pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
         for k, f in enumerate(PLANTED.FAULTS)
     ],
 )
-def test_the_suite_catches_a_planted_fault(fault: dict[str, Any], tmp_path: Path) -> None:
-    assert fault["caught"] in PLANTED.failures(fault, tmp_path)
+def test_a_planted_fault_is_caught(fault: dict[str, Any], tmp_path: Path) -> None:
+    assert PLANTED.caught(fault, tmp_path)[0]
 
 
 def test_the_suite_passes_the_core_without_a_fault(tmp_path: Path) -> None:

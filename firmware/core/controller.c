@@ -6,19 +6,17 @@
 #define STILL_CHECKS 10u /* a prism that swings into a cogging position has not stopped */
 #define FAULT(name) (1u << FAULT_BIT_##name)
 #define STOPPING \
-    (FAULT(STALL) | FAULT(OVER_CURRENT) | FAULT(ENCODER_LOST) | FAULT(OVER_SPEED) | FAULT(SUPPLY_LOST) | FAULT(MAGNET_LOST))
+    (FAULT(STALL) | FAULT(OVER_CURRENT) | FAULT(ENCODER_LOST) | FAULT(OVER_SPEED) | FAULT(SUPPLY_LOST) | FAULT(MAGNET_LOST) \
+     | FAULT(UNDERVOLTAGE) | FAULT(OVERVOLTAGE))
 #define MOST_BAD_ANSWERS 3u /* one after the other */
 #define MOST_BAD_PULSES 3u
 #define NO_MAGNET_MS 20u
 #define RUN_DOWN_US 2000000u
 #define SUPPLY_MS 3u
+#define UNDERVOLTAGE_MS 20u /* the mean needs some 16 ms more */
+#define OVERVOLTAGE_MS 5u
+#define SUPPLY_SHIFT 4 /* the mean is that of 2^4 samples */
 #define LEAST_CHANGE_PER_S 4 /* a change of the speed takes a quarter of a second, else it overshoots */
-
-const struct settings default_settings = {
-    .counts_per_turn = (uint32_t)COUNTS * RATIO, .encoder = QUADRATURE, .pulses = PULSES_TIMED, .has_index = true,
-    .most_rpm = MOST_RPM, .most_ramp = 5000, .stop_ramp = 2000, .stall_ms = 1000,
-    .gains = {.no_load_rpm = 4000, .friction = 600, .kp = 20 * 256, .ki = 100 * 256, .rise_ms = 150, .duty_slew = 1500},
-};
 
 static int32_t size_of(int32_t x) { return x == INT32_MIN ? INT32_MAX : x < 0 ? -x : x; }
 static int32_t step_of(int32_t to, int32_t from) { return (int32_t)((uint32_t)to - (uint32_t)from); } /* may wrap */
@@ -100,11 +98,29 @@ static uint8_t state_of(const struct controller *c) {
     return near ? STATE_AT_SPEED : STATE_ON_THE_WAY_TO_ITS_SPEED;
 }
 
+/* Brake to rest by the ramp of a stop, beginning at the speed at which the prism turns. */
+static void brake(struct controller *c) {
+    if (!c->enabled) speed_catch(&c->control, c->speed);
+    c->control.target = 0;
+    c->control.ramp = RPM(c->settings.stop_ramp) / TICK_HZ;
+    c->target_bits = 0;
+}
+
+/* Stop a motor that nobody watches any more, if the settings say so. */
+static void watch_host(struct controller *c, uint32_t silent_us) {
+    uint32_t timeout_us = (uint32_t)c->settings.host_timeout * 1000000u;
+    set_if(c, FAULT(HOST_LOST), silent_us > HOST_LOST_US);
+    if (!timeout_us || silent_us < timeout_us || c->control.target == 0) return;
+    brake(c);
+    c->faults |= (uint16_t)FAULT(STOPPED_FOR_LOST_HOST);
+    if (c->host_stops < UINT16_MAX) c->host_stops++;
+}
+
 static void check(struct controller *c, uint32_t now) {
     bool slow = c->control.target == 0 && size_of(c->speed) < RPM(10);
     c->still = (uint8_t)(!slow ? 0 : c->still < STILL_CHECKS ? c->still + 1 : c->still);
+    watch_host(c, now - c->heard);
     c->state = state_of(c);
-    set_if(c, FAULT(HOST_LOST), now - c->heard > HOST_LOST_US);
     if (!c->told || now - c->status_at >= STATUS_US || c->state != c->sent_state || c->faults != c->sent_faults
         || c->target_bits != c->sent_target || c->settings.counts_per_turn != c->sent_counts) send_status(c, now);
 }
@@ -149,6 +165,18 @@ static void bad_pulse(struct controller *c, bool bad) {
     if (lasts(&c->bad_turns, bad && meant, stalled ? 1 : MOST_BAD_PULSES)) fail_for(c, FAULT(ENCODER_LOST));
 }
 
+/* Mean of the supply's voltage, and its limits. */
+static void watch_supply(struct controller *c) {
+    uint32_t mv = c->supply_mv, least = (uint32_t)c->settings.undervoltage, most = (uint32_t)c->settings.overvoltage;
+    bool known = mv != UNKNOWN_MV;
+    if (!known || !c->supply_sum) c->supply_sum = known ? mv << SUPPLY_SHIFT : 0;
+    else c->supply_sum += mv - (c->supply_sum >> SUPPLY_SHIFT);
+    uint32_t mean = c->supply_sum >> SUPPLY_SHIFT;
+    c->supply_mean = (uint16_t)(known ? mean : UNKNOWN_MV);
+    if (lasts(&c->undervoltage_ms, known && least && mean < least, UNDERVOLTAGE_MS)) fail_for(c, FAULT(UNDERVOLTAGE));
+    if (lasts(&c->overvoltage_ms, known && most && mean > most, OVERVOLTAGE_MS)) fail(c, FAULT(OVERVOLTAGE));
+}
+
 /* Checks of each sample, before the speed control. */
 static void protect(struct controller *c) {
     const struct settings *s = &c->settings;
@@ -157,6 +185,7 @@ static void protect(struct controller *c) {
     if (lasts(&c->stalled_ms, reference > RPM(20) && speed < reference / 8, s->stall_ms)) fail_stalled(c);
     if (lasts(&c->current_ms, c->driver_fault, 2)) fail(c, FAULT(OVER_CURRENT));
     if (lasts(&c->supply_ms, c->supply_low, SUPPLY_MS)) fail_for(c, FAULT(SUPPLY_LOST));
+    watch_supply(c);
     if (c->bad_answers >= MOST_BAD_ANSWERS) fail_for(c, FAULT(ENCODER_LOST));
     if (c->no_magnet >= NO_MAGNET_MS) fail_for(c, FAULT(MAGNET_LOST));
     guard(c);
@@ -246,22 +275,38 @@ static uint8_t set_speed(struct controller *c, const uint8_t *payload) {
     c->control.ramp = ramp > 0 ? ramp : 1;
     c->target_bits = rpm == 0 ? 0 : bits;
     c->bad_turns = 0;
+    c->faults &= (uint16_t)~FAULT(STOPPED_FOR_LOST_HOST);
     c->commanded = true;
     return REFUSED_ACCEPTED;
 }
 
 static uint8_t stop(struct controller *c) {
-    c->faults &= (uint16_t)~STOPPING;
+    c->faults &= (uint16_t)~(STOPPING | FAULT(STOPPED_FOR_LOST_HOST));
     c->over_ms = c->stalled_ms = c->current_ms = c->supply_ms = c->bad_turns = 0;
+    c->undervoltage_ms = c->overvoltage_ms = 0;
     c->no_magnet = 0;
     guard_begin(&c->guard, c->last.count, c->settings.counts_per_turn);
     c->too_fast = false;
     c->commanded = true;
-    if (!c->enabled) speed_catch(&c->control, c->speed);
-    c->control.target = 0;
-    c->control.ramp = RPM(c->settings.stop_ramp) / TICK_HZ;
-    c->target_bits = 0;
+    brake(c);
     return REFUSED_ACCEPTED;
+}
+
+/* Use other counts per turn, while the prism rests. */
+static void begin_counts(struct controller *c) {
+    uint32_t per_turn = c->settings.counts_per_turn;
+    tracker_begin(&c->tracker, c->last.count, per_turn);
+    guard_begin(&c->guard, c->last.count, per_turn);
+    c->indexed = c->index_known = false;
+    c->last_index = c->last;
+}
+
+/* Use the settings, while the prism rests. */
+static void apply(struct controller *c) {
+    speed_begin(&c->control, &c->settings.gains);
+    c->over_speed = RPM(c->settings.most_rpm) / 5 * 6;
+    c->bounce_us = 25000000u / (uint32_t)c->settings.most_rpm;
+    begin_counts(c);
 }
 
 static uint8_t set_counts(struct controller *c, const uint8_t *payload) {
@@ -270,16 +315,88 @@ static uint8_t set_counts(struct controller *c, const uint8_t *payload) {
     if (per_turn == 0 || per_turn >= (uint32_t)1 << 24) return REFUSED_OUT_OF_RANGE;
     if (c->settings.encoder == MAGNETIC || c->state != STATE_STOPPED) return REFUSED_NOT_POSSIBLE_NOW;
     c->settings.counts_per_turn = per_turn;
-    tracker_begin(&c->tracker, c->last.count, per_turn);
-    guard_begin(&c->guard, c->last.count, per_turn);
-    c->indexed = c->index_known = false;
-    c->last_index = c->last;
+    begin_counts(c);
     return REFUSED_ACCEPTED;
+}
+
+/* Whether settings may change: also after a fault, as one that its limit causes could not be ended else. */
+static bool rests(const struct controller *c) { return c->still >= STILL_CHECKS && !c->enabled; }
+
+static uint8_t set_setting(struct controller *c, const uint8_t *payload) {
+    struct settings wanted = c->settings;
+    uint8_t key = payload[SET_SETTING_KEY];
+    int32_t value = (int32_t)get32(payload + SET_SETTING_VALUE);
+    if (!settings_set(&wanted, key, value)) return REFUSED_OUT_OF_RANGE;
+    if (settings_get(&c->settings, key) == value) return REFUSED_ACCEPTED;
+    if (!rests(c)) return REFUSED_NOT_POSSIBLE_NOW;
+    c->settings = wanted;
+    apply(c);
+    return REFUSED_ACCEPTED;
+}
+
+static uint8_t restore_settings(struct controller *c) {
+    if (!rests(c)) return REFUSED_NOT_POSSIBLE_NOW;
+    c->settings = c->built;
+    apply(c);
+    return REFUSED_ACCEPTED;
+}
+
+/* Give the settings to the port, which writes them. Returns false if that is not possible now. */
+static bool save_settings(struct controller *c, uint16_t sequence) {
+    if (c->saving || !rests(c)) return false;
+    c->slot = store_pack(&c->store, &c->settings, c->record);
+    c->save_sequence = sequence;
+    c->saving = true;
+    return true;
+}
+
+static void send_identity(struct controller *c) {
+    static const char board[] = BOARD;
+    _Static_assert(sizeof board <= BOARD_BYTES + 1, "BOARD: 16 bytes at most");
+    uint8_t payload[IDENTITY_BYTES] = {FIRMWARE_MAJOR, FIRMWARE_MINOR, FIRMWARE_PATCH};
+    for (uint8_t k = 0; board[k]; k++) payload[IDENTITY_BOARD + k] = (uint8_t)board[k];
+    send(c, IDENTITY_TYPE, payload, sizeof payload);
+}
+
+static void send_condition(struct controller *c, uint32_t now) {
+    uint8_t payload[CONDITION_BYTES];
+    put32(payload + CONDITION_T_US, now);
+    put16(payload + CONDITION_SUPPLY_MV, c->supply_mean);
+    put16(payload + CONDITION_HOST_TIMEOUT_S, (uint32_t)c->settings.host_timeout);
+    put16(payload + CONDITION_HOST_STOPS, c->host_stops);
+    payload[CONDITION_STORED] = c->store.stored;
+    send(c, CONDITION_TYPE, payload, sizeof payload);
+}
+
+static uint8_t tell(struct controller *c, const uint8_t *asked, uint32_t now) {
+    uint8_t key = asked[ASK_KEY], payload[SETTING_BYTES];
+    flush(c);
+    if (asked[ASK_KIND] == IDENTITY_TYPE) {
+        send_identity(c);
+    } else if (asked[ASK_KIND] == CONDITION_TYPE) {
+        send_condition(c, now);
+    } else if (asked[ASK_KIND] == SETTING_TYPE && key < SETTINGS) {
+        payload[SETTING_KEY] = key;
+        put32(payload + SETTING_VALUE, (uint32_t)settings_get(&c->settings, key));
+        send(c, SETTING_TYPE, payload, sizeof payload);
+    } else {
+        return REFUSED_OUT_OF_RANGE;
+    }
+    return REFUSED_ACCEPTED;
+}
+
+static void send_answer(struct controller *c, uint16_t sequence, uint8_t refused) {
+    uint8_t answer[ANSWER_BYTES];
+    put16(answer + ANSWER_SEQUENCE, sequence);
+    answer[ANSWER_REFUSED] = refused;
+    flush(c);
+    send(c, ANSWER_TYPE, answer, sizeof answer);
 }
 
 static void execute(struct controller *c, uint32_t size, uint32_t now) {
     const uint8_t *packet = c->decoder.packet, *payload = packet + HEADER_BYTES;
-    uint8_t answer[ANSWER_BYTES], refused = REFUSED_UNKNOWN_COMMAND, type = packet[1];
+    uint8_t refused = REFUSED_UNKNOWN_COMMAND, type = packet[1];
+    uint16_t sequence = get16(packet + 2);
     c->heard = now;
     if (type == PING_TYPE && size == PING_BYTES) {
         check(c, now);
@@ -289,11 +406,24 @@ static void execute(struct controller *c, uint32_t size, uint32_t now) {
     if (type == SET_SPEED_TYPE && size == SET_SPEED_BYTES) refused = set_speed(c, payload);
     else if (type == STOP_TYPE && size == STOP_BYTES) refused = stop(c);
     else if (type == SET_COUNTS_TYPE && size == SET_COUNTS_BYTES) refused = set_counts(c, payload);
-    else c->decoder.unknown++;
-    put16(answer + ANSWER_SEQUENCE, get16(packet + 2));
-    answer[ANSWER_REFUSED] = refused;
-    flush(c);
-    send(c, ANSWER_TYPE, answer, sizeof answer);
+    else if (type == ASK_TYPE && size == ASK_BYTES) refused = tell(c, payload, now);
+    else if (type == SET_SETTING_TYPE && size == SET_SETTING_BYTES) refused = set_setting(c, payload);
+    else if (type == RESTORE_SETTINGS_TYPE && size == RESTORE_SETTINGS_BYTES) refused = restore_settings(c);
+    else if (type == SAVE_SETTINGS_TYPE && size == SAVE_SETTINGS_BYTES) {
+        if (save_settings(c, sequence)) return; /* answered once it is written */
+        refused = REFUSED_NOT_POSSIBLE_NOW;
+    } else c->decoder.unknown++;
+    send_answer(c, sequence, refused);
+    check(c, now);
+}
+
+void controller_saved(struct controller *c, bool good, uint32_t now) {
+    c->saving = false;
+    if (good) { /* else the next record goes to the same slot: the other one has the last good record */
+        c->store.number++;
+        c->store.stored = STORED_SAVED;
+    }
+    send_answer(c, c->save_sequence, good ? REFUSED_ACCEPTED : REFUSED_NOT_POSSIBLE_NOW);
     check(c, now);
 }
 
@@ -310,21 +440,23 @@ static void draw_interval(struct controller *c) {
     c->interval = (uint8_t)(LEAST_PULSE_MS + (uint16_t)(x >> 8) % (MOST_PULSE_MS - LEAST_PULSE_MS + 1u));
 }
 
-void controller_begin(struct controller *c, const struct settings *settings, uint32_t now) {
+void controller_begin(struct controller *c, const struct settings *built, uint32_t now) {
     uint8_t *bytes = (uint8_t *)c;
     for (uint32_t k = 0; k < sizeof *c; k++) bytes[k] = 0;
-    c->settings = *settings;
+    c->built = c->settings = *built;
+    c->supply_mv = c->supply_mean = UNKNOWN_MV;
     frame_begin();
-    speed_begin(&c->control, &settings->gains);
-    c->over_speed = RPM(settings->most_rpm) / 5 * 6;
-    c->bounce_us = 25000000u / (uint32_t)settings->most_rpm;
-    tracker_begin(&c->tracker, 0, settings->counts_per_turn);
-    guard_begin(&c->guard, 0, settings->counts_per_turn);
+    apply(c);
     c->heard = now;
     c->checked_at = now;
     c->random = now;
     draw_interval(c);
     c->until_pulse = c->interval;
+}
+
+void controller_load(struct controller *c, const uint8_t *slot0, const uint8_t *slot1) {
+    store_load(&c->store, &c->settings, slot0, slot1);
+    apply(c);
 }
 
 void controller_poll(struct controller *c, uint32_t now) {

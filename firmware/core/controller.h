@@ -9,7 +9,9 @@
 #include "encoder.h"
 #include "frame.h"
 #include "guard.h"
+#include "settings.h"
 #include "speed.h"
+#include "store.h"
 
 /* Sizes of the rings, powers of two. A port with little memory defines smaller ones. */
 #ifndef TX_BYTES
@@ -24,43 +26,17 @@
 #define WAITING_PULSES 8u
 #define BATCH 5u /* samples per packet */
 
-/* Settings that make may give to a port: COUNTS and RATIO (also a fraction: 3/2) are the encoder's counts per turn and
-   its turns per turn of the prism, MOST_RPM is the limit of the prism's speed. */
-#ifndef COUNTS
-#define COUNTS 4096
-#endif
-#ifndef RATIO
-#define RATIO 1
-#endif
-#ifndef MOST_RPM
-#ifdef __AVR__
-#define MOST_RPM 1000
+/* What Identity says. The version changes with the protocol's messages and the settings; 1.0 had no Identity. */
+#define FIRMWARE_MAJOR 1
+#define FIRMWARE_MINOR 1
+#define FIRMWARE_PATCH 0
+#if defined(__AVR__)
+#define BOARD "ATmega2560"
+#elif defined(__ARM_ARCH_6M__)
+#define BOARD "RP2040"
 #else
-#define MOST_RPM 3000
+#define BOARD "simulated"
 #endif
-#endif
-#ifndef REVERSED
-#define REVERSED 0 /* 1: the magnetic encoder counts backwards */
-#endif
-_Static_assert((int32_t)COUNTS * RATIO > 0 && (int32_t)COUNTS * RATIO < (int32_t)1 << 24, "COUNTS * RATIO: 1 to 16777215");
-_Static_assert(MOST_RPM > 0 && MOST_RPM <= 13000, "MOST_RPM: 1 to 13000"); /* over-speed is seen up to 16000 rpm */
-
-enum encoder { QUADRATURE, MAGNETIC };
-enum pulses {
-    PULSES_TIMED,  /* ten per second, sent to the camera's trigger input */
-    PULSES_INDEX,  /* one per turn at the index, sent to the camera's trigger input */
-    PULSES_CAMERA, /* sent by the camera or another clock, and received */
-};
-
-struct settings {
-    uint32_t counts_per_turn; /* of the prism */
-    uint8_t encoder, pulses;
-    bool has_index;
-    int32_t most_rpm, most_ramp, stop_ramp; /* limits of commands [rpm, rpm/s], and slope of a stop */
-    uint16_t stall_ms;                      /* time at an eighth of the speed or less that is a stall */
-    struct gains gains;
-};
-extern const struct settings default_settings;
 
 #ifdef __AVR__
 typedef uint8_t ring_index; /* read and written at once; rings of 128 items at most, 256 of bytes to send */
@@ -101,7 +77,13 @@ struct controller {
     bool enabled;
     /* Written by the port's main loop. */
     bool driver_fault, supply_low;
+    uint16_t supply_mv; /* of the motor; UNKNOWN_MV: not sensed */
+    /* Written by the main loop, and read by the port's: a record to write, and its slot. */
+    bool saving;
+    uint8_t slot, record[STORE_BYTES];
     /* Private. */
+    struct settings built; /* those of the build */
+    struct store store;
     struct frame_decoder decoder;
     struct tracker tracker;
     struct speed_control control;
@@ -111,6 +93,10 @@ struct controller {
     uint32_t bounce_us;      /* half a turn at the fastest speed that is no fault */
     uint32_t stalled_at;     /* time of the fault stall */
     uint16_t sequence, stalled_ms, over_ms, current_ms, supply_ms, bad_turns, lost_ms;
+    uint16_t save_sequence;           /* of the command that is answered once the record is written */
+    uint16_t host_stops;              /* how often the motor stopped for a silent host */
+    uint32_t supply_sum;              /* mean of the supply in 1/16 mV; 0: none yet */
+    uint16_t supply_mean, undervoltage_ms, overvoltage_ms; /* mean [mV], or UNKNOWN_MV */
     uint16_t faults, sent_faults;
     uint8_t batched, state, sent_state, still;
     int32_t speed, over_speed;
@@ -118,7 +104,9 @@ struct controller {
     bool indexed, sampled, told, commanded;
 };
 
-void controller_begin(struct controller *c, const struct settings *settings, uint32_t now);
+void controller_begin(struct controller *c, const struct settings *built, uint32_t now);
+void controller_load(struct controller *c, const uint8_t *slot0, const uint8_t *slot1); /* after controller_begin() */
+void controller_saved(struct controller *c, bool good, uint32_t now); /* the record is written, and reads as it should */
 void controller_poll(struct controller *c, uint32_t now);
 
 /* What follows is called by interrupts. */

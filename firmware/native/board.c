@@ -19,6 +19,8 @@ struct board {
     uint64_t pulsed, shortest_us, longest_us; /* pulse to the camera: begin or 0, and durations */
     uint16_t answer, angle;       /* magnetic encoder: its next answer, and its latest angle */
     bool error_flag;              /* of the magnetic encoder */
+    uint8_t store[STORE_SLOTS][STORE_BYTES]; /* memory that outlives a reset */
+    uint32_t stored;              /* bytes of the present record that are written; its slot is erased at first */
     struct motor motor;
 };
 
@@ -28,6 +30,8 @@ static uint32_t clock_at(const struct board *b, double now) {
 
 void board_reset(struct board *b) {
     controller_begin(&b->c, &b->settings, 0);
+    controller_load(&b->c, b->store[0], b->store[1]);
+    b->stored = 0;
     b->booted = b->ticked = b->now;
     b->clock_start = 0;
 }
@@ -41,6 +45,7 @@ struct board *board_new(uint32_t counts, int magnetic, int pulses, double drift_
     b->settings.pulses = (uint8_t)pulses;
     b->rate = 1 + drift_ppm * 1e-6;
     motor_begin(&b->motor, counts, seed);
+    memset(b->store, 0xFF, sizeof b->store);
     board_reset(b);
     b->clock_start = clock_start;
     b->c.heard = b->c.checked_at = clock_at(b, 0);
@@ -140,6 +145,20 @@ static void magnetic(struct board *b) {
     read_encoder(&b->c, transfer);
 }
 
+/* Write what the controller saves: one step per millisecond, so that a reset can come between all of them. */
+static void save(struct board *b, uint32_t t) {
+    uint8_t *slot = b->store[b->c.slot];
+    if (!b->c.saving) return;
+    if (b->stored == 0) memset(slot, 0xFF, STORE_BYTES);
+    for (uint32_t k = 0; k < 8 && b->stored < STORE_BYTES; k++, b->stored++) {
+        bool bad = b->motor.values[BAD_STORE] != 0 && b->stored == 20;
+        slot[b->stored] = (uint8_t)(b->c.record[b->stored] ^ (bad ? 4u : 0u));
+    }
+    if (b->stored < STORE_BYTES) return;
+    b->stored = 0;
+    controller_saved(&b->c, memcmp(slot, b->c.record, STORE_BYTES) == 0, t);
+}
+
 void board_feed(struct board *b, const uint8_t *bytes, uint32_t size) {
     for (uint32_t k = 0; k < size; k++) {
         on_byte(&b->c, bytes[k]);
@@ -159,6 +178,7 @@ uint32_t board_advance(struct board *b, uint64_t until, uint8_t *out, uint32_t r
         b->now += STEP_US;
         uint32_t t = clock_at(b, (double)b->now);
         b->c.driver_fault = b->motor.values[DRIVER_FAULT] != 0;
+        b->c.supply_mv = (uint16_t)(b->motor.values[DIVIDER] != 0 ? lround(1000 * motor_volts(&b->motor)) : UNKNOWN_MV);
         b->c.supply_low = b->motor.values[NO_SUPPLY] != 0 && b->motor.values[SENSED] != 0;
         if (b->now - b->ticked >= 1000000 / TICK_HZ) {
             b->ticked = b->now;
@@ -175,6 +195,7 @@ uint32_t board_advance(struct board *b, uint64_t until, uint8_t *out, uint32_t r
             }
         }
         controller_poll(&b->c, t);
+        if (b->ticked == b->now) save(b, t);
         note_feedback(b);
         for (int byte; written < room && (byte = controller_take(&b->c)) >= 0;) out[written++] = (uint8_t)byte;
     }
@@ -191,6 +212,8 @@ uint32_t board_counter(const struct board *b, int which) {
     return which == 0 ? d->frames : which == 1 ? d->damaged : which == 2 ? d->unknown : which == 3 ? d->lost
         : which == 4 ? b->c.overruns : which == 5 ? b->c.encoder_errors : b->c.index_bounces;
 }
+uint8_t *board_store(struct board *b) { return b->store[0]; }
+uint32_t board_store_bytes(void) { return STORE_BYTES; }
 void board_frame(uint8_t *packet, uint32_t size, uint8_t *frame, uint32_t *written) { *written = frame_encode(packet, size, frame); }
 int board_q16(uint32_t bits, int32_t *q16) { return q16_from_f32(bits, q16); }
 uint32_t board_f32(int32_t q16) { return f32_from_q16(q16); }

@@ -26,6 +26,9 @@ enum value {
     NO_SUPPLY,      /* the motor has no voltage; sensed by the pin if SENSED is set */
     SENSED, LOAD,   /* additional friction [rpm/s] */
     HEAVY,          /* inertia beside the usual one, as a part of it */
+    VOLTS,          /* of the supply, where it is not lost */
+    DIVIDER,        /* whether the supply's voltage is connected to its pin */
+    BAD_STORE,      /* one bit of what is saved is not written */
     ANGLE, SPEED, VALUES
 };
 
@@ -49,6 +52,7 @@ static void motor_begin(struct motor *m, uint32_t per_turn, uint32_t seed) {
     m->per_turn = per_turn;
     m->random = seed;
     m->turns = 0.3;
+    m->values[VOLTS] = 12;
     m->position = (int64_t)floor(read_turns(m) * per_turn);
 }
 
@@ -89,6 +93,8 @@ static bool motor_count(struct motor *m, double before, double *share) {
     *share = fabs(after - from) > 0 ? fmin(fmax((at - from) / (after - from), 0), 1) : 0;
     return true;
 }
+
+static double motor_volts(const struct motor *m) { return m->values[NO_SUPPLY] != 0 ? 0 : m->values[VOLTS]; }
 
 static uint8_t motor_levels(const struct motor *m) { /* 2 A + B, A leads */
     static const uint8_t levels[4] = {0, 2, 3, 1};

@@ -57,6 +57,10 @@ SILENCE_S = 10.0
 """Longest silence of the host until the controller must report it [s]."""
 SLICE_S = 0.3
 """Time at which the speed is measured during the ramp, and for which a stopped motor must stand still [s]."""
+LOST_HOST_S, MOST_SUPPLY_V = 2, 60.0
+"""Silence for which the controller is told to stop the motor [s], and largest plausible voltage of its supply [V]."""
+HOST_TIMEOUT = [setting.name for setting in protocol.SETTINGS].index("host-timeout")
+LOST_HOST_STOP = 1 << protocol.FAULTS.index("stopped for lost host")
 STEEP_RPM_S, STEEP_SLICE_S, STEEP_COUNTS = 1e5, 0.05, 20.0
 """Ramp that no motor follows [rpm/s], and least time [s] and counts in which its speed is measured."""
 
@@ -148,6 +152,7 @@ class _Suite:
         self._sent: dict[int, int] = {}
         self._trips: list[tuple[int, int, int]] = []
         self._answers: dict[int, int] = {}
+        self._told: list[protocol.Message] = []  # identities, conditions and settings, as they were asked for
         self._commands: set[int] = set()  # sequence numbers of the commands without an answer
         self._status: protocol.ControllerStatus | None = None
         self._samples: list[tuple[int, int]] = []
@@ -157,6 +162,7 @@ class _Suite:
         self._latest = -math.inf  # time of the latest sample or index pulse
         self._newest = -math.inf  # latest time in any message
         self._disorder, self._apart, self._stray = 0, 0, 0
+        self._older = False  # whether it does not know the messages of firmware 1.1
         self._first: protocol.FrameCounters | None = None  # opening the port cuts the first frame
 
     def checks(self) -> Iterator[Check]:
@@ -176,12 +182,15 @@ class _Suite:
         yield self._check_rest()
         yield self._check_samples()
         yield self._check_refusals()
+        yield self._check_identity()
+        yield self._check_settings()
         yield from self._check_speed()
         yield from self._check_bad_frames()
         yield self._check_silence()
         yield self._check_other_way()
         yield self._check_stop()
         yield self._check_steep_ramp()
+        yield self._check_lost_host()
         remedy = "send samples and index pulses in the order of their times, with time and count latched together"
         yield Check("times increase", self._disorder == 0, f"{self._disorder} out of order", remedy)
         yield self._check_latch()
@@ -254,6 +263,10 @@ class _Suite:
                 self._trips.append((self._sent.pop(message.number), t, host_us))
             else:
                 self._stray += 1
+        elif isinstance(message, protocol.Identity | protocol.Condition | protocol.Setting):
+            self._told.append(message)
+            if isinstance(message, protocol.Condition):
+                self._time(message.t_us, STALE_US)
         elif isinstance(message, protocol.Answer):
             self._stray += message.sequence not in self._commands
             self._commands.discard(message.sequence)
@@ -271,6 +284,17 @@ class _Suite:
         number = self.send(message)
         self._run(ANSWER_S, until=lambda: number in self._answers)
         return self._answers.pop(number, None)
+
+    def _ask(self, kind: type[protocol.Plain], key: int = 0) -> protocol.Message | None:
+        """Ask for a message and return it; None if it does not come, alone and before the answer 0."""
+        self._told.clear()
+        accepted = self._command(protocol.Ask(kind.KIND, key)) == 0
+        return self._told[0] if accepted and len(self._told) == 1 and isinstance(self._told[0], kind) else None
+
+    def _setting(self, key: int) -> int | None:
+        """Return the value of a setting; None if the controller does not tell it."""
+        found = self._ask(protocol.Setting, key)
+        return found.value if isinstance(found, protocol.Setting) and found.key == key else None
 
     @property
     def _now(self) -> protocol.ControllerStatus:
@@ -396,6 +420,87 @@ class _Suite:
         if not arrived:
             what += f'; no state "at speed" {SETTLE_S:g} s after the ramp'
         return Check("follows the ramp", good, what, "limit the change of the speed; tune the control loop")
+
+    def _check_identity(self) -> Check:
+        name, remedy = "says what it is", "answer 0x85 by the message that it asks for, then 0; 2 to other types"
+        older = self._command(protocol.Ask(protocol.Identity.KIND))
+        if older in (None, 1):
+            self._older = True
+            return Check(name, None, f"answer {_reason(older)}: older than firmware 1.1", "")
+        who, condition = self._ask(protocol.Identity), self._ask(protocol.Condition)
+        other = self._command(protocol.Ask(0x7F))
+        if not isinstance(who, protocol.Identity) or not isinstance(condition, protocol.Condition):
+            return Check(name, False, f"answer {_reason(older)}, but no identity or condition before it", remedy)
+        supply = "unknown" if condition.supply_v is None else f"{condition.supply_v:.1f} V"
+        what = f"firmware {who.version} on {who.board_name or 'an unnamed board'}, supply {supply}"
+        named = who.board_name != "" and "?" not in who.board_name and who.version != "0.0.0"
+        possible = condition.supply_v is None or 0 < condition.supply_v <= MOST_SUPPLY_V
+        known = condition.stored < len(protocol.STORED)
+        return Check(name, named and possible and known and other == 2, f"{what}, other: {_reason(other)}", remedy)
+
+    def _check_settings(self) -> Check:
+        name, remedy = "keeps settings within their ranges", "compare the settings' keys and ranges with the protocol"
+        if self._older:
+            return Check(name, None, "older than firmware 1.1", "")
+        wrong = []
+        for key, setting in enumerate(protocol.SETTINGS):
+            value = self._setting(key)
+            if value is None or not setting.contains(value):
+                wrong.append(f"{setting.name} is {value}")
+                continue
+            other = value - 1 if setting.contains(value - 1) else value + 1
+            below = setting.least - 2 if setting.contains(setting.least - 1) else setting.least - 1
+            steps = [(setting.most + 1, 2, value), (below, 2, value), (-(1 << 31), 2, value)]
+            steps += [(other, 0, other), (value, 0, value)]
+            for tried, expected, kept in steps:
+                answer = self._command(protocol.SetSetting(key, tried))
+                if answer != expected or self._setting(key) != kept:
+                    wrong.append(f"{setting.name} {tried}: answer {_reason(answer)}, then {self._setting(key)}")
+        beyond = self._command(protocol.SetSetting(len(protocol.SETTINGS), 1))
+        if beyond != 2:
+            wrong.append(f"an unknown setting: answer {_reason(beyond)}")
+        counts = self._now.counts_per_turn
+        if self._setting(0) != counts:
+            wrong.append(f"counts-per-turn is not the status's {counts:,}")
+        what = "; ".join(wrong[:3]) or f"{len(protocol.SETTINGS)} settings read, changed, and changed back"
+        return Check(name, not wrong, what, remedy)
+
+    def _check_lost_host(self) -> Check:
+        """Turn, be silent, and expect that the motor stops by itself; the setting is the one of before at the end."""
+        name = "stops for a lost host, if told so"
+        if self._older:
+            return Check(name, None, "older than firmware 1.1", "")
+        before, rpm = self._setting(HOST_TIMEOUT), self._rpm / 2.0
+        start = self._ask(protocol.Condition)
+        self._run(SLICE_S)
+        taken = self._command(protocol.SetSetting(HOST_TIMEOUT, LOST_HOST_S))
+        self._command(protocol.SetSpeed(rpm, 2.0 * abs(rpm)))
+        kept = self._run(LOST_HOST_S + 1.0, until=lambda: self._now.target_rpm == 0)
+        silent = self._wire.now_us()
+        self._run(LOST_HOST_S + STOP_S, until=lambda: self._now.target_rpm == 0, pings=False)
+        after = (self._wire.now_us() - silent) * 1e-6
+        stopped = self._run(STOP_S, until=lambda: self._now.state == 0, pings=False)
+        said = bool(self._now.faults & LOST_HOST_STOP)
+        end, again = self._ask(protocol.Condition), self._command(protocol.SetSpeed(rpm, abs(rpm)))
+        self._run(CHANGE_S)
+        cleared = not self._now.faults & LOST_HOST_STOP
+        while_turning = self._command(protocol.SetSetting(HOST_TIMEOUT, LOST_HOST_S + 1))
+        self._command(protocol.Stop())
+        self._run(STOP_S, until=lambda: self._now.state == 0)
+        self._run(SLICE_S)
+        restored = self._command(protocol.SetSetting(HOST_TIMEOUT, before or 0))
+        counted = (
+            isinstance(start, protocol.Condition)
+            and isinstance(end, protocol.Condition)
+            and end.host_stops == min(start.host_stops + 1, 0xFFFF)
+            and end.host_timeout_s == LOST_HOST_S
+        )
+        on_time = LOST_HOST_S - PING_S <= after <= LOST_HOST_S + CHANGE_S
+        good = taken == restored == again == 0 and not kept and stopped and said and counted and cleared
+        what = f"told {LOST_HOST_S} s, {'' if stopped else 'not '}stopped after {after:.1f} s of silence"
+        what += f"{'' if counted else ', not counted'}{'' if said else ', not said'}"
+        remedy = "brake when no frame came for the setting host-timeout; count it; set fault bit 10 until a new command"
+        return Check(name, good and on_time and while_turning == 3, what, remedy)
 
     def _check_index(self, pulses: int) -> Check:
         name, remedy = "one index pulse per turn", "check the index sensor, its interrupt, and the counts per turn"

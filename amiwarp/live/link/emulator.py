@@ -179,7 +179,17 @@ MOST_OUT_BYTES = 1 << 20
 """Largest number of bytes that wait to be fetched. Further output is lost, as on any serial line without flow control.
 """
 STOP_RAMP = 2000.0
-"""Deceleration of a stop command, and acceleration of the fault ``reverse`` [rpm/s]."""
+"""Deceleration of a stop command by default, and acceleration of the fault ``reverse`` [rpm/s]."""
+IDENTITY = protocol.Identity(1, 1, 0, b"emulated".ljust(protocol.BOARD_BYTES, b"\0"))
+"""Firmware and board that the emulated controller says it is."""
+SETTINGS = {
+    "counts-per-turn": 4096, "most-rpm": int(MOST_RPM), "most-ramp": 5000, "stop-ramp": int(STOP_RAMP), "kp": 5120,
+    "ki": 25_600, "friction": 600, "no-load-rpm": 4000, "rise-ms": 150, "host-timeout": 0, "undervoltage": 9000,
+    "overvoltage": 15_000,
+}  # fmt: skip
+"""Settings at the start, by name. Those of the control loop have no effect: the emulated motor needs none."""
+REST_US = 100_000
+"""Time for which the prism must have been at rest before settings may change [us]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +222,8 @@ class Controller:
     """Emulates a controller's firmware, see ``docs/reference/link-protocol.md``. The caller supplies the time [us].
 
     ``drift_ppm``: rate error of the controller's clock. ``clock_start``: clock reading at power-on, at the emulation
-    time ``start_us``. Raises :class:`AmiwarpError` for the fault ``reverse`` with a recorded rotation.
+    time ``start_us``. ``supply_mv``: voltage of the motor's supply [mV]; None: not sensed.
+    Raises :class:`AmiwarpError` for the fault ``reverse`` with a recorded rotation.
     """
 
     def __init__(
@@ -226,13 +237,17 @@ class Controller:
         sync_hz: float | None = None,
         start_us: int = 0,
         faults: Iterable[EmulatedFault] = (),
+        supply_mv: int | None = None,
         seed: int = 0,
     ) -> None:
         faults = tuple(faults)
         if isinstance(rotor, Played) and any(fault.name == "reverse" for fault in faults):
             raise AmiwarpError("fault reverse: a recorded rotation cannot be reversed; remove this fault")
         self.rotor = rotor
-        self.counts_per_turn = counts_per_turn
+        self.supply_mv = supply_mv
+        """Voltage of the motor's supply [mV]; None: not sensed. Its limits do not stop the emulated motor."""
+        self._built = SETTINGS | {"counts-per-turn": counts_per_turn}
+        self._saved: dict[str, int] | None = None
         self.plugged = True
         """Whether the cable is plugged in. The controller keeps running while it is unplugged."""
         self.pulses: deque[tuple[int, int]] = deque(maxlen=1000)
@@ -269,6 +284,11 @@ class Controller:
                 self._heard_us = self._now
                 self._execute(sequence, message)
 
+    @property
+    def counts_per_turn(self) -> int:
+        """Encoder counts per turn of the prism."""
+        return self.settings["counts-per-turn"]
+
     def clock(self, now_us: float) -> int:
         """Return the reading of the controller's clock at an emulation time, without wrap [us]."""
         return self._clock_start + math.floor((now_us - self._boot_us) * self._rate)
@@ -279,12 +299,14 @@ class Controller:
 
     def _boot(self, clock_start: int) -> None:
         self._boot_us, self._clock_start, self._sequence = self._now, clock_start, 0
+        self.settings = dict(self._saved or self._built)
         self._batch: list[tuple[int, int]] = []
         self._before = self._now, float(self.rotor.angle(self._now))
         self._count_offset = math.floor(self._position())  # the reported count is the position minus this offset
         self._frozen_count: int | None = None
         self._sent_status: tuple[int, int, float, int] | None = None
-        self._checked_us = self._now
+        self._checked_us = self._turned_us = self._now
+        self._host_stops, self._stopped_for_host = 0, False
         self._pulse_number, self._next_pulse_us = 0, self._pulse_interval_us()
 
     def _pulse_interval_us(self) -> float:
@@ -388,11 +410,29 @@ class Controller:
             target,
         )
 
+    def _watch_host(self) -> None:
+        """Stop the motor if the host has been silent for too long, and the settings say so."""
+        timeout_us = 1_000_000 * self.settings["host-timeout"]
+        silent = timeout_us and self._now - self._heard_us >= timeout_us
+        if silent and self.rotor.target_rpm(self._now) and self._brake():
+            self._stopped_for_host = True
+            self._host_stops = min(self._host_stops + 1, 0xFFFF)
+
+    def _brake(self) -> bool:
+        return self.rotor.set_speed(0.0, float(self.settings["stop-ramp"]), self._now)
+
     def _send_status(self) -> None:
         """Send the status if it has changed."""
         self._checked_us = self._now
+        self._watch_host()
         state, rpm, target = self._state()
-        fault_bits = (1 << protocol.FAULTS.index("host lost")) * (self._now - self._heard_us > HOST_TIMEOUT_US)
+        if state != 0:
+            self._turned_us = self._now
+        faults = {
+            "host lost": self._now - self._heard_us > HOST_TIMEOUT_US,
+            "stopped for lost host": self._stopped_for_host,
+        }
+        fault_bits = sum(1 << protocol.FAULTS.index(name) for name, on in faults.items() if on)
         sent = state, fault_bits, target, self.counts_per_turn
         if sent != self._sent_status:
             self._sent_status = sent
@@ -406,13 +446,21 @@ class Controller:
             self._send(protocol.Pong(message.number, self.clock(self._now) % WRAP))
             return
         if isinstance(message, protocol.SetSpeed):
-            fits = abs(message.rpm) <= MOST_RPM and 0 < message.ramp < math.inf
+            fits = abs(message.rpm) <= self.settings["most-rpm"] and 0 < message.ramp < math.inf
             rpm = message.rpm if abs(message.rpm) >= LEAST_RPM else 0.0
             refused = 2 if not fits else 0 if self.rotor.set_speed(rpm, message.ramp, self._now) else 3
+            self._stopped_for_host &= refused != 0
         elif isinstance(message, protocol.Stop):
-            refused = 0 if self.rotor.set_speed(0.0, STOP_RAMP, self._now) else 3
+            refused = 0 if self._brake() else 3
+            self._stopped_for_host &= refused != 0
         elif isinstance(message, protocol.SetCounts):
             refused = self._set_counts(message.per_turn)
+        elif isinstance(message, protocol.Ask):
+            refused = self._tell(message)
+        elif isinstance(message, protocol.SetSetting):
+            refused = self._set_setting(message)
+        elif isinstance(message, protocol.SaveSettings | protocol.RestoreSettings):
+            refused = self._keep_settings(save=isinstance(message, protocol.SaveSettings))
         else:
             refused = 1
         self._send(protocol.Answer(sequence, refused))
@@ -426,9 +474,54 @@ class Controller:
             return 2
         if self._state()[0] != 0:
             return 3
+        self._change({"counts-per-turn": per_turn})
+        return 0
+
+    def _change(self, settings: dict[str, int]) -> None:
+        """Use other settings, while the prism rests."""
         self._flush()
-        self.counts_per_turn = per_turn
-        self._count_offset = math.floor(self._position())
+        count = self._count(math.floor(self._position()))
+        self.settings |= settings
+        self._count_offset = math.floor(self._position()) - count  # the count goes on
+
+    def _rests(self) -> bool:
+        return self._state()[0] == 0 and self._now - self._turned_us >= REST_US
+
+    def _tell(self, asked: protocol.Ask) -> int:
+        """Send the message that is asked for; return the reason for a refusal."""
+        if asked.kind == protocol.Identity.KIND:
+            self._send(IDENTITY)
+        elif asked.kind == protocol.Condition.KIND:
+            supply = protocol.UNKNOWN_MV if self.supply_mv is None else self.supply_mv
+            timeout, stored = self.settings["host-timeout"], int(self._saved is not None)
+            t = self.clock(self._now) % WRAP
+            self._send(protocol.Condition(t, supply, timeout, self._host_stops, stored))
+        elif asked.kind == protocol.Setting.KIND and asked.key < len(protocol.SETTINGS):
+            self._send(protocol.Setting(asked.key, self.settings[protocol.SETTINGS[asked.key].name]))
+        else:
+            return 2
+        return 0
+
+    def _set_setting(self, wanted: protocol.SetSetting) -> int:
+        """Change a setting, unless the prism turns; return the reason for a refusal."""
+        found = protocol.SETTINGS[wanted.key] if wanted.key < len(protocol.SETTINGS) else None
+        if found is None or not found.contains(wanted.value):
+            return 2
+        if self.settings[found.name] == wanted.value:
+            return 0
+        if not self._rests():
+            return 3
+        self._change({found.name: wanted.value})
+        return 0
+
+    def _keep_settings(self, *, save: bool) -> int:
+        """Save the settings, or restore those of the start, unless the prism turns; return the reason for a refusal."""
+        if not self._rests():
+            return 3
+        if save:
+            self._saved = dict(self.settings)
+        else:
+            self._change(self._built)
         return 0
 
     def _flush(self) -> None:

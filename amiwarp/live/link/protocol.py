@@ -6,6 +6,7 @@ in little-endian byte order. A simple controller may send text lines ``t_us,coun
 
 import re
 import struct
+import typing
 import zlib
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass
@@ -30,10 +31,56 @@ FAULTS = (
     "over-speed",
     "supply lost",
     "magnet lost",
+    "undervoltage",
+    "overvoltage",
+    "stopped for lost host",
 )
 """Meaning of each bit of :attr:`ControllerStatus.faults`, lowest bit first."""
 REFUSALS = ("accepted", "unknown command", "out of range", "not possible now")
 """Meaning of each value of :attr:`Answer.refused`."""
+UNKNOWN_MV = 0xFFFF
+"""Value of :attr:`Condition.supply_mv` that means that the controller does not know its supply."""
+BOARD_BYTES = 16
+"""Size of :attr:`Identity.board` [bytes]."""
+STORED = ("as built", "saved", "as built: those saved belong to another build", "as built: those saved are damaged")
+"""Meaning of each value of :attr:`Condition.stored`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SettingRange:
+    """Setting of a controller: its name, unit and range."""
+
+    name: str
+    """Name, as the command line takes it."""
+    unit: str
+    """Unit of the value; empty for a pure number."""
+    least: int
+    """Smallest value."""
+    most: int
+    """Largest value."""
+    off: bool = False
+    """Whether 0 is allowed too, and switches the function off."""
+
+    def contains(self, value: int) -> bool:
+        """Return whether a value is allowed."""
+        return self.least <= value <= self.most or (self.off and value == 0)
+
+
+SETTINGS = (
+    SettingRange("counts-per-turn", "counts", 1, (1 << 24) - 1),
+    SettingRange("most-rpm", "rpm", 1, 13_000),
+    SettingRange("most-ramp", "rpm/s", 1, 30_000),
+    SettingRange("stop-ramp", "rpm/s", 1, 30_000),
+    SettingRange("kp", "duty/rpm/256", 0, 1_000_000),
+    SettingRange("ki", "duty/rpm/s/256", 0, 1_000_000),
+    SettingRange("friction", "duty", 0, 32_767),
+    SettingRange("no-load-rpm", "rpm", 1, 30_000),
+    SettingRange("rise-ms", "ms", 0, 10_000),
+    SettingRange("host-timeout", "s", 1, 3600, off=True),
+    SettingRange("undervoltage", "mV", 1000, 60_000, off=True),
+    SettingRange("overvoltage", "mV", 1000, 60_000, off=True),
+)
+"""Settings of a controller; the place of one is its key in the messages."""
 _HEADER = struct.Struct("<BBH")
 _CRC = struct.Struct("<I")
 _SAMPLE = struct.Struct("<Ii")
@@ -120,6 +167,68 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
+class Identity:
+    """Message: firmware and board, as the answer to an :class:`Ask`."""
+
+    KIND: ClassVar[int] = 0x07
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct(f"<BBB{BOARD_BYTES}s")
+    major: int
+    """First number of the firmware's version."""
+    minor: int
+    """Second number of the firmware's version."""
+    patch: int
+    """Third number of the firmware's version."""
+    board: bytes
+    """Name of the board in ASCII, filled with zeros to :data:`BOARD_BYTES`."""
+
+    @property
+    def version(self) -> str:
+        """Version of the firmware as text."""
+        return f"{self.major}.{self.minor}.{self.patch}"
+
+    @property
+    def board_name(self) -> str:
+        """Name of the board as text; bytes that are not printable ASCII become '?'."""
+        name = self.board.partition(b"\0")[0]
+        return "".join(chr(byte) if 32 <= byte < 127 else "?" for byte in name)
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """Message: supply and other values that change, as the answer to an :class:`Ask`."""
+
+    KIND: ClassVar[int] = 0x08
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct("<IHHHB")
+    t_us: int
+    """Time of the values on the controller's clock [us], modulo 2**32."""
+    supply_mv: int
+    """Voltage of the motor's supply [mV]; :data:`UNKNOWN_MV` if the controller does not sense it."""
+    host_timeout_s: int
+    """Silence of the host after which the controller stops the motor [s]; 0: it goes on."""
+    host_stops: int
+    """Number of times that it stopped the motor for a silent host since its start, 65,535 at most."""
+    stored: int
+    """Where the settings are from, as an index into :data:`STORED`."""
+
+    @property
+    def supply_v(self) -> float | None:
+        """Voltage of the motor's supply [V]; None if it is unknown."""
+        return None if self.supply_mv == UNKNOWN_MV else self.supply_mv / 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Message: value of a setting, as the answer to an :class:`Ask`."""
+
+    KIND: ClassVar[int] = 0x09
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct("<Bi")
+    key: int
+    """Which setting, as an index into :data:`SETTINGS`."""
+    value: int
+    """Its present value, in its unit."""
+
+
+@dataclass(frozen=True, slots=True)
 class SetSpeed:
     """Command to change the motor's speed at a constant rate."""
 
@@ -159,11 +268,53 @@ class Ping:
     """Number of the ping, which the pong repeats."""
 
 
-Plain = Index | Sync | ControllerStatus | Pong | Answer | SetSpeed | Stop | SetCounts | Ping
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """Request for an :class:`Identity`, a :class:`Condition` or a :class:`Setting`, which comes before its answer."""
+
+    KIND: ClassVar[int] = 0x85
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct("<BB")
+    kind: int
+    """Type of the message that is wanted."""
+    key: int = 0
+    """For a setting: which, as an index into :data:`SETTINGS`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetSetting:
+    """Command to change a setting until the next reset, while the prism rests."""
+
+    KIND: ClassVar[int] = 0x86
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct("<Bi")
+    key: int
+    """Which setting, as an index into :data:`SETTINGS`."""
+    value: int
+    """Its new value, in its unit."""
+
+
+@dataclass(frozen=True, slots=True)
+class SaveSettings:
+    """Command to save the settings where they outlive a reset. It is answered once they are written and read back."""
+
+    KIND: ClassVar[int] = 0x87
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct("<")
+
+
+@dataclass(frozen=True, slots=True)
+class RestoreSettings:
+    """Command to change all settings back to those of the build, until the next reset."""
+
+    KIND: ClassVar[int] = 0x88
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct("<")
+
+
+Sent = Index | Sync | ControllerStatus | Pong | Answer | Identity | Condition | Setting
+Commands = SetSpeed | Stop | SetCounts | Ping | Ask | SetSetting | SaveSettings | RestoreSettings
+Plain = Sent | Commands
 Message = Samples | Plain
-_PLAIN: dict[int, type[Plain]] = {
-    m.KIND: m for m in (Index, Sync, ControllerStatus, Pong, Answer, SetSpeed, Stop, SetCounts, Ping)
-}
+PLAIN: tuple[type[Plain], ...] = (*typing.get_args(Sent), *typing.get_args(Commands))
+"""Types of all messages that have a fixed layout, in the order of their numbers."""
+_PLAIN: dict[int, type[Plain]] = {m.KIND: m for m in PLAIN}
 
 
 def encode(message: Message, sequence: int) -> bytes:
