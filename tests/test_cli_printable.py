@@ -50,7 +50,7 @@ def test_wrong_usage_is_one_line() -> None:
     ended = run("motor")
     assert ended.returncode == 2
     assert ended.stderr.decode().splitlines() == [
-        "amiwarp: Missing argument 'action'. Choose from: status, set, stop, check; see amiwarp motor --help"
+        "amiwarp: Missing argument 'action'. Choose from: status, set, stop, settings, check; see amiwarp motor --help"
     ]
     strange = run("simulate", "--fl\x1b]0;x\x07at")
     assert strange.returncode == 2

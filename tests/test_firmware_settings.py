@@ -408,9 +408,10 @@ def test_a_memory_that_does_not_keep_what_is_written_is_said(host: Host) -> None
     change(host, {"kp": 1000})
     assert host.command(SaveSettings()) == 0
     host.board.set("bad_store")
-    for _ in range(3):  # the slot of the good record is never written meanwhile
+    for _ in range(2):  # the slot of the good record is never written meanwhile
         change(host, {"kp": 2000})
-        assert host.command(SaveSettings()) == 3
+        for _ in range(3):
+            assert host.command(SaveSettings()) == 3
         reset(host)
         assert settings(host)["kp"] == 1000
     host.board.set("bad_store", 0)

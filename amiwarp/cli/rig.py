@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import math
+import re
 import signal
 import threading
 import time
@@ -30,7 +31,7 @@ from amiwarp.io.native_format import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.link.emulator import Controller, EmulatedFault, Motor, Played, PseudoTerminal, Rotor
 from amiwarp.live.link.link import Link
-from amiwarp.live.link.protocol import FAULTS, STATES
+from amiwarp.live.link.protocol import FAULTS, SETTINGS, STATES, STORED
 from amiwarp.live.queues import Policy
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
 from amiwarp.validation import real
@@ -426,6 +427,7 @@ def run_live(
     data: dict[str, Any] = {
         "files": outputs.files,
         **session_summary(status, opened),
+        "controller": None if link is None else controller_summary(link),
         "latency_ms": status.latency_ms,
         "model": found.model_name,
         "device": device,
@@ -582,6 +584,7 @@ def _live_lines(d: dict[str, Any]) -> list[str]:
     return [
         f"{d['compensated']:,} events ({', '.join(marked) or 'all inside the image with a measured angle'}), {speed}",
         *_clock_lines(d["clock"]),
+        *_controller_lines(d["controller"]),
         *d["files"],
     ]
 
@@ -593,6 +596,13 @@ def _clock_lines(clock: dict[str, Any] | None) -> list[str]:
     if clock["uncertainty_us"] is None:
         return ["clocks of controller and camera: never related"]
     return [f"clocks of controller and camera: by {clock['from']}, ±{clock['uncertainty_us']:.1f} µs"]
+
+
+def _controller_lines(controller: dict[str, Any] | None) -> list[str]:
+    """Return the line of the result about the controller."""
+    if controller is None:
+        return []
+    return [f"controller: firmware {_firmware_text(controller)}, supply {_supply_text(controller)}"]
 
 
 # ``amiwarp record``: recording of a live camera and encoder to a file that survives crashes.
@@ -630,12 +640,22 @@ def run_record(
         with stopped_by_interrupt(stop), writer:  # in this order, so that Ctrl-C leaves no unfinished file
             session = Session(opened, link=link, second_ratio=second_ratio, raw=[writer], say=line.say)
             status = session.run(stop, line.update, seconds=stream.seconds)
-    data = {"file": str(out), **session_summary(status, opened), "messages": list(line.messages)}
+        controller = None if link is None else controller_summary(link)
+    data = {
+        "file": str(out),
+        **session_summary(status, opened),
+        "controller": controller,
+        "messages": list(line.messages),
+    }
     text = f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"
     cli.report(
         common,
         data,
-        [text, *([f"{status.late:,} events arrived too late to be sorted by time"] if status.late else [])],
+        [
+            text,
+            *_controller_lines(controller),
+            *([f"{status.late:,} events arrived too late to be sorted by time"] if status.late else []),
+        ],
     )
     check_whole(opened, status)
 
@@ -658,11 +678,12 @@ _VERDICTS = {True: "passed", False: "FAILED", None: "skipped"}
 
 
 class Action(enum.StrEnum):
-    """Action of ``amiwarp motor``: print the status, set the speed, stop, or check the controller."""
+    """Action of ``amiwarp motor``: print the status, set the speed, stop, show or change settings, or check."""
 
     STATUS = "status"
     SET = "set"
     STOP = "stop"
+    SETTINGS = "settings"
     CHECK = "check"
 
 
@@ -670,8 +691,9 @@ def run_motor(
     action: Annotated[
         Action,
         typer.Argument(
-            help="status: print the status; set: turn at --rpm; stop: stop the motor; check: test the controller "
-            "against the serial protocol, with a turning motor."
+            help="status: print the status; set: turn at --rpm; stop: stop the motor; settings: print the settings of "
+            "the controller, or change them; check: test the controller against the serial protocol, with a turning "
+            "motor."
         ),
     ],
     *,
@@ -693,17 +715,33 @@ def run_motor(
         typer.Option(min=0.0, help="Largest accepted speed (turns/min): what prism, mount and bearing withstand."),
     ] = LIMIT_RPM,
     yes: Annotated[bool, typer.Option("--yes", help="For check: let the motor turn.")] = False,
+    change: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="For settings: value to change, such as host-timeout=5. Can be repeated.", metavar="NAME=VALUE"
+        ),
+    ] = None,
+    as_built: Annotated[
+        bool, typer.Option("--as-built", help="For settings: go back to those of the firmware's build first.")
+    ] = False,
+    save: Annotated[
+        bool, typer.Option("--save", help="For settings: keep them in the controller, also without power.")
+    ] = False,
     common: cli.Common,
 ) -> None:
-    """Set the speed of the prism's motor, stop it, print the controller's status, or check the controller.
+    """Set the speed of the prism's motor, stop it, print the controller's status or settings, or check the controller.
 
-    The motor keeps its last commanded speed after this command exits. A check takes about 25 s, ends with a stop, and
-    fails (status 1) if a part of the serial protocol is violated.
+    The motor keeps its last commanded speed after this command exits, unless the setting host-timeout of the controller
+    says otherwise. Settings change while the prism rests, and hold until the controller's next reset unless saved. A
+    check takes about half a minute, ends with a stop, and fails (status 1) if the serial protocol is violated.
     """
     if action is Action.CHECK:
         rpm = CHECK_RPM if rpm is None else rpm
     elif (rpm is None) == (action is Action.SET):
         raise AmiwarpError("'amiwarp motor set' needs --rpm, the speed to set; status and stop do not accept it")
+    if (change or as_built or save) and action is not Action.SETTINGS:
+        raise AmiwarpError("--change, --as-built and --save apply to 'amiwarp motor settings'")
+    changes = [_parsed_change(text) for text in change or ()]
     if ramp_rpm_s != RAMP_RPM_S and action is not Action.SET:
         raise AmiwarpError("--ramp-rpm-s applies to 'amiwarp motor set'; to stop slowly, set --rpm 0")
     if rpm is not None and not abs(rpm) <= limit_rpm:
@@ -725,7 +763,41 @@ def run_motor(
             link.stop()
             _wait(link, messages, 0.0)
         data = _described(link, messages)
+        if action is Action.SETTINGS:
+            _change_settings(link, changes, as_built=as_built, save=save)
+            _report_settings(link, common, saved=save)
+            return
     cli.report(common, data, [cli.table(_motor_rows(data)), *data["messages"], *_hint(data)])
+
+
+def _parsed_change(text: str) -> tuple[str, int]:
+    """Return name and value of a setting given as ``NAME=VALUE``."""
+    name, equals, value = text.partition("=")
+    if not equals or re.fullmatch(r"-?\d{1,10}", value) is None:
+        raise AmiwarpError(f"--change {text}: give NAME=VALUE with a whole number, such as host-timeout=5")
+    return name, int(value)
+
+
+def _change_settings(link: Link, changes: list[tuple[str, int]], *, as_built: bool, save: bool) -> None:
+    """Change settings in the controller, and save them."""
+    if as_built:
+        link.restore_settings()
+    for name, value in changes:
+        link.set_setting(name, value)
+    if save:
+        link.save_settings()
+
+
+def _report_settings(link: Link, common: cli.Common, *, saved: bool) -> None:
+    """Print the controller's settings."""
+    values = link.settings()
+    rows = []
+    for setting in SETTINGS:
+        allowed = f"{setting.least:,} to {setting.most:,}" + (", or 0: off" if setting.off else "")
+        rows.append((setting.name, f"{values[setting.name]:,}", setting.unit, allowed))
+    data = {"port": link.name, "settings": values, "saved": saved}
+    note = "saved in the controller" if saved else "changes hold until the controller's next reset; --save keeps them"
+    cli.report(common, data, [cli.table(rows, "setting", "value", "unit", "range"), note])
 
 
 def _check_motor(port: str | None, rpm: float, yes: bool, common: cli.Common) -> None:
@@ -766,7 +838,7 @@ def _wait(link: Link, messages: list[str], target: float | None = None) -> None:
         messages += link.poll().messages
         status = link.status
         reported = status is not None and (target is None or math.isclose(status.target_rpm, target, rel_tol=1e-6))
-        if reported and link.clock() is not None:
+        if reported and link.clock() is not None and (link.older or link.condition is not None):
             return
         time.sleep(POLL_S)
 
@@ -784,8 +856,50 @@ def _described(link: Link, messages: list[str]) -> dict[str, Any]:
         "counts_per_turn": status.counts_per_turn,
         "faults": [name for bit, name in enumerate(FAULTS) if status.faults >> bit & 1],
         "answers": link.clock() is not None,
+        **controller_summary(link),
         "messages": messages,
     }
+
+
+def controller_summary(link: Link) -> dict[str, Any]:
+    """Return what the controller says about itself; None for all that is unknown."""
+    who, condition = link.identity, link.condition
+    told: dict[str, Any] = {
+        "firmware": None if who is None else who.version,
+        "board": None if who is None else who.board_name,
+        "older_than_1_1": link.older,
+        "supply_v": None,
+        "host_timeout_s": None,
+        "host_stops": None,
+        "settings": None,
+    }
+    if condition is not None:
+        told["supply_v"] = condition.supply_v
+        told["host_timeout_s"], told["host_stops"] = condition.host_timeout_s, condition.host_stops
+        known = condition.stored < len(STORED)
+        told["settings"] = STORED[condition.stored] if known else f"unknown ({condition.stored})"
+    return told
+
+
+def _firmware_text(d: dict[str, Any]) -> str:
+    if d["firmware"] is not None:
+        return f"{d['firmware']} on {d['board'] or 'a board without a name'}"
+    return "older than 1.1" if d["older_than_1_1"] else "unknown: it does not say"
+
+
+def _supply_text(d: dict[str, Any]) -> str:
+    if d["supply_v"] is not None:
+        return f"{d['supply_v']:.1f} V"
+    return "unknown" if d["firmware"] is None else "unknown: its pin is not connected"
+
+
+def _without_host_text(d: dict[str, Any]) -> str:
+    if d["host_timeout_s"] is None:
+        return "the motor goes on" if d["older_than_1_1"] else "unknown"
+    if not d["host_timeout_s"]:
+        return "the motor goes on"
+    stops = f"; stops since the controller's start: {d['host_stops']:,}" if d["host_stops"] else ""
+    return f"the motor stops after {d['host_timeout_s']} s{stops}"
 
 
 def _motor_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
@@ -795,12 +909,20 @@ def _motor_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
         ("speed", f"{d['rpm']:.1f} rpm, set to {d['target_rpm']:g} rpm"),
         ("encoder", f"{d['counts_per_turn']:,} counts per turn"),
         ("faults", ", ".join(d["faults"]) or "none"),
+        ("firmware", _firmware_text(d)),
+        ("supply", _supply_text(d)),
+        ("without a host", _without_host_text(d)),
+        ("settings", d["settings"] or "unknown"),
     ]
 
 
 def _hint(d: dict[str, Any]) -> list[str]:
-    """Return a line that tells how to stop the motor, if it keeps turning."""
-    return [f"the motor keeps turning; to stop it: amiwarp motor stop --port {d['port']}"] if d["target_rpm"] else []
+    """Return a line about a motor that turns: how to stop it, or when it stops by itself."""
+    if not d["target_rpm"]:
+        return []
+    if d["host_timeout_s"]:
+        return [f"the motor stops {d['host_timeout_s']} s after this command ends, if no other host speaks to it"]
+    return [f"the motor keeps turning; to stop it: amiwarp motor stop --port {d['port']}"]
 
 
 # ``amiwarp emulate``: emulated prism controller behind a serial port that other programs can open.
@@ -837,6 +959,10 @@ class ControllerOptions:
         ),
     ] = None
 
+    supply_v: Annotated[
+        float | None, _in_controller(min=0.0, max=60.0, help="Voltage of the motor's supply (V). Default: not sensed.")
+    ] = None
+
     def build(self, rotor: Rotor, seed: int) -> Controller:
         """Return an emulated controller, with the options' settings, that drives ``rotor``."""
         return Controller(
@@ -844,6 +970,7 @@ class ControllerOptions:
             counts_per_turn=self.counts_per_turn,
             drift_ppm=self.drift_ppm,
             faults=[EmulatedFault.parse(text) for text in self.fault or ()],
+            supply_mv=None if self.supply_v is None else round(1000.0 * self.supply_v),
             seed=seed,
         )
 

@@ -415,6 +415,14 @@ class Follower:
         self.name = name
         self.status: protocol.ControllerStatus | None = None
         """Latest status that the controller sent; None before the first."""
+        self.identity: protocol.Identity | None = None
+        """Firmware and board, once the controller has said them since the port was opened."""
+        self.condition: protocol.Condition | None = None
+        """Latest supply and time-out that the controller told since the port was opened; None before the first."""
+        self.older = False
+        """Whether the controller has refused to say what it is: its firmware is older than 1.1."""
+        self.settings: dict[int, int] = {}
+        """Settings that the controller told, by key."""
         self.trips: deque[tuple[int, int, int]] = deque(maxlen=TRIPS)
         """Round trips of pings: time sent (host), answered (controller), received (host) [us]."""
         self.updates = UpdateQueue()
@@ -426,6 +434,7 @@ class Follower:
     def opened(self, host_us: int) -> None:
         """Reset the state of the connection, because the port was opened or reopened."""
         self._connection = Connection(host_us)
+        self.identity, self.condition, self.older = None, None, False
 
     @property
     def speaks(self) -> bool:
@@ -494,6 +503,13 @@ class Follower:
                 self.trips.append((self._epoch.pings.pop(message.number), t, host_us))
         elif isinstance(message, protocol.ControllerStatus):
             self._take_status(message, self._unwrap_time(message.t_us, host_us))
+        elif isinstance(message, protocol.Identity):
+            self.identity = message
+        elif isinstance(message, protocol.Condition):
+            self._unwrap_time(message.t_us, host_us)
+            self.condition = message
+        elif isinstance(message, protocol.Setting):
+            self.settings[message.key] = message.value
 
     def _sample(self, raw_t: int, raw_count: int, host_us: int, *, text: bool) -> None:
         """Convert a sample. An implausible text line is accepted only once the next line continues it."""
@@ -772,6 +788,11 @@ ANSWER_S = 1.0
 QUICK_PINGS, QUICK_PING_US, PING_US = 10, 50_000, 1_000_000
 """Number of quick pings after the port is opened, interval of the quick pings [us], and interval of later pings [us].
 """
+QUICK_ASK_US, ASK_US = 250_000, 1_000_000
+"""Interval of the questions for the controller's identity and condition until they are known, and later [us]."""
+PINGS_PER_TIMEOUT = 4
+"""Number of pings within the time after which a controller stops the motor for a lost host, so that some may be lost.
+"""
 
 
 class Link(BackgroundLoop):
@@ -799,7 +820,8 @@ class Link(BackgroundLoop):
         self._writing = threading.Lock()  # held while the port or the sequence number is used
         self._answers: dict[int, int | None] = {}  # by the command's sequence number; None: not yet received
         self._sequence = self._number = 0
-        self._ping_us = host_us()
+        self._ping_us = self._ask_us = host_us()
+        self._question: int | None = None  # sequence number of the latest question in the background
         self._start_thread("amiwarp-link")
 
     @property
@@ -811,6 +833,21 @@ class Link(BackgroundLoop):
     def status(self) -> protocol.ControllerStatus | None:
         """Latest status of the controller; None before the first status."""
         return self._follower.status
+
+    @property
+    def identity(self) -> protocol.Identity | None:
+        """Firmware and board of the controller; None if it has not said them, as firmware before 1.1."""
+        return self._follower.identity
+
+    @property
+    def condition(self) -> protocol.Condition | None:
+        """Supply voltage and time-out, asked for once per second; None if the controller has not told them."""
+        return self._follower.condition
+
+    @property
+    def older(self) -> bool:
+        """Whether the controller has refused to say what it is: its firmware is older than 1.1."""
+        return self._follower.older
 
     def poll(self) -> LinkUpdate:
         """Return the data received since the last call, without waiting."""
@@ -843,6 +880,46 @@ class Link(BackgroundLoop):
         """
         self._command(protocol.SetCounts(per_turn), f"set {per_turn} counts per turn")
 
+    def settings(self) -> dict[str, int]:
+        """Return the controller's settings by name, in the units of ``protocol.SETTINGS``.
+
+        Raises :class:`AmiwarpError` if the controller does not tell them, as firmware before 1.1.
+        """
+        for key, setting in enumerate(protocol.SETTINGS):
+            self._command(protocol.Ask(protocol.Setting.KIND, key), f"read the setting {setting.name}")
+        with self._changed:
+            return {setting.name: self._follower.settings[key] for key, setting in enumerate(protocol.SETTINGS)}
+
+    def set_setting(self, name: str, value: int) -> None:
+        """Change a setting of the controller until its next reset, while the prism rests.
+
+        ``name`` and unit are those of ``protocol.SETTINGS``. Raises :class:`AmiwarpError` for another name, for a value
+        out of its range, or if the controller refuses.
+        """
+        found = {setting.name: (key, setting) for key, setting in enumerate(protocol.SETTINGS)}
+        if name not in found:
+            raise AmiwarpError(f"setting {name!r}: there is none of this name; give one of {', '.join(found)}")
+        key, setting = found[name]
+        if not setting.contains(value):
+            off = "0 (off), or " if setting.off else ""
+            unit = f" {setting.unit}" if setting.unit else ""
+            raise AmiwarpError(f"setting {name} = {value}: give {off}{setting.least} to {setting.most}{unit}")
+        self._command(protocol.SetSetting(key, value), f"set {name} = {value}")
+
+    def save_settings(self) -> None:
+        """Save the settings in the controller's memory, where they outlive a reset.
+
+        Raises :class:`AmiwarpError` if it refuses, as while the prism turns, or if the memory does not keep them.
+        """
+        self._command(protocol.SaveSettings(), "save the settings")
+
+    def restore_settings(self) -> None:
+        """Change all settings back to those of the build, until the next reset.
+
+        Raises :class:`AmiwarpError` if the controller refuses, as while the prism turns.
+        """
+        self._command(protocol.RestoreSettings(), "restore the settings of the build")
+
     def _command(self, message: protocol.Message, what: str) -> None:
         """Send a command and wait for its answer. ``what``: name of the command in messages."""
         if self._follower.text:
@@ -862,6 +939,8 @@ class Link(BackgroundLoop):
             )
         if refused:
             why = protocol.REFUSALS[refused] if refused < len(protocol.REFUSALS) else f"reason {refused}"
+            if refused == protocol.REFUSALS.index("not possible now"):
+                why += "; a command to the motor waits for a stop after a fault, one that changes settings for rest"
             raise AmiwarpError(f"{self.name}: {what}: refused by the controller, {why}")
 
     def _send(self, message: protocol.Message, *, answered: bool = False) -> int:
@@ -907,12 +986,26 @@ class Link(BackgroundLoop):
             for answer in self._follower.feed(data, now):
                 if answer.sequence in self._answers:  # ignore answers to commands that nobody waits for
                     self._answers[answer.sequence] = answer.refused
+                elif answer.sequence == self._question:
+                    self._follower.older |= answer.refused == protocol.REFUSALS.index("unknown command")
             self._changed.notify_all()
-            due = self._follower.speaks and now >= self._ping_us
+            speaks, condition = self._follower.speaks, self._follower.condition
             quick = len(self._follower.trips) < QUICK_PINGS
-        if due:
-            self._ping_us = now + (QUICK_PING_US if quick else PING_US)
+        timeout_s = 0 if condition is None else condition.host_timeout_s
+        if speaks and now >= self._ping_us:
+            keep_alive_us = min(PING_US, timeout_s * 1_000_000 // PINGS_PER_TIMEOUT or PING_US)
+            self._ping_us = now + (QUICK_PING_US if quick else keep_alive_us)
             self._ping()
+        if speaks and now >= self._ask_us and not self._follower.older:
+            self._ask_us = now + (QUICK_ASK_US if condition is None else ASK_US)
+            self._ask(protocol.Identity if self._follower.identity is None else protocol.Condition)
+
+    def _ask(self, kind: type[protocol.Identity | protocol.Condition]) -> None:
+        """Ask for a message, without waiting for it."""
+        from serial import SerialTimeoutException
+
+        with contextlib.suppress(SerialTimeoutException):
+            self._question = self._send(protocol.Ask(kind.KIND))
 
     def _ping(self) -> None:
         from serial import SerialTimeoutException
