@@ -99,8 +99,12 @@ from .lens.board import Corners as Corners
 from .lens.calibration import BoardPose as BoardPose
 from .lens.calibration import LensCalibration as LensCalibration
 from .lens.calibration import calibrate_lens as calibrate_lens
+from .live.camera import CameraPackets as CameraPackets
+from .live.camera import open_camera as open_camera
 from .live.compensated import compensate_live as compensate_live
 from .live.queues import Policy as Policy
+from .live.stream.camera_settings import CameraSettings as CameraSettings
+from .live.stream.packets import Packet as Packet
 from .optics.camera import Camera as Camera
 from .optics.camera import CameraRotation as CameraRotation
 from .optics.camera import Distortion as Distortion

@@ -26,8 +26,9 @@ import numpy as np
 
 from amiwarp import open_recording
 from amiwarp.io.native_format import LiveWriter
+from amiwarp.live.stream.camera_neuromorphic import NeuromorphicSource
+from amiwarp.live.stream.camera_settings import parse_camera
 from amiwarp.live.stream.session import Session
-from amiwarp.live.stream.sources import CameraSource
 from amiwarp.studies.cluster import machine
 from reference.camera_stub import POLARITY, TRIGGER, Part, StubCamera, connected
 
@@ -72,7 +73,7 @@ class Sent:
         yield RuntimeError("all events were sent")
 
 
-class TimedSource(CameraSource):
+class TimedSource(NeuromorphicSource):
     """Camera whose conversion of packets is timed."""
 
     cpu_s = 0.0
@@ -106,7 +107,7 @@ def run(sent: Sent, path: Path) -> dict[str, Any]:
     messages: list[str] = []
     before_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     with connected(StubCamera(parts=[sent.parts()])):
-        source = TimedSource("camera:evk4,counts_per_turn=4096", messages.append)
+        source = TimedSource(parse_camera("camera:evk4,counts_per_turn=4096"), messages.append)
         began, cpu = time.perf_counter(), time.process_time()
         with LiveWriter(path, width=source.size[0], height=source.size[1], metadata=source.metadata) as writer:
             status = Session(source, raw=[writer], say=messages.append).run(threading.Event(), lambda _: None)

@@ -46,6 +46,8 @@ class StubCamera:
     """Number of times that the camera can be opened; it is gone afterwards."""
     limits: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Limits of biases, by their names."""
+    exchanges_axes: bool = False
+    """Whether a DAVIS346 reports that it exchanges rows and columns."""
     opened: list[dict[str, Any]] = field(default_factory=list)
     """Arguments of each opening, with the configuration as the package's object."""
     closed: int = 0
@@ -71,6 +73,7 @@ class StubDevice:
                     "maximum": iterator_maximum_raw_packets, "timeout": iterator_timeout, "ring": ring_configuration,
                 })  # fmt: skip
                 self._camera, self._name = camera, name
+                self._configuration = camera.opened[-1]["configuration"]
                 self._parts = iter(camera.parts.pop(0) if camera.parts else ())
                 self._timeout = iterator_timeout
                 return self
@@ -91,17 +94,53 @@ class StubDevice:
         if part is None or (part.events is None and part.triggers is None):
             time.sleep(self._timeout if part is None else 0.0)
             return now, None, packet
-        packet.polarity_events, packet.trigger_events = part.events, part.triggers
+        if part.events is not None:
+            packet.polarity_events = part.events[sends(self._configuration, part.events["x"], part.events["y"])]
+        if getattr(self._configuration, "enable_external_trigger", True):
+            packet.trigger_events = part.triggers
         return now, (now, 0, 1, False, [], 0, part.dropped), packet
 
     def name(self) -> str:
         return self._camera.name
+
+    def orientation(self) -> Any:
+        return SimpleNamespace(dvs_invert_xy=self._camera.exchanges_axes)
 
     def biases_bounds(self) -> bytes:
         package = sys.modules[PACKAGE]
         module = getattr(package, self._name.name.lower())
         bounds = {name: module.Bounds(*limits) for name, limits in self._camera.limits.items()}
         return package.serde.bincode.serialize(module.BiasesBounds(**bounds), module.BiasesBounds)
+
+
+def sends(configuration: Any, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which pixels send events, by what the package's drivers write to the registers of each sensor.
+
+    Prophesee's sensors: a bit of a mask silences a column or a row, and rows are counted from the bottom, as are those
+    of the mask's single pixels. DAVIS346: the region's last column and row are included, which are one too many.
+    """
+    sent = np.ones(x.shape, bool)
+    for silenced, at in (("x_mask", x), ("y_mask", 719 - y.astype(np.int64))):
+        words = np.array(getattr(configuration, silenced, ()), np.uint64)
+        if words.any():
+            sent &= (words[at // 64] >> (at % 64).astype(np.uint64) & np.uint64(1)) == 0
+    code = np.array(configuration_codes(getattr(configuration, "pixel_mask", ())), np.int64)
+    if code.any():
+        width, row = (1280, 719 - y.astype(np.int64)) if len(code) == 64 else (346, y.astype(np.int64))
+        sent &= ~np.isin(1 + x + row * width, code)
+    region = getattr(configuration, "region_of_interest", None)
+    if region is not None:
+        sent &= (x >= region.left) & (x <= region.left + region.width)
+        sent &= (y >= region.top) & (y <= region.top + region.height)
+    return sent
+
+
+def configuration_codes(words: Any) -> list[int]:
+    """Return the numbers of the pixels in a mask: eight words of one each, or 21 of three in 63 bits and one more bit."""
+    if len(words) != 21:
+        return [int(word) for word in words]
+    codes = [int(word) >> (21 * k) & ((1 << 21) - 1) for word in words for k in range(3)]
+    return [*codes, sum((int(word) >> 63) << bit for bit, word in enumerate(words))]
 
 
 @contextlib.contextmanager

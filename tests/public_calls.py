@@ -16,7 +16,7 @@ import amiwarp as aw
 from tests.networks import write_network
 
 NAMES = re.findall(r"import (\w+) as \1", Path(aw.__file__).with_suffix(".pyi").read_text())
-NOT_CALLED = {"AmiwarpError", "CalibrationOptions", "Model", "InspectorHandle", "Triggers"}
+NOT_CALLED = {"AmiwarpError", "CalibrationOptions", "CameraPackets", "InspectorHandle", "Model", "Packet", "Triggers"}
 """Public classes that users catch, receive, derive from or annotate with, and do not make."""
 
 _count = itertools.count()
@@ -223,6 +223,8 @@ OWN: dict[str, dict[str, Any]] = {
     "StageSummary": _all(SUMMARY),
     "StageSummary.of": {"name": "n", "stage": STAGE, "names": ("apex",), "values": [{"apex": 0.1}]},
     "compensate_live": {"source": "in.h5"},
+    "open_camera": {"name": "camera:"},
+    "CameraSettings": {"biases": {"diff_on": 20}, "region": (1, 2, 3, 4), "masked": ((1, 2),), "flicker_hz": (90, 130)},
     "CompensationSummary": {"events": 1, "outside": 1, "seconds": 1.0},
     "Compensated": {"events": EVENTS, "flags": np.zeros(3, np.uint8)},
     "Compensator": {"model": MODEL, "encoder": aw.EncoderStream()},

@@ -1,4 +1,4 @@
-"""Sources of live events and sinks: files, sockets, pipes, and cameras by stand-ins for their libraries."""
+"""Sources of live events and sinks: files, sockets and pipes."""
 
 import itertools
 import os
@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +17,6 @@ from amiwarp import AmiwarpError, Camera, Encoder, Events, Prism, RecordingWrite
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream import sockets, sources
 from amiwarp.live.stream import sockets as connections
-from amiwarp.live.stream import sources as cameras
 from amiwarp.live.stream.packets import (
     HEADER,
     End,
@@ -422,151 +421,3 @@ def test_a_socket_left_behind_is_replaced_one_in_use_is_not(tmp_path):
     with SocketSink(address, HELLO), pytest.raises(AmiwarpError, match="cannot listen at this address"):
         SocketSink(address, HELLO)
     assert not (tmp_path / "s").exists()
-
-
-class FakeDv:
-    """As much of dv-processing 2.0 as is used."""
-
-    def __init__(self, batches: list[object], triggers: list[list[tuple[int, str]]]) -> None:
-        self.batches, self.triggers, self.calls = list(batches), list(triggers), []
-        descriptor = SimpleNamespace(serialNumber="DX0")
-        module = ModuleType("dv_processing")
-        module.TriggerType = SimpleNamespace(EXTERNAL_SIGNAL_RISING_EDGE="rising")
-        module.io = SimpleNamespace(camera=SimpleNamespace(discover=lambda: [descriptor], open=self.open))
-        self.module = module
-
-    def open(self, serial: str) -> "FakeDv":
-        self.calls.append(serial)
-        return self
-
-    def getEventResolution(self):
-        return (320, 240)
-
-    def setTimeInterval(self, interval):
-        self.calls.append(interval.microseconds)
-
-    def setDetectorRisingEdges(self, on):
-        self.calls.append("rising")
-
-    def setDetectorRunning(self, on):
-        self.calls.append("running")
-
-    def isRunning(self):
-        return bool(self.batches)
-
-    def getNextEventBatch(self):
-        events = self.batches.pop(0) if self.batches else None
-        if isinstance(events, Exception):
-            raise events
-        if events is None:
-            return None
-        kind = np.dtype([("timestamp", "<i8"), ("x", "<i2"), ("y", "<i2"), ("polarity", "i1")], align=True)
-        rows = np.zeros(len(events), kind)
-        for name, column in zip(kind.names, (events.t, events.x, events.y, events.p), strict=True):
-            rows[name] = column
-        return SimpleNamespace(numpy=lambda: rows)
-
-    def getNextTriggerBatch(self):
-        edges = self.triggers.pop(0) if self.triggers else None
-        return edges and [SimpleNamespace(timestamp=t, type=kind) for t, kind in edges]
-
-
-def test_a_camera_by_dv_processing(monkeypatch):
-    events = make(2000)
-    fake = FakeDv([events[:900], None, events[900:]], [[(5, "rising"), (6, "falling")], [], [(9, "rising")]])
-    monkeypatch.setitem(sys.modules, "dv_processing", fake.module)
-    source = open_source("dv", packet_us=500)
-    assert (source.size, source.camera, source.prism, source.encoders) == (SIZE, None, None, 0)
-    assert fake.calls == ["DX0", 500, "rising", "running"]
-    got = []
-    with pytest.raises(AmiwarpError, match="dv: the camera stopped"):  # noqa: PT012
-        for packet in source.packets():
-            got.append(packet)
-    assert_equal(joined(got), events)
-    assert np.concatenate([packet.triggers for packet in got]).tolist() == [5, 9]
-    source.close()
-
-
-def test_a_quiet_camera_brings_empty_packets_and_its_errors_are_one_line(monkeypatch):
-    fake = FakeDv([None] * 2000 + [RuntimeError("lost\nStacktrace:\n 0# 0x0")], [])
-    monkeypatch.setitem(sys.modules, "dv_processing", fake.module)
-    packets = open_source("dv:DX0").packets()
-    host = Host()
-    monkeypatch.setattr(cameras, "time", SimpleNamespace(monotonic=host.monotonic, sleep=host.sleep))
-    for _ in range(2):
-        began = host.now
-        assert not len(next(packets).events)
-        assert 50_000 <= host.now - began < 51_000
-    del fake.batches[:-1]
-    with pytest.raises(AmiwarpError, match="dv:DX0: stopped: lost; check cable"):
-        list(packets)
-    with pytest.raises(AmiwarpError, match=r"dv:DX9: no such camera \(found: DX0\)"):
-        open_source("dv:DX9")
-
-
-def test_a_camera_without_its_library(monkeypatch):
-    for name, remedy in (("dv_processing", r"amiwarp\[dv\]"), ("metavision_core.event_io", "install OpenEB")):
-        monkeypatch.setitem(sys.modules, name, None)
-        spec = "dv" if name.startswith("dv") else "prophesee:0004"
-        with pytest.raises(AmiwarpError, match=f"^{spec}: needs the library {name.partition('.')[0]} .*{remedy}"):
-            open_source(spec)
-
-
-def test_a_camera_by_metavision(monkeypatch):
-    events, calls = make(2000), []
-    edges = np.array([(1, 70, 0), (0, 80, 0), (1, 90, 0)], [("p", "<i2"), ("t", "<i8"), ("id", "<i2")])
-
-    class Reader:
-        def __init__(self) -> None:
-            self.edges = edges
-
-        def get_ext_trigger_events(self):
-            return self.edges
-
-        def clear_ext_trigger_events(self):
-            self.edges = edges[:0]
-
-    class EventsIterator:
-        reader = Reader()
-
-        @classmethod
-        def from_device(cls, device, delta_t):
-            calls.append((device.path, delta_t))
-            return cls()
-
-        def get_size(self):
-            return 240, 320
-
-        def __iter__(self):
-            for part in (events[:700], events[:0], events[700:]):
-                rows = np.zeros(len(part), [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
-                for name in rows.dtype.names:
-                    rows[name] = getattr(part, name)
-                yield rows
-
-    def initiate_device(path):
-        enable = SimpleNamespace(enable=calls.append)
-        return SimpleNamespace(path=path, get_i_trigger_in=lambda: enable) if path != "none" else None
-
-    modules = {
-        "metavision_core": {},
-        "metavision_core.event_io": {"EventsIterator": EventsIterator},
-        "metavision_core.event_io.raw_reader": {"initiate_device": initiate_device},
-        "metavision_hal": {"I_TriggerIn": SimpleNamespace(Channel=SimpleNamespace(MAIN="main"))},
-    }
-    for name, content in modules.items():
-        module = ModuleType(name)
-        module.__dict__.update(content)
-        monkeypatch.setitem(sys.modules, name, module)
-    source, got = open_source("prophesee:0004", packet_us=2000), []
-    assert (calls, source.size) == (["main", ("0004", 2000)], SIZE)
-    with pytest.raises(AmiwarpError, match="prophesee:0004: the camera stopped"):  # noqa: PT012
-        for packet in source.packets():
-            got.append(packet)
-    assert [len(packet.events) for packet in got] == [700, 0, 1300]
-    assert_equal(joined(got), events)
-    assert got[0].triggers.tolist() == [70, 90]
-    assert not len(got[1].triggers)
-    source.close()
-    with pytest.raises(AmiwarpError, match="prophesee:none: no such camera"):
-        open_source("prophesee:none")

@@ -64,7 +64,7 @@ def run_info(
 
 def _report_cameras(common: cli.Common) -> None:
     """Print the connected cameras, and the names under which ``amiwarp record`` and ``live`` open them."""
-    from amiwarp.live.stream.sources import list_cameras
+    from amiwarp.live.stream.camera_neuromorphic import list_cameras
 
     data = [
         {"source": each.serial and f"camera:{each.serial}", "model": each.name.value,

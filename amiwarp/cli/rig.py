@@ -53,7 +53,8 @@ _in_source = partial(typer.Option, rich_help_panel="Source")
 SourceArgument = Annotated[
     str,
     typer.Argument(
-        help="Source: camera:, camera:SERIAL or camera:MODEL (then biases: camera:evk4,diff_on=20), dv, prophesee, "
+        help="Source: camera:, camera:SERIAL or camera:MODEL, dv, prophesee (each also with settings: "
+        "camera:evk4,diff_on=20,region=LEFT:TOP:RIGHT:BOTTOM,masked=X:Y+X:Y,most_mev_s=N,trigger=on,settings=FILE), "
         "tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
     ),
 ]
@@ -92,7 +93,7 @@ class SourceOptions:
         float,
         _in_source(
             min=0.0,
-            help="Longest wait for the sender of a socket, or for a camera:, to return after its stream breaks off "
+            help="Longest wait for the sender of a socket, or for a camera, to return after its stream breaks off "
             "(s); 0: do not wait.",
         ),
     ] = 0.0
@@ -231,11 +232,13 @@ def check_model(source: Source, link: Link | None, angles: int, found: Calibrati
 
 def check_whole(source: Source, status: SessionStatus) -> None:
     """Raise :class:`AmiwarpError` if the stream broke off. Call this function after the files are complete."""
+    from amiwarp.live.stream.sources import can_return
+
     problem = getattr(source, "problem", None)
     if problem is None:
         return
-    reopens = source.name.partition(":")[0].removesuffix("-listen") in ("camera", "tcp", "unix")
-    hint = "; --wait-for-source S waits for it to return" if reopens and not hasattr(source, "returns") else ""
+    waits = "; --wait-for-source S waits for it to return"
+    hint = waits if can_return(source.name) and not hasattr(source, "returns") else ""
     kept = f"the {status.events:,} events received until then are kept"
     raise AmiwarpError(f"{source.name}: the stream broke off: {problem}; {kept}{hint}")
 

@@ -180,6 +180,8 @@ class Packet:
         return not (len(self.events) or samples or self.returned)
 
 
+IDLE_S = 0.05
+"""Longest time without a packet from a source [s]. After this time, it delivers an empty packet."""
 NO_TIMES = np.zeros(0, np.int64)
 """Empty array of times, for packets without triggers or encoder samples."""
 NO_ANGLES = np.zeros(0)

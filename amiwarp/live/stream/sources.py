@@ -1,39 +1,34 @@
-"""Sources of live events: replayed recordings, streams of packets, and cameras; and the emulated camera."""
+"""Sources of live events: replayed recordings and streams of packets; their names, also of cameras; their returns."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import socket
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
-from datetime import timedelta
 from functools import partial
-from importlib import import_module
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import LARGEST_ANGLE, TWO_PI
+from amiwarp.events.encoder import LARGEST_ANGLE
 from amiwarp.events.recording import Events, Recording
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.link.emulator import Controller, Played
 from amiwarp.live.queues import BackgroundLoop
 from amiwarp.live.stream import packets as wire
-from amiwarp.live.stream.packets import Packet, Source, make_packet
+from amiwarp.live.stream.camera_source import CameraSource
+from amiwarp.live.stream.cameras import CAMERAS, open_camera_source
+from amiwarp.live.stream.packets import IDLE_S, Packet, Source, make_packet
 from amiwarp.live.stream.sockets import SocketSink, Unreachable, accept, connect, iter_accepted, iter_connected, ready
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import NominalPrism
 
-IDLE_S = 0.05
-"""Longest time without a packet [s]. After this time, an empty packet is delivered."""
 LARGEST_US = 1 << 60
 """Largest accepted magnitude of a time in a stream [us]: the difference of two fits int64."""
 HELLO_S = 10.0
@@ -242,29 +237,36 @@ difference than this warns the user [us]."""
 
 
 SOCKETS = ("tcp", "unix", "tcp-listen", "unix-listen")
-"""Kinds of sources whose sender can return."""
+"""Kinds of sources whose sender can return. Cameras can return, too."""
+
+
+def can_return(spec: str) -> bool:
+    """Return whether a source with this name can be opened again after its stream broke off."""
+    return spec.partition(":")[0] in (*SOCKETS, *CAMERAS)
 
 
 class ReturningSource:
     """Source for a stream that is opened again after a break, if its sender or camera returns within ``wait_s`` [s].
 
     It must be the same camera. The clock of a sender must have continued: otherwise events of the two parts could not
-    be ordered, and :class:`AmiwarpError` is raised. The clock of ``camera:`` begins anew: its later times are shifted,
-    so that the gap is as long as on the host's clock. ``say`` is called with a message when the stream breaks off, when
-    it returns, and when the durations of the gap on the sender's and the host's clock disagree. Raises
-    :class:`AmiwarpError` for a source other than a socket or ``camera:``, or if no sender is there at first.
+    be ordered, and :class:`AmiwarpError` is raised. The clock of a camera begins anew: its later times are shifted, so
+    that the gap is as long as on the host's clock. It is opened with the same settings. ``say`` is called with a
+    message when the stream breaks off, when it returns, and when the durations of the gap on the sender's and the
+    host's clock disagree. Raises :class:`AmiwarpError` for a source other than a socket or a camera, or if no sender is
+    there at first.
     """
 
-    def __init__(self, spec: str, wait_s: float, say: Callable[[str], None]) -> None:
-        kind = spec.partition(":")[0]
-        if kind not in (*SOCKETS, "camera"):
-            what = "give camera:, tcp:, unix:, tcp-listen: or unix-listen:, or omit the option"
+    def __init__(self, spec: str, wait_s: float, say: Callable[[str], None], *, packet_us: int = 1000) -> None:
+        if not can_return(spec):
+            what = "give camera:, dv, prophesee, tcp:, unix:, tcp-listen: or unix-listen:, or omit the option"
             raise AmiwarpError(
-                f"{spec}: --wait-for-source applies to sockets and camera: only, because other sources cannot be "
+                f"{spec}: --wait-for-source applies to sockets and cameras only, because other sources cannot be "
                 f"reopened; {what}"
             )
-        self._wait_s, self._say, self._restarts = wait_s, say, kind == "camera"
-        self._source: StreamSource | CameraSource = CameraSource(spec, say) if self._restarts else open_stream(spec)
+        self._wait_s, self._say, self._restarts = wait_s, say, spec.partition(":")[0] in CAMERAS
+        self._source: StreamSource | CameraSource = (
+            open_camera_source(spec, say, packet_us=packet_us) if self._restarts else open_stream(spec)
+        )
         source = self._source
         self.name, self.size, self.camera, self.prism = source.name, source.size, source.camera, source.prism
         self.encoders = source.encoders
@@ -297,7 +299,8 @@ class ReturningSource:
             if self.returns == before:
                 self.problem = f"{self.problem}, and {self._awaited} was not back in {time.monotonic() - began:.1f} s"
                 return
-            self._say(f"{self.name}: the stream is back after {time.monotonic() - began:.1f} s")
+            same = ", the camera with the same settings" if self._restarts else ""
+            self._say(f"{self.name}: the stream is back after {time.monotonic() - began:.1f} s{same}")
 
     def close(self) -> None:
         """Close the connection, see :meth:`Source.close`."""
@@ -357,7 +360,9 @@ class ReturningSource:
 
         :attr:`problem` is None if the sender returned.
         """
-        with contextlib.closing(_attempts(self.name, self._say)) as attempts:
+        lost = self._source
+        again = _camera_attempts(lost) if isinstance(lost, CameraSource) else _attempts(self.name)
+        with contextlib.closing(again) as attempts:
             for reopen in attempts:
                 if reopen is not None:
                     try:
@@ -386,327 +391,20 @@ class ReturningSource:
         self.returns += 1
 
 
-def _attempts(
-    spec: str, say: Callable[[str], None]
-) -> Generator[Callable[..., StreamSource | CameraSource] | None, None, None]:
-    """Yield functions of ``hello_s`` that open a socket's sender or a camera again; None at least every second."""
-    if spec.partition(":")[0] == "camera":
-        while True:
-            for _ in range(round(REOPEN_S / IDLE_S)):
-                yield None
-                time.sleep(IDLE_S)
-            yield lambda hello_s: CameraSource(spec, say)
+def _attempts(spec: str) -> Generator[Callable[..., StreamSource] | None, None, None]:
+    """Yield functions of ``hello_s`` that open the stream of a socket's sender again; None at least every second."""
     iterate = iter_accepted if spec.partition(":")[0].endswith("-listen") else iter_connected
     for connection in iterate(spec.replace("-listen", "", 1)):
         yield None if connection is None else partial(open_connection, spec, connection)
 
 
-# Cameras: most through neuromorphic-drivers, iniVation's also through dv-processing, Prophesee's also through
-# Metavision or OpenEB. These libraries are optional.
-#
-# Tested with substitutes for these libraries, not yet with cameras.
-
-POLL_S = 0.0005
-"""Pause between two requests to the camera's library for events [s]."""
-
-
-def _library(name: str, camera: str, remedy: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise AmiwarpError(f"{camera}: needs the library {name.partition('.')[0]} ({error}); {remedy}") from error
-
-
-@contextlib.contextmanager
-def _named(camera: str, doing: str, kind: type[AmiwarpError] = AmiwarpError) -> Iterator[None]:
-    """Turn any exception of a camera's library into an :class:`AmiwarpError` of one line."""
-    try:
-        yield
-    except (AmiwarpError, KeyboardInterrupt, SystemExit, GeneratorExit):
-        raise
-    except BaseException as error:
-        lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-        raise kind(f"{camera}: {doing}: {lines[0][:200]}; check cable, power and access rights") from error
-
-
-class _CameraSource:
-    camera: Camera | None = None
-    """Camera intrinsics: None, because the device does not store its calibration."""
-    prism: NominalPrism | None = None
-    encoders = 0
-    size: tuple[int, int]
-    name: str
-
-
-RAW_PACKETS = 8
-"""Largest number of USB packets, of 128 KiB each, that the camera's driver decodes at once: about a million events."""
-
-
-def list_cameras() -> list[Any]:
-    """Return the cameras that neuromorphic-drivers finds, each with ``name``, ``connection``, ``serial`` and ``error``.
-
-    Raises :class:`AmiwarpError` if the library is missing or cannot list the cameras.
-    """
-    remedy = "pip install 'amiwarp[camera]', or give dv or prophesee, which use other libraries"
-    drivers = _library("neuromorphic_drivers", "camera", remedy)
-    with _named("camera", "the cameras cannot be listed", Unreachable):
-        return list(drivers.list_devices())
-
-
-def _find_camera(which: str) -> Any:
-    """Return the camera with the serial number ``which``, or the only one whose model's name contains it."""
-    cameras = list_cameras()
-    found = [each for each in cameras if which == each.serial or _squeezed(which) in _squeezed(each.name.value)]
-    name = f"camera:{which}"
-    if not cameras:
-        raise Unreachable(f"{name}: no camera is connected, or none that neuromorphic-drivers knows; plug it in")
-    if len(found) != 1:
-        listed = ", ".join(
-            f"camera:{each.serial} ({each.name.value})" if each.serial else f"{each.name.value} ({each.error})"
-            for each in found or cameras
-        )
-        raise Unreachable(f"{name}: {len(found)} such cameras are connected; choose one of these: {listed}")
-    if found[0].serial is None:
-        remedy = "on Linux, 'neuromorphic-drivers-install-udev-rules' gives access rights"
-        raise Unreachable(f"{name}: {found[0].name.value} cannot be opened: {found[0].error}; {remedy}")
-    return found[0]
-
-
-def _squeezed(name: str) -> str:
-    """Return the letters and digits of a name in lower case."""
-    return "".join(filter(str.isalnum, name)).lower()
-
-
-class CameraSource(_CameraSource):
-    """Source of events from a camera by Prophesee, iniVation, CenturyArks or Lucid, read through neuromorphic-drivers.
-
-    ``spec``: ``camera:``, then the serial number or a part of the model's name if several cameras are connected, then
-    settings, separated by commas: values of biases, and ``counts_per_turn=N`` if rising edges at the trigger input are
-    counts of the prism's encoder, N per turn; negative: backwards. Without it, rising edges become triggers only.
-    ``say`` gets a message if USB packets are lost. The library puts the times of a device on one clock of 64 bits.
-    Raises :class:`Unreachable` if the camera is not there, and :class:`AmiwarpError` for a missing library and wrong
-    settings.
-    """
-
-    def __init__(self, spec: str, say: Callable[[str], None] = lambda _: None) -> None:
-        which, settings = _settings(spec)
-        found = _find_camera(which)
-        drivers, model = import_module("neuromorphic_drivers"), found.name.value
-        self.name = ",".join([f"camera:{found.serial}", *(f"{key}={value}" for key, value in settings.items())])
-        """Name with the serial number, under which the same camera can be opened again."""
-        self.metadata = {"camera_name": model}
-        """What a recording shall store about the camera."""
-        self.problem: str | None = None
-        """Why the camera stopped, in one line; None while it runs."""
-        self.lost = 0
-        """Number of USB packets that were lost, because the computer was too slow."""
-        self._say, self._count = say, 0
-        self._counts_per_turn = settings.pop("counts_per_turn", 0)
-        self.encoders = int(self._counts_per_turn != 0)
-        module = getattr(drivers, found.name.name.lower())
-        biases = _biases(self.name, model, module.Biases, settings)
-        with _named(self.name, "cannot be opened", Unreachable):
-            self._device = drivers.open(
-                module.Configuration(biases=biases), iterator_timeout=IDLE_S, serial=found.serial,
-                iterator_maximum_raw_packets=RAW_PACKETS,
-            )  # fmt: skip
-        try:
-            with _named(self.name, "cannot be opened", Unreachable):
-                properties, bounds = self._device.properties(), self._device.biases_bounds()
-            self.size = int(properties.width), int(properties.height)
-            for bias, value in settings.items():
-                limits = getattr(bounds, bias, None)  # those of the device; equal if they are unknown
-                if limits is not None and limits.minimum < limits.maximum:
-                    _check_limits(self.name, bias, value, limits.minimum, limits.maximum)
-        except BaseException:
-            self.close()
-            raise
-
-    def packets(self) -> Iterator[Packet]:
-        """Yield packets, see :meth:`Source.packets`. Ends when the camera stops; :attr:`problem` then says why."""
-        try:
-            while True:
-                try:
-                    with _named(self.name, "the camera stopped"):
-                        status, packet = next(self._device)
-                except AmiwarpError as error:
-                    self.problem = str(error).removeprefix(f"{self.name}: ")
-                    return
-                self._count_lost(status.ring)
-                yield self._packet(packet)
-        finally:
-            if self.lost:
-                self._say(f"{self.name}: {self.lost:,} USB packets with events were lost")
-
-    def close(self) -> None:
-        """Release the camera, see :meth:`Source.close`."""
-        with contextlib.suppress(Exception):  # a camera that was unplugged
-            self._device.close()
-
-    def _count_lost(self, ring: Any) -> None:
-        lost = self.lost if ring is None else int(ring.dropped_packets)
-        if lost and not self.lost:
-            self._say(f"{self.name}: this computer is too slow: USB packets with events are lost")
-        self.lost = lost
-
-    def _packet(self, packet: Any) -> Packet:
-        now, rows, edges = monotonic_us(), packet.polarity_events, packet.trigger_events
-        events = None if rows is None else _events(rows["x"], rows["y"], rows["t"], rows["on"])
-        if edges is None:
-            return make_packet(now, events)
-        # The polarity of an edge of the DAVIS346 is 0 for a falling edge, 1 for a rising one, and 2 for a pulse.
-        rising = edges["rising" if "rising" in edges.dtype.names else "polarity"] > 0
-        t = edges["t"][rising].astype(np.int64)
-        if not self._counts_per_turn:
-            return make_packet(now, events, t)
-        angle = np.arange(self._count, self._count + t.size) * (TWO_PI / self._counts_per_turn)
-        self._count += t.size
-        return make_packet(now, events, t, t, angle)
-
-
-def _settings(spec: str) -> tuple[str, dict[str, int]]:
-    """Return the serial number or model in the name of a camera, and its settings."""
-    parts = [part.strip() for part in spec.partition(":")[2].split(",")]
-    which = "" if "=" in parts[0] else parts.pop(0)
-    settings = {}
-    for part in parts:
-        name, _, value = part.partition("=")
-        try:
-            settings[name] = int(value, 0)
-        except ValueError as error:
-            raise AmiwarpError(f"{spec}: setting {part!r}; write NAME=WHOLE_NUMBER, as in diff_on=20") from error
-    if settings.get("counts_per_turn") == 0:
-        raise AmiwarpError(f"{spec}: counts_per_turn is 0; give the trigger edges per turn, negative for backwards")
-    return which, settings
-
-
-def _biases(name: str, model: str, kind: Any, values: dict[str, int]) -> Any:
-    """Return the biases of a camera model, with ``values`` in place of their defaults."""
-    fields: dict[str, Any] = {field.name: field for field in dataclasses.fields(kind)}
-    for bias, value in values.items():
-        if bias not in fields:
-            known = ", ".join(f"{each} ({field.default:d})" for each, field in fields.items())
-            raise AmiwarpError(f"{name}: {model} has no bias {bias!r}; its biases, with their defaults, are {known}")
-        whole = get_args(fields[bias].type)  # of the type's NumPy and Python names; none for a switch
-        low, high = (np.iinfo(whole[0]).min, np.iinfo(whole[0]).max) if whole else (0, 1)
-        _check_limits(name, bias, value, low, high)
-    return kind(**{bias: type(fields[bias].default)(value) for bias, value in values.items()})
-
-
-def _check_limits(name: str, bias: str, value: int, low: int, high: int) -> None:
-    if not low <= value <= high:
-        raise AmiwarpError(f"{name}: bias {bias} = {value}; expected {low} .. {high}")
-
-
-class DvSource(_CameraSource):
-    """Source of events from an iniVation camera (DVXplorer, DAVIS), read through dv-processing 2.
-
-    A serial number of None means the first camera found. Rising edges at its signal input become triggers. Raises
-    :class:`AmiwarpError` if library or camera is missing.
-    """
-
-    def __init__(self, serial: str | None = None, *, packet_us: int = 1000) -> None:
-        self.name = "dv" if serial is None else f"dv:{serial}"
-        dv = _library("dv_processing", self.name, "pip install 'amiwarp[dv]'")
-        with _named(self.name, "cannot be opened"):
-            found = [str(camera.serialNumber) for camera in dv.io.camera.discover()]
-            if serial not in found and (serial is not None or not found):
-                raise AmiwarpError(
-                    f"{self.name}: no such camera (found: {', '.join(found) or 'none'}); plug the camera in"
-                )
-            self._camera = dv.io.camera.open(serial or found[0])
-            self.size = tuple(int(side) for side in self._camera.getEventResolution())  # type: ignore[assignment]
-            self._camera.setTimeInterval(timedelta(microseconds=packet_us))
-            if hasattr(self._camera, "setDetectorRunning"):
-                self._camera.setDetectorRisingEdges(True)
-                self._camera.setDetectorRunning(True)
-        self._rising = dv.TriggerType.EXTERNAL_SIGNAL_RISING_EDGE
-
-    def packets(self) -> Iterator[Packet]:
-        """Yield packets, see :meth:`Source.packets`. Raises :class:`AmiwarpError` when the camera stops."""
-        yielded_s = time.monotonic()
-        while True:
-            with _named(self.name, "stopped"):
-                running = self._camera.isRunning()
-                store, triggers = self._camera.getNextEventBatch(), self._triggers()
-            if store is not None or triggers.size:
-                yield make_packet(monotonic_us(), _dv_events(store), triggers)
-                yielded_s = time.monotonic()
-            elif not running:
-                raise AmiwarpError(f"{self.name}: the camera stopped; was it unplugged?")
-            elif time.monotonic() - yielded_s >= IDLE_S:
-                yield make_packet(monotonic_us())
-                yielded_s = time.monotonic()
-            else:
-                time.sleep(POLL_S)
-
-    def close(self) -> None:
-        """Release the camera, see :meth:`Source.close`."""
-        self._camera = None
-
-    def _triggers(self) -> NDArray[np.int64]:
-        batch = self._camera.getNextTriggerBatch() or ()
-        return np.array([trigger.timestamp for trigger in batch if trigger.type == self._rising], np.int64)
-
-
-def _dv_events(store: Any) -> Events | None:
-    if store is None:
-        return None
-    events = store.numpy()
-    return _events(events["x"], events["y"], events["timestamp"], events["polarity"])
-
-
-def _events(x: Any, y: Any, t: Any, p: Any) -> Events:
-    """Copy the columns of a library's rows into new events, because the library reuses its memory."""
-    return Events(x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), (p > 0).astype(np.uint8))
-
-
-class PropheseeSource(_CameraSource):
-    """Source of events from a Prophesee camera, read through Metavision's or OpenEB's Python binding.
-
-    A serial number of None means the first camera found. Rising edges at its main trigger input become triggers. While
-    the camera sends nothing at all, the library blocks. Raises :class:`AmiwarpError` if library or camera is missing.
-    """
-
-    def __init__(self, serial: str | None = None, *, packet_us: int = 1000) -> None:
-        self.name = "prophesee" if serial is None else f"prophesee:{serial}"
-        remedy = "install OpenEB or the Metavision SDK (they are not on PyPI)"
-        event_io = _library("metavision_core.event_io", self.name, remedy)
-        raw_reader = _library("metavision_core.event_io.raw_reader", self.name, remedy)
-        hal = _library("metavision_hal", self.name, remedy)
-        with _named(self.name, "cannot be opened"):
-            device = raw_reader.initiate_device(path=serial or "")
-            if device is None:
-                raise AmiwarpError(f"{self.name}: no such camera; plug the camera in")
-            trigger_in = device.get_i_trigger_in()
-            if trigger_in is not None:
-                trigger_in.enable(hal.I_TriggerIn.Channel.MAIN)
-            self._iterator = event_io.EventsIterator.from_device(device=device, delta_t=packet_us)
-            height, width = self._iterator.get_size()
-        self.size = (int(width), int(height))
-
-    def packets(self) -> Iterator[Packet]:
-        """Yield packets, see :meth:`Source.packets`. Raises :class:`AmiwarpError` when the camera stops."""
-        slices = iter(self._iterator)
-        while True:
-            with _named(self.name, "stopped"):
-                events = next(slices, None)
-                triggers = self._triggers()
-            if events is None:
-                raise AmiwarpError(f"{self.name}: the camera stopped; was it unplugged?")
-            now = monotonic_us()
-            yield make_packet(now, _events(events["x"], events["y"], events["t"], events["p"]), triggers)
-
-    def close(self) -> None:
-        """Release the camera, see :meth:`Source.close`."""
-        self._iterator = None
-
-    def _triggers(self) -> NDArray[np.int64]:
-        reader = self._iterator.reader
-        edges = reader.get_ext_trigger_events()
-        rising = np.array(edges["t"][edges["p"] == 1], np.int64) if len(edges) else np.zeros(0, np.int64)
-        reader.clear_ext_trigger_events()
-        return rising
+def _camera_attempts(lost: CameraSource) -> Generator[Callable[..., CameraSource] | None, None, None]:
+    """Yield functions that open a camera again that was lost, every :data:`REOPEN_S`; None in between."""
+    while True:
+        for _ in range(round(REOPEN_S / IDLE_S)):
+            yield None
+            time.sleep(IDLE_S)
+        yield lambda hello_s: lost.reopened()
 
 
 # Emulated camera for the emulated controller: serves a recording's events, and a trigger for each sync pulse.
@@ -810,25 +508,21 @@ def open_source(
     The name of a file replays a recording at ``pace`` times its speed (None: as fast as possible), in packets of
     ``packet_us`` [us]. ``-``, ``tcp:HOST:PORT`` and ``unix:PATH`` read a stream (``docs/reference/stream-format.md``);
     ``tcp-listen:HOST:PORT`` and ``unix-listen:PATH`` wait for its sender to connect. ``camera:``, ``camera:SERIAL`` and
-    ``camera:MODEL`` open a camera, with settings as :class:`CameraSource` takes them; ``dv``, ``dv:SERIAL``,
-    ``prophesee`` and ``prophesee:SERIAL`` open one through other libraries. ``wait_s``: how long to wait for the sender
-    of a socket, or for a ``camera:``, to return after its stream broke off [s]; ``say`` gets messages.
+    ``camera:MODEL`` open a camera; ``dv``, ``dv:SERIAL``, ``prophesee`` and ``prophesee:SERIAL`` open one through other
+    libraries. Each may go on with settings (:class:`CameraSettings`). ``wait_s``: how long to wait for the sender of a
+    socket, or for a camera, to return after its stream broke off [s]; ``say`` gets messages.
     Raises :class:`AmiwarpError` if the source cannot be opened, or if ``wait_s`` is given for another source.
     """
-    kind, _, rest = spec.partition(":")
+    kind = spec.partition(":")[0]
     if wait_s > 0.0:
-        return ReturningSource(spec, wait_s, say)
+        return ReturningSource(spec, wait_s, say, packet_us=packet_us)
     if spec == "-":
         # Read the descriptor directly, without the buffer of sys.stdin, and leave it open at the end.
         return StreamSource("standard input", open(0, "rb", buffering=0, closefd=False))
     if kind in SOCKETS:
         return open_stream(spec)
-    if kind == "camera":
-        return CameraSource(spec, say)
-    if kind == "dv":
-        return DvSource(rest or None, packet_us=packet_us)
-    if kind == "prophesee":
-        return PropheseeSource(rest or None, packet_us=packet_us)
+    if kind in CAMERAS:
+        return open_camera_source(spec, say, packet_us=packet_us)
     return FileSource(spec, pace=pace, packet_us=packet_us)
 
 
@@ -839,14 +533,14 @@ def reopen_source(spec: str, stop: threading.Event) -> Source | None:
     """
     kind = spec.partition(":")[0]
     if kind in SOCKETS:
-        with contextlib.closing(_attempts(spec, lambda _: None)) as attempts:
+        with contextlib.closing(_attempts(spec)) as attempts:
             for reopen in attempts:
                 if reopen is not None:
                     with contextlib.suppress(Unreachable):  # the sender left before its hello message
                         return reopen(hello_s=REOPEN_S)
                 if stop.is_set():
                     return None
-    while kind in ("camera", "dv", "prophesee") and not stop.wait(REOPEN_S):
+    while kind in CAMERAS and not stop.wait(REOPEN_S):
         with contextlib.suppress(AmiwarpError):
             return open_source(spec)
     return None
