@@ -4,7 +4,6 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,10 +31,14 @@ from amiwarp import (
 )
 from amiwarp.calib import calibration
 from amiwarp.calib.parameters import ParameterSpace, make_space
-from amiwarp.calib.photometric import consistency, stage
+from amiwarp.calib.photometric import angles, limits
 from amiwarp.calib.photometric.causes import FACES, FOCAL_LENGTH, SEAT, SIDE
-from amiwarp.calib.photometric.consistency import Consistency, Finding, LinearFit
-from amiwarp.calib.photometric.stage import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
+from amiwarp.calib.photometric.consistency import LEAST_GAIN, Consistency, LikelyCause
+from amiwarp.calib.photometric.findings import RivalCauses
+from amiwarp.calib.photometric.limits import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST
+from amiwarp.calib.photometric.linear_fit import LinearFit
+from amiwarp.calib.photometric.systematic import MAP_ERROR, lens_errors, map_errors
+from amiwarp.calib.photometric.verdicts import likeliest, refused, rivals_in_words, warned
 from amiwarp.studies.stability.cells import polygons
 
 CAMERA = Camera.from_fov(160, 120, math.radians(90.0))
@@ -174,7 +177,7 @@ def test_pixels_that_are_read_one_after_another_are_named(wide: Recording) -> No
 def test_an_accepted_delay_of_the_read_out_is_reported_and_no_error_of_the_encoder(
     wide: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stage, "LARGEST_SKEW_PX", 0.1)
+    monkeypatch.setattr(limits, "LARGEST_SKEW_PX", 0.1)
     found = calibrated(read_by_column(wide, 6), density=1.0)
     assert any(re.search(r"late by [56]\.?\d* us more from column to column", said) for said in found.warnings)
     assert found.harmonics is None
@@ -185,7 +188,7 @@ def test_an_accepted_delay_of_the_read_out_is_reported_and_no_error_of_the_encod
 def test_a_very_wrong_camera_is_no_error_of_the_encoder(wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     """A false error of the angle is found first; the camera is corrected with it and without it."""
     errors = iter([np.array([0.004, 0.002, 0.0, 0.006, 0.0, 0.0])])
-    monkeypatch.setattr(stage, "find_angle_error", lambda *_: next(errors, None))
+    monkeypatch.setattr(angles, "find_angle_error", lambda *_: next(errors, None))
     found = calibrated(replace(wide, camera=replace(wide.camera, cx=wide.camera.cx + 3.0)), density=1.0)
     assert next(errors, None) is None
     assert found.harmonics is None
@@ -250,13 +253,12 @@ def test_a_camera_that_shakes_with_the_prism_is_refused(texture: np.ndarray) -> 
 
 
 def test_two_explanations_are_named_with_what_to_free() -> None:
-    side, seat, faces = (SimpleNamespace(cause=cause) for cause in (SIDE, SEAT, FACES))
-    said = stage.rival_in_words(seat, faces, 0.09)  # type: ignore[arg-type]
+    said = rivals_in_words(RivalCauses(SEAT, FACES, 0.09))
     assert "seat in its mount" in said
     assert "evenness of the prism's faces" in said
     assert "0.09 px" in said
     assert "--free apex,phase,wobble_x,wobble_y or --free apex,phase,cylinder_x,cylinder_y" in said
-    assert "flat_side" not in stage.rival_in_words(side, seat, 0.09)  # type: ignore[arg-type]
+    assert "flat_side" not in rivals_in_words(RivalCauses(SIDE, SEAT, 0.09))
 
 
 def test_linear_fit() -> None:
@@ -285,19 +287,19 @@ def seen(curvatures: dict[str, float]) -> tuple[ParameterSpace, np.ndarray, Line
 
 def test_a_lens_that_the_events_do_not_tell_is_a_part_of_the_apex() -> None:
     space, v, fit = seen({"apex": 1.0, "phase": 1.0, "focal_length": 1e-6})
-    std = space.deviations(v, consistency.lens_errors(space, v, fit, consistency.LEAST_GAIN))
+    std = space.deviations(v, lens_errors(space, v, fit, LEAST_GAIN))
     assert 0.01 < std["apex"] / PRISM.apex < 0.03
     assert std["phase"] < 0.002
     space, v, fit = seen({"apex": 1.0, "phase": 1.0, "focal_length": 1e6})
-    told = space.deviations(v, consistency.lens_errors(space, v, fit, consistency.LEAST_GAIN))
+    told = space.deviations(v, lens_errors(space, v, fit, LEAST_GAIN))
     assert told["apex"] < 0.01 * std["apex"]
 
 
 def test_errors_of_the_map_are_shared_by_all_pairs() -> None:
     space, v, fit = seen({"apex": 400.0, "phase": 400.0})
-    coarse, fine = (space.deviations(v, consistency.map_errors(space, v, fit, 40_000, d)) for d in (1.0, 2.0))
+    coarse, fine = (space.deviations(v, map_errors(space, v, fit, 40_000, d)) for d in (1.0, 2.0))
     px_per_rad = float(np.linalg.norm(v))
-    assert coarse["phase"] * px_per_rad == pytest.approx(consistency.MAP_ERROR["phase"] * 10.0, rel=1e-3)
+    assert coarse["phase"] * px_per_rad == pytest.approx(MAP_ERROR["phase"] * 10.0, rel=1e-3)
     assert coarse["phase"] == pytest.approx(4.0 * fine["phase"])
     assert coarse["apex"] / PRISM.apex == pytest.approx(coarse["phase"] * 0.008 / 0.03, rel=1e-3)
 
@@ -315,7 +317,7 @@ def test_the_phase_from_few_sharp_edges_is_as_good_as_stated() -> None:
 
 def outcome(**values: Any) -> Consistency:
     none: dict[str, Any] = {
-        "findings": (),
+        "likely": (),
         "drift": (0.0, 0.0),
         "spread": (0.0, 0.0),
         "untold_px": 0.0,
@@ -325,19 +327,19 @@ def outcome(**values: Any) -> Consistency:
 
 
 def test_what_is_said_and_refused() -> None:
-    lens = Finding(FOCAL_LENGTH, moved_px=0.2, gain=0.1, significance=20.0, start=np.zeros(3))
+    lens = LikelyCause(FOCAL_LENGTH, moved_px=0.2, gain=0.1, significance=20.0, start=np.zeros(3))
     for found, words, error in (
-        (outcome(findings=(lens,)), "focal length seems to be wrong", 0.2),
+        (outcome(likely=(lens,)), "focal length seems to be wrong", 0.2),
         (outcome(spread=(0.3, 0.0)), "size of the orbit differs by 0.30 px", 0.3),
         (outcome(spread=(0.0, 0.3)), "slow where it is dark", 0.0),
         (outcome(drift=(0.15, 0.0)), "size of the orbit drifts", 0.15),
         (outcome(drift=(0.0, -0.15)), "scale or the clock of the encoder", 0.0),
         (outcome(untold_px=0.04), "do not tell which side", 0.0),
     ):
-        [warning] = found.warnings()
+        [warning] = warned(found)
         assert words in warning
         assert found.inconsistent_px() == pytest.approx(error)
-        accepted, reason = judge_consistency(found.inconsistent_px(), found.likeliest())
-        assert accepted == (error == 0.0)
-        assert (found.likeliest() in reason) == (not accepted)
-    assert outcome().warnings() == []
+        reason = refused(found)
+        assert (reason == "") == (error == 0.0)
+        assert (likeliest(found) in reason) == (error != 0.0)
+    assert warned(outcome()) == []

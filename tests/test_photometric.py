@@ -42,7 +42,9 @@ from amiwarp import (
 from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap, EventTable, PairSet, Residuals, Tiles
 from amiwarp.calib.calibration import mean_of_turns
 from amiwarp.calib.calibration_events import EventsAhead
-from amiwarp.calib.photometric.cost import TILE, Slopes, choose_tiles, iterate, near_tiles, one_tile, van_der_corput
+from amiwarp.calib.photometric.descent import Slopes, iterate
+from amiwarp.calib.photometric.pairs import van_der_corput
+from amiwarp.calib.photometric.tiles import TILE, choose_tiles, near_tiles, one_tile
 from amiwarp.imaging.iwe import CanvasShape, Image
 from tests.conftest import COARSE, TRUE_PHASE, TRUE_PRISM
 

@@ -25,7 +25,8 @@ from amiwarp.calib.checks import check_pulses, check_texture
 from amiwarp.calib.first_guess import _period, encoder_turns_per_period
 from amiwarp.calib.model_choice import LARGEST_MOTION_PX, in_pixels
 from amiwarp.calib.parameters import units
-from amiwarp.calib.photometric.stage import judge_optimum
+from amiwarp.calib.photometric.findings import Optimum
+from amiwarp.calib.photometric.verdicts import refused
 from amiwarp.cli.common import interval, number
 from amiwarp.events.encoder import TWO_PI
 from tests.conftest import COARSE, TRUE_PRISM
@@ -217,10 +218,10 @@ def test_a_motion_that_turns_all_out_of_view_is_refused() -> None:
 def test_words_for_numbers_that_mean_nothing() -> None:
     assert in_pixels(0.25) == "0.250 px"
     assert in_pixels(27_431.659) == f"more than {LARGEST_MOTION_PX:g} px"
-    assert "over 1.5 px" in judge_optimum(0.1, rise=0.1, moved=0.1, next_step=3e5)[1]
-    assert "100 %" in judge_optimum(1.7, rise=0.1, moved=0.1, next_step=0.0)[1]
-    assert "explains the events better" in judge_optimum(0.1, rise=-0.02, moved=0.1, next_step=0.0)[1]
-    assert "0.4 % of the residual more" in judge_optimum(0.1, rise=0.004, moved=0.1, next_step=0.0)[1]
+    assert "over 1.5 px" in refused(Optimum(0.1, rise=0.1, moved_px=0.1, next_step_px=3e5))
+    assert "100 %" in refused(Optimum(1.7, rise=0.1, moved_px=0.1, next_step_px=0.0))
+    assert "explains the events better" in refused(Optimum(0.1, rise=-0.02, moved_px=0.1, next_step_px=0.0))
+    assert "0.4 % of the residual more" in refused(Optimum(0.1, rise=0.004, moved_px=0.1, next_step_px=0.0))
     worse = np.linspace(0.0, 1.0, 8)
     with pytest.raises(AmiwarpError, match="it is less sharp, or the same"):
         check_texture(worse, worse + 3.0, worse, "recording")

@@ -9,7 +9,8 @@ import warp as wp
 
 from amiwarp import Calibration, ExactModel, PhotometricSettings, Settings, calibrate, model_error
 from amiwarp.brightness.solver import THRESHOLD, BrightnessMap, EventTable, Tiles, darkness, set_lags
-from amiwarp.calib.photometric.stage import judge_lag
+from amiwarp.calib.photometric.findings import SlowPixels
+from amiwarp.calib.photometric.verdicts import refused
 from amiwarp.studies.stability.cells import Condition, make
 
 SMALL = Condition(width=160, height=120, turns=3.0, latency_us=0.0)
@@ -37,10 +38,9 @@ def test_slow_photoreceptors_are_found() -> None:
 
 def test_pixels_too_slow_are_refused() -> None:
     """About a tenth of a correction remains, and slow pixels turn the path by more than a small angle."""
-    assert judge_lag(0.2, 0.1) == (True, "")
+    assert refused(SlowPixels(2000.0, 0.2, 0.1)) == ""
     for turn, moved_px, words in ((0.4, 0.1, "turns by 23 deg"), (0.2, 0.38, "by 0.38 px rms")):
-        accepted, reason = judge_lag(turn, moved_px)
-        assert not accepted
+        reason = refused(SlowPixels(2000.0, turn, moved_px))
         assert words in reason
         assert "slower prism" in reason
 

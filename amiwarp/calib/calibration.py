@@ -2,7 +2,7 @@
 
 :func:`calibrate` runs a :class:`Calibrator`, and for the model ``auto`` lets a :class:`ModelChooser` choose among the
 models. :func:`prepare` sets up an attempt: the encoder, the events and the parameter space. The attempt is made by the
-stages of the settings; the photometric stage also corrects lens, prism and sensor, see ``photometric/causes.py``.
+stages of the settings; the photometric stage also corrects lens, prism and sensor, see ``photometric/steps.py``.
 If it still says that something is wrong, :meth:`Calibrator.run` makes further attempts. With an encoder:
 
 1. with an error of the encoder that repeats every turn corrected
@@ -45,8 +45,11 @@ from amiwarp.calib.parameters import (
     phase_names,
     units,
 )
-from amiwarp.calib.photometric import consistency, stage
-from amiwarp.calib.photometric.cost import upload_ahead, van_der_corput
+from amiwarp.calib.photometric import distances, limits
+from amiwarp.calib.photometric.equations import Problem
+from amiwarp.calib.photometric.pairs import upload_ahead, van_der_corput
+from amiwarp.calib.photometric.steps import refine, summarised
+from amiwarp.calib.photometric.verdicts import harmonics_in_words
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
 from amiwarp.calib.settings import AUTO, CalibrationOptions, Settings
@@ -217,7 +220,7 @@ class Attempt:
         """Whether the photometric cost is so high that the camera may have rotated."""
         if self.photometric is None:
             return isinstance(self.error, checks.NoSharpOptimumError)
-        return self.cost > stage.LARGEST_STILL_COST
+        return self.cost > limits.LARGEST_STILL_COST
 
     @property
     def moving(self) -> NDArray[np.bool_]:
@@ -227,7 +230,7 @@ class Attempt:
     @property
     def camera_turned(self) -> bool:
         """Whether a rotation of the camera explains much of the photometric residual."""
-        return self.photometric is not None and self.photometric.rotation_gain > stage.LARGEST_ROTATION_GAIN
+        return self.photometric is not None and self.photometric.rotation_gain > limits.LARGEST_ROTATION_GAIN
 
     def found(self) -> Calibration:
         """Return the calibration, or raise the error."""
@@ -307,17 +310,22 @@ class Calibrator:
                 search = _in_larger_sense(recording, max(searches, key=lambda s: s.score))
                 if recording.encoder is None and self.path is None and _path_is_examined(search):
                     search = _with_path(recording, search)
-                if rival is not None:
-                    search.most_cost = stage.LARGEST_COST_RATIO * rival.cost
-                    if rival.search is not None:
-                        checks.check_sharper(search.gain_over(rival.search), recording.name)
+                if rival is not None and rival.search is not None:
+                    checks.check_sharper(search.gain_over(rival.search), recording.name)
                 found = _sharpest(recording, search, *search.check_answer(recording.name))
                 if "photometric" in self.settings.stages:
-                    search.ahead, search.angles_hold, search.fast = ahead, angles_hold, fast
-                    search.meanwhile = iter(()) if self.meanwhile is None else self.meanwhile(found)
+                    problem = Problem(
+                        recording,
+                        search,
+                        angles_hold=angles_hold,
+                        fast=fast,
+                        most_cost=math.inf if rival is None else limits.LARGEST_COST_RATIO * rival.cost,
+                        ahead=ahead,
+                        meanwhile=iter(()) if self.meanwhile is None else self.meanwhile(found),
+                    )
                     try:
-                        refined = stage.refine(recording, search)
-                        for _ in search.meanwhile:
+                        refined = summarised(refine(problem))
+                        for _ in problem.meanwhile:
                             pass
                     except AmiwarpError as error:
                         found = _warning(found, f"the photometric stage failed: {error}")
@@ -325,7 +333,6 @@ class Calibrator:
                         found = _refined(search, found, *refined)
         except AmiwarpError as error:
             return Attempt(None, error, search)
-        search.ahead, search.meanwhile = None, iter(())
         return Attempt(replace(found, seconds=time.perf_counter() - began), search=search)
 
     def with_straight_angles(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
@@ -341,7 +348,7 @@ class Calibrator:
         straight = replace(self.recording, encoder=encoder.with_harmonics(harmonics))
         calibrator = replace(self, recording=straight, harmonics=harmonics)
         again = calibrator.attempt()
-        holds = again.accepted and again.cost <= stage.LARGEST_STILL_COST
+        holds = again.accepted and again.cost <= limits.LARGEST_STILL_COST
         if again.calibration is None or not (holds or again.cost <= LARGEST_STRAIGHT_COST_RATIO * tried.cost):
             return self, tried
         assert found is not None
@@ -350,7 +357,7 @@ class Calibrator:
             rival = self.attempt(angles_hold=True)
             if rival.accepted and rival.cost <= again.cost:
                 return self, rival
-        said = f"{stage.harmonics_in_words(harmonics)}: it was corrected"
+        said = f"{harmonics_in_words(harmonics)}: it was corrected"
         return calibrator, Attempt(_warning(again.calibration, said))
 
     def with_straight_path(self, tried: Attempt) -> Attempt:
@@ -433,7 +440,7 @@ class Calibrator:
         leaves a high cost, the cause with the lower cost is taken.
         """
         wrong = self.with_other_encoder(tried)
-        if wrong is not None and wrong[0] <= stage.LARGEST_STILL_COST:
+        if wrong is not None and wrong[0] <= limits.LARGEST_STILL_COST:
             return Attempt(None, wrong[1])
         moving = tried if self.settings.free is not None else self.with_rotation(tried)
         if wrong is None or (moving is not tried and moving.cost <= wrong[0]):
@@ -459,7 +466,7 @@ class Calibrator:
             again = replace(self, recording=replace(self.recording, encoder=corrected)).attempt(tried)
             # a slipping index remains as an error that repeats every turn
             explains = again.accepted or (again.photometric is not None and again.photometric.harmonics)
-            if not explains or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
+            if not explains or again.cost > limits.LARGEST_COST_RATIO * tried.cost:
                 continue
             if each < 0.0:
                 return again.cost, checks.wrong_direction(name, tried.cost, again.cost)
@@ -486,13 +493,13 @@ class Calibrator:
         if restless and many:
             return self.turn_by_turn(tried, turns) or (tried if tried.accepted else too_fast)
         again = self._turning(rival) if span is None else self._turning_in(span)
-        if not again.accepted or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
+        if not again.accepted or again.cost > limits.LARGEST_COST_RATIO * tried.cost:
             # a rotation makes the image sharper, or the attempt would have failed
             if restless and not tried.accepted and rival is not None and again.calibration is not None:
                 return too_fast
             moves = many and not calm and not tried.accepted
             return (self.turn_by_turn(tried, turns) or too_fast) if moves else tried
-        apart_px = CONFIRMED_PX if many else stage.LARGEST_INCONSISTENCY_PX  # two wrong answers may be alike by chance
+        apart_px = CONFIRMED_PX if many else limits.LARGEST_INCONSISTENCY_PX  # two wrong answers may be alike by chance
         if (not calm or (many and again.unexplained)) and not self._confirmed(again, apart_px):
             mean = self.turn_by_turn(tried, turns) if many else None
             if mean is not None or not calm:
@@ -540,7 +547,7 @@ class Calibrator:
         prism, so the mean of these changes vanishes. Within a turn, the camera's angular velocity is taken as linear in
         time and the growth of the image as steady; the scene of each tile moves on a path beyond that.
         """
-        most_cost = min(LARGEST_FAST_COST, stage.LARGEST_COST_RATIO * tried.cost)
+        most_cost = min(LARGEST_FAST_COST, limits.LARGEST_COST_RATIO * tried.cost)
         single = replace(self, progress=None)
         answers: dict[int, Mapping[str, float]] = {}  # not the attempts, which hold events and images
         best: Attempt | None = None
@@ -662,7 +669,7 @@ def _mean(
         best.found(), parameters=values, uncertainty=stds, free=space.names, photometric=photometric, middle_us=None,
         warnings=(),
     )  # fmt: skip
-    return found, consistency.stated_px(space, v, covariance)
+    return found, distances.stated_px(space, v, covariance)
 
 
 def _warning(found: Calibration, *said: str) -> Calibration:

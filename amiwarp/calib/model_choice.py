@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.calibration_events import CalibrationEvents, rotation_window, thin, thin_events
 from amiwarp.calib.parameters import DRIFTS, MOTION, ParameterSpace, like_size, make_space, values_of
-from amiwarp.calib.photometric.cost import LEAST_CURVATURE, UNDETERMINED_PX
+from amiwarp.calib.photometric.descent import LEAST_CURVATURE, UNDETERMINED_PX
 from amiwarp.calib.result import Calibration, FreedParameter, ModelCandidate, ModelChoice, PhotometricSummary
 from amiwarp.calib.settings import Settings
 from amiwarp.calib.sharpness_search import STEP_PX, HalfSharpness, Quadratic, gradient, padding, split_turns

@@ -16,15 +16,9 @@ from numpy.typing import NDArray
 from amiwarp.brightness.solver import BrightnessMap, Tiles, off_excess
 from amiwarp.calib.calibration_events import middle_time, thin
 from amiwarp.calib.first_guess import autocorrelation
-from amiwarp.calib.photometric.consistency import px_per_rad
-from amiwarp.calib.photometric.cost import (
-    SLOPE_PX,
-    Cost,
-    check_pairs,
-    collect_everywhere,
-    fine_map_is_determined,
-    size_and_phase_directions,
-)
+from amiwarp.calib.photometric.cost import SLOPE_PX, Cost, size_and_phase_directions
+from amiwarp.calib.photometric.distances import px_per_rad
+from amiwarp.calib.photometric.pairs import check_pairs, collect_everywhere, fine_map_is_determined
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
@@ -271,7 +265,7 @@ class PathFit:
 
         def solved_on(tiles: Tiles) -> tuple[Cost, NDArray[np.float32]]:
             brightness = BrightnessMap(self._pairs, tiles, off_excess=excess, middle_us=space.middle_us)
-            cost = Cost(space, brightness, settings.steps)
+            cost = Cost.on(brightness, space, settings.steps)
             cost.warm_up(self._v)
             return cost, brightness.coverage(cost.scale)
 
@@ -328,7 +322,7 @@ class PathFit:
     def _improve(self, k: int) -> tuple[float, float]:
         """Take step number ``k``; return its length and the standard deviation of the path [px rms]."""
         plain = k < FIRST_STEPS
-        self._cost.scale = PLAIN_SCALE if plain else max(0.1, 1.5 * self._cost.brightness.residuals.median())
+        self._cost.set_scale(PLAIN_SCALE if plain else max(0.1, 1.5 * self._cost.brightness.residuals.median()))
         change, size_px, std_px = self._step()
         step = np.append(change * self._px, size_px)
         if self._last is not None and k not in (0, FIRST_STEPS):

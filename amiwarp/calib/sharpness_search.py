@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.calib import checks
-from amiwarp.calib.calibration_events import CalibrationEvents, EventsAhead
+from amiwarp.calib.calibration_events import CalibrationEvents
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
 from amiwarp.calib.parameters import (
     MOTION,
@@ -360,16 +360,6 @@ class Search:
         """Parameter space of the sharpness search: without the parameters that are left to the photometric stage."""
         self.calibration_events, self.settings, self.device = calibration_events, settings, device
         self.progress = progress
-        self.ahead: EventsAhead | None = None
-        """Events of the photometric stage that are already on the device."""
-        self.meanwhile: Iterator[None] = iter(())
-        """Other work, whose steps the photometric stage takes where the host would wait for a GPU."""
-        self.most_cost = math.inf
-        """Cost of the photometric stage above which its answer is of no use."""
-        self.angles_hold = False
-        """Whether the photometric stage corrects lens and prism before it looks for an error of the prism's angles."""
-        self.fast = False
-        """Whether the camera is in fast motion: the photometric stage ends with its first answer."""
         self.stages: list[StageSummary] = []
         self.pad = padding(self.space)
         """Border of the fine image outside the sensor [px]."""

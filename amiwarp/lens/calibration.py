@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.parameters import ParameterSpace, like_size, nominal
-from amiwarp.calib.photometric.consistency import FOLLOW_PX, displacements, over_a_turn
-from amiwarp.calib.photometric.cost import Cost, Slopes
-from amiwarp.calib.photometric.stage import LARGEST_COST, Equations
+from amiwarp.calib.photometric.cost import Cost
+from amiwarp.calib.photometric.descent import Slopes
+from amiwarp.calib.photometric.distances import FOLLOW_PX, displacements, over_a_turn
+from amiwarp.calib.photometric.equations import Equations, Problem, collect_equations
+from amiwarp.calib.photometric.limits import LARGEST_COST
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import PhotometricSettings, Settings
 from amiwarp.calib.sharpness_search import Search
@@ -418,7 +420,7 @@ class LensWork:
             self.full, search.best = search.full_space, dict(search.full_space.start) | dict(values)
             search.full_space = self.full.without(like_size(self.full.names))  # those would ask for a coarse map
             try:
-                out[pose.name] = Equations(recording, search, search.settings.photometric.sensor)
+                out[pose.name] = collect_equations(Problem(recording, search), search.settings.photometric.sensor)
             except AmiwarpError as error:
                 self.left_out[pose.name] = str(error).removeprefix(f"{pose.recording.name}: ")
         return out
@@ -645,7 +647,7 @@ class JointPrism:
         costs = [each.cost for each in self.equations.values()]
         usual = float(np.median([cost.scale for cost in costs]))
         for cost in costs:
-            cost.scale = usual
+            cost.set_scale(usual)
             cost.brightness.set_damping(BOARD_DAMPING)
 
     def refine(
@@ -678,10 +680,10 @@ class JointPrism:
 
         Poses whose events do not determine a fine map keep their coarse one.
         """
-        for each in self.equations.values():
+        for name, each in self.equations.items():
             if each.cost.brightness.tiles.density == FINE:
-                each.use_density(FINEST)
-                each.cost.brightness.set_damping(BOARD_DAMPING)
+                self.equations[name] = finest = each.at_density(FINEST)
+                finest.cost.brightness.set_damping(BOARD_DAMPING)
         return self.refine(camera, ("apex", "phase"), FINEST_STEPS, 0.0)
 
     def set_index(self, index: float) -> None:
@@ -698,7 +700,7 @@ class JointPrism:
         """
         fit, values, rows = dict(vars(self)), self.values, []
         costs = [self.equations[name].cost for name in names]
-        maps, spaces = [cost.brightness.copy_unknowns() for cost in costs], [cost.space for cost in costs]
+        maps = [cost.brightness.copy_unknowns() for cost in costs]
         middle = values["index"]
         for index in (middle - INDEX_STEP, middle, middle + INDEX_STEP):
             for cost, unknowns in zip(costs, maps, strict=True):
@@ -708,9 +710,8 @@ class JointPrism:
             self.set_index(index)
             self.refine(camera, ("apex", "phase"), INDEX_STEPS, 0.0, names)
             rows.append([*self.costs.values()])
-        for cost, unknowns, space in zip(costs, maps, spaces, strict=True):
+        for cost, unknowns in zip(costs, maps, strict=True):
             cost.replace_map(unknowns)
-            cost.space = space
         vars(self).update(fit)
         low, at, high = np.array(rows)
         bend, slope = low - 2.0 * at + high, high - low
@@ -723,10 +724,7 @@ class JointPrism:
     def _costs(self, camera: Camera, names: tuple[str, ...], poses: Iterable[str] = ()) -> dict[str, Cost]:
         """Return the costs of some poses, or of all, by name, as functions of the parameters ``names``."""
         self.space = replace(self.full, camera=camera, names=names).holding(self.values)
-        costs = {name: self.equations[name].cost for name in poses or self.equations}
-        for cost in costs.values():
-            cost.space = self.space
-        return costs
+        return {name: self.equations[name].cost.in_space(self.space) for name in poses or self.equations}
 
     def _slopes(self, costs: Iterable[Cost], v: Vector) -> list[Slopes]:
         """Return the derivatives of the cost of each pose at a vector of parameters."""
@@ -814,7 +812,7 @@ class JointPrism:
         self, camera: Camera, values: Mapping[str, float], uncertainty: Mapping[str, float], seconds: float
     ) -> Calibration:
         """Return the result as a calibration of the prism with ``camera``."""
-        search = next(iter(self.equations.values())).search
+        search = next(iter(self.equations.values())).problem.sharp
         found = {n: values[n] for n in values if n in ALL_FREE}
         space = replace(self.full, camera=camera)
         return Calibration(

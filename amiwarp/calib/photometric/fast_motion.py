@@ -1,0 +1,84 @@
+"""Step of the photometric stage for a vibration or a mirror, whose image moves so fast that pixels miss events."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.calib.photometric.cost import Cost
+from amiwarp.calib.photometric.derivatives import shifted, slopes
+from amiwarp.calib.photometric.distances import distance, fastest_px_per_rad, px_per_rad
+from amiwarp.calib.photometric.findings import BlindTime, RefractoryDoubt, UnsteadySpeed
+from amiwarp.calib.photometric.limits import REFRACTORY_DOUBT_US
+from amiwarp.calib.photometric.linear_fit import SIGNIFICANT, linear_fit, pseudo_inverse
+from amiwarp.calib.photometric.refinement import Refinement
+from amiwarp.calib.photometric.verdicts import refractory_doubt_us
+from amiwarp.optics.models import MODELS
+
+if TYPE_CHECKING:
+    Vector = NDArray[np.float64]
+
+
+def bound_what_blind_pixels_hide(state: Refinement) -> Refinement:
+    """Note how far the image moves while a pixel is blind, and how much an error of that time changes the answer."""
+    kind = MODELS[state.space.model]
+    if kind.PRISM or not (state.are_angles_examined or kind.ANGLES > 1):
+        return state
+    problem = state.problem
+    cost = state.search.cost
+    v = state.answer.x
+    cost.converge(v)
+    if problem.recording.encoder is None:
+        state = state.noticing(UnsteadySpeed(change_of_speed_px(cost, v)))
+    std_us = refractory_doubt_us(state.sensor)
+    doubt = problem.direction * problem.rad_per_us * std_us * by_refractory(cost, v)
+    blind_us = state.sensor.refractory_us or REFRACTORY_DOUBT_US
+    moved_px = fastest_px_per_rad(state.space, v) * (problem.rad_per_us * blind_us)
+    return replace(state, doubt=doubt).noticing(BlindTime(moved_px))
+
+
+def weigh_the_refractory_doubt(state: Refinement) -> Refinement:
+    """Note how far the answer moves by the doubt about the refractory period."""
+    if not len(state.doubt):
+        return state
+    space = state.space
+    v = state.answer.x
+    doubt = np.zeros(len(v))
+    doubt[: len(state.doubt)] = state.doubt
+    moved, here = (space.build(space.to_values(at)) for at in (v + doubt, v))
+    return state.noticing(RefractoryDoubt(state.sensor, distance(moved, here)))
+
+
+def by_refractory(cost: Cost, best: Vector) -> Vector:
+    """Return the change of the answer ``best`` [px] per angle by which what moves turns in the refractory period [rad].
+
+    The period sets the reference of a pair, its first event, later. The map must be solved at ``best``.
+    """
+    columns = slopes(cost, cost.space, best, cost.space.names)
+    columns["refractory"], _ = cost.by_angle(best)
+    hessian = linear_fit(cost, columns).hessian.sum(axis=0)
+    return np.asarray(-pseudo_inverse(hessian[:-1, :-1]) @ hessian[:-1, -1])
+
+
+def change_of_speed_px(cost: Cost, best: Vector) -> float:
+    """Return how far a steady change of the speed over the recording moves events [px rms]; 0 if not significant.
+
+    It is the estimate of a linearised fit, which finds a share of the change only. The map must be solved at ``best``.
+    """
+    pairs = cost.brightness.pairs
+    names = cost.space.names
+    times = pairs.time.astype(np.float64)
+    late = (times - times.mean()) / max(float(times.std()), 1e-9)
+    waves = {"late": late, "square": late**2 - np.mean(late**2)}
+    columns = slopes(cost, cost.space, best, names)
+    for name, wave in waves.items():
+        shift = np.zeros((2, pairs.arrays.stride), np.float32)
+        shift[:, : len(pairs)] = wave
+        columns[name] = shifted(cost, best, wp.array(shift, dtype=float, device=cost.brightness.device))
+    estimate, significance, _ = linear_fit(cost, columns).adding((*names, "late"), ("square",))
+    moved = px_per_rad(cost.space, best) * abs(float(estimate.change[-1])) * float(waves["square"].std())
+    return moved if significance >= SIGNIFICANT else 0.0

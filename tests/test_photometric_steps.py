@@ -1,0 +1,188 @@
+"""The photometric stage is a list of steps, each from one frozen state to the next."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import FrozenInstanceError, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amiwarp import Camera, PhotometricSettings, Prism, Recording, Settings, simulate
+from amiwarp.calib.calibration import prepare
+from amiwarp.calib.photometric import angles, losses, steps, timing
+from amiwarp.calib.photometric.answers import AnswerSearch
+from amiwarp.calib.photometric.causes import FOCAL_LENGTH, SIDE
+from amiwarp.calib.photometric.equations import Problem
+from amiwarp.calib.photometric.findings import (
+    BlindTime,
+    FlatSideCorrected,
+    LensBeyondCorrection,
+    MissingEvents,
+    Optimum,
+    RefractoryPeriod,
+    Silence,
+    SlowPixels,
+)
+from amiwarp.calib.photometric.refinement import Refinement, first_answer
+from amiwarp.calib.photometric.verdicts import refusal, refused, warned, warnings
+from amiwarp.optics.prism import FlatSide, as_wedge
+
+CAMERA = Camera.from_fov(120, 90, math.radians(70.0))
+GOOD = Optimum(cost=0.1, rise=0.05, moved_px=0.2, next_step_px=0.0)
+
+
+@pytest.fixture(scope="module")
+def still(texture: np.ndarray) -> Recording:
+    return simulate(texture, CAMERA, Prism(math.radians(2.0)), duration_s=0.17, seed=6)
+
+
+@pytest.fixture(scope="module")
+def problem(still: Recording) -> Problem:
+    photometric = PhotometricSettings(pairs=30_000, density=1.0)
+    settings = Settings(model="exact", events=30_000, global_evaluations=60, photometric=photometric)
+    [search] = prepare(still, settings)
+    search.run()
+    return Problem(still, search)
+
+
+@pytest.fixture(scope="module")
+def first(problem: Problem) -> Refinement:
+    return first_answer(problem, problem.settings.sensor)
+
+
+def test_steps_that_do_not_apply_return_the_same_state(first: Refinement) -> None:
+    for step in steps.STEPS:
+        if step not in (losses.see_what_can_be_examined, losses.count_lost_events, steps.correct_camera_and_prism):
+            assert step(first) is first, step.__name__
+
+
+def test_the_state_is_frozen_and_a_finished_one_is_the_last(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[str] = []
+
+    def one(state: Refinement) -> Refinement:
+        taken.append("one")
+        return state.noticing(Silence(0.5)).ending()
+
+    def two(state: Refinement) -> Refinement:
+        taken.append("two")
+        return state
+
+    monkeypatch.setattr(steps, "STEPS", (one, two))
+    state = steps.refine(problem)
+    assert taken == ["one"]
+    assert state.findings == (Silence(0.5),)
+    with pytest.raises(FrozenInstanceError):
+        state.finished = False  # type: ignore[misc]
+
+
+def test_a_cost_in_another_space_leaves_the_first_one_as_it_is(
+    first: Refinement, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both use one map. What is known about it in one space must not be taken for the other one."""
+    search, v = first.search, first.answer.x
+    cost = search.cost
+    cost.residuals(v, rounds=2)
+    calls: list[str] = []
+
+    def column() -> str:
+        calls.append("found")
+        return "column"
+
+    assert cost.column("name", column) == cost.column("name", column) == "column"
+    assert calls == ["found"]
+    space = search.space
+    other = search.with_cause(FOCAL_LENGTH, v)
+    assert (search.space, cost.space) == (space, space)
+    assert other.cost.shared is cost.shared
+    assert other.space.names == (*space.names, "focal_length")
+    wide = other.space.to_vector({**other.space.start, **space.to_values(v)})
+    other.cost.slopes(wide)
+    assert cost.column("name", column) == "column"
+    assert calls == ["found", "found"]
+    solved: list[int] = []
+    monkeypatch.setattr(cost.brightness, "solve", lambda *_, rounds, **__: solved.append(rounds))
+    cost.converge(v)  # the map was solved in the other space
+    cost.converge(v)
+    assert solved == [2]
+    other.cost.slopes(wide)
+    moved = np.array([0.1, 0.0])
+    added: list[float] = []
+    monkeypatch.setattr(cost.brightness, "add", lambda _, by: added.append(by))
+    other.cost.predict(wide + np.append(moved, 0.0))
+    assert added == pytest.approx([0.1, 0.0, 0.0])
+    cost.predict(v + moved)  # by derivatives of the map in this space, of which there are none
+    assert len(added) == 3
+
+
+def test_the_other_flat_side_has_its_own_result_of_the_sharpness_stage(first: Refinement) -> None:
+    search = first.search
+    turned = search.with_cause(SIDE, first.answer.x)
+    assert as_wedge(turned.space.prism).flat_side is not as_wedge(search.space.prism).flat_side
+    assert math.remainder(turned.sharpest["phase"] - search.sharpest["phase"] - math.pi, math.tau) == pytest.approx(0.0)
+    assert search.sharpest["apex"] == first.problem.sharp.best["apex"]
+
+
+class Stopped(Exception):
+    """The user stopped the work."""
+
+
+@pytest.mark.parametrize("what", ["angle", "refractory"])
+def test_angles_of_the_pairs_are_the_given_ones_after_a_stop(
+    first: Refinement, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    azimuth = first.equations.pairs.arrays.azimuth
+    given = azimuth.numpy().copy()
+    changed: list[bool] = []
+
+    def stop(self: AnswerSearch, start: np.ndarray, most_cost: float | None = None) -> Any:
+        changed.append(not np.array_equal(azimuth.numpy(), given))
+        raise Stopped
+
+    monkeypatch.setattr(AnswerSearch, "descend", stop)
+    error = angles.AngleFit(angles.HARMONICS, np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.1)
+    monkeypatch.setattr(angles, "fit_angles", lambda *_: error)
+    search, v = first.search, first.answer.x
+    changing = {
+        "angle": lambda: angles.find_angle_error(search, v),
+        "refractory": lambda: timing.find_refractory(search, v, 0.05, 1.0),
+    }
+    with pytest.raises(Stopped):
+        changing[what]()
+    assert changed == [True]
+    np.testing.assert_array_equal(azimuth.numpy(), given)
+
+
+def test_the_first_reason_counts_whatever_the_order_of_the_findings() -> None:
+    lens, lost = LensBeyondCorrection({"focal_length": 50.0}), MissingEvents(0.3)
+    slow = SlowPixels(4000.0, 0.5, 0.1)
+    bad = replace(GOOD, cost=0.9)
+    assert refusal((GOOD,)) == refusal((GOOD, Silence(0.4))) == ""
+    assert refusal((GOOD, lost, slow)) == refusal((GOOD, slow, lost)) == refused(slow)
+    assert refusal((bad, slow, lost)) == refused(bad)
+    assert refusal((bad, slow, lens)) == refused(lens)
+
+
+def test_warnings_have_one_order() -> None:
+    found = (FlatSideCorrected(FlatSide.CAMERA, FlatSide.SCENE), BlindTime(0.42), Silence(0.2), RefractoryPeriod(900.0))
+    said = warnings(found)
+    assert said == warnings(found[::-1])
+    assert [words for each in said for words in ("refractory period): 900", "20 % of the time", "points to the scene",
+            "by up to 0.42 px") if words in each] == ["refractory period): 900", "20 % of the time",
+                                                      "points to the scene", "by up to 0.42 px"]  # fmt: skip
+
+
+def kinds(base: type) -> Iterator[type]:
+    for kind in base.__subclasses__():
+        yield kind
+        yield from kinds(kind)
+
+
+def test_every_finding_is_said_or_refused() -> None:
+    from amiwarp.calib.photometric import verdicts
+    from amiwarp.calib.photometric.findings import Finding
+
+    for kind in kinds(Finding):
+        assert (refused.dispatch(kind) is not refused.dispatch(object)) == (kind in verdicts.REFUSED_IN_ORDER)
+        assert (warned.dispatch(kind) is not warned.dispatch(object)) == (kind in verdicts.SAID_IN_ORDER)
+        assert kind in (*verdicts.REFUSED_IN_ORDER, *verdicts.SAID_IN_ORDER)
