@@ -19,5 +19,10 @@
 #define PIN_SPI_SCK 18
 #define PIN_SPI_MOSI 19
 #define PIN_LED 25          /* on while the motor is driven */
+#define PIN_SUPPLY_ADC 26   /* supply of the motor by DIVIDER_UPPER and _LOWER: its voltage. Not connected means unknown */
+
+/* Divider of the supply's voltage [ohm]: 12 V are 2.1 V at the pin, and 3.3 V are 18.8 V. The port for the AVR has the same. */
+#define DIVIDER_UPPER 47000u
+#define DIVIDER_LOWER 10000u
 
 #endif

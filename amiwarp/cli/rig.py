@@ -671,6 +671,8 @@ RAMP_RPM_S = 500.0
 """Default of ``--ramp-rpm-s``, the largest change of the speed [turns/min/s]."""
 WAIT_S = 2.5
 """Longest wait for the controller's status, which is sent once a second, and for its clock [s]."""
+TELL_S = 1.0
+"""Longest wait for what the controller says about itself [s]: firmware of amiwarp 0.1 does not answer the question."""
 POLL_S = 0.02
 """Interval between two readings of the data that the controller has sent [s]."""
 
@@ -841,7 +843,8 @@ def _wait(link: Link, messages: list[str], target: float | None = None) -> None:
         messages += link.poll().messages
         status = link.status
         reported = status is not None and (target is None or math.isclose(status.target_rpm, target, rel_tol=1e-6))
-        if reported and link.clock() is not None and (link.older or link.condition is not None):
+        told = link.older or link.condition is not None or time.monotonic() > end - WAIT_S + TELL_S
+        if reported and told and link.clock() is not None:
             return
         time.sleep(POLL_S)
 

@@ -1,5 +1,6 @@
 /* The image for the ATmega2560 on simavr, with the simulated motor and encoder, in simulated time: a library with the
    functions of native/board.c, and measurements. */
+#include <simavr/avr_adc.h>
 #include <simavr/avr_ioport.h>
 #include <simavr/avr_uart.h>
 #include <simavr/sim_avr.h>
@@ -8,10 +9,11 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "../pins.h"
 #include "motor.h"
 
 enum { HZ = 16000000, PER_US = HZ / 1000000, BYTE_CYCLES = 22 * PER_US, VECTORS = 57, TIMES = 100000 };
-enum { PORTA = 0x22, TIMSK1 = 0x6F, TCCR1B = 0x81, OCR3A = 0x98, TICK_VECTOR = 17, RX_VECTOR = 25, ENDLESS = 0x3F000 };
+enum { PORTA = 0x22, PORTF = 0x31, PULL_UP_OHM = 35000, TIMSK1 = 0x6F, TCCR1B = 0x81, OCR3A = 0x98, TICK_VECTOR = 17, RX_VECTOR = 25, ENDLESS = 0x3F000 };
 enum { TIME = VALUES, CYCLES, WATCHDOGS, BOOT_US, ENABLE, CAMERA };
 enum { INDEX_TIMES, TRIGGER_TIMES, ENABLED_TIMES, LISTS };
 
@@ -55,6 +57,18 @@ static void on_port(struct avr_irq_t *irq, uint32_t value, void *board) {
     if (value & ~b->outputs & 8) note(b, TRIGGER_TIMES);
     if (value & ~b->outputs & 2) note(b, ENABLED_TIMES);
     b->outputs = (uint8_t)value;
+}
+
+/* The pin of the divider, as a conversion begins [mV]: without the divider it follows the pull-up, or floats. */
+static void on_conversion(struct avr_irq_t *irq, uint32_t value, void *board) {
+    struct board *b = board;
+    bool pulled = b->avr->data[PORTF] & 1;
+    double source = 1000 * motor_volts(&b->motor) * DIVIDER_LOWER / (DIVIDER_UPPER + DIVIDER_LOWER);
+    double impedance = DIVIDER_UPPER * (DIVIDER_LOWER / (double)(DIVIDER_UPPER + DIVIDER_LOWER));
+    if (pulled) source += (5000 - source) * impedance / (impedance + PULL_UP_OHM);
+    if (b->motor.values[DIVIDER] == 0) source = pulled ? 5000 : 300;
+    (void)irq, (void)value;
+    avr_raise_irq(avr_io_getirq(b->avr, AVR_IOCTL_ADC_GETIRQ, ADC_IRQ_ADC0), (uint32_t)lround(source));
 }
 
 static void on_pending(struct avr_irq_t *irq, uint32_t value, void *interrupt) {
@@ -170,6 +184,7 @@ struct board *board_new(const char *image, uint32_t counts) {
     if (!is_flash) avr_load_firmware(avr, &firmware);
     else if (!load_flash(avr, image)) return 0;
     avr->frequency = HZ;
+    avr->vcc = avr->avcc = avr->aref = 5000;
     avr->sleep = on_sleep;
     b->run = avr->run;
     b->flash = malloc(avr->flashend + 1);
@@ -178,6 +193,7 @@ struct board *board_new(const char *image, uint32_t counts) {
     avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &flags);
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_sent, b);
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('A'), IOPORT_IRQ_PIN_ALL), on_port, b);
+    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_ADC_GETIRQ, ADC_IRQ_OUT_TRIGGER), on_conversion, b);
     avr_irq_register_notify(avr_iomem_getirq(avr, TCCR1B, 0, AVR_IOMEM_IRQ_ALL), on_clock, b);
     for (int k = 1; k < VECTORS; k++) {
         avr_irq_t *irq = avr_get_interrupt_irq(avr, (uint8_t)k);

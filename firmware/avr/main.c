@@ -2,12 +2,13 @@
 
    Pins (number on an Arduino Mega): A on PE4 (2), B on PE5 (3), both pulled up; index on PL0 (49) and pulses of the camera
    on PL1 (48), which the timers capture; driver: PWM of 27 kHz on PE3 (5), direction PA0 (22), enable PA1 (23), fault PA2
-   (24), pulled up; pulse to the camera PA3 (25); supply of the motor, divided, PA4 (26), pulled up. The link is UART 0 at 500,000 baud: 16 MHz cannot divide to 460,800. */
+   (24), pulled up; pulse to the camera PA3 (25); supply of the motor, divided, PA4 (26), pulled up; its voltage by the divider of pins.h ADC0 (A0). The link is UART 0 at 500,000 baud: 16 MHz cannot divide to 460,800. */
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <avr/sleep.h>
 #include <avr/wdt.h>
 
+#include "../pins.h"
 #include "controller.h"
 
 #ifndef PULSES
@@ -16,8 +17,11 @@
 #define PER_TICK 2000u /* timers count 2 MHz */
 #define PWM_TOP 589u
 #define TRIGGER (1 << 3)
+#define FULL_SCALE_MV (5000ul * (DIVIDER_UPPER + DIVIDER_LOWER) / DIVIDER_LOWER) /* of the supply; an int has 16 bits */
+#define OPEN_ADC 1000u /* of 1023, with the pull-up: nothing else pulls at the pin */
+#define SLOT_BYTES 256u /* of the EEPROM */
 
-_Static_assert((uint32_t)COUNTS * RATIO * MOST_RPM / 60 <= 75000, "75,000 edges per second at most: see MOST_RPM");
+_Static_assert((uint32_t)COUNTS * RATIO * MOST_RPM / 60 <= MOST_EDGES_PER_S, "75,000 edges per second at most: see MOST_RPM");
 
 static struct controller c;
 static volatile uint32_t tick_us; /* time of the last tick */
@@ -147,6 +151,71 @@ static void drive(void) {
     sei();
 }
 
+/* The supply's voltage. Whether its divider is connected is found at the start: an open pin follows its pull-up. */
+
+static bool supply_is_sensed;
+
+static uint16_t convert(void) {
+    ADCSRA |= 1 << ADSC;
+    while (ADCSRA & 1 << ADSC) { }
+    return ADC;
+}
+
+static void begin_supply(void) {
+    DIDR0 = 1;
+    ADMUX = 1 << REFS0; /* full scale: the board's 5 V */
+    ADCSRA = 1 << ADEN | 1 << ADPS2 | 1 << ADPS1 | 1 << ADPS0; /* 125 kHz */
+    PORTF = 1;
+    convert();
+    supply_is_sensed = convert() < OPEN_ADC;
+    PORTF = 0;
+    if (!supply_is_sensed) return;
+    convert();
+    ADCSRA |= 1 << ADSC;
+}
+
+static void read_supply(void) {
+    if (!supply_is_sensed || ADCSRA & 1 << ADSC) return;
+    c.supply_mv = (uint16_t)(ADC * FULL_SCALE_MV >> 10);
+    ADCSRA |= 1 << ADSC;
+}
+
+/* Saved settings in the EEPROM. */
+
+static uint8_t read_eeprom(uint16_t address) { /* not while a byte is written */
+    EEAR = address;
+    EECR |= 1 << EERE;
+    return EEDR;
+}
+
+static void load(void) {
+    static uint8_t slots[STORE_SLOTS][STORE_BYTES];
+    for (uint8_t slot = 0; slot < STORE_SLOTS; slot++) {
+        for (uint16_t k = 0; k < STORE_BYTES; k++) slots[slot][k] = read_eeprom(slot * SLOT_BYTES + k);
+    }
+    controller_load(&c, slots[0], slots[1]);
+}
+
+/* Write the next byte of a record, which takes 3.4 ms, and compare all when they are written. */
+static void save(uint32_t t) {
+    static uint16_t written;
+    if (!c.saving || EECR & 1 << EEPE) return;
+    uint16_t first = c.slot * SLOT_BYTES;
+    if (written < STORE_BYTES) {
+        EEAR = first + written;
+        EEDR = c.record[written++];
+        cli(); /* the second bit counts within four cycles after the first */
+        EECR |= 1 << EEMPE;
+        EECR |= 1 << EEPE;
+        sei();
+        return;
+    }
+    bool good = true;
+    for (uint16_t k = 0; k < STORE_BYTES; k++) good = good && read_eeprom(first + k) == c.record[k];
+    written = 0;
+    controller_saved(&c, good, t);
+}
+
 int main(void) {
     wdt_enable(WDTO_120MS); /* after a reset by the watchdog it runs with its shortest time */
     DDRE = 1 << 3, PORTE = 1 << 4 | 1 << 5;
@@ -155,6 +224,8 @@ int main(void) {
     struct settings settings = default_settings;
     settings.pulses = PULSES;
     controller_begin(&c, &settings, 0); /* takes half a tick */
+    load();
+    begin_supply();
     begin_edges();
     UCSR0A = 1 << U2X0, UBRR0 = 3, UCSR0B = 1 << RXCIE0 | 1 << RXEN0 | 1 << TXEN0, UCSR0C = 3 << UCSZ00;
     OCR1A = PER_TICK - 1, TCCR1B = 1 << WGM12 | 1 << CS11, TIMSK1 = 1 << OCIE1A;
@@ -167,7 +238,9 @@ int main(void) {
     for (uint8_t ticks = 0;;) {
         c.driver_fault = !(PINA & 1 << 2);
         c.supply_low = !(PINA & 1 << 4);
+        read_supply();
         controller_poll(&c, time());
+        save(time());
         drive();
         if ((uint8_t)c.ticks != ticks) {
             ticks = (uint8_t)c.ticks;

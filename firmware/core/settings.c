@@ -32,8 +32,8 @@ int32_t settings_get(const struct settings *s, uint8_t key) {
 
 /* Whether the port can count the edges at the largest speed. */
 static bool can_be_counted(const struct settings *s) {
-#ifdef MOST_EDGES
-    return (uint64_t)s->counts_per_turn * (uint32_t)s->most_rpm / 60 <= MOST_EDGES;
+#ifdef MOST_EDGES_PER_S
+    return (uint64_t)s->counts_per_turn * (uint32_t)s->most_rpm / 60 <= MOST_EDGES_PER_S;
 #else
     (void)s;
     return true;

@@ -27,7 +27,7 @@
 #define REVERSED 0 /* 1: the magnetic encoder counts backwards */
 #endif
 #ifdef __AVR__
-#define MOST_EDGES 75000 /* per second, which the port counts */
+#define MOST_EDGES_PER_S 75000 /* per second, which the port counts */
 #endif
 _Static_assert((int32_t)COUNTS * RATIO > 0 && (int32_t)COUNTS * RATIO < (int32_t)1 << 24, "COUNTS * RATIO: 1 to 16777215");
 _Static_assert(MOST_RPM > 0 && MOST_RPM <= 13000, "MOST_RPM: 1 to 13000"); /* over-speed is seen up to 16000 rpm */

@@ -1,6 +1,8 @@
 /* RP2040, without the vendor's libraries. Registers are those of the RP2040 data sheet. Runs from RAM at 125 MHz. */
 #include "../pins.h"
 #include "controller.h"
+#include "flash.h"
+#include "registers.h"
 
 #ifndef ENCODER
 #define ENCODER QUADRATURE /* or MAGNETIC */
@@ -11,17 +13,13 @@
 
 _Static_assert(ENCODER == QUADRATURE || COUNTS == AS5047_COUNTS, "the magnetic encoder has 16384 counts per turn");
 
-#define REG(address) (*(volatile uint32_t *)(address))
-#define SET(address) REG((address) + 0x2000u)
-#define CLEAR(address) REG((address) + 0x3000u)
-#define BIT(n) (1u << (n))
-
 #define PSM_WDSEL 0x40010008u
 #define RESETS 0x4000C000u
 #define RESETS_DONE 0x4000C008u
 #define CLOCKS 0x40008000u
 #define XOSC 0x40024000u
 #define PLL_SYS 0x40028000u
+#define PLL_USB 0x4002C000u
 #define IO_CTRL(n) (0x40014004u + 8u * (n))
 #define IO_INTR0 0x400140F0u
 #define IO_INTE0 0x40014100u
@@ -29,6 +27,7 @@ _Static_assert(ENCODER == QUADRATURE || COUNTS == AS5047_COUNTS, "the magnetic e
 #define PAD(n) (0x4001C004u + 4u * (n))
 #define UART0 0x40034000u
 #define SPI0 0x4003C000u
+#define ADC 0x4004C000u
 #define PWM4 0x40050050u
 #define TIMER 0x40054000u
 #define TIMERAWL (TIMER + 0x28u)
@@ -41,11 +40,14 @@ _Static_assert(ENCODER == QUADRATURE || COUNTS == AS5047_COUNTS, "the magnetic e
 #define NVIC_PRIORITY(n) (0xE000E400u + 4u * (n)) /* of four interrupts */
 #define VTOR 0xE000ED08u
 
-enum { IRQ_TIMER_0 = 0, IRQ_IO = 13, IRQ_UART0 = 20, FUNCTION_SPI = 1, FUNCTION_UART = 2, FUNCTION_PWM = 4, FUNCTION_SIO = 5 };
+enum { IRQ_TIMER_0 = 0, IRQ_IO = 13, IRQ_UART0 = 20, FUNCTION_SPI = 1, FUNCTION_UART = 2, FUNCTION_PWM = 4, FUNCTION_SIO = 5, FUNCTION_NONE = 31 };
 enum { PULL_DOWN = 0x46, PULL_UP = 0x4A, OUTPUT = 0x52 }; /* pads: input enable, pulls, Schmitt trigger, 4 mA */
+enum { ANALOG = 0x80, ANALOG_PULL_UP = 0x88 };            /* neither input nor output */
 #define EDGE_LOW(pin) BIT(4 * (pin) + 2)
 #define EDGE_HIGH(pin) BIT(4 * (pin) + 3)
 #define PWM_PERIOD 5000 /* 125 MHz / 25 kHz */
+#define FULL_SCALE_MV (3300u * (DIVIDER_UPPER + DIVIDER_LOWER) / DIVIDER_LOWER) /* of the supply, at the ADC's 3.3 V */
+#define OPEN_ADC 4000u /* of 4095, with the pull-up: nothing else pulls at the pin */
 #define WATCHDOG_TICKS 200000u /* 100 ms: it counts twice per microsecond */
 
 static struct controller c;
@@ -59,7 +61,7 @@ void io_interrupt(void) {
     if (ENCODER == QUADRATURE) on_edge(&c, (uint8_t)((in >> (PIN_A - 1) & 2u) | (in >> PIN_B & 1u)));
     if (pending & (EDGE_LOW(PIN_INDEX) | EDGE_HIGH(PIN_INDEX))) {
         bool rising = pending & EDGE_HIGH(PIN_INDEX);
-        if (is_index(&c, t, c.count, rising)) {
+        if (!has_absolute_angle(&c.settings) && is_index(&c, t, c.count, rising)) {
             if (PULSES == PULSES_INDEX) {
                 REG(GPIO_SET) = BIT(PIN_TRIGGER);
                 pulse_begins(&c);
@@ -124,6 +126,19 @@ static void wait_for(uint32_t address, uint32_t bits) {
     while ((REG(address) & bits) != bits) { }
 }
 
+/* A clock of 12 MHz * factor / first / second. Returns when it runs. */
+static void start_pll(uint32_t pll, uint32_t reset_bit, uint32_t factor, uint32_t first, uint32_t second) {
+    SET(RESETS) = BIT(reset_bit);
+    CLEAR(RESETS) = BIT(reset_bit);
+    wait_for(RESETS_DONE, BIT(reset_bit));
+    REG(pll) = 1u;
+    REG(pll + 0x08u) = factor;
+    CLEAR(pll + 0x04u) = BIT(0) | BIT(5);
+    wait_for(pll, BIT(31));
+    REG(pll + 0x0Cu) = first << 16 | second << 12;
+    CLEAR(pll + 0x04u) = BIT(3);
+}
+
 static void start_clocks(void) {
     REG(XOSC + 0x0Cu) = 47u; /* 1 ms */
     REG(XOSC) = 0xFABAA0u;
@@ -132,18 +147,12 @@ static void start_clocks(void) {
     wait_for(CLOCKS + 0x38u, BIT(2));
     REG(CLOCKS + 0x3Cu) = 0u; /* system: reference, until the PLL is ready */
     wait_for(CLOCKS + 0x44u, BIT(0));
-    SET(RESETS) = BIT(12);
-    CLEAR(RESETS) = BIT(12);
-    wait_for(RESETS_DONE, BIT(12));
-    REG(PLL_SYS) = 1u;
-    REG(PLL_SYS + 0x08u) = 125u; /* 1500 MHz */
-    CLEAR(PLL_SYS + 0x04u) = BIT(0) | BIT(5);
-    wait_for(PLL_SYS, BIT(31));
-    REG(PLL_SYS + 0x0Cu) = 6u << 16 | 2u << 12;
-    CLEAR(PLL_SYS + 0x04u) = BIT(3);
+    start_pll(PLL_SYS, 12, 125u, 6u, 2u);
+    start_pll(PLL_USB, 13, 100u, 5u, 5u); /* 48 MHz */
     REG(CLOCKS + 0x3Cu) = 1u; /* system: PLL, 125 MHz */
     wait_for(CLOCKS + 0x44u, BIT(1));
     REG(CLOCKS + 0x48u) = BIT(11); /* peripherals: system */
+    REG(CLOCKS + 0x60u) = BIT(11); /* ADC: PLL of 48 MHz */
     REG(WATCHDOG + 0x2Cu) = BIT(9) | 12u; /* ticks of 1 us */
 }
 
@@ -153,7 +162,7 @@ static void set_pin(uint32_t pin, uint32_t pad, uint32_t function) {
 }
 
 static void start_peripherals(void) {
-    uint32_t used = BIT(5) | BIT(8) | BIT(14) | BIT(16) | BIT(21) | BIT(22); /* IO, pads, PWM, SPI0, timer, UART0 */
+    uint32_t used = BIT(0) | BIT(5) | BIT(8) | BIT(14) | BIT(16) | BIT(21) | BIT(22); /* ADC, IO, pads, PWM, SPI0, timer, UART0 */
     CLEAR(RESETS) = used;
     wait_for(RESETS_DONE, used);
     REG(SIO + 0x10u) = BIT(PIN_SPI_CS); /* output levels, then directions */
@@ -187,16 +196,57 @@ static void drive(void) {
     REG(c.enabled ? GPIO_SET : GPIO_CLEAR) = BIT(PIN_ENABLE) | BIT(PIN_LED);
 }
 
+/* The supply's voltage. Whether its divider is connected is found at the start: an open pin follows its pull-up. */
+
+static bool supply_is_sensed;
+
+static uint32_t convert(void) {
+    SET(ADC) = BIT(2);
+    wait_for(ADC, BIT(8));
+    return REG(ADC + 0x04u);
+}
+
+static void begin_supply(void) {
+    REG(ADC) = BIT(0); /* channel 0, GPIO 26 */
+    wait_for(ADC, BIT(8));
+    set_pin(PIN_SUPPLY_ADC, ANALOG_PULL_UP, FUNCTION_NONE);
+    uint32_t start = REG(TIMERAWL);
+    while (REG(TIMERAWL) - start < 1000u) { } /* for the capacitance of a wire */
+    supply_is_sensed = convert() < OPEN_ADC;
+    set_pin(PIN_SUPPLY_ADC, ANALOG, FUNCTION_NONE);
+    SET(ADC) = BIT(2);
+}
+
+static void read_supply(void) {
+    if (!supply_is_sensed || !(REG(ADC) & BIT(8))) return;
+    c.supply_mv = (uint16_t)(REG(ADC + 0x04u) * FULL_SCALE_MV >> 12);
+    SET(ADC) = BIT(2);
+}
+
+static void load(void) {
+    static uint8_t slots[STORE_SLOTS][STORE_BYTES];
+    flash_begin();
+    for (uint8_t slot = 0; slot < STORE_SLOTS; slot++) flash_read(slot, slots[slot]);
+    controller_load(&c, slots[0], slots[1]);
+}
+
+static void save(void) {
+    bool good = false;
+    if (c.saving && flash_write(c.slot, c.record, &good)) controller_saved(&c, good, REG(TIMERAWL));
+}
+
 int main(void) {
     start_clocks();
     start_peripherals();
     struct settings settings = default_settings;
     settings.encoder = ENCODER, settings.pulses = PULSES;
     controller_begin(&c, &settings, REG(TIMERAWL));
+    load();
+    begin_supply();
     uint32_t in = REG(GPIO_IN), ticks = 0;
     c.levels = (uint8_t)((in >> (PIN_A - 1) & 2u) | (in >> PIN_B & 1u));
     REG(IO_INTE0) = (ENCODER == QUADRATURE ? EDGE_LOW(PIN_A) | EDGE_HIGH(PIN_A) | EDGE_LOW(PIN_B) | EDGE_HIGH(PIN_B) : 0u)
-        | (has_absolute_angle(&settings) ? 0u : EDGE_LOW(PIN_INDEX) | EDGE_HIGH(PIN_INDEX))
+        | EDGE_LOW(PIN_INDEX) | EDGE_HIGH(PIN_INDEX) /* with an absolute angle, too: a setting may change it */
         | (PULSES == PULSES_CAMERA ? EDGE_HIGH(PIN_CAMERA_SYNC) : 0u);
     REG(NVIC_PRIORITY(0)) = 0x40u;         /* timer 0 */
     REG(NVIC_PRIORITY(5)) = 0x80u;         /* UART 0 */
@@ -211,7 +261,9 @@ int main(void) {
         uint32_t now = REG(GPIO_IN);
         c.driver_fault = !(now & BIT(PIN_DRIVER_FAULT));
         c.supply_low = !(now & BIT(PIN_SUPPLY));
+        read_supply();
         controller_poll(&c, REG(TIMERAWL));
+        save();
         drive();
         int byte = 0;
         while (!(REG(UART0 + 0x18u) & 0x20u) && (byte = controller_take(&c)) >= 0) REG(UART0) = (uint32_t)byte;

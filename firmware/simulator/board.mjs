@@ -11,12 +11,93 @@ const [path, kind, counts] = process.argv.slice(2);
 const image = readFileSync(path);
 const magnetic = kind === 'MAGNETIC';
 const STEP_NS = 50_000, TAU = 2 * Math.PI, BYTE_NS = 10e9 / 460_800;
-const PIN = { a: 2, b: 3, index: 4, sync: 5, trigger: 6, direction: 9, enable: 10, fault: 11, supply: 12, cs: 17 };
+const PIN = { a: 2, b: 3, index: 4, sync: 5, trigger: 6, direction: 9, enable: 10, fault: 11, supply: 12, cs: 17, adc: 26 };
 const perTurn = Number(counts), absolute = magnetic && perTurn === 16384;  // then there is no index pulse
 const faults = {
   jammed: 0, driver_fault: 0, no_index: 0, dead_a: 0, reversed_motor: 0, bad_spi: 0, runaway: 0, dead_encoder: 0,
-  no_magnet: 0, error_flag: 0, bouncing_index: 0, no_supply: 0, sensed: 0,
+  no_magnet: 0, error_flag: 0, bouncing_index: 0, no_supply: 0, sensed: 0, volts: 12, divider: 0, bad_store: 0,
 };
+const UPPER_OHM = 47_000, LOWER_OHM = 10_000, PULL_UP_OHM = 60_000;
+
+// A serial flash of 2 MB: it outlives resets. A reset in the middle of an erase or a write leaves half of it done.
+const flash = new Uint8Array(2 << 20).fill(0xff);
+flash.set(image);
+let flashBusyNs = -1, flashEnd = null, flashSent = [], flashSelected = false, writeEnabled = false;
+
+function flashIsBusy() {
+  if (flashEnd !== null && now() >= flashBusyNs) {
+    flashEnd();
+    flashEnd = null;
+  }
+  return flashEnd !== null;
+}
+
+function busyFor(us, begin, end) {
+  begin();
+  flashBusyNs = now() + 1000 * us;
+  flashEnd = end;
+  writeEnabled = false;
+}
+
+function flashAnswer(byte) {  // to a byte that is sent while the flash is selected
+  const sent = flashSent, [command] = sent, at = (sent[1] << 16) | (sent[2] << 8) | sent[3];
+  if (command === 0x05) return Number(flashIsBusy());
+  if (command === 0x03 && sent.length >= 4 && !flashIsBusy()) return flash[(at + sent.length - 4) % flash.length];
+  return 0xff;
+}
+
+function endOfCommand() {  // the flash is released: commands that change it begin
+  const [command, high, middle, low, ...data] = flashSent, at = ((high << 16) | (middle << 8) | low) % flash.length;
+  if (flashIsBusy()) return;
+  if (command === 0x06) writeEnabled = true;
+  if (!writeEnabled || flashSent.length < 4) return;
+  if (command === 0x20) {
+    const sector = at & ~0xfff;
+    busyFor(45_000, () => flash.fill(0xff, sector, sector + 0x800), () => flash.fill(0xff, sector, sector + 0x1000));
+  } else if (command === 0x02) {
+    const write = (from, to) => {
+      for (let k = from; k < to; k++) {
+        const place = (at & ~0xff) | ((at + k) & 0xff);
+        flash[place] &= faults.bad_store && k === 20 ? 0 : data[k];
+      }
+    };
+    const half = data.length >> 1;
+    busyFor(700, () => write(0, half), () => write(half, data.length));
+  }
+}
+
+function connectFlash() {  // the controller of the flash (SSI), with the override of its select line
+  const ssi = mcu.peripherals[0x18000], io = mcu.peripherals[0x40018], registers = {};
+  let received = [];
+  flashSelected = false;
+  flashEnd = null;  // the power was cut
+  writeEnabled = false;
+  ssi.writeUint32 = (register, value) => {
+    registers[register] = value;
+    if (register !== 0x60 || registers[0x08] !== 1) return;
+    const ready = registers[0x00] === 7 << 16 && registers[0x10] === 1;  // bytes, both ways, one flash
+    received.push(ready && flashSelected ? flashAnswer(value) : 0xff);
+    if (ready && flashSelected) flashSent.push(value & 0xff);
+  };
+  ssi.readUint32 = (register) => {
+    if (register === 0x28) return 6 | (received.length ? 8 : 0);
+    return register === 0x60 ? received.shift() ?? 0xff : registers[register] ?? 0;
+  };
+  io.writeUint32 = (register, value) => {
+    if (register !== 0x0c) return;
+    const selected = ((value >> 8) & 3) === 2;
+    if (selected && !flashSelected) flashSent = [];
+    if (!selected && flashSelected) endOfCommand();
+    flashSelected = selected;
+  };
+}
+
+function supplyAtPin() {  // of the ADC, as a part of its 3.3 V
+  const pulled = mcu.gpio[PIN.adc].pullupEnabled, impedance = (UPPER_OHM * LOWER_OHM) / (UPPER_OHM + LOWER_OHM);
+  if (!faults.divider) return pulled ? 1 : 0.07;
+  const volts = faults.no_supply ? 0 : faults.volts, pin = (volts * LOWER_OHM) / (UPPER_OHM + LOWER_OHM);
+  return Math.min(1, (pin + (pulled ? ((3.3 - pin) * impedance) / (impedance + PULL_UP_OHM) : 0)) / 3.3);
+}
 
 let mcu, clock, cycleNs = 8, out = [], inbox = [], arrivesNs = 0, resets = 0, watchdogs = 0;
 let turns = 0.3, rpm = 0, position = Math.floor(turns * perTurn), inPulse = false, random = 1;
@@ -31,7 +112,13 @@ function boot() {
   mcu = new RP2040();
   clock = mcu.clock;
   mcu.logger = { debug() {}, info() {}, warn() {}, error(_, text) { process.stderr.write(`rp2040js: ${text}\n`); } };
-  mcu.flash.set(image);
+  mcu.flash.set(flash);
+  connectFlash();
+  mcu.adc.onADCRead = (channel) => {
+    mcu.adc.currentChannel = channel;
+    mcu.adc.channelValues[0] = Math.round(4095 * supplyAtPin());
+    mcu.adc.sampleAlarm.schedule(2000);
+  };
   mcu.sram.fill(0);
   offset = was + offset;
   mcu.core.VTOR = 0;
