@@ -5,9 +5,10 @@ models. :func:`prepare` sets up an attempt: the encoder, the events and the para
 stages of the settings; the photometric stage also corrects lens, prism and sensor, see ``photometric/steps.py``.
 If it still says that something is wrong, :meth:`Calibrator.run` makes further attempts. With an encoder:
 
-1. with an error of the encoder that repeats every turn corrected
-2. without hot and flickering pixels, if no brightness map explains the events
-3. then one of these: without the parts of the image in which something moves; or, if no map explains the events, with
+1. with counts that the encoder lost put back, or with the path between pulses that come once a turn found in the events
+2. with an error of the encoder that repeats every turn corrected
+3. without hot and flickering pixels, if no brightness map explains the events
+4. then one of these: without the parts of the image in which something moves; or, if no map explains the events, with
    the encoder's direction or scale corrected, which ends in an error that says so, or with the camera's rotation free;
    or with the rotation free, if it explains much of the rest at a low cost. A camera that never rests is calibrated
    turn by turn. The rotation is dropped from the result
@@ -31,6 +32,7 @@ from numpy.typing import NDArray
 from amiwarp.calib import checks, first_guess, plate
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
+from amiwarp.calib.lost_counts import lost_counts, steps_in_events, steps_in_words, without_steps
 from amiwarp.calib.model_choice import ModelChooser
 from amiwarp.calib.parameters import (
     CHANGES,
@@ -45,12 +47,14 @@ from amiwarp.calib.parameters import (
     phase_names,
     units,
 )
-from amiwarp.calib.photometric import distances, limits
+from amiwarp.calib.photometric import limits
+from amiwarp.calib.photometric.distances import px_per_rad, stated_px
 from amiwarp.calib.photometric.equations import Problem
 from amiwarp.calib.photometric.pairs import upload_ahead, van_der_corput
 from amiwarp.calib.photometric.steps import refine, summarised
 from amiwarp.calib.photometric.verdicts import harmonics_in_words
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
+from amiwarp.calib.pulses import off_path, pulses_only, smooth_path
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
 from amiwarp.calib.settings import AUTO, CalibrationOptions, Settings
 from amiwarp.calib.sharpness_search import Search
@@ -138,7 +142,7 @@ def calibrate(
         settings = replace(settings, model=best)
     used, warnings = without_start_burst(recording)
     found = _calibration(used, settings, device, progress)
-    if found.path is not None and len(recording.events):
+    if found.path is not None and recording.encoder is None and len(recording.events):
         found = replace(found, path=reaching_back(found.path, recording.events.t_first))
     return _warning(found, *warnings)
 
@@ -187,6 +191,8 @@ LEAST_LONGER = 1.5
 calm span. Each end then begins half a turn from the middle span."""
 QUADRATURE, NEAR_QUADRATURE = (0.25, 0.5, 2.0, 4.0), 0.03
 """Scales of a quadrature encoder of which other edges are counted than stated, and how near a found one must be."""
+GRADUAL_US = 5000
+"""Duration of a step of an encoder's angle from which on the events must tell how it came about [us]."""
 LEAST_SCALE_ERROR = 0.003
 """Smallest relative error of an encoder's scale that is reported. Three turns measure the scale to about 0.001."""
 
@@ -223,6 +229,11 @@ class Attempt:
         return self.cost > limits.LARGEST_STILL_COST
 
     @property
+    def doubtful(self) -> bool:
+        """Whether there is any sign that something is wrong."""
+        return not self.accepted or self.photometric is None or bool(self.photometric.warnings) or self.camera_turned
+
+    @property
     def moving(self) -> NDArray[np.bool_]:
         """Parts of the image in which something moves while others are still, shape (rows, columns); empty for none."""
         return np.array(() if self.photometric is None else self.photometric.moving, np.bool_)
@@ -255,6 +266,10 @@ class Calibrator:
     are taken while a GPU works on the photometric stage, those that are left after the stage."""
     path: Encoder | None = None
     """Path of the prism's angle that was found before, if the recording has no encoder."""
+    mended: Encoder | None = None
+    """Angles in place of those of the recording's encoder, if they were wrong; they are in the recording already."""
+    mended_words: str = ""
+    """What was wrong with them, in words."""
 
     def run(self) -> Calibration:
         """Return the calibration of ``settings.model``; raise :class:`AmiwarpError` as :func:`calibrate` does.
@@ -267,6 +282,7 @@ class Calibrator:
             return self._told(tried.found())
         recording, calibrator = self.recording, replace(self, meanwhile=None)
         if recording.encoder is not None:
+            calibrator, tried = calibrator.with_mended_encoder(tried)
             calibrator, tried = calibrator.with_straight_angles(tried)
             if tried.unexplained:
                 calibrator, tried = calibrator.without_bad_pixels(tried)
@@ -281,6 +297,8 @@ class Calibrator:
         else:
             tried = calibrator.at_found_speed(tried)
         found = self._told(replace(tried.found(), harmonics=calibrator.harmonics))
+        if calibrator.mended is not None:
+            found = _warning(replace(found, path=calibrator.mended), calibrator.mended_words)
         if not tried.accepted:  # the answer of sharpness alone may be off by tenths of a pixel
             reasons = [w for w in found.warnings if "photometric" in w]
             raise AmiwarpError(
@@ -334,6 +352,84 @@ class Calibrator:
         except AmiwarpError as error:
             return Attempt(None, error, search)
         return Attempt(replace(found, seconds=time.perf_counter() - began), search=search)
+
+    def with_mended_encoder(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
+        """Put back counts that the encoder lost, or find the path between pulses that come once a turn.
+
+        Return the calibrator of the mended recording, and its attempt; both unchanged if the events do not confirm it.
+        """
+        encoder = self.recording.encoder
+        assert encoder is not None
+        if MODELS[self.settings.model].ANGLES > 1 or tried.search is None or not tried.search.space.sized:
+            return self, tried
+        try:
+            calibrator = self._between_pulses(tried.search) if pulses_only(encoder) else self._with_all_counts(tried)
+        except AmiwarpError:  # the events do not determine the path
+            return self, tried
+        if calibrator is None:
+            return self, tried
+        again = calibrator.attempt()
+        holds = again.accepted and again.cost < tried.cost and not (again.unexplained or again.camera_turned)
+        if again.calibration is None or not (holds or again.cost <= limits.LARGEST_COST_RATIO * tried.cost):
+            return self, tried
+        return calibrator, again
+
+    def _with_all_counts(self, tried: Attempt) -> Calibrator | None:
+        """Return the calibrator of the recording without the steps of its encoder; None if there are none.
+
+        The index pulses, the encoder's samples and, if something is wrong or there is no index, the events tell them.
+        """
+        recording, encoder = self.recording, self.recording.encoder
+        assert encoder is not None
+        steps = lost_counts(encoder)
+        told_by_index = bool(steps) and encoder.index_t is not None
+        if not told_by_index and (steps or tried.doubtful):
+            steps = steps_in_events(recording, encoder) or steps
+        if not steps:
+            return None
+        mended = without_steps(encoder, steps)
+        if any(step.last_us - step.first_us > GRADUAL_US for step in steps):
+            mended = self._on(mended)._fitted()
+        said = steps_in_words(steps, recording.events.t_first + round(encoder.clock_offset_us))
+        shown = "its index pulses" if told_by_index else "the events"
+        return self._on(mended, f"{said}, as {shown} show: it lost counts, or slipped. They were put back for this "
+                                "recording only: check its cable, supply and coupling")  # fmt: skip
+
+    def _between_pulses(self, search: Search) -> Calibrator | None:
+        """Return the calibrator of the recording with a path between its pulses; None if they are evenly spaced.
+
+        ``search`` is that of an attempt at the pulses' angles.
+        """
+        source, encoder = self.recording.events, self.recording.encoder
+        assert encoder is not None
+        path = smooth_path(encoder)
+        recording, start = replace(self.recording, encoder=path), _search_on(path, search)
+        t = start.calibration_events.events.t
+        px = px_per_rad(start.space, start.space.to_vector(start.best))
+        bent_px = px * float(np.std(path.angle_at(t) - encoder.angle_at(t)))
+        if bent_px < LEAST_DEVIATION_PX and not PathFit(recording, start, GATE_PAIRS, GATE_TILES).deviates():
+            return None
+        path, _ = PathFit(recording, start).run()
+        off = off_path(encoder, path, source.t_first, source.t_last)
+        path = replace(path, angle=path.angle - float(np.mean(off)))
+        jitter_us = float(np.std(off)) / abs(encoder.rpm) * 60e6 / math.tau
+        said = (
+            "the encoder gives pulses only: the angle between them was found in the events. The speed "
+            f"{speed_in_words(path)}, and the pulses came {jitter_us:.0f} us rms early or late. This holds for this "
+            "recording only; if the camera moved, which looks the same, hold it still"
+        )
+        return self._on(path, said)
+
+    def _on(self, encoder: Encoder, said: str = "") -> Calibrator:
+        """Return the calibrator with other angles in place of those of the recording's encoder, and why."""
+        recording = replace(self.recording, encoder=encoder)
+        return replace(self, recording=recording, mended=encoder, mended_words=said, meanwhile=None)
+
+    def _fitted(self) -> Encoder:
+        """Return the recording's encoder, corrected by the path that the events tell."""
+        search = prepare(self.recording, self.settings, device=self.device, progress=self.progress)[0]
+        search.run()
+        return PathFit(self.recording, search).run()[0]
 
     def with_straight_angles(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
         """Correct an error of the encoder that repeats every turn, if the events ask for it, and calibrate again.
@@ -669,7 +765,7 @@ def _mean(
         best.found(), parameters=values, uncertainty=stds, free=space.names, photometric=photometric, middle_us=None,
         warnings=(),
     )  # fmt: skip
-    return found, distances.stated_px(space, v, covariance)
+    return found, stated_px(space, v, covariance)
 
 
 def _warning(found: Calibration, *said: str) -> Calibration:

@@ -69,9 +69,12 @@ class ModelChooser:
         # the camera and the flat side are those that the calibration found
         prism = replace(as_wedge(self._recording.prism or UnsizedPrism()), flat_side=as_wedge(first.prism).flat_side)
         recording = replace(self._recording, camera=first.camera, prism=prism)
-        if first.harmonics is not None and recording.encoder is not None:
-            recording, self._ready = replace(recording, encoder=recording.encoder.with_harmonics(first.harmonics)), None
-        harmonics, first = first.harmonics, replace(first, harmonics=None)
+        mended, harmonics = first.path if recording.encoder is not None else None, first.harmonics
+        if mended is not None:
+            recording, first, self._ready = replace(recording, encoder=mended), replace(first, path=None), None
+        if harmonics is not None and recording.encoder is not None:
+            recording, self._ready = replace(recording, encoder=recording.encoder.with_harmonics(harmonics)), None
+        first = replace(first, harmonics=None)
         trial, parameters = self._with_free_parameters(recording, first, calibrate)
         candidates = compare_models(trial)
         chosen = express(trial, next(c.model for c in candidates if c.chosen), self.settings)
@@ -92,7 +95,12 @@ class ModelChooser:
             *(f"prediction and held-out turns disagree on the {c.model} model: {c.verdict}" for c in disagreements),
         )
         return replace(
-            chosen, ladder=choice, seconds=whole, warnings=(*chosen.warnings, *warnings), harmonics=harmonics
+            chosen,
+            ladder=choice,
+            seconds=whole,
+            warnings=(*chosen.warnings, *warnings),
+            harmonics=harmonics,
+            path=chosen.path if mended is None else mended,
         )
 
     def _with_free_parameters(

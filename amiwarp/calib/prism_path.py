@@ -1,4 +1,4 @@
-"""Path of the prism's angle over time, found in the events of a recording without an encoder.
+"""Path of the prism's angle over time, found in the events: without an encoder, or where that tells too little.
 
 :func:`varying_paths` finds a smooth path from the repetition of the events alone, if the speed varies much.
 :class:`PathFit` finds ripple and remaining errors by the brightness map that the photometric stage uses too.
@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -255,7 +256,8 @@ class PathFit:
     def __init__(self, recording: Recording, search: Search, pairs: int = PAIRS, tiles: int = TILES) -> None:
         """Collect about ``pairs`` pairs at the answer of ``search``, and solve the map.
 
-        The encoder of ``search`` is the first path. Raises :class:`AmiwarpError` for too few pairs.
+        The encoder of ``search`` is the first path: a constant speed, or the encoder of the recording if it has one.
+        Raises :class:`AmiwarpError` for too few pairs.
         """
         space, settings = search.space, search.settings.photometric
         self._recording, self._first = recording, search.calibration_events.encoder
@@ -302,7 +304,8 @@ class PathFit:
     def run(self) -> tuple[Encoder, float]:
         """Improve the path and the size until the steps are short; return the path and its deviation [px rms].
 
-        The deviation is that from constant speed. Raises :class:`AmiwarpError` if the events do not determine the path.
+        The deviation is that from constant speed, or from the recording's encoder. Raises :class:`AmiwarpError` if the
+        events do not determine the path.
         """
         for k in range(MOST_STEPS):
             moved_px, std_px = self._improve(k)
@@ -314,8 +317,10 @@ class PathFit:
                 f"{self._recording.name}: the prism's speed varies, and the events determine the path of its angle to "
                 f"{error_px:.2f} px only; use an encoder, let the prism turn steadily, or show a scene with more edges"
             )
-        t = self._first.t - self._recording.events.t_first
+        t = self._first.t - round(self._first.clock_offset_us) - self._recording.events.t_first
         theta = self._first.angle + _design(self._knots, t.astype(np.float64)) @ self._found
+        if self._recording.encoder is not None:  # it keeps its zero: the correction has no mean
+            return replace(self._first, angle=theta), self._deviation_px()
         theta -= np.interp(middle_time(self._recording) - self._recording.events.t_first, t, theta)
         return Encoder(self._first.t, theta), self._deviation_px()
 
@@ -334,7 +339,9 @@ class PathFit:
         return self._px * float(np.std(self._splines[0] @ change)), std_px
 
     def _deviation_px(self) -> float:
-        """Return the deviation of the present path from constant speed [px rms]."""
+        """Return the deviation of the present path from constant speed, or from the encoder [px rms]."""
+        if self._recording.encoder is not None:
+            return self._px * float(np.std(self._splines[0] @ self._found))
         times = np.rint(self._t[0]).astype(np.int64) + self._recording.events.t_first
         angle = self._first.angle_at(times) + self._splines[0] @ self._found
         t = (self._t[0] - self._t[0].mean()) * 1e-6

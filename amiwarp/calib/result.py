@@ -285,8 +285,9 @@ class Calibration:
     """Correction of the encoder's angle e by an error that repeats every turn: the factors of cos e, sin e, cos 2e and
     sin 2e [rad] (see :meth:`amiwarp.Encoder.with_harmonics`); None for no correction."""
     path: Encoder | None = None
-    """Path of the prism's angle that was found in the events of a recording without an encoder; None if the speed is
-    constant, or if the recording has an encoder."""
+    """Path of the prism's angle that was found in the events. Without an encoder, that of a speed that is not constant.
+    With one, the angles in place of its own, on its clock, if these were wrong: after counts that were lost, or between
+    index pulses that come once a turn. Else None. It holds for its own recording only."""
 
     def __repr__(self) -> str:
         values = ", ".join(map(self._in_words, self.parameters))
@@ -339,9 +340,9 @@ class Calibration:
         Returns
         -------
         Encoder
-            The given encoder with the calibrated clock offset and correction; without an encoder, the path that was
-            found, or one of the calibrated constant speed. If the prism's size is 0, an encoder at rest: the angle then
-            has no effect.
+            The given encoder with the calibrated clock offset and correction, or with the path in place of its angles
+            if it was found for this encoder's samples; without an encoder, the path that was found, or one of the
+            calibrated constant speed. If the prism's size is 0, an encoder at rest: the angle then has no effect.
 
         Raises
         ------
@@ -355,6 +356,8 @@ class Calibration:
             return rest if kind.ANGLES == 1 else rest.with_second(1.0)
         if encoder is not None:
             check_made_with_encoder(self)
+            if self.path is not None and replaces(self.path, encoder):
+                encoder = replace(self.path, clock_offset_us=encoder.clock_offset_us)
             encoder = encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
             return encoder if self.harmonics is None else encoder.with_harmonics(self.harmonics)
         if self.path is not None:
@@ -491,11 +494,24 @@ class Calibration:
 
 def check_made_with_encoder(calibration: Calibration) -> None:
     """Raise :class:`AmiwarpError` for a calibration without an encoder: the angle 0 of an encoder is another one."""
-    if calibration.path is not None or "rpm" in calibration.parameters:
+    if calibration.zero_us is not None or "rpm" in calibration.parameters:
         raise AmiwarpError(
             "the recording has an encoder, and the calibration was made without one, so its phase holds for its own"
             " recording only; calibrate a recording with the encoder"
         )
+
+
+def replaces(path: Encoder, encoder: Encoder) -> bool:
+    """Return whether a path was found for the samples of this encoder, or for a part of them.
+
+    It then has their times, and angles that differ by less than half a turn. Another recording has other times.
+    """
+    first, last = np.searchsorted(encoder.t, [path.t[0], path.t[-1] + 1])
+    own = slice(int(first), int(last))
+    if last - first < 2 or not np.isin(encoder.t[own], path.t).all():
+        return False
+    at = np.searchsorted(path.t, encoder.t[own])
+    return bool((np.abs(path.angle[at] - encoder.angle[own]) < math.pi).all())
 
 
 def prism_to_json(prism: Prism | Plate) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.parameters import best_model, nominal, optical_parameters
 from amiwarp.calib.plate import LARGEST_INVERSE
-from amiwarp.calib.result import Calibration, constant_speed
+from amiwarp.calib.result import Calibration, constant_speed, replaces
 from amiwarp.choices import Colour, Sharpness, Vote
 from amiwarp.compensation.recordings import at_depths, compensate_events
 from amiwarp.errors import AmiwarpError
@@ -380,6 +380,7 @@ class Inspector:
         self._is_beside = False
         self._found: tuple[Knobs, Calibration] | None = None
         self._harmonics: tuple[float, ...] | None = None
+        self._mended: Encoder | None = None  # angles that a calibration found in place of those of the encoder
         self._window: LoadedWindow | None = None
         self._span: Span | None = None
         self._closing = Event()
@@ -494,8 +495,10 @@ class Inspector:
 
     @cached_property
     def _corrected(self) -> Encoder | None:
-        """The recording's encoder without the error that a calibration found in it; None if there is no encoder."""
+        """The recording's encoder without the errors that a calibration found in it; None if there is no encoder."""
         encoder, harmonics = self.recording.encoder, self._harmonics
+        if encoder is not None and self._mended is not None:
+            encoder = replace(self._mended, clock_offset_us=encoder.clock_offset_us)
         return encoder if encoder is None or harmonics is None else encoder.with_harmonics(harmonics)
 
     @property
@@ -631,6 +634,8 @@ class Inspector:
             )
         self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
         self._harmonics = calibration.harmonics
+        own, path = self.recording.encoder, calibration.path
+        self._mended = path if own is not None and path is not None and replaces(path, own) else None
         self._forget_angles()
         self.set(self.knobs_of(calibration))
         found, free = (
@@ -691,6 +696,7 @@ class Inspector:
             free=(), sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before, sharpness_after=after,
             stages=(), events=len(w.counted), seconds=0.0, warnings=("set by hand in the inspector",),
             zero_us=None if self.has_encoder else self.zero_us, harmonics=self._harmonics,
+            path=self._mended,
         )  # fmt: skip
 
     def set(self, knobs: Knobs) -> None:

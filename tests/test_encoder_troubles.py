@@ -1,0 +1,181 @@
+"""Troubles of encoders that calibration corrects: lost counts, and pulses that leave the angle between them open."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amiwarp import Calibration, EncoderModel, PrismMotion, calibrate
+from amiwarp.calib.lost_counts import Step, changes_of_mean, lost_counts, steps_in_events, without_steps
+from amiwarp.calib.pulses import pulses_only, smooth_path
+from amiwarp.events.encoder import Encoder
+from amiwarp.viewer.inspector import Inspector
+from benchmarks import encoder_troubles
+from benchmarks.encoder_troubles import Trouble, compensation_error, hunting, losing, recorded, steady, turns_of
+from tests.conftest import COARSE
+
+SIZE = (160, 120)
+LOST_AT = 337_300
+"""Time at which the encoder loses counts [us]."""
+STEP = math.radians(100 * 360 / 4096)
+
+
+@pytest.fixture(scope="module")
+def still() -> Trouble:
+    """Eight turns of a steady prism with a good encoder."""
+    return recorded(SIZE, steady(), seconds=0.68)
+
+
+def found_in(trouble: Trouble) -> Calibration:
+    return calibrate(trouble.recording, model="exact", photometric=COARSE)
+
+
+def samples(motion: PrismMotion, counts: int, *, index: bool, within_us: int = 0, **model: Any) -> Encoder:
+    """Return an encoder without events that loses counts at 0.337 s."""
+    encoder = replace(EncoderModel(counts_per_turn=4096), **model).sample(motion, 1_000_000, 1)
+    lost = np.clip((encoder.t - LOST_AT) / max(within_us, 1), 0.0, 1.0)
+    given = Encoder(encoder.t, encoder.angle - np.rint(counts * lost) * (math.tau / 4096))
+    return given.with_index(turns_of(motion, int(encoder.t[0]), int(encoder.t[-1]))) if index else given
+
+
+@pytest.mark.parametrize("motion", [steady(), hunting(0.3, 0.7), PrismMotion(-720.0)], ids=["steady", "slow", "back"])
+@pytest.mark.parametrize("index", [True, False])
+@pytest.mark.parametrize("counts", [10, 100, -500])
+def test_samples_show_when_counts_were_lost(motion: PrismMotion, index: bool, counts: int) -> None:
+    [step] = lost_counts(samples(motion, counts, index=index))
+    assert step.angle == pytest.approx(-counts * math.tau / 4096, abs=math.radians(0.15))
+    assert step.first_us <= LOST_AT <= step.last_us
+    assert step.last_us - step.first_us < 1100
+
+
+@pytest.mark.parametrize("index", [True, False])
+@pytest.mark.parametrize(
+    "model", [{}, {"jitter_us": 50.0}, {"dropouts_hz": 10.0}, {"harmonics": (0.05, 0.02, 0.01, 0.0)}, {"rate_hz": 1e4}],
+    ids=["plain", "late", "gaps", "eccentric", "fast"],
+)  # fmt: skip
+def test_a_right_encoder_has_no_step(index: bool, model: dict[str, Any]) -> None:
+    for motion in (steady(), hunting(0.3, 0.7), hunting(0.1, 60.0)):
+        assert lost_counts(samples(motion, 0, index=index, **model)) == ()
+
+
+def test_an_index_shows_counts_that_were_lost_gradually() -> None:
+    [step] = lost_counts(samples(steady(), 100, index=True, within_us=40_000))
+    assert step.angle == pytest.approx(-STEP, abs=1e-3)
+    assert step.first_us <= LOST_AT
+    assert step.last_us >= LOST_AT + 40_000
+    assert step.last_us - step.first_us < 84_000
+
+
+def test_two_losses_are_two_steps() -> None:
+    once = samples(steady(), 100, index=True)
+    twice = replace(once, angle=once.angle + 0.1 * (once.t > 700_000))
+    first, second = lost_counts(twice)
+    assert (first.angle, second.angle) == pytest.approx((-STEP, 0.1), abs=1e-3)
+    mended = without_steps(twice, (first, second))
+    assert float(np.abs(mended.slip()).max()) < 3e-3
+
+
+def test_a_drift_is_no_step() -> None:
+    assert changes_of_mean(np.linspace(0.0, 1.0, 40)) == []
+    noise = np.random.default_rng(0).normal(0.0, 0.001, 40)
+    assert changes_of_mean(np.where(np.arange(40) < 17, 0.0, 0.3) + noise) == [(17, pytest.approx(0.3, abs=0.002))]
+
+
+def test_events_show_counts_that_were_lost(still: Trouble) -> None:
+    encoder = still.recording.encoder
+    assert encoder is not None
+    assert steps_in_events(still.recording, encoder) == ()
+    for within_us in (0, 40_000):
+        slipped = losing(still, 100, LOST_AT, index=False, within_us=within_us).recording
+        assert slipped.encoder is not None
+        [step] = steps_in_events(slipped, slipped.encoder)
+        assert step.angle == pytest.approx(-STEP, abs=math.radians(0.5))
+        assert step.first_us <= LOST_AT + within_us
+        assert step.last_us >= LOST_AT
+
+
+def test_steps_come_on_the_encoder_s_clock(still: Trouble) -> None:
+    slipped = losing(still, 100, LOST_AT, index=False).recording
+    assert slipped.encoder is not None
+    late = replace(slipped.encoder, t=slipped.encoder.t + 500_000, clock_offset_us=500_000.0)
+    [step] = steps_in_events(slipped, late)
+    assert step.first_us - 500_000 <= LOST_AT <= step.last_us - 500_000
+    assert "at 0.337 s" in Step(337_000, 338_000, STEP).in_words(0)
+
+
+@pytest.mark.parametrize("index", [True, False])
+def test_lost_counts_are_put_back(still: Trouble, index: bool, tmp_path: Path) -> None:
+    trouble = losing(still, 100, LOST_AT, index=index)
+    found = found_in(trouble)
+    assert compensation_error(trouble, found)[0] < 0.015  # px; 0.13 without the correction
+    shown = "its index pulses" if index else "the events"
+    assert "the encoder's angle steps by -8." in found.warnings[-1]
+    assert f"at 0.337 s, as {shown} show" in found.warnings[-1]
+    found.save(tmp_path / "c.json")
+    again = Calibration.load(tmp_path / "c.json")
+    encoder, events = trouble.recording.encoder, trouble.recording.events
+    assert encoder is not None
+    ends = events.t_first, events.t_last
+    mended = again.encoder_for(encoder, *ends)
+    assert found.path is not None
+    np.testing.assert_array_equal(mended.angle, found.path.angle)
+    inspector = Inspector(trouble.recording, again)
+    np.testing.assert_array_equal(inspector.encoder.angle, found.path.angle)
+    # the encoder of another recording keeps its angles
+    other = replace(encoder, t=encoder.t + 1)
+    np.testing.assert_array_equal(again.encoder_for(other, *ends).angle, other.angle)
+    # of a part of the same recording they are replaced
+    part = Encoder(encoder.t[100:500], encoder.angle[100:500])
+    np.testing.assert_array_equal(again.encoder_for(part, *part.coverage).angle, found.path.angle)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", [True, False])
+def test_counts_that_were_lost_gradually_are_put_back(still: Trouble, index: bool) -> None:
+    trouble = losing(still, 100, LOST_AT, index=index, within_us=40_000)
+    found = found_in(trouble)
+    assert compensation_error(trouble, found)[0] < 0.03
+    assert "the encoder's angle steps by" in found.warnings[-1]
+
+
+def test_a_right_encoder_is_left_alone(still: Trouble) -> None:
+    found = found_in(still)
+    assert found.path is None
+    assert found.warnings == ()
+
+
+def test_pulses_have_a_smooth_path() -> None:
+    motion = hunting(0.05, 3.0)
+    t = turns_of(motion, -200_000, 1_200_000)
+    pulses = Encoder(t, np.rint(motion.angle(t) / math.tau) * math.tau, 25.0)
+    assert pulses_only(pulses)
+    assert not pulses_only(samples(motion, 0, index=True))
+    path = smooth_path(pulses)
+    assert path.clock_offset_us == 25.0
+    inside = (path.t > 0) & (path.t < 1_000_000)
+    away = (path.angle - motion.angle(path.t))[inside]
+    assert float(np.std(away)) < 0.01  # rad; linear between the pulses it is 0.027
+    assert set(t.tolist()) <= set(path.t.tolist())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("motion", "jitter_us"), [(steady, 500.0), (lambda: hunting(0.06, 17.0), 0.0), (lambda: hunting(0.05, 3.0), 0.0)],
+    ids=["jitter", "17 Hz", "3 Hz"],
+)  # fmt: skip
+def test_the_angle_between_pulses_is_found(motion: Callable[[], PrismMotion], jitter_us: float) -> None:
+    trouble = encoder_troubles.pulses_only(recorded(SIZE, motion()), jitter_us)
+    found = found_in(trouble)
+    assert compensation_error(trouble, found)[0] < 0.02
+    assert "the encoder gives pulses only" in found.warnings[-1]
+
+
+def test_even_pulses_keep_their_angles() -> None:
+    trouble = encoder_troubles.pulses_only(recorded(SIZE, steady(), seconds=0.4))
+    found = found_in(trouble)
+    assert found.path is None
+    assert found.warnings == ()
