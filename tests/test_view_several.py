@@ -142,7 +142,8 @@ def test_the_page_has_a_row_of_rates_for_each_recording(inspector: Inspector, br
                 counts, _ = np.histogram(t[events.p == polarity], edges)
                 found = np.frombuffer(row[name], np.float32) * (300_000 / layout.BINS * 1e-6)
                 np.testing.assert_allclose(found, counts, atol=0.01)
-            assert np.count_nonzero(found == 0.0) >= layout.BINS * 24 // 300  # where the recording has not started, or ended
+            # where the recording has not started, or has ended
+            assert np.count_nonzero(found == 0.0) >= layout.BINS * 24 // 300
         assert page.locator("#beside").input_value() == "0"
         page.locator("#beside").select_option("1")
         page.wait_for_function("document.querySelector('#against-title').innerText.includes('late')")
