@@ -517,8 +517,13 @@ def errors_px(rig: Rig, recording: Recording, found: amiwarp.Calibration) -> tup
     return rms(float(best.x)), float(away(float(best.x)).max())
 
 
-def deviation_px(found: amiwarp.Calibration) -> float:
-    """Return the error that the parameters' standard deviations amount to, each for itself [px rms]."""
+def stated_px(found: amiwarp.Calibration) -> float:
+    """Return the standard deviation that is stated of the motion [px rms].
+
+    Where the stage states none, it is what the parameters' standard deviations amount to, each for itself.
+    """
+    if found.photometric is not None and found.photometric.deviation_px is not None:
+        return found.photometric.deviation_px
     total = 0.0
     for name, std in found.uncertainty.items():
         changed = {**found.parameters, name: found.parameters[name] + std}
@@ -528,6 +533,11 @@ def deviation_px(found: amiwarp.Calibration) -> float:
         except amiwarp.AmiwarpError:
             continue
     return math.sqrt(total)
+
+
+def hidden_px(found: amiwarp.Calibration) -> dict[str, float]:
+    """Return the stated bounds of what could hide [px rms], by cause."""
+    return {} if found.photometric is None else dict(found.photometric.hidden_px)
 
 
 def measure(optic: str, trouble: str, seed: int, folder: Path | None = None, device: str = "cpu") -> dict[str, Any]:
@@ -554,7 +564,7 @@ def measure(optic: str, trouble: str, seed: int, folder: Path | None = None, dev
         error, largest = errors_px(rig, recording, found)
         accepted = found.photometric is None or found.photometric.accepted
         row |= {"refused": not accepted, "error_px": error, "largest_px": largest, "model": found.model_name,
-                "stated_px": deviation_px(found)}  # fmt: skip
+                "stated_px": stated_px(found), "hidden_px": hidden_px(found)}  # fmt: skip
     row["seconds"] = time.perf_counter() - began
     row["named"] = any(word in text for word in rig.needs for text in said)
     row["said"] = said

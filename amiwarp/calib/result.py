@@ -134,6 +134,12 @@ class PhotometricSummary:
     moving: tuple[tuple[bool, ...], ...] = ()
     """Parts of the image, row by row, in which something moves while the other parts are still: True for those; empty
     if there are no such parts."""
+    deviation_px: float | None = None
+    """Standard deviation of the motion that the result takes out of the events, as far as they determine it [px rms],
+    without a constant lag; None if it was not examined."""
+    hidden_px: Mapping[str, float] = field(default_factory=dict)
+    """By how much each cause of an error that was looked for may still change that motion [px rms], by its words: twice
+    the standard deviation of what the events show of it, beyond its estimate."""
     warnings: tuple[str, ...] = ()
     """Corrections of the given camera and prism, and where the result does not hold, one sentence each."""
 

@@ -396,7 +396,14 @@ def _photometric(c: Calibration) -> list[str]:
     if c.photometric is None or not c.photometric.accepted:
         return []
     p = c.photometric
-    return [f"photometric: {p.verdict}; {p.pairs:,} pairs, {p.moved_px:.3f} px from the result of the sharpness stage"]
+    said = [f"photometric: {p.verdict}; {p.pairs:,} pairs, {p.moved_px:.3f} px from the result of the sharpness stage"]
+    if p.deviation_px is not None:
+        said.append(f"the events determine their motion within ± {p.deviation_px:.2g} px rms, a constant lag apart")
+    if p.hidden_px:
+        bounds = sorted(p.hidden_px.items(), key=lambda each: -each[1])
+        could = ", ".join(f"{words} {px:.2g} px" for words, px in bounds)
+        said.append(f"what was looked for and could still hide in it, at most: {could}")
+    return said
 
 
 def _shown(entry: dict[str, Any]) -> tuple[str, str, str]:

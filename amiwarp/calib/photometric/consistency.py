@@ -8,7 +8,7 @@ residual each of a few likely causes would remove, were it free.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,7 @@ from amiwarp.calib.photometric.derivatives import SHAKE, by_cause, by_parts_of_p
 from amiwarp.calib.photometric.distances import distance
 from amiwarp.calib.photometric.findings import Finding
 from amiwarp.calib.photometric.linear_fit import SIGNIFICANT, LinearFit, linear_fit, telling
+from amiwarp.calib.photometric.stated_errors import hidden_px
 from amiwarp.calib.photometric.systematic import errors_of_a_wrong_lens, gap_errors, lens_errors, map_errors
 from amiwarp.optics.camera import LENS
 from amiwarp.optics.prism import as_wedge
@@ -59,6 +60,9 @@ LEAST_FURTHER_GAIN = 0.0005
 """Smallest share that a further cause must remove once the given lens has turned out to be wrong."""
 LEAST_MOVE_PX = 0.005
 """Smallest change of the model for which a cause is reported [px rms over the image and a turn]."""
+BOUND_VARIANCE = 3.0
+"""Ratio of a bound's square to the variance of what lies anywhere within it. The errors of a map's interpolation are
+bounds: all pairs would have to err in the same sense."""
 REGIONS = (3, 2)
 """Number of columns and rows of the parts of the image whose answers are compared."""
 FEWEST_SQUARES = 4
@@ -90,6 +94,10 @@ class Consistency(Finding):
     """Remaining Gauss-Newton step of the free parameters [px], shape (n,)."""
     systematic: Vector
     """Covariance of the errors that do not scatter from place to place [px²], shape (n, n)."""
+    method: Vector
+    """The part of it that is the method's own: it is an error of the motion, whatever the lens [px²], shape (n, n)."""
+    hidden_px: Mapping[str, float]
+    """By how much each cause that was looked for may still change the motion [px rms], by its words."""
     likely: tuple[LikelyCause, ...]
     """Causes that are significant, the likeliest first."""
     drift: tuple[float, float]
@@ -141,9 +149,12 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         of_lens = of_lens + errors_of_a_wrong_lens(space, fit, causes)
     brightness = cost.brightness
     of_map = map_errors(space, best, fit, brightness.count, brightness.tiles.density)
+    of_gaps = gap_errors(space, fit)
     return Consistency(
         step=fit.fit(space.names).change,
-        systematic=gap_errors(space, fit) + of_map + of_lens,
+        systematic=of_gaps + of_map + of_lens,
+        method=of_gaps + of_map / BOUND_VARIANCE,
+        hidden_px=hidden_px(space, best, fit, causes),
         likely=tuple(likely),
         drift=_drift(space, best, fit),
         spread=_spread(space, best, fit),

@@ -18,12 +18,13 @@ from amiwarp.calib.parameters import ParameterSpace
 from amiwarp.calib.photometric import limits
 from amiwarp.calib.photometric.answers import Answer, AnswerSearch, is_accepted, join_runs
 from amiwarp.calib.photometric.causes import FLAT_SIDE, SHAPES, Cause
-from amiwarp.calib.photometric.consistency import LikelyCause, check_consistency
+from amiwarp.calib.photometric.consistency import Consistency, LikelyCause, check_consistency
 from amiwarp.calib.photometric.distances import distance, stated_px
 from amiwarp.calib.photometric.findings import (
     Finding,
     FlatSideCorrected,
     LensBeyondCorrection,
+    MotionError,
     ParameterCorrected,
     RivalCauses,
     Shake,
@@ -31,6 +32,7 @@ from amiwarp.calib.photometric.findings import (
 )
 from amiwarp.calib.photometric.linear_fit import SIGNIFICANT
 from amiwarp.calib.photometric.refinement import Refinement
+from amiwarp.calib.photometric.stated_errors import BOUND, motion_slopes, shift_px, spread_px
 from amiwarp.calib.sharpness_search import LEAST_INSIDE_PX
 from amiwarp.optics.camera import LENS
 from amiwarp.optics.models import MODELS
@@ -236,11 +238,29 @@ def judge_the_consistency(state: Refinement) -> Refinement:
         v = v + check.step
     covariance = state.answer.covariance + systematic
     answer = replace(state.answer, parameters=space.to_values(v), uncertainty=space.deviations(v, covariance))
-    state = replace(state, answer=answer).noticing(check)
+    state = replace(state, answer=answer).noticing(check, motion_error(state, check, v))
     # an answer with a free speed is found again at that speed
     if MODELS[space.model].PRISM or "rpm" in space.names:
         return state
     return state.noticing(StatedError(stated_px(space, v, covariance)))
+
+
+def motion_error(state: Refinement, check: Consistency, v: Vector) -> MotionError:
+    """Return what is stated of the error of the motion of an answer with a search vector.
+
+    A doubt about the refractory period is no scatter: it is one of the causes that could hide.
+    """
+    n = len(v)
+    timing = _padded(TIMING_SHARE * state.timing, n)
+    covariance = state.answer.covariance + check.method + np.outer(check.step, check.step) + np.outer(timing, timing)
+    for change in state.apart:
+        covariance[: len(change), : len(change)] += RIVAL_STD**2 * np.outer(change, change)
+    slopes = motion_slopes(state.space, v)
+    hidden = dict(check.hidden_px)
+    doubt_px = BOUND * shift_px(slopes, _padded(state.doubt, n))
+    if doubt_px > 0.0:
+        hidden["the refractory period"] = doubt_px
+    return MotionError(spread_px(slopes, covariance), hidden)
 
 
 def name_the_corrections(state: Refinement) -> Refinement:

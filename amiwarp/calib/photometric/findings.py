@@ -156,6 +156,16 @@ class StatedError(Finding):
 
 
 @dataclass(frozen=True)
+class MotionError(Finding):
+    """What is stated of the error of the motion that the answer takes out of the events."""
+
+    deviation_px: float
+    """Its standard deviation, as far as the events determine it [px rms]."""
+    hidden_px: Mapping[str, float]
+    """By how much causes that were looked for may still change it [px rms], by their words."""
+
+
+@dataclass(frozen=True)
 class Silence(Finding):
     """No events came for some of the time."""
 

@@ -19,7 +19,7 @@ from amiwarp.calib.photometric.corrections import (
 )
 from amiwarp.calib.photometric.equations import Problem
 from amiwarp.calib.photometric.fast_motion import bound_what_blind_pixels_hide, weigh_the_refractory_doubt
-from amiwarp.calib.photometric.findings import AngleError, MovingParts
+from amiwarp.calib.photometric.findings import AngleError, MotionError, MovingParts
 from amiwarp.calib.photometric.losses import (
     count_lost_events,
     give_up_a_worse_answer,
@@ -72,6 +72,7 @@ def summarised(state: Refinement) -> tuple[PhotometricSummary, StageSummary, Par
     check = state.check
     reason = state.refusal
     harmonics = [found.harmonics for found in state.findings if isinstance(found, AngleError)]
+    stated = [found for found in state.findings if isinstance(found, MotionError)]
     moving = [found.parts for found in state.findings if isinstance(found, MovingParts)]
     result = PhotometricSummary(
         accepted=not reason,
@@ -93,6 +94,8 @@ def summarised(state: Refinement) -> tuple[PhotometricSummary, StageSummary, Par
         held=state.held,
         harmonics=harmonics[0] if harmonics else (),
         moving=moving[0] if moving else (),
+        deviation_px=stated[0].deviation_px if stated else None,
+        hidden_px=stated[0].hidden_px if stated else {},
         warnings=warnings(state.findings),
     )
     summary = StageSummary.of("photometric", answer.stage, space.names, map(space.to_values, answer.stage.points))
