@@ -53,7 +53,7 @@ def compensate_live(
     ----------
     source : str or Path
         Source: ``camera:``, ``dv``, ``prophesee``, ``tcp:HOST:PORT``, ``unix:PATH``, ``-`` for standard input, or a
-        file to replay.
+        file to replay. :class:`CameraSettings` continue the name of a camera: ``f"camera:evk4,{settings}"``.
     calibration : Calibration
         Calibration of the camera.
     port : str, optional
@@ -64,7 +64,7 @@ def compensate_live(
     fast : bool, default False
         Whether to replay a file as fast as possible, not in real time.
     wait_for_source_s : float, default 0.0
-        Longest wait for the sender to return after a socket's stream breaks off [s].
+        Longest wait for the sender of a socket, or for a camera, to return after the stream breaks off [s].
     wait_ms : float, default 10.0
         Longest wait for encoder samples [ms]; after it the angle is extrapolated.
     policy : Policy or str, default "block"
