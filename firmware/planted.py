@@ -19,6 +19,7 @@ import boards
 
 HERE = Path(__file__).parent
 FAULTS: list[dict[str, Any]] = tomllib.loads((HERE / "planted.toml").read_text())["fault"]
+VERDICTS = {True: "caught", False: "MISSED", None: "left out"}
 COMPILE = ("gcc", "-std=gnu11", "-O1", "-shared", "-fPIC", "-Icore", "-o", "libboard.so", "native/board.c")
 
 
@@ -50,10 +51,10 @@ def failures(fault: dict[str, Any], folder: Path, rpm: float = 240.0) -> list[st
     return [c.name for c in check_controller(boards.SimulatedWire(board), rpm) if c.passed is False]
 
 
-def fails(fault: dict[str, Any], folder: Path) -> bool:
-    """Copy the firmware with a fault to a folder, and return whether the fault's test fails there and only there.
+def fails(fault: dict[str, Any], folder: Path) -> bool | None:
+    """Copy the firmware with a fault to a folder, and return whether the fault's test fails; None if it was skipped.
 
-    Raises RuntimeError if the test is skipped or not found, as it then shows nothing.
+    Raises RuntimeError if there is no such test.
     """
     copy = folder / "firmware"
     shutil.copytree(HERE, copy, ignore=shutil.ignore_patterns("build", "node_modules", "__pycache__"))
@@ -65,13 +66,13 @@ def fails(fault: dict[str, Any], folder: Path) -> bool:
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider", f"tests/{fault['test']}"]
     environment = os.environ | {"AMIWARP_FIRMWARE": str(copy)}
     done = subprocess.run(command, cwd=HERE.parent, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode not in (0, 1) or "skipped" in done.stdout:
+    if done.returncode not in (0, 1):
         raise RuntimeError(f"{fault['test']}: {done.stdout[-500:]}{done.stderr[-500:]}")
-    return done.returncode == 1
+    return None if done.returncode == 0 and "skipped" in done.stdout else done.returncode == 1
 
 
-def caught(fault: dict[str, Any], folder: Path) -> tuple[bool, str]:
-    """Return whether a fault is caught, and by what; its check of the suite, or its test."""
+def caught(fault: dict[str, Any], folder: Path) -> tuple[bool | None, str]:
+    """Return whether a fault is caught, and by what: checks of the suite, or a test; None: its tools are missing."""
     if "test" in fault:
         return fails(fault, folder), str(fault["test"])
     found = failures(fault, folder)
@@ -81,15 +82,18 @@ def caught(fault: dict[str, Any], folder: Path) -> tuple[bool, str]:
 def main() -> int:
     """Run the faults and print what failed for each."""
     wanted = sys.argv[1] if len(sys.argv) > 1 else ""
-    missed = 0
-    chosen = [fault for fault in FAULTS if wanted in fault["wrong"]]
-    for fault in chosen:
+    results = []
+    for fault in FAULTS:
+        if wanted not in fault["wrong"]:
+            continue
         with tempfile.TemporaryDirectory() as folder:
             found, what = caught(fault, Path(folder))
-        missed += not found
-        print(f"{'caught' if found else 'MISSED'}: {fault['wrong']}: {what}", flush=True)
-    print(f"{len(chosen) - missed} of {len(chosen)} planted faults were caught")
-    return int(missed > 0)
+        results.append(found)
+        print(f"{VERDICTS[found]}: {fault['wrong']}: {what}", flush=True)
+    tried = len(results) - results.count(None)
+    left_out = f"; {results.count(None)} left out, as their tools are missing" if None in results else ""
+    print(f"{results.count(True)} of {tried} planted faults were caught{left_out}")
+    return int(False in results)
 
 
 if __name__ == "__main__":

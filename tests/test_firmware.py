@@ -8,6 +8,7 @@ import json
 import math
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -142,6 +143,16 @@ def of(kind: type[T], messages: list[Message]) -> list[T]:
 def test_the_header_is_that_of_the_python_protocol() -> None:
     generate = load("generate")
     assert generate.HEADER.read_text() == generate.described()
+
+
+def test_the_figure_of_the_wires_shows_each_pin() -> None:
+    table = re.findall(r"#define PIN_(\w+) +(\d+)", (FIRMWARE / "pins.h").read_text(encoding="utf-8"))
+    figure = (Path(__file__).parents[1] / "docs/images/rig_wiring.svg").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[1] / "docs/how-to/build-a-rig.md").read_text(encoding="utf-8")
+    assert len(table) > 15
+    for name, number in table:
+        assert re.search(rf"GPIO{number}\b", figure), name
+        assert re.search(rf"^\| [^|]*\b(GPIO)?{number}\b", page, re.MULTILINE), name
 
 
 def test_frames_have_the_bytes_of_the_documentation(board: Callable[..., Any]) -> None:

@@ -28,7 +28,10 @@ pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
     ],
 )
 def test_a_planted_fault_is_caught(fault: dict[str, Any], tmp_path: Path) -> None:
-    assert PLANTED.caught(fault, tmp_path)[0]
+    found, what = PLANTED.caught(fault, tmp_path)
+    if found is None:
+        pytest.skip(f"{what} is skipped: tools of a port are missing")
+    assert found
 
 
 def test_the_suite_passes_the_core_without_a_fault(tmp_path: Path) -> None:

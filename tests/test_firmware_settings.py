@@ -1,6 +1,7 @@
 """The core's settings and their memory, its supply, and what it does without a host."""
 
 import ctypes
+import itertools
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,8 +16,10 @@ from amiwarp.live.link.protocol import (
     Ask,
     Condition,
     Identity,
+    Index,
     Message,
     RestoreSettings,
+    Samples,
     SaveSettings,
     SetSetting,
     SetSpeed,
@@ -24,6 +27,7 @@ from amiwarp.live.link.protocol import (
     Stop,
     encode,
 )  # fmt: skip
+from tests import test_firmware as base
 from tests.test_firmware import FAULT, FIRMWARE, Host, S, built, load, of
 
 pytestmark = [
@@ -433,3 +437,144 @@ def test_a_magnetic_encoder_can_get_another_ratio(board: Callable[..., Any]) -> 
     assert host.command(SaveSettings()) == 0
     reset(host)
     assert host.status.counts_per_turn == 32_768
+
+
+# The images for the RP2040 and the ATmega2560.
+
+
+images, chip, avr, image = base.images, base.chip, base.avr, base.image
+
+
+@pytest.fixture
+def chip_host(image: Callable[..., Any]) -> Host:
+    return rested(image())
+
+
+def saved(host: Host, seconds: float = 1.0) -> int:
+    """Save, and return the answer: an EEPROM of 64 bytes takes a fifth of a second."""
+    number = host.send(SaveSettings())
+    return next(m.refused for m in host.run(seconds) if isinstance(m, Answer) and m.sequence == number)
+
+
+def test_an_image_senses_its_supply_if_it_is_connected(chip_host: Host) -> None:
+    host = chip_host
+    who = asked(host, Identity)
+    assert who.board_name == ("RP2040" if type(host.board).__name__ == "SimulatedBoard" else "ATmega2560")
+    assert asked(host, Condition).supply_v is None
+    assert host.status.faults == 0
+    host.board.set("divider")
+    for volts in (12.0, 9.5, 14.5):
+        host.board.set("volts", volts)
+        reset(host)
+        assert asked(host, Condition).supply_v == pytest.approx(volts, rel=0.01)
+        assert host.status.faults == 0
+    host.board.set("volts", 12.0)
+    host.run(0.2)
+    assert host.command(SetSpeed(300.0, 4000.0)) == 0
+    host.run(0.4)
+    assert (host.status.state, host.status.faults) == (1, 0)
+    host.board.set("volts", 7.0)
+    host.run(0.1)
+    assert (host.status.faults, host.board.get("enable")) == (FAULT["undervoltage"], False)
+    assert asked(host, Condition).supply_v == pytest.approx(7.0, rel=0.02)
+    host.board.set("volts", 16.0)
+    assert host.command(Stop()) == 0
+    host.run(0.1)
+    assert host.status.faults == FAULT["overvoltage"]
+
+
+def test_an_image_that_starts_without_voltage_knows_it_when_it_comes(image: Callable[..., Any]) -> None:
+    host = Host(image())
+    host.board.set("divider")
+    host.board.set("volts", 0.0)
+    reset(host)
+    assert asked(host, Condition).supply_v == pytest.approx(0.0, abs=0.05)
+    host.board.set("volts", 12.0)
+    host.run(0.2)
+    assert asked(host, Condition).supply_v == pytest.approx(12.0, rel=0.01)
+
+
+def test_an_image_keeps_its_settings_without_power(chip_host: Host) -> None:
+    host, most = chip_host, 900
+    before = settings(host)
+    change(host, SAVED | {"most-rpm": most})
+    assert saved(host) == 0
+    reset(host)
+    assert settings(host) == before | SAVED | {"most-rpm": most}
+    assert asked(host, Condition).stored == 1
+    samples = of(Samples, host.run(0.3))  # and while it writes, it goes on with its samples
+    times = [t for m in samples for t in m.t_us]
+    assert max(b - a for a, b in itertools.pairwise(times)) < 1100
+    change(host, {"kp": 77})
+    number = host.send(SaveSettings())
+    during = host.run(0.6)
+    times = [t for m in of(Samples, during) for t in m.t_us]
+    assert max(b - a for a, b in itertools.pairwise(times)) < 1100
+    assert Answer(number, 0) in during
+    assert host.board.get("watchdogs") == 0
+
+
+def test_an_image_without_power_in_the_middle_of_a_save_has_the_old_settings(chip_host: Host) -> None:
+    host = chip_host
+    for kp in (1000, 2000):
+        change(host, {"kp": kp})
+        assert saved(host) == 0
+    found = []
+    for us in (2_000, 20_000, 44_000, 46_000, 60_000, 150_000, 400_000):
+        change(host, {"kp": 2000 + us})
+        host.send(SaveSettings())
+        host.board.advance(host.board.now + us)
+        reset(host)
+        old = found[-1] if found else 2000
+        kp = settings(host)["kp"]
+        assert asked(host, Condition).stored == 1
+        assert kp in (old, 2000 + us), us
+        found.append(kp)
+    assert found[0] == 2000
+    assert found[-1] == 402_000
+
+
+def test_an_image_says_that_its_memory_is_bad(chip: Callable[..., Any]) -> None:
+    host = rested(chip())
+    change(host, {"kp": 1000})
+    assert saved(host) == 0
+    host.board.set("bad_store")
+    change(host, {"kp": 2000})
+    assert saved(host) == 3
+    host.board.set("bad_store", 0)
+    reset(host)
+    assert settings(host)["kp"] == 1000
+
+
+def test_an_image_stops_its_motor_without_a_host(chip_host: Host) -> None:
+    host = chip_host
+    change(host, {"host-timeout": 1})
+    assert host.command(SetSpeed(300.0, 4000.0)) == 0
+    host.run(0.3)
+    assert host.status.state == 1
+    silent(host, 1.5)
+    assert (host.status.target_rpm, host.board.get("enable")) == (0.0, False)
+    assert host.status.faults == FAULT["stopped for lost host"]
+    assert asked(host, Condition).host_stops == 1
+
+
+def test_the_avr_takes_no_limit_of_speed_that_it_cannot_count(avr: Callable[..., Any]) -> None:
+    host = rested(avr())
+    assert host.command(SetSetting(KEY["most-rpm"], 1098)) == 0  # 74,957 edges per second
+    assert host.command(SetSetting(KEY["most-rpm"], 1099)) == 2
+    assert host.command(SetSetting(KEY["counts-per-turn"], 4100)) == 2
+    assert settings(host)["most-rpm"] == 1098
+
+
+def test_a_magnetic_image_gets_the_ratio_of_its_pulleys(chip: Callable[..., Any]) -> None:
+    """One that was built for a magnet on the prism, with a magnet that turns twice as fast: it then reads the index."""
+    host = rested(chip("MAGNETIC", "PULSES_TIMED", counts=32_768))
+    assert host.status.counts_per_turn == 16_384
+    change(host, {"counts-per-turn": 32_768})
+    assert host.command(SetSpeed(600.0, 5000.0)) == 0
+    host.run(0.8)
+    pulses = of(Index, host.messages)[1:]
+    assert len(pulses) > 3
+    assert all(abs(b.count - a.count - 32_768) < 10 for a, b in itertools.pairwise(pulses))
+    assert (host.status.state, host.status.faults) == (1, 0)
+    assert host.status.rpm == pytest.approx(600.0, abs=60.0)
