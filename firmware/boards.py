@@ -131,23 +131,26 @@ class SimulatedBoard:
     """The image for the RP2040 on rp2040js (needs Node.js and ``npm install`` in ``simulator``), in simulated time.
 
     ``image``: flash image (``.bin`` or ``.uf2``); ``counts_per_turn`` of the prism is that for which it was built.
-    Times are in us.
+    Times are in us. ``usb``: a host is connected to the chip's USB.
     """
 
     MHZ = 125
     plugged = True
 
-    def __init__(self, image: Path, *, magnetic: bool = False, counts_per_turn: int | None = None) -> None:
+    def __init__(
+        self, image: Path, *, magnetic: bool = False, counts_per_turn: int | None = None, usb: bool = False
+    ) -> None:
+        bus = "usb" if usb else "no-usb"
         kind, counts = "MAGNETIC" if magnetic else "QUADRATURE", counts_per_turn or COUNTS[magnetic]
         with flash_of(image) as flash:
-            self._start(flash, kind, counts)
+            self._start(flash, kind, counts, bus)
         self._inbox = b""
         self.now = 0
 
-    def _start(self, flash: Path, kind: str, counts: int) -> None:
+    def _start(self, flash: Path, kind: str, counts: int, bus: str) -> None:
         """Start the simulator, and wait until it has read the flash."""
         self._process = subprocess.Popen(
-            ["node", str(HERE / "simulator" / "board.mjs"), str(flash), kind, str(counts)],
+            ["node", str(HERE / "simulator" / "board.mjs"), str(flash), kind, str(counts), bus],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
         )  # fmt: skip
         self.get("resets")
@@ -180,6 +183,10 @@ class SimulatedBoard:
         """Return a value of the simulated board."""
         return json.loads(self._ask(f"get {name}"))
 
+    def usb(self, what: bytes | str = b"") -> bytes:
+        """Give bytes to the USB host's serial port, or ``open``, ``close`` or ``reset`` it; return what it received."""
+        return bytes.fromhex(self._ask(f"usb {what if isinstance(what, str) else what.hex()}"))
+
     def interrupts(self) -> dict[str, dict[str, int]]:
         """Return the longest run and the sum of the runs [cycles], by interrupt."""
         worst, busy = self.get("worst"), self.get("busy")
@@ -197,6 +204,25 @@ class SimulatedBoard:
     def close(self) -> None:
         """End the simulator."""
         self._process.communicate()
+
+
+class UsbBoard(SimulatedBoard):
+    """The image for the RP2040 on rp2040js, with the link over USB instead of the UART."""
+
+    def __init__(self, image: Path, *, magnetic: bool = False, counts_per_turn: int | None = None) -> None:
+        super().__init__(image, magnetic=magnetic, counts_per_turn=counts_per_turn, usb=True)
+        self._received = b""
+
+    def advance(self, now_us: int) -> bytes:
+        """Run until a simulated time and return the bytes that the host received."""
+        super().advance(now_us)
+        received, self._received = self._received + self.usb(), b""
+        return received
+
+    def feed(self, data: bytes, now_us: int) -> None:
+        """Give bytes to the host's serial port."""
+        if data:
+            self._received += self.usb(data)
 
 
 class AvrBoard(NativeBoard):
@@ -264,13 +290,14 @@ class SimulatedWire:
         return True
 
 
-def make(name: str, counts_per_turn: int | None = None) -> Any:
+def make(name: str, counts_per_turn: int | None = None, *, usb: bool = False) -> Any:
     """Return the board ``native``, ``native-magnetic``, or one for an image: .bin, .uf2 (RP2040), .elf, .hex (AVR)."""
     if name.startswith("native"):
         return NativeBoard(magnetic=name.endswith("magnetic"), counts_per_turn=counts_per_turn)
     if name.endswith((".elf", ".hex")):
         return AvrBoard(Path(name), counts_per_turn=counts_per_turn)
-    return SimulatedBoard(Path(name), magnetic="MAGNETIC" in name, counts_per_turn=counts_per_turn)
+    kind = UsbBoard if usb else SimulatedBoard
+    return kind(Path(name), magnetic="MAGNETIC" in name, counts_per_turn=counts_per_turn)
 
 
 def serve(board: Any, link: Path, seconds: float) -> None:
@@ -298,10 +325,11 @@ def main() -> int:
     options.add_argument("board", help="native, native-magnetic, or an image (.bin, .uf2: RP2040; .elf, .hex: AVR)")
     options.add_argument("--link", type=Path, help="symbolic link for the serial port")
     options.add_argument("--counts-per-turn", type=int, help="of the prism, for which the image was built")
+    options.add_argument("--usb", action="store_true", help="link over the RP2040's USB instead of its UART")
     options.add_argument("--seconds", type=float, default=3600.0)
     options.add_argument("--rpm", type=float, default=240.0)
     chosen = options.parse_args()
-    board = make(chosen.board, chosen.counts_per_turn)
+    board = make(chosen.board, chosen.counts_per_turn, usb=chosen.usb)
     if chosen.link is not None:
         serve(board, chosen.link, chosen.seconds)
         return 0

@@ -520,7 +520,7 @@ def test_an_image_without_power_in_the_middle_of_a_save_has_the_old_settings(chi
         change(host, {"kp": kp})
         assert saved(host) == 0
     found = []
-    for us in (2_000, 20_000, 44_000, 46_000, 60_000, 150_000, 400_000):
+    for us in (2_000, 20_000, 150_000, 299_000, 301_500, 310_000, 400_000):
         change(host, {"kp": 2000 + us})
         host.send(SaveSettings())
         host.board.advance(host.board.now + us)

@@ -3,6 +3,7 @@
 #include "controller.h"
 #include "flash.h"
 #include "registers.h"
+#include "usb.h"
 
 #ifndef ENCODER
 #define ENCODER QUADRATURE /* or MAGNETIC */
@@ -52,6 +53,9 @@ enum { ANALOG = 0x80, ANALOG_PULL_UP = 0x88 };            /* neither input nor o
 
 static struct controller c;
 static uint32_t next_tick;
+
+/* The link is the UART or USB, whichever brings the first valid frame; the other one is not heard until the next reset. */
+static volatile enum { LINK_UNKNOWN, LINK_UART, LINK_USB } chosen_link, latest_link;
 
 /* Interrupts. Edges have the highest priority, so that their times are exact; the tick comes next. */
 
@@ -116,7 +120,12 @@ void tick_interrupt(void) {
 }
 
 void uart_interrupt(void) {
-    while (!(REG(UART0 + 0x18u) & 0x10u)) on_byte(&c, (uint8_t)REG(UART0));
+    while (!(REG(UART0 + 0x18u) & 0x10u)) {
+        uint8_t byte = (uint8_t)REG(UART0);
+        if (chosen_link == LINK_USB) continue;
+        latest_link = LINK_UART;
+        on_byte(&c, byte);
+    }
     REG(UART0 + 0x44u) = 0x50u;
 }
 
@@ -235,6 +244,28 @@ static void save(void) {
     if (c.saving && flash_write(c.slot, c.record, &good)) controller_saved(&c, good, REG(TIMERAWL));
 }
 
+void on_usb_byte(uint8_t byte) {
+    if (chosen_link == LINK_UART) return;
+    __asm__ volatile("cpsid i" ::: "memory"); /* the UART's interrupt writes to the same ring, until the link is chosen */
+    latest_link = LINK_USB;
+    on_byte(&c, byte);
+    __asm__ volatile("cpsie i" ::: "memory");
+}
+
+/* Send what waits; until the link is chosen to both, so that a host on either one hears the controller. Returns whether
+   bytes are left. */
+static bool send_waiting(void) {
+    bool open = usb_is_open();
+    for (;;) {
+        bool fits = chosen_link == LINK_USB ? !open || usb_has_room() : !(REG(UART0 + 0x18u) & 0x20u);
+        if (!fits) return true;
+        int byte = controller_take(&c);
+        if (byte < 0) return false;
+        if (chosen_link != LINK_USB) REG(UART0) = (uint32_t)byte;
+        if (chosen_link != LINK_UART && open) usb_put((uint8_t)byte);
+    }
+}
+
 int main(void) {
     start_clocks();
     start_peripherals();
@@ -243,6 +274,7 @@ int main(void) {
     controller_begin(&c, &settings, REG(TIMERAWL));
     load();
     begin_supply();
+    usb_begin();
     uint32_t in = REG(GPIO_IN), ticks = 0;
     c.levels = (uint8_t)((in >> (PIN_A - 1) & 2u) | (in >> PIN_B & 1u));
     REG(IO_INTE0) = (ENCODER == QUADRATURE ? EDGE_LOW(PIN_A) | EDGE_HIGH(PIN_A) | EDGE_LOW(PIN_B) | EDGE_HIGH(PIN_B) : 0u)
@@ -262,16 +294,17 @@ int main(void) {
         c.driver_fault = !(now & BIT(PIN_DRIVER_FAULT));
         c.supply_low = !(now & BIT(PIN_SUPPLY));
         read_supply();
+        usb_poll(RX_BYTES - WAITING(c.rx));
         controller_poll(&c, REG(TIMERAWL));
+        if (chosen_link == LINK_UNKNOWN && c.decoder.frames) chosen_link = latest_link;
         save();
         drive();
-        int byte = 0;
-        while (!(REG(UART0 + 0x18u) & 0x20u) && (byte = controller_take(&c)) >= 0) REG(UART0) = (uint32_t)byte;
+        bool left = send_waiting();
         if (c.ticks != ticks) { /* both the timer's interrupt and this loop run */
             ticks = c.ticks;
             REG(WATCHDOG + 0x04u) = WATCHDOG_TICKS;
         }
-        while (byte < 0 && c.ticks == ticks && c.rx.head == c.rx.tail) __asm__ volatile("wfi"); /* edges wake it, too */
+        while (!left && c.ticks == ticks && c.rx.head == c.rx.tail) __asm__ volatile("wfi"); /* edges wake it, too */
     }
 }
 

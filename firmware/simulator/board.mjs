@@ -2,12 +2,14 @@
 //
 // Lines on standard input: "run UNTIL_US HEX" gives bytes to the UART and runs; the answer is "NOW_US HEX", the time
 // and the bytes sent. "set NAME VALUE" switches a fault, "get NAME" reads a value, "reset" resets the chip, "hang WHERE"
-// lets the program hang until a reset.
+// lets the program hang until a reset. "usb HEX" gives bytes to the serial port of the simulated USB host (usb.mjs), "usb" reads
+// from it, "usb open" and "usb close" open and close it. Without the argument "usb", no host is connected.
 import { readFileSync } from 'node:fs';
 import { createInterface } from 'node:readline';
 import { RP2040 } from 'rp2040js';
+import { UsbHost } from './usb.mjs';
 
-const [path, kind, counts] = process.argv.slice(2);
+const [path, kind, counts, bus] = process.argv.slice(2);
 const image = readFileSync(path);
 const magnetic = kind === 'MAGNETIC';
 const STEP_NS = 50_000, TAU = 2 * Math.PI, BYTE_NS = 10e9 / 460_800;
@@ -17,6 +19,7 @@ const faults = {
   jammed: 0, driver_fault: 0, no_index: 0, dead_a: 0, reversed_motor: 0, bad_spi: 0, runaway: 0, dead_encoder: 0,
   no_magnet: 0, error_flag: 0, bouncing_index: 0, no_supply: 0, sensed: 0, volts: 12, divider: 0, bad_store: 0,
 };
+const ERASE_US = 300_000;  // data sheets: 45 ms as a rule, 400 ms at most
 const UPPER_OHM = 47_000, LOWER_OHM = 10_000, PULL_UP_OHM = 60_000;
 
 // A serial flash of 2 MB: it outlives resets. A reset in the middle of an erase or a write leaves half of it done.
@@ -53,7 +56,7 @@ function endOfCommand() {  // the flash is released: commands that change it beg
   if (!writeEnabled || flashSent.length < 4) return;
   if (command === 0x20) {
     const sector = at & ~0xfff;
-    busyFor(45_000, () => flash.fill(0xff, sector, sector + 0x800), () => flash.fill(0xff, sector, sector + 0x1000));
+    busyFor(ERASE_US, () => flash.fill(0xff, sector, sector + 0x800), () => flash.fill(0xff, sector, sector + 0x1000));
   } else if (command === 0x02) {
     const write = (from, to) => {
       for (let k = from; k < to; k++) {
@@ -99,6 +102,7 @@ function supplyAtPin() {  // of the ADC, as a part of its 3.3 V
   return Math.min(1, (pin + (pulled ? ((3.3 - pin) * impedance) / (impedance + PULL_UP_OHM) : 0)) / 3.3);
 }
 
+let host = null, usbOut = [];
 let mcu, clock, cycleNs = 8, out = [], inbox = [], arrivesNs = 0, resets = 0, watchdogs = 0;
 let turns = 0.3, rpm = 0, position = Math.floor(turns * perTurn), inPulse = false, random = 1;
 let unseen = 0;  // counts that a dead encoder has missed
@@ -126,6 +130,10 @@ function boot() {
   mcu.core.PC = 0x10000000;  // the ROM calls the boot stage
   mcu.uart[0].onByte = (byte) => out.push(byte);
   mcu.pwm.channels[4].updateEnable = () => {};  // the duty is read from its register; its edges would take half the time
+  if (bus === 'usb') {
+    const after = (ms, action) => clock.createAlarm(action).schedule(ms * 1e6);
+    host = new UsbHost(mcu.usbCtrl, mcu.usbDPRAM, after, (buffer) => usbOut.push(...buffer));
+  }
   let answer = 0, errorFlag = false, selectedNs = 0, releasedNs = -1e9;
   mcu.gpio[PIN.cs].addListener((value) => {
     if (value !== 0) releasedNs = now();
@@ -305,9 +313,16 @@ for await (const line of createInterface({ input: process.stdin })) {
       trigger_end_us: triggerEndNs.map((t) => t / 1000), spi_ns: spiNs,
       worst, busy, resets, watchdogs, fed, cycles: mcu.core.cycles, boot_us: offset / 1000,
       enable: mcu.gpio[PIN.enable].value === 1, enabled_us: enabledNs.map((t) => t / 1000),
+      usb: host && { ...host.found, problems: host.problems, open: host.open },
       watchdog_resets: mcu.peripherals[0x40010].wdsel,
     };
     process.stdout.write(`${JSON.stringify(values[rest[0]])}\n`);
+  } else if (what === 'usb') {
+    if (rest[0] === 'open' || rest[0] === 'close') host.setOpen(rest[0] === 'open');
+    else if (rest[0] === 'reset') host.reset();
+    else if (rest[0]) host.feed(Buffer.from(rest[0], 'hex'));
+    process.stdout.write(`${Buffer.from(usbOut).toString('hex')}\n`);
+    usbOut = [];
   } else if (what === 'reset' || what === 'hang') {
     if (what === 'reset') boot();
     else hang(rest[0]);
