@@ -120,12 +120,12 @@ void tick_interrupt(void) {
 }
 
 void uart_interrupt(void) {
+    bool heard = chosen_link != LINK_USB;
     while (!(REG(UART0 + 0x18u) & 0x10u)) {
         uint8_t byte = (uint8_t)REG(UART0);
-        if (chosen_link == LINK_USB) continue;
-        latest_link = LINK_UART;
-        on_byte(&c, byte);
+        if (heard) on_byte(&c, byte);
     }
+    if (heard) latest_link = LINK_UART;
     REG(UART0 + 0x44u) = 0x50u;
 }
 
