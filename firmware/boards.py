@@ -48,7 +48,9 @@ FAULTS = (
     "bad_store",
 )
 """Faults of the simulated motor and encoder, explained by ``enum value`` in ``native/motor.h``, in its order."""
-MOTOR = (*FAULTS, "angle", "rpm")
+PHYSICS = ("no_load_rpm", "rise_s", "cogging", "cogs", "friction", "most_pull", "noise", "inl")
+"""What the simulated motor and encoder are, after :data:`FAULTS` in ``enum value``."""
+MOTOR = (*FAULTS, *PHYSICS, "angle", "rpm")
 
 
 @contextlib.contextmanager

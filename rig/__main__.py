@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 import amiwarp
-from rig import files, limits, numbers, parts
+from rig import drive, files, gimbal, limits, numbers, parts
+from rig.gimbal import GimbalRig
 from rig.numbers import OVERSPEED, SPEEDS, Tolerance, View
 from rig.parts import Part, Rig
 
@@ -172,7 +173,7 @@ def checked(rig: Rig, view: View | None = None, rpm: float = max(SPEEDS)) -> Seq
     """Return the rig's parts, or end with what is wrong with them."""
     if refused := limits.refusals(rig, view, rpm):
         sys.exit("\n".join(f"{rig.name}: {line}" for line in refused))
-    made = parts.assembly(rig)
+    made = numbers.assembly(rig)
     wrong = parts.problems(rig, made)
     wrong += [f"{part.name} is not watertight" for part in made if not numbers.in_file(part).is_watertight]
     if wrong:
@@ -262,7 +263,7 @@ def arguments_of(given: Sequence[str] | None) -> argparse.Namespace:
     """Return the parsed command line."""
     parser = argparse.ArgumentParser(prog="python -m rig", description=__doc__)
     parser.add_argument("out", type=Path, help="folder for the files")
-    parser.add_argument("--rig", choices=[rig.name for rig in parts.RIGS], help="only this rig")
+    parser.add_argument("--rig", choices=[rig.name for rig in gimbal.KINDS], help="only this rig")
     parser.add_argument("--pictures", action="store_true", help="write drawing and pictures, too")
     parser.add_argument(
         "--format", nargs="+", choices=("stl", "3mf", "step"), default=["stl"], help="formats of the parts; default stl"
@@ -274,7 +275,7 @@ def arguments_of(given: Sequence[str] | None) -> argparse.Namespace:
         group.add_argument(name, type=float, help=text, **count)
 
     wedge = parser.add_argument_group("wedge")
-    sizes(wedge, "--wedge-mm", "diameter [mm]; default: 25.4 for one-inch, 50.8 for two-inch", "DIAMETER")
+    sizes(wedge, "--wedge-mm", "diameter [mm]; default: 25.4 for one-inch, 50.8 for the others", "DIAMETER")
     sizes(wedge, "--thickness-mm", "thickness on the axis [mm]", "THICKNESS")
     sizes(wedge, "--apex-deg", "apex angle [deg]; default 1", "ANGLE")
     sizes(wedge, "--edges-mm", "thin and thick edge [mm], instead of thickness and apex", "THIN", "THICK")
@@ -298,6 +299,15 @@ def arguments_of(given: Sequence[str] | None) -> argparse.Namespace:
     sizes(motor, "--motor-screws-mm", "distance of its two M3 threads, and its boss [mm]", "DISTANCE", "BOSS")
     motor.add_argument("--teeth", type=int, nargs=2, metavar=("ROTOR", "MOTOR"), help="teeth of both pulleys")
     sizes(motor, "--belt-mm", "length of the belt [mm]", "LENGTH")
+    hollow = parser.add_argument_group("hollow-shaft motor, with --rig gimbal")
+    sizes(hollow, "--hollow-mm", "outer diameter, height and bore [mm]", "OUTER", "HEIGHT", "BORE")
+    sizes(hollow, "--hollow-screws-mm", "circles of its 4 × M3 threads, rear and front [mm]", "STATOR", "ROTOR")
+    sizes(hollow, "--kv", "speed without load for each volt [turns/min/V]", "KV")
+    sizes(hollow, "--resistance-ohm", "between two wires [Ω]", "OHM")
+    sizes(hollow, "--current-a", "current limit of its driver [A]", "AMPERE")
+    sizes(hollow, "--cogging-mnm", "amplitude of its cogging [mN m]", "TORQUE")
+    sizes(hollow, "--friction-mnm", "friction of its bearings and the encoder's belt [mN m]", "TORQUE")
+    hollow.add_argument("--slots-poles", type=int, nargs=2, metavar=("SLOTS", "POLES"), help="of its stator and bell")
     return parser.parse_args(given)
 
 
@@ -318,7 +328,7 @@ def wedge_of(rig: Rig, given: argparse.Namespace) -> Rig:
     own = replace(rig, thickness=thickness, apex_deg=apex)
     if not (math.isfinite(diameter) and diameter > 0.0):
         sys.exit(f"--wedge-mm {diameter:g}: give a number above 0")
-    if refused := list(limits.bearings(replace(own, wedge=diameter))):
+    if not isinstance(rig, GimbalRig) and (refused := list(limits.bearings(replace(own, wedge=diameter)))):
         sys.exit(f"{rig.name}: " + refused[0])
     return parts.for_wedge(own, diameter, teeth=teeth, belt=given.belt_mm)
 
@@ -351,7 +361,37 @@ def rig_of(rig: Rig, given: argparse.Namespace) -> Rig:
         motor=tuple(given.motor_mm or rig.motor),
         motor_screws=tuple(given.motor_screws_mm or rig.motor_screws),
     )
+    hollow = hollow_of(given)
+    if isinstance(own, GimbalRig):
+        if given.motor_mm or given.motor_screws_mm:
+            sys.exit(
+                "--motor-mm, --motor-screws-mm: the gimbal has no such motor; give --hollow-mm, --hollow-screws-mm"
+            )
+        own = replace(own, hollow=replace(own.hollow, **hollow))
+    elif hollow and given.rig is not None:
+        sys.exit(f"--rig {given.rig}: options of the hollow-shaft motor belong to --rig gimbal")
     return wedge_of(optics_of(own, given), given)
+
+
+def hollow_of(given: argparse.Namespace) -> dict[str, float | int]:
+    """Return the fields of the hollow-shaft motor that the command line gives."""
+    fields: dict[str, float | int] = {}
+    if given.hollow_mm:
+        fields |= dict(zip(("outer", "height", "bore"), given.hollow_mm, strict=True))
+    if given.hollow_screws_mm:
+        fields |= dict(zip(("stator_circle", "rotor_circle"), given.hollow_screws_mm, strict=True))
+    if given.slots_poles:
+        fields |= dict(zip(("slots", "poles"), given.slots_poles, strict=True))
+    for name, value in (
+        ("kv", given.kv),
+        ("resistance", given.resistance_ohm),
+        ("current", given.current_a),
+        ("cogging", given.cogging_mnm),
+        ("friction", given.friction_mnm),
+    ):
+        if value is not None:
+            fields[name] = value
+    return fields
 
 
 def view_of(given: argparse.Namespace) -> View | None:
@@ -402,7 +442,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = arguments_of(arguments)
     view = view_of(given)
     rpm = max(SPEEDS) if given.rpm is None else given.rpm
-    for rig in parts.RIGS:
+    for rig in gimbal.KINDS:
         if given.rig not in (None, rig.name):
             continue
         own = rig_of(rig, given)
@@ -413,7 +453,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for part in printed:
             write_part(part, folder, given.format)
         print(f"{folder}: {len(printed)} parts to print, all watertight, none overlaps; {', '.join(given.format)}")
-        for line in (*said(own, given), view_text(own, view), balance_text(own)):
+        lines = [*said(own, given), view_text(own, view), balance_text(own)]
+        if isinstance(own, GimbalRig):
+            lines += drive.text(drive.drive_of(own))
+        for line in lines:
             print(line)
         if given.pictures:
             from rig import drawings

@@ -1,14 +1,15 @@
 """Drawings and pictures of the rig."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
-from rig import parts
+from rig import gimbal, parts
+from rig.gimbal import GimbalRig
 from rig.numbers import to_mesh
 from rig.parts import Part, Rig
 
@@ -38,6 +39,12 @@ COLOURS = {
     "O-ring": "#1a1a1a",
     "lens": "#56657a",
     "wave spring": "#7a8fb0",
+    "stator": "#7a5c3e",
+    "bell": "#a07850",
+    "cell": "#e0a04c",
+    "encoder block": "#8fb0cc",
+    "encoder shaft": "#7f858f",
+    "encoder pulley": "#e0a04c",
 }
 """Colour of each part in all pictures."""
 SCREWS = "#3f3f3f"
@@ -105,8 +112,13 @@ def drawing(rig: Rig, made: Sequence[Part], out: Path) -> None:
     import matplotlib.pyplot as plt
 
     solids = {part.name: part.solid for part in made}
-    figure, rows = plt.subplots(3, 3, figsize=(24, 19), layout="constrained")
-    sheets = (whole, housing, holder, rotor, cover, base, rings, plate, bearing_cap)
+    sheets: tuple[Callable[..., None], ...]
+    if isinstance(rig, GimbalRig):
+        figure, rows = plt.subplots(2, 3, figsize=(24, 13), layout="constrained")
+        sheets = (whole, gimbal_housing, holder, cell, cover, base)
+    else:
+        figure, rows = plt.subplots(3, 3, figsize=(24, 19), layout="constrained")
+        sheets = (whole, housing, holder, rotor, cover, base, rings, plate, bearing_cap)
     for axes, draw in zip(rows.flat, sheets, strict=True):
         draw(axes, rig, solids)
         axes.set_aspect("equal")
@@ -169,6 +181,51 @@ def holder(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     spigot = rig.centring - 0.05
     dimension(axes, (shift + 1.5, -spigot), (shift + 1.5, spigot), f"spigot ⌀ {number(2 * spigot)}", 7)
     dimension(axes, (rear + shift, -at), (rear + shift, at), f"⌀ {number(2 * at)}", -6)
+
+
+def gimbal_housing(axes: Any, rig: GimbalRig, solids: dict[str, Manifold]) -> None:
+    """Draw the housing of the hollow-shaft motor from the camera, through the wall that carries the motor."""
+    solid = solids["housing"]
+    fill(axes, solid.slice(rig.face_z - 0.5).mirror((1, 0)), COLOURS["housing"], 0.25)
+    fill(axes, solid.slice(2.5).mirror((1, 0)), COLOURS["housing"])
+    motor, bore = rig.hollow, 2 * (rig.barrel)
+    axes.set_title(f"housing, from the camera; wall {number(parts.PLATE)}, bore for the bell ⌀ {number(bore)}")
+    dimension(axes, (-rig.centring, 0), (rig.centring, 0), f"⌀ {number(2 * rig.centring)}")
+    half = motor.stator_circle / 2
+    dimension(axes, (-half, 0), (half, 0), f"4 × M3 countersunk on ⌀ {number(2 * half)}, at 45°", half + 6)
+    dimension(axes, (-rig.distance, 0), (0, 0), number(rig.distance) + " (slot ± 3)", rig.outline + 6)
+    dimension(axes, (0, -rig.height), (0, 0), number(rig.height), rig.outline + 8)
+    low, high = parts.plate_screws(rig)
+    at = -low[0]
+    side = rig.distance + 26 - low[0]
+    dimension(axes, (at, low[1]), (at, high[1]), f"{number(high[1] - low[1])}, 2 × M3 for the encoder block", -side)
+
+
+def cell(axes: Any, rig: GimbalRig, solids: dict[str, Manifold]) -> None:
+    """Draw the cuts through cell and encoder block."""
+    for name in ("cell", "bell", "stator", "wedge", "wedge ring", "screws of the cell"):
+        fill(axes, section(solids[name]), COLOURS.get(name, SCREWS))
+    block = section(solids["encoder block"]).translate((0.0, 12.0))
+    fill(axes, block, COLOURS["encoder block"])
+    motor, front = rig.hollow, rig.front_z
+    axes.set_title(f"cell on the motor, wedge ({number(rig.apex_deg)}°), wedge ring; encoder block (above)")
+    items = [
+        (rig.clear, rig.shoulder_z + 1, number(2 * rig.clear)),
+        (motor.rotor_circle / 2, rig.shoulder_z + 1, f"{number(motor.rotor_circle)}, 4 × M3"),
+        (rig.wedge / 2 + rig.seat, rig.seat_z + 2, number(rig.wedge + 2 * rig.seat)),
+        (rig.pulley_flange, front, number(2 * rig.pulley_flange)),
+    ]
+    diameters(axes, items, front + 8)
+    y = -rig.flag
+    dimension(axes, (rig.shoulder_z, y), (front, y), number(front - rig.shoulder_z), -5)
+    dimension(axes, (rig.seat_z, y), (front, y), number(front - rig.seat_z), -12)
+    dimension(axes, (parts.PLATE, y), (rig.shoulder_z, y), f"motor {number(motor.height)}", -5)
+    rear, high = gimbal.block_z(rig)
+    top = rig.distance + 12.0 + gimbal.TUBE
+    dimension(axes, (rear, top), (high, top), number(high - rear), 5)
+    wide = gimbal.SMALL[1] + 0.05
+    middle = rig.distance + 12.0
+    dimension(axes, (rear, middle - wide / 2), (rear, middle + wide / 2), f"2 × ⌀ {number(wide)}", -6)
 
 
 def rotor(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:

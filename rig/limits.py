@@ -9,7 +9,9 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from rig import numbers, parts
+from rig import gimbal, numbers, parts
+from rig.drive import SUPPLY, Drive
+from rig.gimbal import GimbalRig
 from rig.numbers import View
 from rig.parts import BEARINGS, HEADS, LEAST_WALL, SLIDE, Rig
 
@@ -37,7 +39,8 @@ def refusals(rig: Rig, view: View | None = None, rpm: float = max(numbers.SPEEDS
     rpm : float
         Fastest speed of the prism [turns/min], at which it must be balanced.
     """
-    for check in (sizes(rig), bearings(rig), glass(rig), rotor(rig), motor(rig), camera(rig), lens(rig)):
+    drive = (hollow(rig, rpm),) if isinstance(rig, GimbalRig) else (bearings(rig), motor(rig))
+    for check in (sizes(rig), *drive, glass(rig), rotor(rig), camera(rig), lens(rig)):
         # Later checks take for granted what earlier ones have found.
         if found := list(check):
             return found
@@ -85,7 +88,7 @@ def glass(rig: Rig) -> Iterator[str]:
             f"{rig.thin_edge:.2f} mm, and {LEAST_EDGE:g} mm are needed; give {least:.1f} or more on the "
             "axis, or a smaller apex"
         )
-    if rig.edge > (thickest := parts.thickest_edge(rig)) + 1e-9:
+    if rig.edge > (thickest := rig.thickest_edge) + 1e-9:
         slope = rig.edge - rig.thickness
         yield (
             f"--thickness-mm {rig.thickness:g}: the thick edge of {rig.edge:.2f} mm leaves the rotor no shoulder "
@@ -168,6 +171,62 @@ def motor(rig: Rig) -> Iterator[str]:
         )
 
 
+def hollow(rig: GimbalRig, rpm: float) -> Iterator[str]:
+    """Refuse hollow-shaft motors whose screws do not fit beside bore and wedge, that are too wide, or too slow."""
+    own = rig.hollow
+    for option, values in (
+        ("--hollow-mm", (own.outer, own.height, own.bore)),
+        ("--hollow-screws-mm", (own.stator_circle, own.rotor_circle)),
+        ("--kv", (own.kv,)),
+        ("--resistance-ohm", (own.resistance,)),
+        ("--current-a", (own.current,)),
+    ):
+        for value in values:
+            if not (math.isfinite(value) and value > 0.0):
+                yield f"{option} {value:g}: give a number above 0"
+                return
+    sunk = gimbal.SUNK + LEAST_WALL
+    inner, outer = own.bore + 2.0 * sunk, own.outer - 14.0
+    if not inner - 1e-9 <= own.stator_circle <= outer + 1e-9:
+        yield (
+            f"--hollow-screws-mm, stator {own.stator_circle:g}: beside a bore of {own.bore:g} mm and within the motor "
+            f"of {own.outer:g} mm, the housing's screws need a circle of {inner:.1f} to {outer:.1f}; give one of them"
+        )
+    head = HEADS[3.0][0] / 2 + 0.15
+    widest = rig.wedge + 2.0 * (rig.seat - head)
+    least = own.bore + 3.0 + 2.0 * LEAST_WALL
+    if not least - 1e-9 <= own.rotor_circle <= widest + 1e-9:
+        yield (
+            f"--hollow-screws-mm, rotor {own.rotor_circle:g}: the heads of the cell's screws must lie under the wedge "
+            f"of {rig.wedge:g} mm, and beside the bore of {own.bore:g} mm; give {least:.1f} to {widest:.1f}, or "
+            "another wedge"
+        )
+    if beside_motor(rig) < 0.0:
+        widest = largest(lambda size: replace(rig, hollow=replace(own, outer=size)), own.outer)
+        yield (
+            f"--hollow-mm, outer diameter {own.outer:g}: the motor's housing or the index flag touches the encoder "
+            f"shaft; give at most {widest:.1f}, or a belt longer than {rig.belt:g} mm (--belt-mm)"
+        )
+    slim = 2.0 * (own.bore / 2 - 2.0 - LEAST_WALL - 1.0)
+    if rig.lens > slim + 1e-9:
+        yield (
+            f"--lens-mm, diameter {rig.lens:g}: the bore of {own.bore:g} mm (--hollow-mm) is too narrow for it and the "
+            f"holder's spigot; give at most {slim:.1f}, or a wider bore"
+        )
+    if own.friction < 0.0 or own.cogging < 0.0 or own.slots < 1 or own.poles < 2:
+        yield "--friction-mnm, --cogging-mnm, --slots-poles: give numbers that are not negative"
+        return
+    engine = Drive(own, 1.0)  # its speed does not depend on the inertia
+    if engine.fastest < rpm:
+        yield (
+            f"--rpm {rpm:g}: with --kv {own.kv:g}, {SUPPLY:g} V and its friction, the motor reaches "
+            f"{engine.fastest:.0f} rpm; give at most that, or --kv {math.ceil(own.kv * rpm / engine.fastest * 1.05):d}"
+            if engine.fastest
+            else f"--current-a {own.current:g}: {1e3 * engine.torque:.0f} mN m do not overcome the friction of "
+            f"{own.friction:g} mN m (--friction-mnm); give {own.friction * 1e-3 / engine.constant * 1.5:.1f} or more"
+        )
+
+
 STILL = 0.3
 """Smallest gap between two parts that do not turn."""
 
@@ -175,7 +234,8 @@ STILL = 0.3
 def beside_motor(rig: Rig) -> float:
     """Return the smallest gap between motor with its plate and what stands beside it, less :data:`STILL`.
 
-    The motor is where it slackens the belt. Holder and housing are hulls of circles: barrel, and eyes of the screws.
+    The motor is where it slackens the belt. Its pulley must also stay away from the index flag. Holder and housing are
+    hulls of circles: barrel, and eyes of the screws.
     """
     x = parts.holder_screws(rig)[0][0]
     at = rig.distance - SLIDE
@@ -187,6 +247,7 @@ def beside_motor(rig: Rig) -> float:
         at - body - parts.clamp_radius(rig),
         numbers.to_hull(eye, (barrel, (x, x, 3.2))) - 4.5,
         at - body - rig.camera[0] / 2,
+        at - rig.pitch(rig.teeth[1]) - 1.2 - rig.flag - rig.clearance + STILL,
     )
     return min(gaps) - STILL
 

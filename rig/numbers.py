@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import amiwarp
-from rig import parts
+from rig import gimbal, parts
 from rig.parts import GLASS, PETG, STEEL, Part, Rig
 
 SPEEDS = (720.0, 1440.0)
@@ -79,16 +79,26 @@ def in_file(part: Part):
     return trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, process=True)
 
 
+def assembly(rig: Rig) -> tuple[Part, ...]:
+    """Return all parts of a rig with a belt or with a hollow-shaft motor."""
+    return gimbal.assembly(rig) if isinstance(rig, gimbal.GimbalRig) else parts.assembly(rig)
+
+
 @lru_cache(maxsize=4)
 def bodies(rig: Rig) -> tuple[Body, ...]:
     """Return the mass properties of all parts."""
-    return tuple(Body.of(part) for part in parts.assembly(rig))
+    return tuple(Body.of(part) for part in assembly(rig))
 
 
 def rotating(rig: Rig) -> Body:
-    """Return the body that turns: printed parts, wedge, screws of the rings, and the inner half of the bearings."""
-    turning = [body for part, body in zip(parts.assembly(rig), bodies(rig), strict=True) if part.moves == "prism"]
-    rings = [point(rig.bearing.mass * 0.45, 0.0, 0.0, z + rig.bearing.width / 2) for z in rig.bearing_z]
+    """Return the body that turns: printed parts, wedge, screws of the rings, and the inner half of the bearings.
+
+    With a hollow-shaft motor it is its bell instead of bearings.
+    """
+    turning = [body for part, body in zip(assembly(rig), bodies(rig), strict=True) if part.moves == "prism"]
+    rings = []
+    if not isinstance(rig, gimbal.GimbalRig):
+        rings = [point(rig.bearing.mass * 0.45, 0.0, 0.0, z + rig.bearing.width / 2) for z in rig.bearing_z]
     total = turning[0]
     for body in (*turning[1:], *rings):
         total = total + body

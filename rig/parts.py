@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import numpy as np
 from manifold3d import CrossSection, Manifold, OpType
 
 ADD = OpType.Add
@@ -35,6 +36,8 @@ CORD, SQUEEZED = 1.0, 0.75
 HEADS = {2.0: (3.8, 2.0, 1.6), 2.5: (4.5, 2.5, 2.05), 3.0: (5.5, 3.0, 2.5), 4.0: (7.0, 4.0, 3.3)}
 """Screws by thread [mm]: diameter and height of a cylinder head (ISO 4762), and core hole. Countersunk heads (ISO 7046)
 have the same diameter to within 0.3 mm."""
+LEAST_WALL = 1.2
+"""Thinnest printed wall: three lines of a nozzle of 0.4 mm [mm]."""
 ROUNDED = 2e-3
 """How far the surfaces of printed parts may be moved when short edges are removed [mm]."""
 FORK_WIDTH, FORK_DEPTH, FORK_SLOT, FORK_SLOT_DEPTH, FORK_LENGTH = 14.0, 10.0, 5.0, 7.0, 6.0
@@ -175,6 +178,16 @@ class Rig:
         return self.wedge / 2 - self.lip
 
     @property
+    def front_clear(self) -> float:
+        """Radius of the clear aperture in front of the wedge."""
+        return self.wedge / 2 - self.lip
+
+    @property
+    def thickest_edge(self) -> float:
+        """Largest thick edge of a wedge: behind its seat, a wall remains before the rear ring's threads."""
+        return self.front_z - 1.3 - (self.bearing_z[0] + 8.0 + LEAST_WALL)
+
+    @property
     def edge(self) -> float:
         """Thickness of the wedge at its thick edge."""
         return self.thickness + self.wedge / 2 * math.tan(math.radians(self.apex_deg))
@@ -284,8 +297,8 @@ class Rig:
         return (
             ("seat's lip", self.seat_z, self.clear),
             ("O-ring", self.front_z, self.o_ring),
-            ("wedge's ring", self.front_z, self.clear),
-            ("wedge's ring", self.front_z + 2.0, self.clear),
+            ("wedge's ring", self.front_z, self.front_clear),
+            ("wedge's ring", self.front_z + 2.0, self.front_clear),
             ("cover", self.cover_z, opening),
             ("cover", self.cover_z + 2.0, opening + 2.0),
         )
@@ -293,7 +306,7 @@ class Rig:
     @property
     def opening(self) -> float:
         """Radius of the cover's opening on its inner side: it lets pass what the wedge's ring lets pass."""
-        return self.clear + 1.0 * (self.cover_z - self.front_z)
+        return self.front_clear + 1.0 * (self.cover_z - self.front_z)
 
 
 ONE_INCH = Rig(
@@ -451,7 +464,7 @@ def screws(
 def sinks(points: Iterable[tuple[float, float]], size: float, z: float, *, rear: bool = False) -> Manifold:
     """Return countersinks of 90° in a face at z that looks to the front or to the rear, to subtract."""
     top = HEADS[size][0] / 2 + 0.15
-    one = Manifold.cylinder(top, 0.0, top, 32).translate((0, 0, -top)) + rod(top, -0.001, 0.5, sides=32)
+    one = Manifold.cylinder(top + 0.5, 0.0, top + 0.5, 32).translate((0, 0, -top))  # beyond the face, there is nothing
     if rear:
         one = one.rotate((180, 0, 0))
     return Manifold.batch_boolean([one.translate((x, y, z)) for x, y in points], ADD)
@@ -482,10 +495,6 @@ BALANCE_STEP = 15.0
 """Angle between neighbouring set screws [deg]."""
 
 
-LEAST_WALL = 1.2
-"""Thinnest printed wall: three lines of a nozzle of 0.4 mm [mm]."""
-
-
 def least_teeth(wedge: float, seat: float, hole: float) -> int:
     """Return the smallest even number of teeth of a rotor's pulley that leaves walls beside and between the screws.
 
@@ -505,11 +514,6 @@ def least_teeth(wedge: float, seat: float, hole: float) -> int:
     return teeth + teeth % 2
 
 
-def thickest_edge(rig: Rig) -> float:
-    """Return the largest thick edge of a wedge: behind its seat, 1.2 mm remain before the rear ring's threads."""
-    return rig.front_z - 1.3 - (rig.bearing_z[0] + 8.0 + LEAST_WALL)
-
-
 def balance_holes(rig: Rig) -> tuple[float, list[float]]:
     """Return the radius and the angles [deg] of the twelve threads for set screws that balance the rotor."""
     angles = [k * BALANCE_STEP for k in range(24) if (k * BALANCE_STEP) % 90 not in (30.0, 45.0, 60.0)]
@@ -518,19 +522,28 @@ def balance_holes(rig: Rig) -> tuple[float, list[float]]:
 
 def rotor(rig: Rig) -> Manifold:
     """Return the rotor: tube, shoulder, pulley, seat of the wedge, index flag, threads of M2 screws."""
-    bearing, low, high, flange = rig.bearing, rig.pulley_z, rig.front_z, rig.pulley_flange
-    out = ring(0, bearing.bore / 2 - 0.01, rig.bearing_z[0] + 0.2, high)
-    out += ring(0, bearing.inner, rig.shoulder_z, low + 0.1)
-    out += pulley(rig.teeth[0]).extrude(high - low).translate((0, 0, low))
+    out = ring(0, rig.bearing.bore / 2 - 0.01, rig.bearing_z[0] + 0.2, rig.front_z)
+    out += ring(0, rig.bearing.inner, rig.shoulder_z, rig.pulley_z + 0.1)
+    return seated(rig, out + rim(rig)) - holes(rear_screws(rig), 1.6, 0, rig.bearing_z[0] + 8.0)
+
+
+def rim(rig: Rig) -> Manifold:
+    """Return the rim of the rotor: pulley with its flanges, and index flag."""
+    low, high, flange = rig.pulley_z, rig.front_z, rig.pulley_flange
+    out = pulley(rig.teeth[0]).extrude(high - low).translate((0, 0, low))
     out += ring(0, flange, low, low + FLANGE) + ring(0, flange, high - FLANGE, high)
-    out += box((-rig.flag, -flange + 2.0), (-2.0, 2.0), (high - FLANGE, high))
+    return out + box((-rig.flag, -flange + 2.0), (-2.0, 2.0), (high - FLANGE, high))
+
+
+def seated(rig: Rig, out: Manifold) -> Manifold:
+    """Return a rotor with the clear aperture, the seat of the wedge, and the threads of M2 screws in its front."""
+    high = rig.front_z
     out -= rod(rig.clear, -1, high + 1, sides=SEGMENTS) + rod(
         rig.wedge / 2 + rig.seat, rig.seat_z, high + 1, sides=SEGMENTS
     )
     radius, angles = balance_holes(rig)
     out -= holes(ring_screws(rig)[1], 1.6, high - 8.0, high + 1)
-    out -= holes(around(radius, angles), rig.screw[0], high - 8.2, high + 1)
-    return out - holes(rear_screws(rig), 1.6, 0, rig.bearing_z[0] + 8.0)
+    return out - holes(around(radius, angles), rig.screw[0], high - 8.2, high + 1)
 
 
 def rear_screws(rig: Rig) -> list[tuple[float, float]]:
@@ -606,7 +619,7 @@ def housing_body(rig: Rig) -> Manifold:
     eyes = [(circle + CrossSection.circle(3.2, 48).translate(point)).hull() for point in holder_screws(rig)]
     out = with_lugs(rig).extrude(PLATE).translate((0, 0, face - PLATE))
     out += CrossSection.batch_boolean(eyes, ADD).extrude(face)
-    out += box((-barrel, barrel), (-rig.height, 0), (face - PLATE, face))
+    out += box((-barrel, barrel), (-rig.height, -0.5), (face - PLATE, face))  # at 0, corners would lie 1e-9 apart
     out += box((-barrel, barrel), (-rig.height, -rig.height + PLATE), (0, face + 20))
     for x in (-barrel, barrel - 4):
         out += box((x, x + 4), (-rig.height, -barrel * 0.5), (0, face))
@@ -661,8 +674,8 @@ def wedge_ring(rig: Rig) -> Manifold:
     """
     low, high = rig.front_z, rig.front_z + 2.0
     outer = rig.pitch(rig.teeth[0]) + 1.0
-    lip = beyond(rig, ring(rig.clear, rig.wedge / 2 + rig.seat - 0.15, rig.seat_z, low + 0.1), SQUEEZED)
-    out = ring(rig.clear, outer, low, high) + lip - holes(ring_screws(rig)[1], 2.4, low - 3, high + 1)
+    lip = beyond(rig, ring(rig.front_clear, rig.wedge / 2 + rig.seat - 0.15, rig.seat_z, low + 0.1), SQUEEZED)
+    out = ring(rig.front_clear, outer, low, high) + lip - holes(ring_screws(rig)[1], 2.4, low - 3, high + 1)
     return out - rod(0.8, low - 1, high + 1, outer)
 
 
@@ -873,20 +886,30 @@ def bearing_solids(rig: Rig) -> list[Manifold]:
     return [ring(made.bore / 2, made.outer / 2, z, z + made.width) for z in rig.bearing_z]
 
 
+def fork_and_clamp(rig: Rig) -> tuple[Manifold, Manifold]:
+    """Return the screws of the fork barrier, and the screw of the clamp with its nut."""
+    fork = [(x, y + 1.6, z) for x, y, z in fork_screws(rig)]
+    y, z = clamp_y(rig), clamp_z(rig)
+    clamp = screws(2.5, 16.0, 16.0, [(-CLAMP, y, z)], (0.0, -90.0, 0.0))
+    clamp += (rod(2.75, CLAMP, CLAMP + 2.0, sides=6) - rod(1.25, 0, 20)).rotate((0, 90, 0)).translate((0, y, z))
+    return screws(2.0, 5.0, 1.6, fork, (-90.0, 0.0, 0.0)), clamp
+
+
+def board_nuts(rig: Rig) -> Manifold:
+    """Return the nuts of the encoder's board."""
+    nuts = holes(board_screws(rig), 5.5, rig.cover_z - 2.0, rig.cover_z)
+    return nuts - holes(board_screws(rig), 2.5, rig.cover_z - 3.0, rig.cover_z + 1.0)
+
+
 def screw_solids(rig: Rig) -> list[tuple[str, str, Manifold, tuple[float, float, float]]]:
     """Return the screws: name, what they move with, solids, and how far the exploded view moves them.
 
     Left out are the set screws.
     """
-    behind, aside, up = (180.0, 0.0, 0.0), (-90.0, 0.0, 0.0), (90.0, 0.0, 0.0)
+    behind, up = (180.0, 0.0, 0.0), (90.0, 0.0, 0.0)
     low, board = rig.face_z - PLATE, rig.cover_z + 3.6
-    nuts = holes(board_screws(rig), 5.5, rig.cover_z - 2.0, rig.cover_z)
-    nuts -= holes(board_screws(rig), 2.5, rig.cover_z - 3.0, rig.cover_z + 1.0)
-    fork = [(x, y + 1.6, z) for x, y, z in fork_screws(rig)]
+    fork, clamp = fork_and_clamp(rig)
     foot = [(x, -rig.height - 6.0, z) for x, z in foot_holes(rig)]
-    y, z = clamp_y(rig), clamp_z(rig)
-    clamp = screws(2.5, 16.0, 16.0, [(-CLAMP, y, z)], (0.0, -90.0, 0.0))
-    clamp += (rod(2.75, CLAMP, CLAMP + 2.0, sides=6) - rod(1.25, 0, 20)).rotate((0, 90, 0)).translate((0, y, z))
     cap_at, cover_at = at_z(cap_screws(rig), cap_z(rig)), at_z(lugs(rig), rig.face_z + 4.0)
     ring_at, rear_at = at_z(ring_screws(rig)[1], rig.front_z + 2.0), at_z(rear_screws(rig), rig.bearing_z[0] - 2.5)
     holder_at, motor_at = at_z(holder_screws(rig), -HOLDER), at_z(motor_points(rig), low)
@@ -901,19 +924,28 @@ def screw_solids(rig: Rig) -> list[tuple[str, str, Manifold, tuple[float, float,
         ("screws of the motor", "", screws(3.0, 8.0, MOTOR_PLATE, motor_at, sunk=True), (0, 0, -8)),
         ("screws of the motor plate", "", screws(3.0, 8.0, MOTOR_PLATE, plate_at, behind), (0, 0, -20)),
         ("screws of the base", "", screws(4.0, 12.0, 6.0, foot, up), (0, -42, 0)),
-        ("screws of the fork barrier", "", screws(2.0, 5.0, 1.6, fork, aside), (0, 38, 150)),
-        ("screws of the encoder board", "", screws(2.5, 8.0, 8.0, board_at) + nuts, (0, 0, 176)),
+        ("screws of the fork barrier", "", fork, (0, 38, 150)),
+        ("screws of the encoder board", "", screws(2.5, 8.0, 8.0, board_at) + board_nuts(rig), (0, 0, 176)),
     ]
+
+
+def printed(name: str, solid: Manifold, moves: str, apart: tuple[float, float, float]) -> Part:
+    """Return a printed part.
+
+    STL files have float32 numbers, in which no two corners may become one, nor nearly: short edges are removed until
+    none do.
+    """
+    for more in (1, 2, 4, 8):
+        solid = solid.simplify(more * ROUNDED)
+        corners = np.asarray(solid.to_mesh64().vert_properties)[:, :3].astype(np.float32).round(5)
+        if len(np.unique(corners, axis=0)) == len(corners):
+            break
+    return Part(name, solid, "printed", moves, solid.volume() * PETG, apart)
 
 
 @lru_cache(maxsize=4)
 def assembly(rig: Rig) -> tuple[Part, ...]:
     """Return all parts in their places."""
-
-    def printed(name: str, solid: Manifold, moves: str, apart: tuple[float, float, float]) -> Part:
-        solid = solid.simplify(ROUNDED)  # the files have float32 numbers: no edge may be shorter than they resolve
-        return Part(name, solid, "printed", moves, solid.volume() * PETG, apart)
-
     glass = wedge(rig)
     rear, front = bearing_solids(rig)
     mass = rig.bearing.mass
@@ -986,5 +1018,13 @@ def problems(rig: Rig, made: Sequence[Part]) -> list[str]:
 
 FITS = {"rear bearing", "front bearing"}
 """Parts that touch what turns and what does not."""
-RUNS = ({"belt", "rotor"}, {"belt", "motor pulley"}, {"motor", "motor pulley"}, {"motor", "magnet cup"})
+RUNS = (
+    {"belt", "rotor"},
+    {"belt", "motor pulley"},
+    {"motor", "motor pulley"},
+    {"motor", "magnet cup"},
+    {"belt", "encoder pulley"},
+    {"belt", "cell"},
+    {"stator", "bell"},
+)
 """Pairs that touch, though they do not move in the same way."""

@@ -52,6 +52,11 @@ struct board *board_new(uint32_t counts, int magnetic, int pulses, double drift_
     return b;
 }
 
+/* Gains for another motor than the simulated one; before the start. */
+void board_tune(struct board *b, const struct gains *gains) {
+    b->settings.gains = *gains;
+    board_reset(b);
+}
 void board_set(struct board *b, int what, double value) { b->motor.values[what] = value; }
 double board_get(const struct board *b, int what) {
     if (what < VALUES) return motor_get(&b->motor, what);
@@ -123,7 +128,9 @@ static uint16_t transfer(uint16_t frame) {
         b->error_flag = true;
         b->answer = 0;
     } else if (frame == AS5047_READ_ANGLE) {
-        double angle = read_turns(m) * b->settings.counts_per_turn - (double)m->unseen + 1.5 * uniform(m);
+        double angle = read_turns(m) * b->settings.counts_per_turn - (double)m->unseen + m->values[NOISE] * uniform(m);
+        double magnet = TAU * angle / AS5047_COUNTS;
+        angle += m->values[INL] * (sin(magnet + 0.4) + 0.5 * sin(2 * magnet + 1.1));
         if (no_magnet) angle = 8192 * uniform(m);
         if (m->values[DEAD_ENCODER] == 0) b->angle = (uint16_t)((int64_t)floor(angle) & 0x3FFF);
         b->answer = b->angle;

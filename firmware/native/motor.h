@@ -1,7 +1,7 @@
 /* Simulated motor and encoder, for the core on a computer (native/board.c) and for the image on simavr (avr/board.c).
 
-   Motor: voltage, back-EMF, inertia, friction, cogging, noise. Encoder: eccentric disc (once per turn), index pulse with
-   a width, or a magnetic encoder with noise. Faults are switched by setting `values`. */
+   Motor: voltage, back-EMF, inertia, friction, cogging, current limit, noise. Encoder: eccentric disc (once per turn),
+   index pulse with a width, or a magnetic encoder with noise and non-linearity. Faults are switched by setting `values`. */
 #ifndef MOTOR_H
 #define MOTOR_H
 
@@ -29,6 +29,14 @@ enum value {
     VOLTS,          /* of the supply, where it is not lost */
     DIVIDER,        /* whether the supply's voltage is connected to its pin */
     BAD_STORE,      /* one bit of what is saved is not written */
+    /* The motor, by default a DC motor on a belt */
+    NO_LOAD,        /* speed without load at full voltage [rpm] */
+    RISE,           /* time constant of motor and rotor [s] */
+    COGGING, COGS,  /* amplitude [rpm/s], and periods per turn */
+    FRICTION,       /* at rest [rpm/s] */
+    MOST_PULL,      /* acceleration by the driver's current limit [rpm/s] */
+    NOISE,          /* half of the width of the magnetic encoder's noise [counts] */
+    INL,            /* its error once, and half of it twice per turn of the magnet [counts] */
     ANGLE, SPEED, VALUES
 };
 
@@ -53,6 +61,8 @@ static void motor_begin(struct motor *m, uint32_t per_turn, uint32_t seed) {
     m->random = seed;
     m->turns = 0.3;
     m->values[VOLTS] = 12;
+    m->values[NO_LOAD] = 4000, m->values[RISE] = 0.15, m->values[MOST_PULL] = 1e9;
+    m->values[COGGING] = 200, m->values[COGS] = 12, m->values[FRICTION] = 200, m->values[NOISE] = 1.5;
     m->position = (int64_t)floor(read_turns(m) * per_turn);
 }
 
@@ -62,10 +72,12 @@ static void motor_turn(struct motor *m, bool enabled, double drive) {
     if (m->values[REVERSED_MOTOR] != 0) drive = -drive;
     if (m->values[RUNAWAY] != 0) drive = 1.3;
     bool driven = (enabled || m->values[RUNAWAY] != 0) && m->values[NO_SUPPLY] == 0;
-    double pull = driven ? (4000.0 * drive - m->rpm) / (0.15 * (1 + m->values[HEAVY])) : 0; /* rpm per second */
-    pull += 200.0 * sin(12 * TAU * m->turns + 1.0) + 40.0 * sin(TAU * m->turns); /* cogging, unbalance */
+    const double *v = m->values;
+    double pull = driven ? (v[NO_LOAD] * drive - m->rpm) / (v[RISE] * (1 + v[HEAVY])) : 0; /* rpm per second */
+    pull = fmax(-v[MOST_PULL], fmin(v[MOST_PULL], pull));
+    pull += v[COGGING] * sin(v[COGS] * TAU * m->turns + 1.0) + 40.0 * sin(TAU * m->turns); /* cogging, unbalance */
     pull += 3000.0 * uniform(m) * fmin(1, fabs(m->rpm) / 50); /* noise, none at rest */
-    double friction = (200.0 + m->values[LOAD] + 0.1 * fabs(m->rpm)) * dt;
+    double friction = (v[FRICTION] + m->values[LOAD] + 0.1 * fabs(m->rpm)) * dt;
     m->rpm += pull * dt;
     m->rpm = fabs(m->rpm) > friction ? m->rpm - copysign(friction, m->rpm) : 0;
     if (m->values[JAMMED] != 0) m->rpm = 0;
