@@ -77,7 +77,7 @@ def compensation_error(trouble: Trouble, found: Calibration) -> tuple[float, flo
     encoder = found.encoder_for(trouble.recording.encoder, source.t_first, source.t_last)
     rng = np.random.default_rng(0)
     # a burst at the start has no place in the truth
-    begin, end = (int(source.slice(k, k + 1).t[0]) for k in (len(source) // 100, len(source) - 1))
+    begin, end = (int(source.slice(k, k + 1).t[0]) for k in (len(source) // 40, len(source) - 1))
     t = np.sort(rng.integers(begin + spare, end - spare, TIMES))
     columns = round(GRID * camera.width / camera.height)
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, GRID))

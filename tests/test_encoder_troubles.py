@@ -4,14 +4,17 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from amiwarp import Calibration, EncoderModel, PrismMotion, calibrate
+from amiwarp import AmiwarpError, Calibration, EncoderModel, Events, MemoryEvents, PrismMotion, calibrate
 from amiwarp.calib.lost_counts import Step, changes_of_mean, lost_counts, steps_in_events, without_steps
+from amiwarp.calib.prism_path import PathFit
 from amiwarp.calib.pulses import pulses_only, smooth_path
+from amiwarp.calib.start_burst import without_start_burst
 from amiwarp.events.encoder import Encoder
 from amiwarp.viewer.inspector import Inspector
 from benchmarks import encoder_troubles
@@ -179,3 +182,29 @@ def test_even_pulses_keep_their_angles() -> None:
     found = found_in(trouble)
     assert found.path is None
     assert found.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("tick_us", "stamps", "before_us"), [(1, 1, 0), (1, 20, 0), (1, 20, 100_000), (1000, 1, 0), (1000, 1, 100_000)],
+    ids=["one stamp", "several", "long before", "coarse clock", "coarse, before"],
+)  # fmt: skip
+def test_a_burst_is_set_aside_whatever_the_clock(still: Trouble, tick_us: int, stamps: int, before_us: int) -> None:
+    source = still.recording.events
+    given = source.slice(0, len(source))
+    ticks = MemoryEvents(Events(given.x, given.y, given.t // tick_us * tick_us, given.p), *SIZE)
+    plain = replace(still, recording=replace(still.recording, events=ticks))
+    assert without_start_burst(plain.recording)[1] == ()
+    started = encoder_troubles.with_burst(plain, 6139, stamps, before_us).recording
+    used, (said,) = without_start_burst(started)
+    gone = len(started.events) - len(used.events)
+    assert 6139 <= gone < 6139 + 1500  # those of two milliseconds at most
+    assert f"{gone:,} events c" in said
+    assert used.events.t_first > started.events.t_first + stamps - 2
+
+
+def test_a_path_that_is_no_number_is_refused(still: Trouble, monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = object.__new__(PathFit)
+    fit._recording, fit._cost, fit._px = still.recording, SimpleNamespace(scale=1.0), 10.0
+    monkeypatch.setattr(PathFit, "_step", lambda _: (np.array([math.nan]), 0.0, 0.0))
+    with pytest.raises(AmiwarpError, match="do not determine the path of the prism's angle"):
+        fit._improve(0)

@@ -330,6 +330,8 @@ class PathFit:
         self._cost.set_scale(PLAIN_SCALE if plain else max(0.1, 1.5 * self._cost.brightness.residuals.median()))
         change, size_px, std_px = self._step()
         step = np.append(change * self._px, size_px)
+        if not np.isfinite(step).all():
+            raise self._undetermined()
         if self._last is not None and k not in (0, FIRST_STEPS):
             shrunk = float(step @ self._last) / max(float(self._last @ self._last), 1e-30)
             step = step / (1.0 - min(max(shrunk, -0.5), 1.0 - 1.0 / LONGEST_EXTRAPOLATION))
@@ -377,10 +379,7 @@ class PathFit:
         try:
             factor = cho_factor(normal + ridge * np.eye(len(normal)))
         except np.linalg.LinAlgError as error:  # knots without events
-            raise AmiwarpError(
-                f"{self._recording.name}: the events do not determine the path of the prism's angle at all times; use "
-                "an encoder, or record a scene with more edges"
-            ) from error
+            raise self._undetermined() from error
         left = -(columns.T @ (weight * unexplained(residual)))
         x, direction = np.zeros(len(left)), cho_solve(factor, left)
         first = power = float(left @ direction)
@@ -399,6 +398,12 @@ class PathFit:
         products, inverse = (spline.T @ spline).toarray() / n, cho_solve(factor, np.eye(len(normal)))[:-1, :-1]
         std = math.sqrt(variance * float(np.sum(inverse * products)))
         return change - float(np.mean(spline @ change)), float(x[-1]), self._px * std
+
+    def _undetermined(self) -> AmiwarpError:
+        return AmiwarpError(
+            f"{self._recording.name}: the events do not determine the path of the prism's angle at all times; use "
+            "an encoder, or record a scene with more edges"
+        )
 
     def _slopes(self) -> tuple[Vector, Vector]:
         """Return the residuals' derivatives by the angle at each event of a pair, shape (2, pairs), and by the size."""

@@ -1,4 +1,4 @@
-"""Burst of events at the first time stamp, which some event cameras emit when they start.
+"""Burst of events at the first time stamps, which some event cameras emit when they start.
 
 These events show no edge of the scene. Without an encoder they also look like turns of the prism in no time.
 """
@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import (
@@ -29,10 +30,15 @@ LEAST_RATIO = 10
 Where many events share each time stamp because a clock is coarse, the first one has no more than the others."""
 COMPARED, MOST_COMPARED = 4, 1 << 20
 """Number of later events that are compared, as a multiple of the events at the first time stamp, and its limit."""
+WINDOWS_US = (20, 200, 2000)
+"""Lengths of a burst that is spread over several time stamps, or that falls on a tick of a coarse clock [us]."""
+FEWEST_IN_WINDOW, LEAST_WINDOW_RATIO, FEWEST_WINDOWS = 1000, 2.0, 50
+"""Smallest number of events of such a burst, smallest ratio of it to the number in any later window of that length, and
+smallest number of later windows with events. The rate of a still scene changes by less, and slowly."""
 
 
 def without_start_burst(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
-    """Return the recording without a burst at its first time stamp, and a warning that says so.
+    """Return the recording without a burst at its first time stamps, and a warning that says so.
 
     Without such a burst, these are the recording itself and no warning.
     """
@@ -43,27 +49,43 @@ def without_start_burst(recording: Recording) -> tuple[Recording, tuple[str, ...
     later: EventSource = LaterEvents(source, count)
     if isinstance(source, MemoryEvents):
         later = MemoryEvents(later[:], *source.size)
-    said = (
-        f"{count:,} events carry the first time stamp ({source.t_first} us), far more than any later one, as cameras "
-        "emit when they start: they were left out of the calibration"
-    )
+    last = int(source.slice(count - 1, count).t[0])
+    stamps = f"carry the first time stamp ({source.t_first} us), far more than any later one"
+    if last > source.t_first:
+        stamps = f"came in the first {last - source.t_first} us (from {source.t_first} us on), far more than later"
+    said = f"{count:,} events {stamps}, as cameras emit when they start: they were left out of the calibration"
     # The ground truth has a value for each event of the whole recording. Calibration does not use it.
     return replace(recording, events=later, truth=None), (said,)
 
 
 def burst_size(source: EventSource) -> int:
-    """Return the number of events at the first time stamp if it is far larger than at later ones, else 0."""
+    """Return the number of events at the first time stamps if there are far more than at later ones, else 0."""
     if not len(source):
         return 0
     count = source.find(source.t_first + 1)
-    if count < FEWEST_EVENTS:
+    if count >= FEWEST_EVENTS:
+        t = source.slice(count, count + min(COMPARED * count, MOST_COMPARED)).t
+        if len(t) and count >= LEAST_RATIO * int(_runs(t).max()):
+            return count
+    return next((size for window_us in WINDOWS_US if (size := _size_within(source, window_us))), 0)
+
+
+def _size_within(source: EventSource, window_us: int) -> int:
+    """Return the number of events in the first ``window_us`` if there are far more than in later ones, else 0."""
+    first = source.t_first
+    count = source.find(first + window_us)
+    if count < FEWEST_IN_WINDOW:
         return 0
-    t = source.slice(count, count + min(COMPARED * count, MOST_COMPARED)).t
-    if not len(t):
-        return 0
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(t)) + 1, [len(t)]])
-    most = int(np.diff(starts).max())
-    return count if count >= LEAST_RATIO * most else 0
+    t = source.slice(count, count + MOST_COMPARED).t
+    # the last window may not be whole, which makes it smaller
+    later = _runs((t - first) // window_us)
+    return count if len(later) >= FEWEST_WINDOWS and count >= LEAST_WINDOW_RATIO * int(later.max()) else 0
+
+
+def _runs(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return how often each of some ascending values occurs, shape (k,)."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
+    return np.diff(starts)
 
 
 def reaching_back(path: Encoder, t: int) -> Encoder:
@@ -79,7 +101,7 @@ def reaching_back(path: Encoder, t: int) -> Encoder:
 @guarded
 @dataclass(frozen=True, eq=False, repr=False)
 class LaterEvents(EventSource):
-    """Events of a source from an index on. All earlier events have the first time stamp."""
+    """Events of a source from an index on. All earlier events have earlier times."""
 
     source: EventSource
     """Source of which these are the later events."""
@@ -110,7 +132,7 @@ class LaterEvents(EventSource):
 
     def between(self, t_start: int, t_end: int) -> Events:
         check_window(t_start, t_end)
-        later = self.source.t_first + 1
+        later = self.t_first
         return self.source.between(max(t_start, later), max(t_end, later))
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
