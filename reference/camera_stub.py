@@ -136,7 +136,7 @@ def sends(configuration: Any, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bo
 
 
 def configuration_codes(words: Any) -> list[int]:
-    """Return the numbers of the pixels in a mask: eight words of one each, or 21 words of three each."""
+    """Return the numbers of the pixels in a mask: eight words of one each, or 21 of three and one bit of the last."""
     if len(words) != 21:
         return [int(word) for word in words]
     codes = [int(word) >> (21 * k) & ((1 << 21) - 1) for word in words for k in range(3)]

@@ -30,7 +30,7 @@ from amiwarp.live.stream.camera_settings import parse_camera
 from amiwarp.live.stream.sources import open_source
 from reference.camera_stub import POLARITY, TRIGGER, Part, StubCamera, connected
 from reference.dv_stub import DvPart, StubDv, dv_connected
-from reference.metavision_stub import AntiFlicker, MetavisionPart, StubMetavision, metavision_connected
+from reference.metavision_stub import AntiFlicker, MetavisionPart, StubMetavision, TriggerIn, metavision_connected
 
 UNPLUGGED = RuntimeError("gone")
 DAVIS_SIZE, EVK_SIZE = (346, 260), (1280, 720)
@@ -396,3 +396,21 @@ def test_only_cameras_are_opened_as_cameras() -> None:
 def test_settings_that_make_no_sense(values: dict[str, Any], says: str) -> None:
     with pytest.raises(AmiwarpError, match=says):
         CameraSettings(**values)
+
+
+@pytest.mark.parametrize(("setting", "on"), [("trigger=off", False), ("trigger=on", True), ("", True)])
+def test_the_trigger_input_itself_is_switched(setting: str, on: bool) -> None:
+    for spec in ("camera:evk4", "dv:DX0", "dv:DA0", "prophesee:"):
+        camera, connect, _ = stand_in(spec)
+        with connect(camera):
+            source = open_source(f"{spec},{setting}" if setting else spec)
+            source.close()
+        opened = camera.opened[0]
+        if spec == "camera:evk4":
+            assert opened["configuration"].enable_external_trigger is on
+        elif spec == "prophesee:":
+            assert opened.facilities["get_i_trigger_in"].is_enabled(TriggerIn.Channel.MAIN) is on
+        else:
+            assert opened.isDetectorRunning() is on
+        saved = str(source.metadata["camera_settings"])  # type: ignore[attr-defined]
+        assert saved.endswith(f"trigger={'on' if on else 'off'}")
