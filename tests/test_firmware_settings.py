@@ -109,6 +109,16 @@ def test_the_identity_is_the_version_and_the_board(host: Host) -> None:
     assert replace(who, board=b"a\xff\nb\0c".ljust(16, b"\0")).board_name == "a??b"
 
 
+def test_a_host_that_does_not_ask_sees_no_message_that_it_does_not_know(host: Host) -> None:
+    """Its suite would count such a message as unknown, and fail."""
+    host.command(SetSpeed(300.0, 3000.0))
+    host.run(2.0)
+    host.command(Stop())
+    host.run(1.0)
+    assert not of(Identity | Condition | Setting, host.messages)  # type: ignore[arg-type]
+    assert max(type(m).KIND for m in host.messages) == Answer.KIND
+
+
 @pytest.mark.parametrize("wanted", [Ask(0x06), Ask(0x0A), Ask(0), Ask(Setting.KIND, 12), Ask(Setting.KIND, 255)])
 def test_other_questions_are_out_of_range(host: Host, wanted: Message) -> None:
     assert host.command(wanted) == 2

@@ -226,6 +226,7 @@ def test_a_controller_measures_one_prism(two_angles: Path, tmp_path: Path) -> No
     assert "leave --port out to take the samples of the source, or --second-ratio" in refused.stderr
     assert "--adaptive sets the speed of one prism" in adaptive.stderr
     assert done.exit_code == 0, done.stderr
+    assert "controller: firmware 1.1.0 on emulated, supply unknown: its pin is not connected\n" in done.stdout
     encoder = open_recording(tmp_path / "r.h5").encoder
     assert encoder is not None
     assert encoder.second is not None
@@ -448,13 +449,15 @@ def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path, monke
 
     motor = Motor()
     monkeypatch.setattr("amiwarp.live.link.link.ANSWER_S", LONG_S)
-    with PseudoTerminal(Controller(motor), tmp_path / "prism") as port:
+    with PseudoTerminal(Controller(motor, supply_mv=11_900), tmp_path / "prism") as port:
         args = ["live", str(folder / "recording.h5"), "--port", port.name, "--calibration", str(folder / "c.json")]
         options = ["--adaptive", "--most-mev-s", "0.05", "--device", "cpu", "--json"]
         done = CliRunner().invoke(app, [*args, *options])
     assert done.exit_code == 0, done.stderr
     assert 119.0 < motor.target_rpm(0) < 715.0
     said = json.loads(done.stdout)
+    controller = said["controller"]
+    assert (controller["firmware"], controller["board"], controller["supply_v"]) == ("1.1.0", "emulated", 11.9)
     assert said["events"] == said["compensated"] == SENT
 
 
