@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import amiwarp
-from rig import drive, files, gimbal, limits, numbers, parts
+from rig import bill, drive, files, gimbal, limits, numbers, parts, perfboard
 from rig.gimbal import GimbalRig
 from rig.numbers import OVERSPEED, SPEEDS, Tolerance, View
 from rig.parts import Part, Rig
@@ -268,6 +268,7 @@ def arguments_of(given: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--format", nargs="+", choices=("stl", "3mf", "step"), default=["stl"], help="formats of the parts; default stl"
     )
+    parser.add_argument("--boards", action="store_true", help="write the wiring and the perfboard plans, too")
     parser.add_argument("--numbers", type=Path, help="page of numbers to write; takes some minutes")
 
     def sizes(group: argparse._ArgumentGroup, name: str, text: str, *values: str) -> None:
@@ -452,6 +453,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         printed = [part for part in made if part.kind == "printed"]
         for part in printed:
             write_part(part, folder, given.format)
+        files.written(folder / "bill.csv", bill.of_rig(own).encode())
         print(f"{folder}: {len(printed)} parts to print, all watertight, none overlaps; {', '.join(given.format)}")
         lines = [*said(own, given), view_text(own, view), balance_text(own)]
         if isinstance(own, GimbalRig):
@@ -464,6 +466,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             drawings.drawing(own, made, folder / "drawing.svg")
             drawings.exploded(made, folder / "exploded.png")
             drawings.exploded(made, folder / "whole.png", apart=0.0)
+    if given.boards:
+        names = perfboard.write(given.out)
+        print(f"{given.out}: {', '.join(names)}")
     if given.numbers:
         given.numbers.write_text(report(), encoding="utf-8")
 

@@ -2,7 +2,6 @@
 
 import functools
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -317,33 +316,6 @@ def test_wobble_costs_little_and_nothing_once_it_is_freed() -> None:
     size = {"apex_deg": 1.0, "width": 320}
     assert 0.01 < numbers.error(off, (), **size) < 0.02  # px
     assert numbers.error(off, ("wobble",), **size) < 1e-3
-
-
-def test_list_of_parts_is_complete(made: Sequence[Part]) -> None:
-    """Each number in the pictures has its row, printed parts have their names, and screws their count and length."""
-    page = (ROOT / "docs" / "how-to" / "build-a-rig.md").read_text()
-    section = page[page.index("## Parts") : page.index("## Wires")]
-    rows = [line.split("|")[1:] for line in section.splitlines() if line.startswith("|")]
-    numbered = [part for part in made if part.kind != "screws"]
-    listed = {int(n) for row in rows for n in re.findall(r"\d+", row[0])}
-    assert listed == set(range(1, len(numbered) + 1))
-    printed = next(row for row in rows if row[2].strip() == "printed")
-    names = dict(zip(re.findall(r"\d+", printed[0]), printed[1].strip().split(", "), strict=True))
-    assert names == {str(k): part.name for k, part in enumerate(numbered, 1) if part.kind == "printed"}
-    text = next(row[2] for row in rows if row[1].strip() == "screws")
-    screws = re.findall(
-        r"(\d) × M([\d.]+)×(\d+)( countersunk)?(?: with nut| and nuts)? for (?:the |its )?([a-z0-9 ]+)", text
-    )
-    phrases = {"fork barrier": "part 20", "encoder board": "part 21"}
-    for part in made:
-        if part.kind == "screws":
-            place = part.name.split(" of the ")[1]
-            count, thread, length, sunk, _ = next(found for found in screws if found[4] == phrases.get(place, place))
-            each = part.solid.decompose()
-            assert len(each) == int(count), part.name
-            size = np.array(max(each, key=lambda solid: solid.volume()).bounding_box()).reshape(2, 3)
-            head = 0.0 if sunk else parts.HEADS[float(thread)][1]
-            assert (size[1] - size[0]).max() == pytest.approx(int(length) + head, abs=0.15), part.name
 
 
 def test_page_states_what_is_computed() -> None:

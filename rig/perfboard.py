@@ -1,0 +1,319 @@
+"""Perfboard plan of the controller's board, made from the nets of :mod:`rig.wires`.
+
+Holes are 2.54 mm apart, columns are A, B, C, ... from the left and rows 1, 2, 3, ... from the top, seen from the side
+of the parts. Each lead has a hole of its own. Two bare wires on the solder side are rails, for ground and for the level
+of the logic. All other wires are insulated, run on the solder side, and are soldered to the leads at both ends.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+from rig import wires
+from rig.wires import GND, V5, VIO, VM, Component
+
+COLUMNS, ROWS = 31, 26
+"""Holes of a board of 9 x 7 cm as it is sold."""
+Hole = tuple[int, int]
+"""Column and row, from 1."""
+
+RAILS = {VIO: 1, GND: 24}
+"""Rows of the rails, which reach from column 2 to the last but one."""
+PICO_AT, PICO_WIDE = (16, 3), 7
+"""Hole of the Pico's pin 1, and distance of its two rows of pins [holes]: 17.78 mm."""
+
+STRIPS: dict[str, tuple[Hole, Hole]] = {
+    "J4": ((2, 3), (0, 1)),
+    "J1": ((2, 8), (0, 1)),
+    "J3": ((2, 13), (0, 1)),
+    "J6": ((2, 18), (0, 1)),
+    "J5": ((4, 26), (1, 0)),
+    "J7": ((14, 26), (1, 0)),
+    "J8": ((29, 3), (0, 1)),
+    "J2": ((29, 15), (0, 1)),
+}
+"""First hole of each connector, and the step to the next."""
+LEADS: dict[str, tuple[Hole, Hole]] = {
+    "R1": ((6, 3), (10, 3)),
+    "R2": ((6, 5), (10, 5)),
+    "R3": ((6, 7), (10, 7)),
+    "R6": ((6, 9), (10, 9)),
+    "R5": ((6, 11), (10, 11)),
+    "R11": ((6, 13), (10, 13)),
+    "R12": ((6, 15), (10, 15)),
+    "R4": ((6, 17), (10, 17)),
+    "R14": ((6, 19), (10, 19)),
+    "R13": ((6, 21), (10, 21)),
+    "R7": ((6, 23), (10, 23)),
+    "R8": ((12, 23), (12, 19)),
+    "R9": ((25, 23), (25, 19)),
+    "R10": ((27, 19), (27, 23)),
+    "C1": ((25, 6), (27, 6)),
+    "C2": ((25, 16), (25, 14)),
+}
+"""Holes of the two leads of each resistor and capacitor."""
+
+
+@dataclass(frozen=True)
+class Lead:
+    """A lead in its hole; of a rail, a place on it."""
+
+    ref: str
+    pin: str
+    net: str
+    hole: Hole
+
+
+def holes_of(part: Component, kind: str) -> list[Hole]:
+    """Return the holes of a part's pins."""
+    if part.ref == "U1":
+        column, row = PICO_AT
+        if kind == "avr":
+            return [(column, row + k) for k in range(len(part.pins))]
+        left = [(column, row + k) for k in range(20)]
+        right = [(column + PICO_WIDE, row + 19 - k) for k in range(20)]
+        return left + right
+    if part.ref in STRIPS:
+        (column, row), (across, down) = STRIPS[part.ref]
+        return [(column + k * across, row + k * down) for k in range(len(part.pins))]
+    return list(LEADS[part.ref])
+
+
+def leads(kind: str, drive: str) -> list[Lead]:
+    """Return all leads, those without a net too."""
+    out = []
+    for part in wires.components(kind, drive):
+        for pin, net, hole in zip(part.pins, part.nets, holes_of(part, kind), strict=True):
+            out.append(Lead(part.ref, pin, net, hole))
+    return out
+
+
+def rail(net: str) -> list[Lead]:
+    """Return the places on a rail."""
+    return [Lead(f"rail {net}", str(column), net, (column, RAILS[net])) for column in range(2, COLUMNS)]
+
+
+def far(one: Hole, other: Hole) -> float:
+    """Return the squared distance of two holes."""
+    return (one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2
+
+
+def links(kind: str, drive: str) -> list[tuple[Lead, Lead]]:
+    """Return the insulated wires: for each net a tree, which grows by the shortest wire to what is connected already.
+
+    On a rail, each place takes one wire.
+    """
+    out = []
+    by_net: dict[str, list[Lead]] = {}
+    for lead in leads(kind, drive):
+        if lead.net:
+            by_net.setdefault(lead.net, []).append(lead)
+    for net, members in by_net.items():
+        places = rail(net) if net in RAILS else []
+        done = list(places) or members[:1]
+        left = members if places else members[1:]
+        while left:
+            pairs = ((far(a.hole, b.hole), a.hole, b.hole, a, b) for a in done for b in left)
+            *_, old, new = min(pairs, key=lambda pair: pair[:3])
+            out.append((old, new))
+            left = [lead for lead in left if lead is not new]
+            done = [lead for lead in done if lead is not old or old not in places]
+            if not places:
+                done.append(new)
+    return out
+
+
+def name(hole: Hole) -> str:
+    """Return a hole as text: column in letters, and row."""
+    column, row = hole
+    letters = chr(64 + column) if column <= 26 else "A" + chr(38 + column)
+    return f"{letters}{row}"
+
+
+def as_csv(kind: str, drive: str) -> str:
+    """Return where each lead goes, and all wires, as CSV."""
+    out = io.StringIO()
+    write = csv.writer(out, lineterminator="\n").writerow
+    whats = {part.ref: part.what for part in wires.components(kind, drive)}
+    write(("part", "what", "pin", "hole", "net"))
+    for lead in leads(kind, drive):
+        write((lead.ref, whats[lead.ref], lead.pin, name(lead.hole), lead.net))
+    write(())
+    write(("wire", "net", "from", "hole", "to", "hole"))
+    for net, row in RAILS.items():
+        write(("bare", net, "rail", name((2, row)), "rail", name((COLUMNS - 1, row))))
+    for number, (old, new) in enumerate(links(kind, drive), 1):
+        write((number, new.net, f"{new.ref}.{new.pin}", name(new.hole), f"{old.ref}.{old.pin}", name(old.hole)))
+    return out.getvalue()
+
+
+PITCH, EDGE = 26, 60
+"""Distance of holes, and margin around the board, in the drawing [px]."""
+COLOURS = {GND: "#222222", VIO: "#c0392b", V5: "#e67e22", VM: "#8e44ad"}
+SIGNAL_COLOURS = ("#1f77b4", "#2ca02c", "#17a2a2", "#8c564b", "#d4a017", "#e377c2", "#5b6abf", "#7f7f00")
+
+
+def colour_of(net: str, order: list[str]) -> str:
+    """Return the colour of a net."""
+    return COLOURS.get(net) or SIGNAL_COLOURS[order.index(net) % len(SIGNAL_COLOURS)]
+
+
+def at(hole: Hole) -> tuple[int, int]:
+    """Return the middle of a hole in the drawing [px]."""
+    return EDGE + (hole[0] - 1) * PITCH, EDGE + (hole[1] - 1) * PITCH
+
+
+def drawing(kind: str, drive: str) -> str:
+    """Return the plan as SVG, seen from the side of the parts."""
+    wide, high = 2 * EDGE + (COLUMNS - 1) * PITCH, 2 * EDGE + (ROWS - 1) * PITCH
+    whats = {part.ref: part.what for part in wires.components(kind, drive)}
+    order = sorted({lead.net for lead in leads(kind, drive)} - {""})
+    title = f"{whats['U1']}, {'DC motor with belt' if drive == 'belt' else 'hollow-shaft motor'}"
+    out = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" font-family="sans-serif" font-size="11">',
+        f"<title>Perfboard plan: {escape(title)}</title>",
+        f'<rect width="{wide}" height="{high}" fill="#ffffff"/>',
+        f'<rect x="{EDGE - 18}" y="{EDGE - 18}" width="{wide - 2 * EDGE + 36}" height="{high - 2 * EDGE + 36}" rx="4" '
+        'fill="#f7f0dc" stroke="#b8a878"/>',
+        f'<text x="{wide / 2}" y="16" text-anchor="middle" font-size="14" font-weight="bold">{escape(title)}: '
+        "parts, seen from their side; wires lie on the other side</text>",
+    ]
+    for column in range(1, COLUMNS + 1):
+        x, y = at((column, 1))
+        label = name((column, 1))[:-1]
+        out.append(f'<text x="{x}" y="{y - 24}" text-anchor="middle" fill="#666">{label}</text>')
+        out.append(f'<text x="{x}" y="{high - EDGE + 32}" text-anchor="middle" fill="#666">{label}</text>')
+    for row in range(1, ROWS + 1):
+        x, y = at((1, row))
+        out.append(f'<text x="{x - 24}" y="{y + 4}" text-anchor="end" fill="#666">{row}</text>')
+        out.append(f'<text x="{wide - EDGE + 24}" y="{y + 4}" fill="#666">{row}</text>')
+        out += [f'<circle cx="{x + k * PITCH}" cy="{y}" r="2.6" fill="#fff" stroke="#c9ba8c"/>' for k in range(COLUMNS)]
+    out += bodies(kind, drive, whats)
+    for net, row in RAILS.items():
+        (x, y), (end, _) = at((2, row)), at((COLUMNS - 1, row))
+        out.append(f'<path d="M{x} {y}H{end}" stroke="{COLOURS[net]}" stroke-width="5" opacity="0.45"/>')
+        out.append(
+            f'<text x="{at((14, row))[0]}" y="{y - 6}" text-anchor="middle" font-weight="bold">{net} rail</text>'
+        )
+    out += wire_lines(kind, drive, order)
+    for lead in leads(kind, drive):
+        x, y = at(lead.hole)
+        fill = colour_of(lead.net, order) if lead.net else "#ffffff"
+        out.append(f'<circle cx="{x}" cy="{y}" r="5" fill="{fill}" stroke="#333" data-net="{lead.net}"/>')
+    out += labels(kind, drive)
+    return "\n".join([*out, "</svg>", ""])
+
+
+def wire_lines(kind: str, drive: str, order: list[str]) -> list[str]:
+    """Return the insulated wires, bent so that they pass no lead of another net, with their numbers."""
+    out = []
+    taken = [at(lead.hole) for lead in leads(kind, drive)]
+    for number, (old, new) in enumerate(links(kind, drive), 1):
+        foreign = [at(lead.hole) for lead in leads(kind, drive) if lead.hole not in (old.hole, new.hole)]
+        bends = (0.0, 0.5, -0.5, 0.9, -0.9, 1.4, -1.4, 2.0, -2.0, 2.8, -2.8)
+        paths = [curve(at(old.hole), at(new.hole), bend * PITCH) for bend in bends]
+        points = max(paths, key=lambda path: (min(gap(path, foreign), 0.42 * PITCH), -paths.index(path)))
+        colour = colour_of(new.net, order)
+        line = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
+        out.append(f'<path d="M{line}" stroke="{colour}" stroke-width="2.2" opacity="0.8" fill="none"/>')
+        x, y = max(points[3:-3], key=lambda point: min(gap([point], taken), 15.0))
+        taken.append((round(x), round(y)))
+        out.append(
+            f'<text x="{x:.1f}" y="{y + 3:.1f}" text-anchor="middle" font-size="9" fill="{colour}" stroke="#fff" '
+            f'stroke-width="2.5" paint-order="stroke">{number}</text>'
+        )
+    return out
+
+
+def curve(start: tuple[int, int], end: tuple[int, int], bend: float) -> list[tuple[float, float]]:
+    """Return points on an arc between two points, whose middle is ``bend`` beside the straight line."""
+    (x1, y1), (x2, y2) = start, end
+    long = math.hypot(x2 - x1, y2 - y1)
+    across = (y1 - y2) / long, (x2 - x1) / long
+    out = []
+    for k in range(25):
+        t = k / 24
+        side = bend * 4 * t * (1 - t)
+        out.append((x1 + t * (x2 - x1) + side * across[0], y1 + t * (y2 - y1) + side * across[1]))
+    return out
+
+
+def gap(path: Iterable[tuple[float, float]], points: Iterable[tuple[float, float]]) -> float:
+    """Return the smallest distance of a path's points from others [px]."""
+    return min((math.dist(p, q) for p in path for q in points), default=math.inf)
+
+
+def bodies(kind: str, drive: str, whats: dict[str, str]) -> list[str]:
+    """Return the outlines of the parts, with their names."""
+    out = []
+    for part in wires.components(kind, drive):
+        points = [at(hole) for hole in holes_of(part, kind)]
+        (x1, y1), (x2, y2) = (tuple(f(values) for values in zip(*points, strict=True)) for f in (min, max))
+        thin = part.ref[0] in "RC"
+        pad = 7 if thin else 11
+        fill = {"R": "#d8e6f3", "C": "#f3e3b8", "J": "#dddddd", "U": "#cfe8cf"}[part.ref[0]]
+        out.append(
+            f'<rect x="{x1 - pad}" y="{y1 - pad}" width="{x2 - x1 + 2 * pad}" height="{y2 - y1 + 2 * pad}" rx="4" '
+            f'fill="{fill}" stroke="#555" opacity="0.85"/>'
+        )
+        middle_x, middle_y = (x1 + x2) / 2, (y1 + y2) / 2
+        if thin:
+            turn = f' transform="rotate(-90 {middle_x} {middle_y})"' if x1 == x2 else ""
+            out.append(
+                f'<text x="{middle_x}" y="{middle_y - 9}" text-anchor="middle" font-weight="bold"{turn}>'
+                f"{part.ref} {escape(whats[part.ref])}</text>"
+            )
+        elif part.ref == "U1" and kind == "rp2040":
+            out.append(
+                f'<text x="{middle_x}" y="{y1 - 14}" text-anchor="middle" font-weight="bold">{escape(part.what)}, '
+                "USB at this end</text>"
+            )
+        elif y1 == y2:
+            out.append(
+                f'<text x="{middle_x}" y="{y1 - 30}" text-anchor="middle" font-weight="bold">{part.ref} '
+                f"{escape(part.what)}</text>"
+            )
+        else:
+            out.append(
+                f'<text x="{x1 - 10}" y="{y1 - 14}" font-weight="bold">{part.ref} {escape(part.what)}</text>'
+                if x1 < 400
+                else f'<text x="{x2 + 10}" y="{y1 - 14}" text-anchor="end" font-weight="bold">{part.ref} '
+                f"{escape(part.what)}</text>"
+            )
+    return out
+
+
+def labels(kind: str, drive: str) -> list[str]:
+    """Return the names of the pins of controller and connectors."""
+    out = []
+    halo = 'font-size="9" stroke="#f7f0dc" stroke-width="2" paint-order="stroke"'
+    for lead in leads(kind, drive):
+        x, y = at(lead.hole)
+        if lead.ref[0] not in "UJ":
+            continue
+        if lead.ref in STRIPS and STRIPS[lead.ref][1] == (1, 0):
+            out.append(f'<text x="{x}" y="{y - 13}" text-anchor="middle" {halo}>{lead.pin}</text>')
+            continue
+        inside = lead.ref == "U1" and kind == "rp2040"
+        right = lead.hole[0] > PICO_AT[0] or (lead.ref == "U1" and not inside)
+        side = 9 if inside else 13
+        place = f'x="{x - side}" y="{y + 4}" text-anchor="end"' if right else f'x="{x + side}" y="{y + 4}"'
+        out.append(f"<text {place} {halo}>{lead.pin}</text>")
+    return out
+
+
+def write(folder: Path) -> list[str]:
+    """Write plan and lists of both controllers and both drives, and return the names of the files."""
+    names = []
+    for kind in wires.CONTROLLERS:
+        for drive in wires.DRIVES:
+            stem = f"board_{kind}_{drive}"
+            (folder / f"{stem}.svg").write_text(drawing(kind, drive), encoding="utf-8")
+            (folder / f"{stem}.csv").write_text(as_csv(kind, drive), encoding="utf-8")
+            names += [f"{stem}.svg", f"{stem}.csv"]
+    (folder / "wires.csv").write_text(wires.as_csv(), encoding="utf-8")
+    return [*names, "wires.csv"]
