@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amiwarp import AmiwarpError, Calibration, EncoderModel, Events, MemoryEvents, PrismMotion, calibrate
+from amiwarp import AmiwarpError, Calibration, EncoderModel, Events, MemoryEvents, Prism, PrismMotion, calibrate
+from amiwarp.calib import checks
 from amiwarp.calib.lost_counts import Step, changes_of_mean, lost_counts, steps_in_events, without_steps
 from amiwarp.calib.prism_path import PathFit
 from amiwarp.calib.pulses import pulses_only, smooth_path
@@ -208,3 +209,27 @@ def test_a_path_that_is_no_number_is_refused(still: Trouble, monkeypatch: pytest
     monkeypatch.setattr(PathFit, "_step", lambda _: (np.array([math.nan]), 0.0, 0.0))
     with pytest.raises(AmiwarpError, match="do not determine the path of the prism's angle"):
         fit._improve(0)
+
+
+def test_prisms_look_swapped_only_if_they_fit_the_other_way_round() -> None:
+    pair = Prism(0.02, second=Prism(0.016))
+    swapped = {"apex": 0.0161, "second_apex": 0.0199}
+    assert checks.look_swapped(swapped, pair)
+    assert checks.pair_is_far(swapped, pair)
+    for right in ({"apex": 0.0199, "second_apex": 0.0161}, {"apex": 0.015, "second_apex": 0.015}, {"apex": 0.016}):
+        assert not checks.look_swapped(right, pair)
+    alike = Prism(0.02, second=Prism(0.018))
+    assert checks.look_swapped({"apex": 0.018, "second_apex": 0.02}, alike)
+    assert not checks.pair_is_far({"apex": 0.018, "second_apex": 0.02}, alike)
+    assert not checks.look_swapped({"apex": 0.019, "second_apex": 0.019}, alike)
+
+
+@pytest.mark.slow
+def test_swapped_encoders_of_a_pair_are_named() -> None:
+    swapped = encoder_troubles.pair(SIZE, swapped=True).recording
+    said = (
+        "the encoders of the two prisms seem to be swapped: as given, the prisms have 80 and 12[56] % of their nominal"
+    )
+    with pytest.raises(AmiwarpError, match=said):
+        calibrate(swapped, photometric=COARSE)
+    assert not any("swapped" in w for w in calibrate(encoder_troubles.pair(SIZE, swapped=False).recording).warnings)

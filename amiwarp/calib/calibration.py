@@ -307,6 +307,7 @@ class Calibrator:
             )
         given = {*self.settings.bounds, *self.settings.start}
         if isinstance(recording.prism, Prism) and not size_names() & given:
+            found = calibrator.with_order_examined(found)
             checks.check_nominal(found.model_name, found.parameters, recording.prism, recording.name)
         return replace(found, seconds=time.perf_counter() - began)
 
@@ -430,6 +431,26 @@ class Calibrator:
         search = prepare(self.recording, self.settings, device=self.device, progress=self.progress)[0]
         search.run()
         return PathFit(self.recording, search).run()[0]
+
+    def with_order_examined(self, found: Calibration) -> Calibration:
+        """Return the calibration, with a warning if the encoders of two prisms seem to be swapped.
+
+        Raises :class:`AmiwarpError` for it if the prisms are far from their nominal sizes.
+        """
+        recording, encoder = self.recording, self.recording.encoder
+        nominal_prism = recording.prism
+        if not isinstance(nominal_prism, Prism) or encoder is None or encoder.second is None:
+            return found
+        if not checks.look_swapped(found.parameters, nominal_prism):
+            return found
+        exchanged = encoder.second.with_second(replace(encoder, second=None))
+        again = replace(self, recording=replace(recording, encoder=exchanged)).attempt()
+        if not again.accepted or checks.look_swapped(again.found().parameters, nominal_prism):
+            return found
+        said = checks.swapped_encoders(found.parameters, again.found().parameters, nominal_prism)
+        if checks.pair_is_far(found.parameters, nominal_prism):
+            raise AmiwarpError(f"{recording.name}: {said}")
+        return _warning(found, said)
 
     def with_straight_angles(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
         """Correct an error of the encoder that repeats every turn, if the events ask for it, and calibrate again.

@@ -206,6 +206,51 @@ def check_nominal(model: str, parameters: Mapping[str, float], nominal: Prism, n
         )
 
 
+SWAPPED_SHARE, LEAST_SWAPPED = 1.0 / 3.0, 0.05
+"""Two prisms look exchanged if, with their nominal apexes exchanged, the largest relative difference of an apex from
+the nominal one is at most this share of that without, which must have this least size."""
+
+
+def look_swapped(parameters: Mapping[str, float], nominal: Prism) -> bool:
+    """Return whether the apexes of two prisms fit the nominal ones far better the other way round."""
+    second = nominal.second
+    if second is None or not {"apex", "second_apex"} <= parameters.keys() or not min(nominal.apex, second.apex) > 0.0:
+        return False
+    away, exchanged = _from_nominal(parameters, (nominal.apex, second.apex)), (second.apex, nominal.apex)
+    return away >= LEAST_SWAPPED and _from_nominal(parameters, exchanged) <= SWAPPED_SHARE * away
+
+
+def pair_is_far(parameters: Mapping[str, float], nominal: Prism) -> bool:
+    """Return whether a prism of a pair is so far from its nominal size that the answer is refused."""
+    assert nominal.second is not None
+    return _from_nominal(parameters, (nominal.apex, nominal.second.apex)) > LARGEST_FROM_NOMINAL
+
+
+def _from_nominal(parameters: Mapping[str, float], apexes: tuple[float, float]) -> float:
+    """Return the largest relative difference of the apexes of two prisms from nominal ones [rad]."""
+    found = (parameters["apex"], parameters["second_apex"])
+    return max(abs(apex / stated - 1.0) for apex, stated in zip(found, apexes, strict=True))
+
+
+def swapped_encoders(given: Mapping[str, float], parameters: Mapping[str, float], nominal: Prism) -> str:
+    """Return that the encoders of two prisms seem to be swapped, in words.
+
+    ``given`` are the parameters with the encoders as they are, ``parameters`` those with them exchanged.
+    """
+    assert nominal.second is not None
+
+    def of_nominal(values: Mapping[str, float]) -> str:
+        assert nominal.second is not None
+        first, second = values["apex"] / nominal.apex, values["second_apex"] / nominal.second.apex
+        return f"{100 * first:.0f} and {100 * second:.0f} %"
+
+    return (
+        f"the encoders of the two prisms seem to be swapped: as given, the prisms have {of_nominal(given)} of their nominal "
+        f"apexes, with the encoders exchanged {of_nominal(parameters)}; give --encoder that of the prism next to the camera and "
+        "--second-encoder the other, or exchange the nominal apexes if those are swapped"
+    )
+
+
 def significance(best: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """Return the mean of ``best - other``, a gain in sharpness of disjoint parts [standard deviations of the mean]."""
     gain = best - other
