@@ -245,9 +245,9 @@ def swapped_encoders(given: Mapping[str, float], parameters: Mapping[str, float]
         return f"{100 * first:.0f} and {100 * second:.0f} %"
 
     return (
-        f"the encoders of the two prisms seem to be swapped: as given, the prisms have {of_nominal(given)} of their nominal "
-        f"apexes, with the encoders exchanged {of_nominal(parameters)}; give --encoder that of the prism next to the camera and "
-        "--second-encoder the other, or exchange the nominal apexes if those are swapped"
+        f"the encoders of the two prisms seem to be swapped: as given, the prisms have {of_nominal(given)} of their "
+        f"nominal apexes, with the encoders exchanged {of_nominal(parameters)}; give --encoder that of the prism next to "
+        "the camera and --second-encoder the other, or exchange the nominal apexes if those are swapped"
     )
 
 
