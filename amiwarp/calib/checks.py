@@ -246,8 +246,8 @@ def swapped_encoders(given: Mapping[str, float], parameters: Mapping[str, float]
 
     return (
         f"the encoders of the two prisms seem to be swapped: as given, the prisms have {of_nominal(given)} of their "
-        f"nominal apexes, with the encoders exchanged {of_nominal(parameters)}; give --encoder that of the prism next to "
-        "the camera and --second-encoder the other, or exchange the nominal apexes if those are swapped"
+        f"nominal apexes, with the encoders exchanged {of_nominal(parameters)}; give --encoder that of the prism next "
+        "to the camera and --second-encoder the other, or exchange the nominal apexes if those are swapped"
     )
 
 
