@@ -217,15 +217,24 @@ def rotation(tilt: tuple[float, float]) -> Array:
     return np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
 
 
-def through_plate(plate: Plate, rays: Array, phi: Array) -> tuple[Array, Array]:
-    """Trace bearings (n, 3) from the camera's centre through both faces of a plate 0.05 m away.
+def through_plate(
+    plate: Plate, rays: Array, phi: Array, wedge: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Array, Array]:
+    """Trace bearings (n, 3) from the camera's centre through both faces of a plate 0.1 mm away.
 
-    ``phi`` (n,) [rad] is the azimuth of the tilt. Return a point on each ray behind the plate [m], and its bearing.
+    ``phi`` (n,) [rad] is the azimuth of the tilt. ``wedge``: tangents of the angles by which the normal of the far face
+    leans, further along the tilt and across it [rad]. Return a point on each ray behind the plate [m], and its bearing.
     """
     s, c = np.sin(plate.tilt), np.cos(plate.tilt)
-    normal = np.stack([s * np.cos(phi), s * np.sin(phi), np.full_like(phi, c)], axis=1)
+    near = np.stack([s * np.cos(phi), s * np.sin(phi), np.full_like(phi, c)], axis=1)
+    steeper = plate.tilt + np.arctan(wedge[0])
+    s, c, aside = np.sin(steeper), np.cos(steeper), wedge[1] * np.cos(np.arctan(wedge[0]))
+    far = np.stack(
+        [s * np.cos(phi) - aside * np.sin(phi), s * np.sin(phi) + aside * np.cos(phi), np.full_like(phi, c)], axis=1
+    ) / np.hypot(1.0, aside)
     place, bearing = np.zeros_like(rays), rays
-    for distance, ratio in ((0.05, 1.0 / plate.index), (0.05 + plate.thickness, plate.index)):
+    faces = ((near, 1e-4, 1.0 / plate.index), (far, 1e-4 + plate.thickness, plate.index))
+    for normal, distance, ratio in faces:
         along = np.sum(bearing * normal, axis=1, keepdims=True)
         place = place + (distance - np.sum(place * normal, axis=1, keepdims=True)) / along * bearing
         bearing = refract(bearing, normal, ratio)
@@ -243,9 +252,12 @@ def through_pair(
     return rays_to_pixels(camera, rays)
 
 
-def at_depth(camera: Camera, plate: Plate, phase: float, xy: Array, theta: Array, inverse_depth: Array) -> Array:
+def at_depth(
+    camera: Camera, plate: Plate, phase: float, xy: Array, theta: Array, inverse_depth: Array,
+    wedge: tuple[float, float] = (0.0, 0.0),
+) -> Array:  # fmt: skip
     """Return the pixels (n, 2) that see without the plate what ``xy`` see through it, at inverse depths (n,) [1/m]."""
-    origin, direction = through_plate(plate, pixels_to_rays(camera, xy), theta + phase)
+    origin, direction = through_plate(plate, pixels_to_rays(camera, xy), theta + phase, wedge)
     depth = 1.0 / np.maximum(inverse_depth, 1e-9)
     point = origin + ((depth - origin[:, 2]) / direction[:, 2])[:, None] * direction
     return rays_to_pixels(camera, point / np.linalg.norm(point, axis=1, keepdims=True))
@@ -292,6 +304,7 @@ def vibration(values: Mapping[str, float], theta: Array) -> Rotation:
 
     circle = values["amplitude"] * np.exp(1j * (theta + values["phase"]))
     circle = circle + part("backward", -1) + part("second", 2) + part("second_backward", -2)
+    circle = circle + part("third", 3) + part("third_backward", -3)
     roll = values.get("roll_x", 0.0) * np.cos(theta) + values.get("roll_y", 0.0) * np.sin(theta)
     return Rotation.from_rotvec(np.stack([circle.real, circle.imag, roll], axis=1))
 

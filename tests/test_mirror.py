@@ -10,7 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 import amiwarp
-from amiwarp.calib.parameters import best_model
+from amiwarp.calib.parameters import ParameterSpace, best_model, globally_searched, make_space
+from amiwarp.calib.sharpness_search import bound_warnings
 from amiwarp.cli.app import app
 from reference import optics as reference
 
@@ -92,6 +93,28 @@ def test_a_tilt_is_searched_up_to_a_displacement_of_24_px() -> None:
         middle = np.array([[camera.cx, camera.cy]])
         away = model.compensate_points(middle, np.zeros((1, 2))) - middle
         assert np.linalg.norm(away) == pytest.approx(24.0, rel=0.01)  # px
+
+
+def test_a_direction_has_no_bounds_but_given_ones() -> None:
+    camera = amiwarp.Camera.from_fov(320, 240, 1.0)
+
+    def space_with(**bounds: tuple[float, float]) -> ParameterSpace:
+        return make_space("mirror", camera, NO_PRISM, free=None, start={"ratio": 1.3}, bounds=bounds, rad_per_us=1e-3,
+                          duration_us=1e5)  # fmt: skip
+
+    space = space_with()
+    turned = {**space.start, "direction": 2.5, "second_direction": -1.8, "fold": 6.0, "amplitude": 0.01}
+    assert space.to_values(space.to_vector(turned))["direction"] == pytest.approx(2.5)
+    assert bound_warnings(space, {**turned, "second_amplitude": 0.01}) == ()
+    tilted = {**turned, "second_amplitude": 0.01, "incidence": space.high["incidence"]}
+    assert len(bound_warnings(space, tilted)) == 1
+    coarse = globally_searched(space)
+    for name, middle in (("direction", 0.0), ("second_direction", 0.5 * math.pi)):
+        assert middle - math.pi < coarse.low[name] < middle - 0.5 * math.pi
+        assert middle + 0.5 * math.pi < coarse.high[name] < middle + math.pi
+    given = space_with(direction=(-0.3, 0.2))
+    assert (globally_searched(given).low["direction"], globally_searched(given).high["direction"]) == (-0.3, 0.2)
+    assert "direction = 0.2 rad lies on its bound" in bound_warnings(given, {**tilted, "direction": 0.2})[0]
 
 
 def test_the_twin_moves_the_image_nearly_alike() -> None:

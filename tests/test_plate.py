@@ -41,6 +41,19 @@ def test_model_agrees_with_a_trace_of_rays(distortion: amiwarp.Distortion | None
     np.testing.assert_allclose(model.compensate_at(xy, theta, rho), expected, rtol=0, atol=2e-3)  # px
 
 
+@pytest.mark.parametrize("rho_scale", [0.0, 1.0])
+def test_faces_that_are_not_parallel_agree_with_a_trace_of_rays(rho_scale: float) -> None:
+    camera, wedge = amiwarp.Camera.from_fov(320, 240, 1.0), (0.0003, -0.0002)
+    plate = amiwarp.Plate(0.01, math.radians(40.0), 1.6)
+    xy, theta, rho = random_points(camera)
+    expected = reference.at_depth(camera, plate, PHASE, xy, theta, rho_scale * rho, wedge)
+    parallel = reference.at_depth(camera, plate, PHASE, xy, theta, rho_scale * rho)
+    assert np.linalg.norm(expected - parallel, axis=1).min() > 0.02  # px
+    model = amiwarp.PlateModel(camera, plate, PHASE, wedge=wedge)
+    tolerance = 2e-3 if rho_scale == 0.0 else 1e-2  # px; the model bends rays at the centre, not at the face
+    np.testing.assert_allclose(model.compensate_at(xy, theta, rho_scale * rho), expected, rtol=0, atol=tolerance)
+
+
 def test_one_depth_for_all_pixels_is_a_map_of_equal_depths(device: str) -> None:
     camera = amiwarp.Camera.from_fov(64, 48, 1.0)
     xy, theta, _ = random_points(camera)

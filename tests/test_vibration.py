@@ -12,6 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 import amiwarp
+from amiwarp.calib.parameters import make_space
+from amiwarp.calib.photometric.causes import THIRD, Cause, doubtful_harmonic
+from amiwarp.calib.photometric.consistency import testable
 from amiwarp.cli.app import app
 from reference import optics as reference
 from tests.conftest import COARSE
@@ -19,8 +22,9 @@ from tests.conftest import COARSE
 VALUES = {
     "amplitude": 0.012, "phase": 0.7, "backward_x": 0.005, "backward_y": -0.003, "roll_x": 0.002, "roll_y": 0.004,
     "second_x": 0.001, "second_y": -0.002, "second_backward_x": 0.0007, "second_backward_y": 0.0004,
+    "third_x": -0.0008, "third_y": 0.0011, "third_backward_x": -0.0005, "third_backward_y": 0.0009,
 }  # fmt: skip
-"""Every part of a vibration: 3 px of the first harmonic, 0.5 px of the second."""
+"""Every part of a vibration: 3 px of the first harmonic, 0.5 px of the second, 0.3 px of the third."""
 NO_PRISM = amiwarp.Prism(0.0)
 
 
@@ -101,6 +105,8 @@ SHAKE = amiwarp.Vibration(
     hz=90.0, amplitude=0.014, phase=0.7, backward=(0.006, -0.003), roll=(0.001, 0.002), second=(0.0015, -0.001)
 )
 """An ellipse of up to 3.5 px in the view of ``shaken``, with roll and a second harmonic."""
+BUZZ = replace(SHAKE, third=(0.0007, 0.0003), third_backward=(0.0, -0.0006))
+"""The same with a third harmonic of 0.2 px."""
 FAST = amiwarp.SensorModel(refractory_us=0.0)
 
 
@@ -189,10 +195,12 @@ def distance(found: amiwarp.Calibration, shake: amiwarp.Vibration) -> float:
     return amiwarp.predicted_error(found.model, true, remove_lag=True).rms
 
 
+PROMPT = amiwarp.PhotometricSettings(pairs=25_000, sensor=amiwarp.SensorTiming(refractory_us=1.0))
+
+
 @pytest.fixture(scope="module")
 def calibrated(shaken: amiwarp.Recording) -> amiwarp.Calibration:
-    prompt = amiwarp.PhotometricSettings(pairs=25_000, sensor=amiwarp.SensorTiming(refractory_us=1.0))
-    return amiwarp.calibrate(shaken, model="vibration", events=50_000, photometric=prompt)
+    return amiwarp.calibrate(shaken, model="vibration", events=50_000, photometric=PROMPT)
 
 
 @pytest.mark.slow
@@ -204,7 +212,39 @@ def test_an_unknown_refractory_period_is_refused_with_the_remedy(shaken: amiwarp
 def test_it_is_calibrated_without_start_values(calibrated: amiwarp.Calibration) -> None:
     assert distance(calibrated, SHAKE) < 0.02  # px
     assert calibrated.parameters["rpm"] == pytest.approx(5400.0, rel=1e-4)
-    assert set(calibrated.free) == {*amiwarp.VibrationModel.FREE, "rpm"} == set(calibrated.uncertainty)
+    assert set(calibrated.free) == {*amiwarp.VibrationModel.FREED, "rpm"} == set(calibrated.uncertainty)
+
+
+def test_a_third_harmonic_is_looked_for_unless_it_is_given() -> None:
+    camera = amiwarp.Camera.from_fov(128, 96, 1.0)
+
+    def causes_with(free: tuple[str, ...] | None = None, **start: float) -> list[Cause]:
+        return testable(make_space("vibration", camera, NO_PRISM, free=free, start=start, bounds={}, rad_per_us=1e-3,
+                                   duration_us=1e5))  # fmt: skip
+
+    assert causes_with() == [THIRD]
+    assert causes_with(third_x=0.0) == []
+    assert causes_with((*amiwarp.VibrationModel.FREED, *THIRD.names)) == []
+
+
+def test_a_harmonic_that_may_be_none_is_left_out() -> None:
+    values = {"amplitude": 0.01, "third_x": 8e-5, "third_y": 2e-5}
+    certain = {"amplitude": 1e-5, "third_x": 2e-5, "third_y": 2e-5}
+    assert doubtful_harmonic(values, certain) == {}
+    assert doubtful_harmonic(values, {**certain, "third_x": 3e-5}) == {"third_x": 0.0, "third_y": 0.0}
+    assert doubtful_harmonic(values, {"amplitude": 1e-5}) == {}
+
+
+@pytest.mark.slow
+def test_a_third_harmonic_is_found_where_there_is_one(texture: np.ndarray) -> None:
+    camera = amiwarp.Camera.from_fov(160, 120, math.radians(43.0))
+    recording = amiwarp.simulate(texture, camera, BUZZ, duration_s=0.2, sensor=FAST, seed=3)
+    more = replace(PROMPT, pairs=100_000)
+    found = amiwarp.calibrate(recording, model="vibration", events=50_000, photometric=more)
+    assert distance(found, BUZZ) < 0.02  # px
+    hz = abs(found.parameters["rpm"]) / 60.0
+    assert abs(hz - 90.0) < 3.0 * found.uncertainty["rpm"] / 60.0
+    assert {"third_x", "third_backward_y"} <= {*found.free}
 
 
 def test_the_file_has_no_prism(calibrated: amiwarp.Calibration, shaken: amiwarp.Recording, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ def find_depths(
     tried = np.linspace(least, largest, max(5, 1 + math.ceil((largest - least) * radius / PLANE_PX)))
     pixels = []
     for k, each in enumerate(tried):
-        cost = costs.of(PlateModel(model.camera, model.plate, model.phase, float(each)))
+        cost = costs.of(replace(model, inverse_depth=float(each), depths=None))
         pixels.append(cost.astype(np.float32))
         report((k + 1) / (len(tried) + 4))
     windows: NDArray[np.float32] = np.stack([gaussian_filter(one, WINDOW_PX) for one in pixels])

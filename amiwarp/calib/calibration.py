@@ -47,7 +47,7 @@ from amiwarp.calib.parameters import (
     phase_names,
     units,
 )
-from amiwarp.calib.photometric import limits
+from amiwarp.calib.photometric import causes, limits
 from amiwarp.calib.photometric.distances import px_per_rad, stated_px
 from amiwarp.calib.photometric.equations import Problem
 from amiwarp.calib.photometric.pairs import upload_ahead, van_der_corput
@@ -57,7 +57,7 @@ from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX,
 from amiwarp.calib.pulses import off_path, pulses_only, smooth_path
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
 from amiwarp.calib.settings import AUTO, CalibrationOptions, Settings
-from amiwarp.calib.sharpness_search import Search
+from amiwarp.calib.sharpness_search import Search, bound_warnings
 from amiwarp.calib.start_burst import reaching_back, without_start_burst
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
@@ -332,6 +332,7 @@ class Calibrator:
                 if rival is not None and rival.search is not None:
                     checks.check_sharper(search.gain_over(rival.search), recording.name)
                 found = _sharpest(recording, search, *search.check_answer(recording.name))
+                space, values = search.space, found.parameters
                 if "photometric" in self.settings.stages:
                     problem = Problem(
                         recording,
@@ -350,6 +351,9 @@ class Calibrator:
                         found = _warning(found, f"the photometric stage failed: {error}")
                     else:
                         found = _refined(search, found, *refined)
+                        if refined[0].accepted:
+                            space, values = refined[-1], refined[0].parameters
+                found = _warning(found, *bound_warnings(space, values))
         except AmiwarpError as error:
             return Attempt(None, error, search)
         return Attempt(replace(found, seconds=time.perf_counter() - began), search=search)
@@ -492,9 +496,10 @@ class Calibrator:
         found = tried.calibration
         if found is None or found.zero_us is None or not tried.accepted or "rpm" not in found.free:
             return tried
+        held = {} if self.settings.free else causes.doubtful_harmonic(found.parameters, found.uncertainty)
         known = {n: x for n, x in found.parameters.items() if n != "rpm"}
-        settings = replace(self.settings, free=tuple(n for n in found.free if n != "rpm"), start=known,
-                           global_algorithm=None)  # fmt: skip
+        free = tuple(n for n in found.free if n != "rpm" and n not in held)
+        settings = replace(self.settings, free=free, start={**known, **held}, global_algorithm=None)
         events = self.recording.events
         path = constant_speed(found.parameters["rpm"], events.t_first, events.t_last, found.zero_us)
         again = replace(self, settings=settings, path=path).attempt()

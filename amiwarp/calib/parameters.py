@@ -386,6 +386,16 @@ def values_of(model: str, values: Mapping[str, float]) -> dict[str, float]:
     return {name: value for name, value in values.items() if name not in foreign}
 
 
+def globally_searched(space: ParameterSpace) -> ParameterSpace:
+    """Return the space with bounds of one period, and a margin, for the parameters that repeat."""
+    low, high = dict(space.low), dict(space.high)
+    for name, parameter in optical_parameters().items():
+        if parameter.period and name in space.names:
+            low[name] = max(low[name], space.start[name] - parameter.half_range)
+            high[name] = min(high[name], space.start[name] + parameter.half_range)
+    return replace(space, low=low, high=high)
+
+
 def kept_by_global_search(space: ParameterSpace) -> tuple[str, ...]:
     """Return the names of the free parameters whose start values the global search keeps."""
     fine = {name for name, parameter in optical_parameters().items() if parameter.fine}

@@ -19,6 +19,7 @@ from amiwarp.calib.nlopt_solver import SearchStage, maximise
 from amiwarp.calib.parameters import (
     MOTION,
     ParameterSpace,
+    globally_searched,
     kept_by_global_search,
     like_size,
     of_orbit,
@@ -398,7 +399,7 @@ class Search:
         """
         s, space = self.settings, self.space
         starts = [space.to_vector(space.start if start is None else start)]
-        still = space.without(kept_by_global_search(space))
+        still = globally_searched(space.without(kept_by_global_search(space)))
         if start is None and s.global_algorithm is not None and still.names:
             found = [dict(still.start)]
             for part in self._global_parts(still):
@@ -513,13 +514,7 @@ class Search:
             checks.check_directions(self.fine.image(best), inset, name)
         v = space.to_vector(best)
         covariance, warnings = estimate_covariance(parts, v)
-        at_bound = [
-            n for n in (each for each in space.names if each not in phase_names())
-            if min(best[n] - space.low[n], space.high[n] - best[n]) * space.pixels[n] < LEAST_INSIDE_PX
-        ]  # fmt: skip
-        unit = units()
-        bounds = (f"{n} = {best[n]:.6g} {unit[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)
-        return (*bounds, *warnings), space.deviations(v, covariance)
+        return warnings, space.deviations(v, covariance)
 
     def sharpness_in(self, space: ParameterSpace, values: Mapping[str, float]) -> float:
         """Return the sharpness at ``values`` with the camera and the prism of ``space``."""
@@ -531,6 +526,17 @@ class Search:
             smoothing = self.settings.smoothing_px
             fine = self._objective(self.calibration_events, scale=1.0, smoothing=smoothing, space=space)
         return fine.values(values)
+
+
+def bound_warnings(space: ParameterSpace, values: Mapping[str, float]) -> tuple[str, ...]:
+    """Return a warning for each free parameter whose value lies on one of its bounds."""
+    unit = units()
+    at_bound = []
+    for name in space.names:
+        inside = min(values[name] - space.low[name], space.high[name] - values[name])
+        if name not in phase_names() and inside * space.pixels[name] < LEAST_INSIDE_PX:
+            at_bound.append(name)
+    return tuple(f"{n} = {values[n]:.6g} {unit[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)
 
 
 def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:

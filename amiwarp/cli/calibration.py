@@ -160,11 +160,13 @@ class ParameterOptions:
             help="Parameters to estimate, separated by commas: apex (or deflection), phase, clock_offset, rpm, tilt_x, "
             "tilt_y, cylinder_x, cylinder_y, wobble_x, wobble_y, index, focal_length; of a pair of prisms also "
             "second_apex, second_phase, ratio; of a plate phase, inverse_depth; of a vibration amplitude, phase, "
-            "rpm, backward_x, backward_y, roll_x, roll_y, second_x, second_y, second_backward_x, second_backward_y; of "
-            "a mirror amplitude, phase, direction, second_amplitude, second_phase, second_direction, fold, incidence; "
+            "rpm, backward_x, backward_y, roll_x, roll_y, second_x, second_y, second_backward_x, second_backward_y, "
+            "third_x, third_y, third_backward_x, third_backward_y; of a mirror amplitude, phase, direction, "
+            "second_amplitude, second_phase, second_direction, fold, incidence; "
             "motion (or rate_x, rate_y, rate_z) and change_x, change_y, change_z for a rotating camera, growth for one "
             "that moves forward; off_ratio and leak of the sensor. "
-            "Default: apex,phase, and rpm without an encoder; all of a vibration and of a mirror.",
+            "Default: apex,phase, and rpm without an encoder; all of a mirror; all of a vibration, its third harmonic "
+            "where the events ask for it.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None

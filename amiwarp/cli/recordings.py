@@ -284,7 +284,7 @@ def _listed(names: list[str]) -> str:
 
 def _degrees(parameters: dict[str, float]) -> dict[str, float]:
     """Return the true parameters of the optic with angles in degrees, under names that end in ``_deg``."""
-    pairs = ("tilt", "cylinder", "wobble", "backward", "roll", "second", "second_backward")
+    pairs = ("tilt", "cylinder", "wobble", "backward", "roll", "second", "second_backward", "third", "third_backward")
     single = ("apex", "amplitude", "phase", "plate_tilt", "direction", "fold", "incidence")
     second = (f"second_{name}" for name in ("apex", "amplitude", "phase", "direction"))
     angles = (*single, *second, *(f"{name}_{axis}" for name in pairs for axis in "xy"))

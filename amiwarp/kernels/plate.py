@@ -25,6 +25,7 @@ class PlateParams:
     sin_tilt: float  # sine of the angle between the faces' normal and the optical axis
     cos_tilt: float  # cosine of this angle
     inverse_depth: float  # inverse depth of the scene [1/m]
+    wedge: wp.vec2  # angle between the faces, along the tilt and across it [rad]
 
 
 @wp.struct
@@ -49,6 +50,25 @@ def plate_shift(m: PlateParams, x: float, y: float, z: float, w0: float, w1: flo
 
 
 @wp.func
+def bent_by_wedge(m: PlateParams, x: float, y: float, z: float, w: wp.vec2) -> wp.vec3:
+    """Return the direction behind the plate of a camera's ray, which faces at an angle to each other change.
+
+    Snell's law in vector form at both faces; the direction inside has the length n. NaN if no ray passes.
+    """
+    if m.wedge[0] == 0.0 and m.wedge[1] == 0.0:
+        return wp.vec3(x, y, z)
+    ray = wp.normalize(wp.vec3(x, y, z))
+    near = wp.vec3(m.sin_tilt * w[0], m.sin_tilt * w[1], m.cos_tilt)
+    along = wp.vec3(m.cos_tilt * w[0], m.cos_tilt * w[1], -m.sin_tilt)
+    across = wp.vec3(-w[1], w[0], 0.0)
+    far = wp.normalize(near + m.wedge[0] * along + m.wedge[1] * across)
+    c = wp.dot(ray, near)
+    inside = ray + (wp.sqrt(m.inside + c * c) - c) * near
+    c = wp.dot(inside, far)
+    return inside - (c - wp.sqrt(c * c - m.inside)) * far
+
+
+@wp.func
 def seen_from(m: PlateParams, x: float, y: float, z: float, w: wp.vec2) -> wp.vec3:
     """Return the place, in the camera's frame, from which the camera sees along a ray through the plate [m]."""
     g = plate_shift(m, x, y, z, w[0], w[1])
@@ -59,7 +79,12 @@ def seen_from(m: PlateParams, x: float, y: float, z: float, w: wp.vec2) -> wp.ve
 def move_direction(m: PlateParams, inverse_depth: float, x: float, y: float, z: float, w0: float, w1: float):
     """Return the direction from the resting centre to the point at an inverse depth [1/m] on the ray of a pixel."""
     k = inverse_depth * plate_shift(m, x, y, z, w0, w1)
-    return x + k * (m.sin_tilt * w0 * z - m.cos_tilt * x), y + k * (m.sin_tilt * w1 * z - m.cos_tilt * y), z
+    b = bent_by_wedge(m, x, y, z, wp.vec2(w0, w1))
+    return (
+        b[0] + k * (m.sin_tilt * w0 * b[2] - m.cos_tilt * b[0]),
+        b[1] + k * (m.sin_tilt * w1 * b[2] - m.cos_tilt * b[1]),
+        b[2],
+    )
 
 
 @wp.func
@@ -98,11 +123,11 @@ def compensate(model: PlateMapParams, camera: CameraParams, xy: wp.vec2, w: wp.v
 @wp.func
 def displace(model: PlateMapParams, camera: PinholeParams, x: float, y: float, w0: float, w1: float):
     """Return the compensated position of an event, for a camera without distortion."""
-    a, b, _ = move_direction(
+    a, b, c = move_direction(
         model.plate, model.table[int(y), int(x)], (x - camera.cx) * camera.inverse_fx,
         (y - camera.cy) * camera.inverse_fy, 1.0, w0, w1,
     )  # fmt: skip
-    return camera.fx * a + camera.cx, camera.fy * b + camera.cy
+    return camera.fx * (a / c) + camera.cx, camera.fy * (b / c) + camera.cy
 
 
 @wp.func

@@ -21,6 +21,8 @@ class VibrationParams:
     roll: wp.vec2  # rotation about the optical axis: factors of cos φ and sin φ [rad]
     second: wp.vec2  # rotation about x and y by the forward circle of the second harmonic at φ = 0 [rad]
     second_backward: wp.vec2  # the same of its backward circle [rad]
+    third: wp.vec2  # rotation about x and y by the forward circle of the third harmonic at φ = 0 [rad]
+    third_backward: wp.vec2  # the same of its backward circle [rad]
 
 
 @wp.func
@@ -45,12 +47,15 @@ def rotate_by_vector(x: float, y: float, z: float, a: float, b: float, c: float)
 @wp.func
 def rotate_by_vibration(m: VibrationParams, sign: float, x: float, y: float, z: float, w0: float, w1: float):
     """Rotate a direction by the camera's rotation from rest at φ = (w0, w1), or back with ``sign`` -1."""
-    t0, t1 = w0 * w0 - w1 * w1, 2.0 * w0 * w1
+    t0, t1 = w0 * w0 - w1 * w1, 2.0 * w0 * w1  # cosine and sine of 2φ
+    u0, u1 = w0 * t0 - w1 * t1, w0 * t1 + w1 * t0  # and of 3φ
     a = m.amplitude * w0 + m.backward[0] * w0 + m.backward[1] * w1
     b = m.amplitude * w1 + m.backward[1] * w0 - m.backward[0] * w1
     c = m.roll[0] * w0 + m.roll[1] * w1
     a += m.second[0] * t0 - m.second[1] * t1 + m.second_backward[0] * t0 + m.second_backward[1] * t1
     b += m.second[1] * t0 + m.second[0] * t1 + m.second_backward[1] * t0 - m.second_backward[0] * t1
+    a += m.third[0] * u0 - m.third[1] * u1 + m.third_backward[0] * u0 + m.third_backward[1] * u1
+    b += m.third[1] * u0 + m.third[0] * u1 + m.third_backward[1] * u0 - m.third_backward[0] * u1
     return rotate_by_vector(x, y, z, sign * a, sign * b, sign * c)
 
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
-from amiwarp.kernels.plate import PlateParams, seen_from
+from amiwarp.kernels.plate import PlateParams, bent_by_wedge, seen_from
 from amiwarp.kernels.prism_view import Steps, View, ray_without_prisms
 from amiwarp.kernels.refraction import ExactParams
 from amiwarp.kernels.world import (
@@ -46,6 +46,7 @@ def look_through(view: RayView, steps: Steps, k: int, x: float, y: float) -> wp.
     """Return the unit vector in the world's frame along which a point of the image looks at instant ``k``."""
     ray = pixel_to_ray(view.camera, wp.vec2(x, y))
     ray = ray_without_prisms(view.prism, view.second, ray, steps.at[k].azimuth, steps.at[k].second)
+    ray = bent_by_wedge(view.plate, ray[0], ray[1], ray[2], steps.at[k].azimuth)
     return view.poses[k].rotation * wp.normalize(ray)
 
 
@@ -282,11 +283,13 @@ def find_surfaces(
 
 @wp.kernel
 def find_centres(
-    view: RayView, azimuth: wp.vec2, rays: wp.array(dtype=wp.vec3), start: int, out: wp.array(dtype=wp.vec3)
-):
-    """Compute the place in the camera's frame from which each ray looks through the plate."""
+    view: RayView, azimuth: wp.vec2, rays: wp.array(dtype=wp.vec3), start: int, out: wp.array(dtype=wp.vec3),
+    bent: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """Compute the place in the camera's frame from which each ray looks through the plate, and its direction there."""
     i = start + wp.tid()
     out[i] = seen_from(view.plate, rays[i][0], rays[i][1], rays[i][2], azimuth)
+    bent[i] = bent_by_wedge(view.plate, rays[i][0], rays[i][1], rays[i][2], azimuth)
 
 
 # -- the surface that each event saw
@@ -429,7 +432,9 @@ def find_surfaces_through_plate(
     angle = steps.angle[k] + steps.turn[k] * share
     ray = pixel_to_ray(view.camera, points[i])
     pose = between(view.poses[k], view.poses[k + 1], share)
-    centre = seen_from(view.plate, ray[0], ray[1], ray[2], wp.vec2(wp.cos(angle), wp.sin(angle)))
+    azimuth = wp.vec2(wp.cos(angle), wp.sin(angle))
+    centre = seen_from(view.plate, ray[0], ray[1], ray[2], azimuth)
+    ray = bent_by_wedge(view.plate, ray[0], ray[1], ray[2], azimuth)
     met = meet_anywhere(world, k + int(share + 0.5), pose.position + pose.rotation * centre, pose.rotation * ray)
     place = centre + met.distance * ray
     out.instance[i] = wp.uint16(instance_of(world, met.face))

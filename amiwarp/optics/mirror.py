@@ -68,9 +68,10 @@ class MirrorModel(Model):
         Parameter("second_amplitude", "rad"),
         next(parameter for parameter in RisleyModel.PARAMETERS if parameter.name == "second_phase"),
         next(parameter for parameter in RisleyModel.PARAMETERS if parameter.name == "ratio"),
-        Parameter("direction", "rad", 0.6 * math.pi),
-        Parameter("second_direction", "rad", 0.6 * math.pi),
-        Parameter("fold", "rad", 1.25 * math.pi, fine=True),
+        # a tilt along the opposite direction is one of the opposite phase
+        Parameter("direction", "rad", 0.6 * math.pi, period=math.pi),
+        Parameter("second_direction", "rad", 0.6 * math.pi, period=math.pi),
+        Parameter("fold", "rad", math.pi, fine=True, period=math.tau),
         Parameter("incidence", "rad", 0.6, fine=True),
     )
     ORBITS = (("amplitude", "phase"), ("second_amplitude", "second_phase"))

@@ -71,11 +71,15 @@ class Parameter:
     value."""
     fine: bool = False
     """Whether its effect is so small that the global search keeps its start value."""
+    period: float = 0.0
+    """Period of an angle after which the motion repeats [rad], as that of a direction; 0 for none. Such a parameter has
+    no bounds unless they are given: only the global search keeps to ``half_range``."""
 
     def __post_init__(self) -> None:
         for name in ("name", "unit", "label"):
             instance(getattr(self, name), str, f"parameter's {name}")
         real(self.half_range, f"parameter {shown(self.name)}: half_range", 0.0)
+        real(self.period, f"parameter {shown(self.name)}: period", 0.0)
         vector(self.slider, 3, f"parameter {shown(self.name)}: slider", real)
         low, high = vector(self.limits, 2, f"parameter {shown(self.name)}: limits", _limit)
         if low > high:
@@ -87,6 +91,8 @@ def _limit(value: object, what: str) -> float:
     return value if isinstance(value, float) and math.isinf(value) else real(value, what)
 
 
+BEYOND_TURNS = 2
+"""Turns from its start to which a direction may go: further than any search does, so that it never ends there."""
 PHASE = Parameter("phase", "rad")
 """Phase θ_b, which is added to the encoder's angle."""
 AMPLITUDE = Parameter(
@@ -253,7 +259,8 @@ class Model:
             return 0.0, 2.0 * value
         if name in dict(cls.ORBITS).values():
             return -PHASE.half_range, PHASE.half_range
-        half = next(parameter.half_range for parameter in cls.PARAMETERS if parameter.name == name)
+        parameter = next(parameter for parameter in cls.PARAMETERS if parameter.name == name)
+        half = BEYOND_TURNS * math.tau if parameter.period else parameter.half_range
         return value - half, value + half
 
     @classmethod
@@ -1161,6 +1168,8 @@ NOMINAL_INVERSE_DEPTH = 2.0
 """Inverse depth with which a search starts [1/m]."""
 LARGEST_INVERSE_DEPTH = 20.0
 """Upper limit of inverse depths [1/m]."""
+LARGEST_WEDGE = math.radians(0.5)
+"""Default bound of the angle between a plate's faces [rad]. Stock windows have 1 arcmin or less."""
 
 
 @guarded
@@ -1181,7 +1190,8 @@ class PlateModel(Model):
     -----
     A bearing u sees along the line from g N, where N = (sin α · w, cos α) is the normal of the faces at φ = θ + θ_b,
     and g = t (1 − c / √(n² − 1 + c²)) with c = u · N. A point of inverse depth ρ on it appears at
-    u_xy + ρ g (N_xy u_z − N_z u_xy), with u_z unchanged. See ``docs/explanation/optics.md``.
+    u_xy + ρ g (N_xy u_z − N_z u_xy), with u_z unchanged. Faces that are not parallel change u before, by Snell's law.
+    See ``docs/explanation/optics.md``.
 
     Examples
     --------
@@ -1193,12 +1203,14 @@ class PlateModel(Model):
     array([[323.7, 240. ]])
     """
 
-    NAME, TEXT, NUMBERS, STRUCT = "plate", "tilted plate", "2, plate given", plate_kernels.PlateParams
+    NAME, TEXT, NUMBERS, STRUCT = "plate", "tilted plate", "4, plate given", plate_kernels.PlateParams
     GLASS = Plate
     PARAMETERS = (
         Parameter("inverse_depth", "1/m", 1.0, limits=(0.0, LARGEST_INVERSE_DEPTH), label="inverse depth",
                   slider=(0.0, 5.0, 0.01)),
         PHASE,
+        Parameter("wedge_x", "rad", LARGEST_WEDGE, fine=True),
+        Parameter("wedge_y", "rad", LARGEST_WEDGE, fine=True),
     )  # fmt: skip
 
     camera: Camera
@@ -1211,11 +1223,14 @@ class PlateModel(Model):
     """Inverse depth of the scene [1/m], as seen from the resting centre; 0: the plate moves nothing."""
     depths: NDArray[np.float32] | None = field(default=None, repr=False)
     """Inverse depth of what each pixel sees [1/m], shape ``(height, width)``, instead of :attr:`inverse_depth`."""
+    wedge: tuple[float, float] = (0.0, 0.0)
+    """Angle between the faces, along the tilt and across it [rad]: the normal of the face to the scene leans by it."""
 
     def __post_init__(self) -> None:
         instance(self.camera, Camera, "camera")
         instance(self.plate, Plate, "plate")
         object.__setattr__(self, "phase", check_phase(self.phase))
+        object.__setattr__(self, "wedge", check_angles(self.wedge, "wedge"))
         largest = LARGEST_INVERSE_DEPTH
         object.__setattr__(self, "inverse_depth", real(self.inverse_depth, "inverse_depth", 0.0, largest, " 1/m"))
         if self.depths is None:
@@ -1229,7 +1244,7 @@ class PlateModel(Model):
 
     @classmethod
     def start_values(cls, prism: Prism | Plate) -> dict[str, float]:
-        return {cls.SIZE: NOMINAL_INVERSE_DEPTH, PHASE.name: 0.0}
+        return {cls.SIZE: NOMINAL_INVERSE_DEPTH, PHASE.name: 0.0, "wedge_x": 0.0, "wedge_y": 0.0}
 
     @classmethod
     def default_bounds(cls, name: str, value: float, camera: Camera, prism: Prism | Plate) -> tuple[float, float]:
@@ -1241,7 +1256,12 @@ class PlateModel(Model):
     def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
         if not isinstance(prism, Plate):
             raise AmiwarpError("the plate model needs the plate's thickness and tilt; give a Plate as the glass")
-        return cls(camera, prism, values["phase"], values["inverse_depth"])
+        wedge = values.get("wedge_x", 0.0), values.get("wedge_y", 0.0)
+        return cls(camera, prism, values["phase"], values["inverse_depth"], wedge=wedge)
+
+    @classmethod
+    def still_values(cls, values: Mapping[str, float]) -> dict[str, float]:
+        return {**super().still_values(values), "wedge_x": 0.0, "wedge_y": 0.0}
 
     def with_depths(self, depths: NDArray[Any]) -> PlateModel:
         """Return this model with the inverse depth of what each pixel sees.
@@ -1261,16 +1281,21 @@ class PlateModel(Model):
     def kernel_values(self) -> tuple[Any, ...]:
         sine, cosine = math.sin(self.plate.tilt), math.cos(self.plate.tilt)
         inside = self.plate.index**2 - 1.0
-        return *phase_values(self.phase), self.plate.thickness, inside, sine, cosine, self.inverse_depth
+        wedge = np.array(self.wedge)
+        return *phase_values(self.phase), self.plate.thickness, inside, sine, cosine, self.inverse_depth, wedge
 
     def params(self, device: Any) -> Any:
         values = self.kernel_values()
-        plate = struct_of(plate_kernels.PlateParams, values)
+        plate = self._plate_params()
         if self.depths is None:
             return plate
         if str(device) not in self._tables:
             self._tables[str(device)] = wp.array(self.depths, dtype=float, device=device)
         return struct_of(plate_kernels.PlateMapParams, [*values[:3], plate, self._tables[str(device)]])
+
+    def _plate_params(self) -> Any:
+        *numbers, wedge = self.kernel_values()
+        return struct_of(plate_kernels.PlateParams, [*numbers, wp.vec2(*wedge.tolist())])
 
     @cached_property
     def _tables(self) -> dict[str, Any]:
@@ -1300,7 +1325,7 @@ class PlateModel(Model):
             raise AmiwarpError(f"{given}; give (n, 2), (n,) and (n,)")
         points = points_on_host(xy, theta)
         depths = wp.array(rho.astype(np.float32), dtype=float, device="cpu")
-        plate = struct_of(plate_kernels.PlateParams, self.kernel_values())
+        plate = self._plate_params()
         out = wp.empty_like(points[0])
         inputs = [plate, model_camera(self, "cpu"), *points, depths]
         launch(plate_kernels.compensate_at_depths, len(out), inputs, [out], device="cpu")

@@ -1,4 +1,4 @@
-"""A vibrating camera without a prism: it rotates by small angles, one frequency and its second harmonic.
+"""A vibrating camera without a prism: it rotates by small angles, at one frequency, twice and three times it.
 
 The model's angle theta is that of the vibration, 2π f t. The formulas are in ``docs/explanation/optics.md``.
 """
@@ -52,7 +52,8 @@ class VibrationModel(Model):
     Notes
     -----
     The camera's rotation vector about its x and y axes, as a complex number x + iy, is
-    ``amplitude`` e^i(θ+phase) + ``backward`` e^-iθ + ``second`` e^2iθ + ``second_backward`` e^-2iθ.
+    ``amplitude`` e^i(θ+phase) + ``backward`` e^-iθ + ``second`` e^2iθ + ``second_backward`` e^-2iθ + ``third`` e^3iθ +
+    ``third_backward`` e^-3iθ.
     About the optical axis it is ``roll`` · (cos θ, sin θ). See ``docs/explanation/optics.md``.
 
     Examples
@@ -64,7 +65,7 @@ class VibrationModel(Model):
     array([[320., 235.]])
     """
 
-    NAME, TEXT, NUMBERS, STRUCT = "vibration", "vibrating camera", "10", VibrationParams
+    NAME, TEXT, NUMBERS, STRUCT = "vibration", "vibrating camera", "14", VibrationParams
     PARAMETERS = (
         AMPLITUDE,
         PHASE,
@@ -72,8 +73,10 @@ class VibrationModel(Model):
         *_parameters("roll", "roll", fine=True),
         *_parameters("second harmonic", "second", fine=True),
         *_parameters("second harmonic, backward", "second_backward", fine=True),
+        *_parameters("third harmonic", "third", fine=True),
+        *_parameters("third harmonic, backward", "third_backward", fine=True),
     )
-    FREED = tuple(parameter.name for parameter in PARAMETERS)
+    FREED = tuple(parameter.name for parameter in PARAMETERS if not parameter.name.startswith("third"))
     PRISM, MOVER, SIZE_HINT = False, "vibration", f"{LARGEST_PX:g} px"
     TIME_BIN_US, SECTORS = 200, 8  # no events come where a vibration along a line turns back
 
@@ -91,6 +94,10 @@ class VibrationModel(Model):
     """Rotation about x and y by the forward circle of the second harmonic at θ = 0 [rad]."""
     second_backward: tuple[float, float] = (0.0, 0.0)
     """Rotation about x and y by the backward circle of the second harmonic at θ = 0 [rad]."""
+    third: tuple[float, float] = (0.0, 0.0)
+    """Rotation about x and y by the forward circle of the third harmonic at θ = 0 [rad]."""
+    third_backward: tuple[float, float] = (0.0, 0.0)
+    """Rotation about x and y by the backward circle of the third harmonic at θ = 0 [rad]."""
 
     def __post_init__(self) -> None:
         instance(self.camera, Camera, "camera")
@@ -124,7 +131,7 @@ class VibrationModel(Model):
     @classmethod
     def turned_values(cls, values: Mapping[str, float], angle: float) -> dict[str, float]:
         found = super().turned_values(values, angle)
-        for name, times in (("backward", -1.0), ("roll", -1.0), ("second", 2.0), ("second_backward", -2.0)):
+        for name, times in {**CIRCLES, "roll": -1}.items():
             part = complex(values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0))
             part *= cmath.rect(1.0, times * angle)
             found |= {f"{name}_x": part.real, f"{name}_y": part.imag}
@@ -137,11 +144,17 @@ class VibrationModel(Model):
         given = {name: values.get(name, 0.0) for name in cls.FREE[2:]}
         backward = complex(given["backward_x"], given["backward_y"])
         changed = {
-            "amplitude": abs(backward), "phase": cmath.phase(backward), "backward_x": forward.real,
-            "backward_y": forward.imag, "roll_x": given["roll_x"], "roll_y": -given["roll_y"],
-            "second_x": given["second_backward_x"], "second_y": given["second_backward_y"],
-            "second_backward_x": given["second_x"], "second_backward_y": given["second_y"],
-        }  # fmt: skip
+            "amplitude": abs(backward),
+            "phase": cmath.phase(backward),
+            "backward_x": forward.real,
+            "backward_y": forward.imag,
+            "roll_x": given["roll_x"],
+            "roll_y": -given["roll_y"],
+        }
+        for name in ("second", "third"):
+            for axis in "xy":
+                changed[f"{name}_{axis}"] = given[f"{name}_backward_{axis}"]
+                changed[f"{name}_backward_{axis}"] = given[f"{name}_{axis}"]
         return {**values, **changed}
 
     def rotations(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -168,29 +181,31 @@ class VibrationModel(Model):
         theta = array(theta, "theta")
         if theta.ndim != 1:
             raise AmiwarpError(f"theta has shape {theta.shape}; give angles of shape (n,)")
-        circles = {1: cmath.rect(self.amplitude, self.phase), -1: complex(*self.backward),
-                   2: complex(*self.second), -2: complex(*self.second_backward)}  # fmt: skip
         theta = np.where(np.isfinite(theta), theta, np.nan)
-        vector = sum(size * np.exp(1j * k * theta) for k, size in circles.items())
+        vector = self.amplitude * np.exp(1j * (theta + self.phase))
+        for name, times in CIRCLES.items():
+            vector += complex(*getattr(self, name)) * np.exp(1j * times * theta)
         roll = self.roll[0] * np.cos(theta) + self.roll[1] * np.sin(theta)
         return np.asarray(Rotation.from_rotvec(np.stack([vector.real, vector.imag, roll], axis=1)).as_matrix())
 
     def kernel_values(self) -> tuple[Any, ...]:
-        # the kernels' angle is φ = θ + phase
-        turn = cmath.rect(1.0, self.phase)
-        backward, second = complex(*self.backward) * turn, complex(*self.second) * turn.conjugate() ** 2
-        roll, second_backward = complex(*self.roll) * turn, complex(*self.second_backward) * turn**2
-        vectors = (np.array([z.real, z.imag]) for z in (backward, roll, second, second_backward))
+        vectors = []
+        for name in PARTS:  # the kernels' angle is φ = θ + phase
+            times = -1 if name == "roll" else CIRCLES[name]
+            part = complex(*getattr(self, name)) * cmath.rect(1.0, -times * self.phase)
+            vectors.append(np.array([part.real, part.imag]))
         return self.amplitude, *phase_values(self.phase), *vectors
 
     def params(self, device: Any) -> Any:
-        amplitude, *phase, backward, roll, second, second_backward = self.kernel_values()
-        vectors = (wp.vec2(*pair.tolist()) for pair in (backward, roll, second, second_backward))
-        return struct_of(VibrationParams, [amplitude, *phase, *vectors])
+        values = self.kernel_values()
+        numbers, vectors = values[: -len(PARTS)], values[-len(PARTS) :]
+        return struct_of(VibrationParams, [*numbers, *(wp.vec2(*pair.tolist()) for pair in vectors)])
 
 
-PARTS = ("backward", "roll", "second", "second_backward")
-"""Names of the parts of a vibration, besides the forward circle."""
+CIRCLES = {"backward": -1, "second": 2, "second_backward": -2, "third": 3, "third_backward": -3}
+"""Names of the circles besides the forward one, and how often each is run through, forwards, while θ turns once."""
+PARTS = ("backward", "roll", "second", "second_backward", "third", "third_backward")
+"""Names of the parts of a vibration, besides the forward circle, in the order of the kernels' struct."""
 
 
 def check_amplitude(value: object) -> float:

@@ -21,7 +21,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.mirror import INCIDENCE, MirrorModel
 from amiwarp.optics.models import ExactModel, Model, PlateModel, RisleyModel
 from amiwarp.optics.prism import Plate, Prism, check_angles, check_phase
-from amiwarp.optics.vibration import VibrationModel
+from amiwarp.optics.vibration import PARTS, VibrationModel
 from amiwarp.simulation.pictures import linear_luminance, read_picture
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.world import BLUR_PX, WorldScene
@@ -67,6 +67,8 @@ class PrismMotion:
     """Wobble of the prism about the axis of rotation [rad], as in :class:`amiwarp.ExactModel`."""
     second: PrismMotion | None = None
     """Motion of the second prism of a pair; None for one prism."""
+    wedge: tuple[float, float] = (0.0, 0.0)
+    """Angle between the faces of a plate, along its tilt and across it [rad], as in :class:`amiwarp.PlateModel`."""
 
     def __post_init__(self) -> None:
         _check_table("prism speed", self._table())
@@ -77,7 +79,7 @@ class PrismMotion:
             if any((*self.tilt, *self.cylinder, *self.wobble)):
                 raise AmiwarpError("a pair of prisms has tilt, cylinder power or wobble; simulate one prism with them")
         object.__setattr__(self, "phase", check_phase(self.phase, "prism phase"))
-        for name in ("tilt", "cylinder", "wobble"):
+        for name in ("tilt", "cylinder", "wobble", "wedge"):
             object.__setattr__(self, name, check_angles(getattr(self, name), name))
 
     @classmethod
@@ -198,6 +200,10 @@ class Vibration:
     """Rotation about x and y by the forward circle of the second harmonic at the start [rad]."""
     second_backward: tuple[float, float] = (0.0, 0.0)
     """The same by the backward circle of the second harmonic [rad]."""
+    third: tuple[float, float] = (0.0, 0.0)
+    """Rotation about x and y by the forward circle of the third harmonic at the start [rad]."""
+    third_backward: tuple[float, float] = (0.0, 0.0)
+    """The same by the backward circle of the third harmonic [rad]."""
 
     def __post_init__(self) -> None:
         _ = self.motion, self.model(Camera.from_fov(8, 8, 1.0))  # their checks
@@ -223,8 +229,7 @@ class Vibration:
         VibrationModel
             The model.
         """
-        parts = (self.backward, self.roll, self.second, self.second_backward)
-        return VibrationModel(camera, self.amplitude, self.phase, *parts)
+        return VibrationModel(camera, self.amplitude, self.phase, **self._parts())
 
     def parameters(self) -> dict[str, float]:
         """Return the true values by the names that calibration uses.
@@ -234,11 +239,13 @@ class Vibration:
         dict
             Values in their units. ``rpm`` is missing if the frequency changes.
         """
-        parts = {"backward": self.backward, "roll": self.roll, "second": self.second,
-                 "second_backward": self.second_backward}  # fmt: skip
-        pairs = {f"{name}_{axis}": float(x) for name, pair in parts.items() for axis, x in zip("xy", pair, strict=True)}
+        parts = self._parts().items()
+        pairs = {f"{name}_{axis}": float(x) for name, pair in parts for axis, x in zip("xy", pair, strict=True)}
         speed = {"rpm": 60.0 * float(self.hz)} if isinstance(self.hz, int | float) else {}
         return {"amplitude": float(self.amplitude), "phase": float(self.phase), **pairs, **speed}
+
+    def _parts(self) -> dict[str, tuple[float, float]]:
+        return {name: getattr(self, name) for name in PARTS}
 
 
 @guarded
@@ -648,6 +655,8 @@ class SimulationValues:
             instance(getattr(self, name), kind, f"simulation's {name}")
         if isinstance(self.prism, Plate):
             self._check_plate()
+        elif any(self.prism_motion.wedge):
+            raise AmiwarpError("wedge is the angle between the faces of a plate; give a prism its apex angle")
         real(self.duration_s, "duration_s", 1e-3, LONGEST_S, " s")
         if self.camera.width * self.camera.height > 1 << 22:
             given = f"{self.camera.width}x{self.camera.height}"
@@ -709,7 +718,9 @@ class SimulationValues:
     @property
     def plate(self) -> PlateModel | None:
         """True model of the plate, for a scene at infinity; None for a prism."""
-        return PlateModel(self.camera, self.prism, self.prism_motion.phase) if isinstance(self.prism, Plate) else None
+        if not isinstance(self.prism, Plate):
+            return None
+        return PlateModel(self.camera, self.prism, self.prism_motion.phase, wedge=self.prism_motion.wedge)
 
     @property
     def moving_model(self) -> Model:

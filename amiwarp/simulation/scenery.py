@@ -1168,15 +1168,17 @@ class WorldSight:
         """Set the plate through which the camera looks; None takes it out."""
         self._view.plate = PlateParams() if plate is None else plate.params(self._world.device)
 
-    def centres(self, rays: NDArray[Any], angle: float) -> NDArray[np.float32]:
-        """Return where rays of the camera, shape (n, 3), begin at an azimuth of the plate [rad]: places [m], (n, 3)."""
+    def through_plate(self, rays: NDArray[Any], angle: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return where rays of the camera, shape (n, 3), begin at an azimuth of the plate [rad], and their directions.
+
+        Places [m] and directions have the shape (n, 3).
+        """
         device = self._world.device
         given = wp.array(rays.astype(np.float32), dtype=wp.vec3, device=device)
-        out = wp.empty_like(given)
+        places, directions = wp.empty_like(given), wp.empty_like(given)
         inputs = [self._view, wp.vec2(math.cos(angle), math.sin(angle)), given]
-        launch(world_rays.find_centres, len(rays), inputs, [out], device=device)
-        found: NDArray[np.float32] = out.numpy()
-        return found
+        launch(world_rays.find_centres, len(rays), inputs, [places, directions], device=device)
+        return places.numpy(), directions.numpy()
 
     def set_instants(self, t_us: NDArray[np.float64], view: Any) -> None:
         """Set the poses of the camera and the bodies at the instants of a chunk.

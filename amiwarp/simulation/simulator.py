@@ -248,7 +248,7 @@ class TruthRenderer:
             ends = self._plate_pixels(plate, rays, depth, later)
             known = np.isfinite(ends).all(axis=1, keepdims=True)
             rays = np.where(known, camera.pixels_to_rays(ends), self._rays)
-            centres = self._plate_centres(rays, later)
+            centres, rays = self._behind_plate(rays, later)
         elif prism:
             ends = self._simulation.moving_model.deflect_points(ends, self._angles(next_us))
         (rotation,), (position,) = self._poses([later])
@@ -287,16 +287,18 @@ class TruthRenderer:
     ) -> tuple[scenery.SurfaceView, NDArray[np.float64]]:
         """Return the surfaces that the pixels see through the turning plate at time ``t`` [s], and where they appear
         without it [px], shape (n, 2)."""
-        seen = scenery.surfaces_at(
-            self._world, self._rays, rotation, position, centres=self._plate_centres(self._rays, t)
-        )
-        away = np.where(np.isfinite(seen.depth)[:, None], (seen.place - position) @ rotation, self._rays)
+        centres, rays = self._behind_plate(self._rays, t)
+        seen = scenery.surfaces_at(self._world, rays, rotation, position, centres=centres)
+        away = np.where(np.isfinite(seen.depth)[:, None], (seen.place - position) @ rotation, rays)
         return seen, self._simulation.camera.rays_to_pixels(away)
 
-    def _plate_centres(self, rays: NDArray[np.float64], t: float) -> NDArray[np.float32]:
-        """Return where rays of the camera begin through the plate at time ``t`` [s]: places [m], shape (n, 3)."""
+    def _behind_plate(self, rays: NDArray[np.float64], t: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return where rays of the camera begin through the plate at time ``t`` [s], and their directions there.
+
+        Places [m] and directions have the shape (n, 3).
+        """
         motion = self._simulation.prism_motion
-        return self._sight.centres(rays, motion.phase + float(motion.angle([t * 1e6])[0]))
+        return self._sight.through_plate(rays, motion.phase + float(motion.angle([t * 1e6])[0]))
 
     def _plate_pixels(
         self, model: PlateModel, rays: NDArray[np.float64], depth: NDArray[np.float64], later: float
@@ -1023,7 +1025,7 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
         return {**glass.parameters(), **clock, **moving, **asdict(simulation.sensor)}
     uneven = {
         f"{name}_{axis}": angle
-        for name in ("tilt", "cylinder", "wobble")
+        for name in (("tilt", "cylinder", "wobble") if isinstance(glass, Prism) else ("wedge",))
         for axis, angle in zip("xy", getattr(simulation.prism_motion, name), strict=True)
     }
     size = (
@@ -1035,7 +1037,7 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
         "phase": simulation.prism_motion.phase,
         **of_second_prism(simulation),
         **clock,
-        **(uneven if isinstance(glass, Prism) else {}),
+        **uneven,
         **moving,
         **asdict(simulation.sensor),
     }

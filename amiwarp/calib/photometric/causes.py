@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 FLAT_SIDE = "flat_side"
 """Name of the unknown that is 0 for the given flat side of the prism, and 1 for the other."""
 
+CERTAIN = 3.0
+"""Number of whole standard deviations from which on a harmonic is certainly there."""
+
 
 @dataclass(frozen=True)
 class Cause:
@@ -49,14 +52,27 @@ ASPECT = Cause("the ratio of the focal lengths fy / fx", ("fy_over_fx",))
 AXIS = Cause("the direction of the prism's axis", ("tilt_x", "tilt_y"))
 SEAT = Cause("the prism's seat in its mount", ("wobble_x", "wobble_y"))
 FACES = Cause("the evenness of the prism's faces", ("cylinder_x", "cylinder_y"))
-CAUSES = (FOCAL_LENGTH, CENTER, SIDE, INDEX, DISTORTION, ASPECT, AXIS, SEAT, FACES)
+THIRD = Cause("the vibration's third harmonic", ("third_x", "third_y", "third_backward_x", "third_backward_y"))
+CAUSES = (FOCAL_LENGTH, CENTER, SIDE, INDEX, DISTORTION, ASPECT, AXIS, SEAT, FACES, THIRD)
 """All causes that the photometric stage can name and correct, the likeliest first."""
 SHAPES = (SEAT, FACES)
 """Causes that make the prism uneven."""
 GATED = (INDEX, ASPECT, *SHAPES)
 """Causes whose effect is examined only if a first look, without the map's change, finds one."""
-SCREENED = (FOCAL_LENGTH, CENTER, SIDE, *GATED)
+SCREENED = (FOCAL_LENGTH, CENTER, SIDE, *GATED, THIRD)
 """Causes that every answer is tested for. The effects of the others resemble those of the first two."""
+
+
+def doubtful_harmonic(parameters: Mapping[str, float], uncertainty: Mapping[str, float]) -> dict[str, float]:
+    """Return the values without a third harmonic of a vibration, if it was found but may as well be none; else none.
+
+    The search frees it where it makes the scatter smaller. Errors of the map and of the sensor's timing, which are part
+    of the standard deviations, can look like a harmonic of a hundredth of a pixel.
+    """
+    names = [name for name in THIRD.names if name in uncertainty]
+    if any(abs(parameters[name]) > CERTAIN * uncertainty[name] for name in names):
+        return {}
+    return dict.fromkeys(names, 0.0)
 
 
 def turned(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, float]:

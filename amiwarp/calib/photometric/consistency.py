@@ -28,6 +28,7 @@ from amiwarp.calib.photometric.causes import (
     SEAT,
     SHAPES,
     SIDE,
+    THIRD,
     Cause,
     other_side,
     turned,
@@ -41,6 +42,7 @@ from amiwarp.calib.photometric.linear_fit import SIGNIFICANT, LinearFit, linear_
 from amiwarp.calib.photometric.stated_errors import hidden_px
 from amiwarp.calib.photometric.systematic import errors_of_a_wrong_lens, gap_errors, lens_errors, map_errors
 from amiwarp.optics.camera import LENS
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import as_wedge
 
 if TYPE_CHECKING:
@@ -253,7 +255,9 @@ def _center(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float,
 
 
 def testable(space: ParameterSpace) -> list[Cause]:
-    """Return the causes that can be tested: those that are not free anyway, for the exact model."""
+    """Return the causes that can be tested: those of the exact model that are not free anyway, or of a vibration."""
+    if {*THIRD.names} <= {*MODELS[space.model].FREE} and not {*THIRD.names} & {*space.start}:
+        return [THIRD]
     if space.model != "exact" or not space.cartesian:
         return []
     # a prism whose other side is flat looks nearly like one with cylinder power

@@ -117,7 +117,8 @@ def by_shake(cost: Cost, best: Vector) -> dict[str, Any]:
     """
     pairs = cost.brightness.pairs
     camera = cost.space.camera
-    if cost.space.moving or not orbit_of(cost.space) or MODELS[cost.space.model].ANGLES > 1:
+    kind = MODELS[cost.space.model]
+    if cost.space.moving or not orbit_of(cost.space) or kind.ANGLES > 1 or not kind.PRISM:
         return {}
     at = cost.at(best)
     middle_us = cost.brightness.middle_us
