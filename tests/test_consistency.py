@@ -322,8 +322,10 @@ def outcome(**values: Any) -> Consistency:
         "spread": (0.0, 0.0),
         "untold_px": 0.0,
         "rotation_gain": 0.0,
+        "hidden_px": {},
     }
-    return Consistency(step=np.zeros(2), systematic=np.zeros((2, 2)), **{**none, **values})
+    covariance = np.zeros((2, 2))
+    return Consistency(step=np.zeros(2), systematic=covariance, method=covariance, **{**none, **values})
 
 
 def test_what_is_said_and_refused() -> None:
