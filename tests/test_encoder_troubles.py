@@ -205,7 +205,7 @@ def test_a_burst_is_set_aside_whatever_the_clock(still: Trouble, tick_us: int, s
 
 def test_a_path_that_is_no_number_is_refused(still: Trouble, monkeypatch: pytest.MonkeyPatch) -> None:
     fit = object.__new__(PathFit)
-    fit._recording, fit._cost, fit._px = still.recording, SimpleNamespace(scale=1.0), 10.0
+    fit._recording, fit._cost, fit._px = still.recording, SimpleNamespace(set_scale=lambda scale: None), 10.0
     monkeypatch.setattr(PathFit, "_step", lambda _: (np.array([math.nan]), 0.0, 0.0))
     with pytest.raises(AmiwarpError, match="do not determine the path of the prism's angle"):
         fit._improve(0)
