@@ -48,6 +48,8 @@ class StubCamera:
     """Limits of biases, by their names."""
     exchanges_axes: bool = False
     """Whether a DAVIS346 reports that it exchanges rows and columns."""
+    filters: bool = True
+    """Whether the camera has the filters that regions and masks set. Without them, the driver ignores both."""
     opened: list[dict[str, Any]] = field(default_factory=list)
     """Arguments of each opening, with the configuration as the package's object."""
     closed: int = 0
@@ -95,7 +97,8 @@ class StubDevice:
             time.sleep(self._timeout if part is None else 0.0)
             return now, None, packet
         if part.events is not None:
-            packet.polarity_events = part.events[sends(self._configuration, part.events["x"], part.events["y"])]
+            sent = sends(self._configuration, part.events["x"], part.events["y"])
+            packet.polarity_events = part.events[sent] if self._camera.filters else part.events
         if getattr(self._configuration, "enable_external_trigger", True):
             packet.trigger_events = part.triggers
         return now, (now, 0, 1, False, [], 0, part.dropped), packet
@@ -126,8 +129,9 @@ def sends(configuration: Any, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bo
             sent &= (words[at // 64] >> (at % 64).astype(np.uint64) & np.uint64(1)) == 0
     code = np.array(configuration_codes(getattr(configuration, "pixel_mask", ())), np.int64)
     if code.any():
-        width, row = (1280, 719 - y.astype(np.int64)) if len(code) == 64 else (346, y.astype(np.int64))
-        sent &= ~np.isin(1 + x + row * width, code)
+        row = y.astype(np.int64)
+        number = 1 + x + (719 - row) * 1280 if len(code) == 64 else 1 + x + row * 346
+        sent &= ~np.isin(number, code)
     region = getattr(configuration, "region_of_interest", None)
     if region is not None:
         sent &= (x >= region.left) & (x <= region.left + region.width)

@@ -14,13 +14,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-ROWS = np.dtype({"names": ["timestamp", "x", "y", "polarity"], "formats": ["<i8", "<i2", "<i2", "i1"],
-                 "offsets": [0, 8, 10, 12], "itemsize": 16})  # fmt: skip
+ROWS = np.dtype(
+    {
+        "names": ["timestamp", "x", "y", "polarity"],
+        "formats": ["<i8", "<i2", "<i2", "i1"],
+        "offsets": [0, 8, 10, 12],
+        "itemsize": 16,
+    }
+)
 """Rows of ``EventStore.numpy()``."""
 
-TriggerType = enum.Enum("TriggerType", [
-    "TIMESTAMP_RESET", "EXTERNAL_SIGNAL_RISING_EDGE", "EXTERNAL_SIGNAL_FALLING_EDGE", "EXTERNAL_SIGNAL_PULSE",
-])  # fmt: skip
+TriggerType = enum.Enum(
+    "TriggerType",
+    [
+        "TIMESTAMP_RESET",
+        "EXTERNAL_SIGNAL_RISING_EDGE",
+        "EXTERNAL_SIGNAL_FALLING_EDGE",
+        "EXTERNAL_SIGNAL_PULSE",
+    ],
+)
 """The first kinds of triggers of the library."""
 
 
@@ -51,7 +63,8 @@ class CameraInputBase:
     """What all cameras of the library have."""
 
     def __init__(self, camera: StubDv) -> None:
-        self._camera, self._crop = camera, (0, 0, *camera.size)
+        self._camera = camera
+        self._crop = (0, 0, *camera.size)
         self._parts = iter(camera.parts.pop(0) if camera.parts else ())
         self._next: DvPart | Exception | None = None
         self._ended = False
@@ -82,14 +95,16 @@ class CameraInputBase:
         return not self._ended
 
     def getNextEventBatch(self) -> Any:
-        part, self._next = self._next, None
+        part = self._next
+        self._next = None
         if isinstance(part, Exception):
             raise part
         self._edges = [] if part is None else [edge for edge in part.edges if self._detects(edge[1])]
         if part is None or part.events is None:
             return None
         left, top, width, height = self._crop
-        x, y = part.events["x"].astype(int), part.events["y"].astype(int)
+        x = part.events["x"].astype(int)
+        y = part.events["y"].astype(int)
         kept = part.events[(x >= left) & (x < left + width) & (y >= top) & (y < top + height)]
         rows = np.zeros(len(kept), ROWS)
         for name, source in (("timestamp", "t"), ("x", "x"), ("y", "y"), ("polarity", "on")):
@@ -109,7 +124,9 @@ class DetectorInput(CameraInputBase):
 
     def __init__(self, camera: StubDv) -> None:
         super().__init__(camera)
-        self._running, self._rising, self._falling = False, False, True
+        self._running = False
+        self._rising = False
+        self._falling = True
 
     def setDetectorRunning(self, run: bool) -> None:
         self._running = run
@@ -135,7 +152,8 @@ class DVXplorer(DetectorInput):
 
     def __init__(self, camera: StubDv) -> None:
         super().__init__(camera)
-        self._on, self._off = 9, 10
+        self._on = 9
+        self._off = 10
 
     def setContrastThresholdOn(self, contrastThresholdOn: int) -> None:
         self._on = min(contrastThresholdOn, 17)
@@ -192,9 +210,15 @@ def dv_connected(*cameras: StubDv) -> Iterator[None]:
         return device
 
     module = ModuleType("dv_processing")
-    content: dict[str, Any] = {"TriggerType": TriggerType, "io": SimpleNamespace(camera=SimpleNamespace(
-        discover=lambda: [SimpleNamespace(serialNumber=camera.serial) for camera in present()], open=open_camera,
-    ))}  # fmt: skip
+    content: dict[str, Any] = {
+        "TriggerType": TriggerType,
+        "io": SimpleNamespace(
+            camera=SimpleNamespace(
+                discover=lambda: [SimpleNamespace(serialNumber=camera.serial) for camera in present()],
+                open=open_camera,
+            )
+        ),
+    }
     module.__dict__.update(content)
     kept = sys.modules.get("dv_processing")
     sys.modules["dv_processing"] = module

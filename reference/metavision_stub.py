@@ -87,7 +87,9 @@ class Roi:
         height: int
 
     def __init__(self) -> None:
-        self.window, self.on, self.mode = Roi.Window(0, 0, 0, 0), False, Roi.Mode.RONI
+        self.window = Roi.Window(0, 0, 0, 0)
+        self.on = False
+        self.mode = Roi.Mode.RONI
 
     def set_mode(self, mode: Mode) -> bool:
         self.mode = mode
@@ -130,7 +132,8 @@ class ErcModule:
     """``I_ErcModule``: counts events in periods of 200 us."""
 
     def __init__(self) -> None:
-        self._count, self._on = 4000, False
+        self._count = 4000
+        self._on = False
 
     def enable(self, b: bool) -> bool:
         self._on = b
@@ -163,7 +166,9 @@ class AntiFlicker:
         BandPass = 1
 
     def __init__(self) -> None:
-        self._band, self._on, self.mode = (50, 520), False, AntiFlicker.AntiFlickerMode.BandPass
+        self._band = (50, 520)
+        self._on = False
+        self.mode = AntiFlicker.AntiFlickerMode.BandPass
 
     def enable(self, b: bool) -> bool:
         self._on = b
@@ -214,9 +219,13 @@ class TriggerIn:
 
 
 FACILITIES = {
-    "get_i_ll_biases": LLBiases, "get_i_roi": Roi, "get_i_digital_event_mask": DigitalEventMask,
-    "get_i_erc_module": ErcModule, "get_i_antiflicker_module": AntiFlicker, "get_i_trigger_in": TriggerIn,
-}  # fmt: skip
+    "get_i_ll_biases": LLBiases,
+    "get_i_roi": Roi,
+    "get_i_digital_event_mask": DigitalEventMask,
+    "get_i_erc_module": ErcModule,
+    "get_i_antiflicker_module": AntiFlicker,
+    "get_i_trigger_in": TriggerIn,
+}
 """Class of the facility that each method of the device returns."""
 
 
@@ -242,7 +251,8 @@ class Device:
     def sends(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which pixels send events."""
         sent = np.ones(x.shape, bool)
-        roi, masks = self.facilities["get_i_roi"], self.facilities["get_i_digital_event_mask"]
+        roi = self.facilities["get_i_roi"]
+        masks = self.facilities["get_i_digital_event_mask"]
         if isinstance(roi, Roi) and roi.on:
             window = roi.window
             sent &= (x >= window.x) & (x < window.x + window.width)
@@ -272,7 +282,9 @@ class EventsIterator:
     """``EventsIterator``: slices of events, until the camera is gone."""
 
     def __init__(self, device: Device, delta_t: int) -> None:
-        self.reader, self.delta_t, self._device = Reader(), delta_t, device
+        self.reader = Reader()
+        self.delta_t = delta_t
+        self._device = device
 
     @classmethod
     def from_device(cls, device: Device, delta_t: int = 10_000) -> EventsIterator:

@@ -35,7 +35,8 @@ def rows(n: int, start_us: int = 0, size: tuple[int, int] = (640, 480), seed: in
     rng = np.random.default_rng(seed)
     made = np.zeros(n, POLARITY)
     made["t"] = start_us + np.arange(n, dtype=np.uint64)
-    made["x"], made["y"] = rng.integers(0, size[0], n), rng.integers(0, size[1], n)
+    made["x"] = rng.integers(0, size[0], n)
+    made["y"] = rng.integers(0, size[1], n)
     made["on"] = rng.integers(0, 2, n)
     return made
 
@@ -48,7 +49,10 @@ class Rig:
     """One model of a camera through one driver, with a stand-in for the driver's library."""
 
     def __init__(self, spec: str, connect: Callable[..., Any], camera: Any, make: Callable[..., Any]) -> None:
-        self.spec, self.camera, self._connect, self._make = spec, camera, connect, make
+        self.spec = spec
+        self.camera = camera
+        self._connect = connect
+        self._make = make
 
     def connected(self, *openings: list[Any], most: int | None = None) -> contextlib.AbstractContextManager[Any]:
         """Connect the camera; each opening is a list of events with edges, and of exceptions."""
@@ -129,7 +133,8 @@ def test_a_camera_that_returns_has_its_settings_again(rig: Rig, monkeypatch: pyt
     """Its clock begins anew, and goes on by the host's."""
     monkeypatch.setattr(sources, "REOPEN_S", 0.1)
     size = (346, 260)
-    before, after = rows(500, 7_000_000, size, 1), rows(400, 30, size, 2)
+    before = rows(500, 7_000_000, size, 1)
+    after = rows(400, 30, size, 2)
     said: list[str] = []
     with rig.connected([(before, ((7_000_100, True),)), UNPLUGGED], [(after, ((40, True),)), UNPLUGGED]):
         source = open_source(f"{rig.spec},region=100:50:300:200", wait_s=0.4, say=said.append)
@@ -228,8 +233,12 @@ def test_cameras_of_dv_processing_are_chosen_by_their_serial_number() -> None:
 def test_the_substitute_for_dv_processing_has_the_interface_of_the_library() -> None:
     """Its methods are those of the library's classes, with the same names of arguments."""
     dv = pytest.importorskip("dv_processing")
-    pairs = ((dv_stub.CameraInputBase, dv.io.camera.CameraInputBase), (dv_stub.DVXplorer, dv.io.camera.DVXplorer),
-             (dv_stub.DAVIS, dv.io.camera.DAVIS), (dv_stub.DVXplorerM, dv.io.camera.DVXplorerM))  # fmt: skip
+    pairs = (
+        (dv_stub.CameraInputBase, dv.io.camera.CameraInputBase),
+        (dv_stub.DVXplorer, dv.io.camera.DVXplorer),
+        (dv_stub.DAVIS, dv.io.camera.DAVIS),
+        (dv_stub.DVXplorerM, dv.io.camera.DVXplorerM),
+    )
     checked = 0
     for stub, real in pairs:
         for name in (each for each in dir(stub) if not each.startswith("_") and each[0].islower()):

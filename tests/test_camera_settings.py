@@ -6,6 +6,7 @@ No camera was connected in any of these tests.
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,12 @@ from typer.testing import CliRunner
 
 from amiwarp import (
     AmiwarpError,
+    Camera,
     CameraSettings,
     Encoder,
     Events,
     MemoryEvents,
+    Prism,
     Recording,
     open_camera,
     open_recording,
@@ -28,12 +31,14 @@ from amiwarp.cli.app import app
 from amiwarp.live.stream import sources
 from amiwarp.live.stream.camera_settings import parse_camera
 from amiwarp.live.stream.sources import open_source
+from reference.calibration_sample import exact_calibration
 from reference.camera_stub import POLARITY, TRIGGER, Part, StubCamera, connected
 from reference.dv_stub import DvPart, StubDv, dv_connected
 from reference.metavision_stub import AntiFlicker, MetavisionPart, StubMetavision, TriggerIn, metavision_connected
 
 UNPLUGGED = RuntimeError("gone")
-DAVIS_SIZE, EVK_SIZE = (346, 260), (1280, 720)
+DAVIS_SIZE = (346, 260)
+EVK_SIZE = (1280, 720)
 
 
 def every_pixel(size: tuple[int, int]) -> np.ndarray:
@@ -101,6 +106,16 @@ def test_masked_pixels_are_silent_and_no_others(spec: str, count: int) -> None:
     image = seen(spec, "masked=" + "+".join(f"{x}:{y}" for x, y in pixels))
     y, x = np.nonzero(~image)
     assert sorted(zip(x.tolist(), y.tolist(), strict=True)) == pixels
+
+
+def test_a_davis_without_the_filters_has_a_region_and_masked_pixels_nevertheless() -> None:
+    parts = [[Part(every_pixel(DAVIS_SIZE)), UNPLUGGED]]
+    with connected(StubCamera(name="iniVation DAVIS 346", parts=parts, filters=False)):
+        source = open_source("camera:,region=10:20:30:40,masked=12:21+29:39+30:40")
+        events = Events.concatenate([packet.events for packet in source.packets()])
+    pixels = {(int(x), int(y)) for x, y in zip(events.x, events.y, strict=True)}
+    assert pixels == {(x, y) for x in range(10, 30) for y in range(20, 40)} - {(12, 21), (29, 39)}
+    assert len(events) == len(pixels)
 
 
 def test_region_and_mask_together() -> None:
@@ -219,7 +234,7 @@ def test_a_value_that_the_camera_changes_is_said() -> None:
         ("camera:evk4,trigger=off,counts_per_turn=1", "counts_per_turn counts edges at the trigger input"),
         ("camera:evk4,settings=none.h5", "none.h5: no such file"),
     ],
-)  # fmt: skip
+)
 def test_what_a_camera_cannot_do_is_refused_in_one_line(tmp_path: Path, spec: str, says: str) -> None:
     cameras = [
         StubCamera("1"),
@@ -261,9 +276,14 @@ def test_a_trigger_input_that_may_be_off_is_said() -> None:
 
 
 SETTINGS = CameraSettings(
-    biases={"diff_on": -20, "fo": 3}, region=(1, 2, 30, 40), masked=((5, 6), (7, 8)), most_per_s=1_005_000,
-    flicker_hz=(90, 130), trigger=True, counts_per_turn=-4,
-)  # fmt: skip
+    biases={"diff_on": -20, "fo": 3},
+    region=(1, 2, 30, 40),
+    masked=((5, 6), (7, 8)),
+    most_per_s=1_005_000,
+    flicker_hz=(90, 130),
+    trigger=True,
+    counts_per_turn=-4,
+)
 
 
 def test_the_text_of_settings_can_be_read_again() -> None:
@@ -343,7 +363,8 @@ def test_settings_that_the_camera_reports_are_saved(tmp_path: Path) -> None:
 def test_a_camera_in_python(spec: str) -> None:
     """The same settings as in the name of a source; the camera is closed after the block."""
     camera, connect, size = stand_in("dv:DX0" if spec == "dv" else spec)
-    settings, said = CameraSettings(region=(5, 6, 50, 60), trigger=True), []
+    settings = CameraSettings(region=(5, 6, 50, 60), trigger=True)
+    said = []
     events = 0
     with connect(camera):
         with open_camera(spec, settings, say=said.append) as packets:
@@ -363,7 +384,8 @@ def test_a_camera_in_python_returns_with_its_settings(monkeypatch: pytest.Monkey
     monkeypatch.setattr(sources, "REOPEN_S", 0.05)
     camera = StubCamera(parts=[[Part(every_pixel(EVK_SIZE)), UNPLUGGED] for _ in range(2)], most_openings=2)
     said: list[str] = []
-    settings, counts = CameraSettings(region=(5, 6, 50, 60)), []
+    settings = CameraSettings(region=(5, 6, 50, 60))
+    counts = []
     with (  # noqa: PT012
         connected(camera),
         open_camera("camera:", settings, wait_for_source_s=0.2, say=said.append) as packets,
@@ -414,3 +436,34 @@ def test_the_trigger_input_itself_is_switched(setting: str, on: bool) -> None:
             assert opened.isDetectorRunning() is on
         saved = str(source.metadata["camera_settings"])  # type: ignore[attr-defined]
         assert saved.endswith(f"trigger={'on' if on else 'off'}")
+
+
+def test_settings_in_a_live_compensation(tmp_path: Path) -> None:
+    """Both files have only the events of the region, and the settings."""
+    camera = Camera.from_fov(*DAVIS_SIZE, math.radians(60))
+    prism = Prism(math.radians(2.0))
+    exact_calibration(camera, prism, {"apex": prism.apex, "phase": 0.4}).save(tmp_path / "c.json")
+    stub, connect, _ = stand_in("dv:DA0")
+    stub.parts[0][0].edges = tuple((t, True) for t in range(5, 90_000, 2000))
+    args = ["live", "dv:DA0,region=100:50:300:200,counts_per_turn=40", "--calibration", str(tmp_path / "c.json")]
+    files = tmp_path / "out.h5", tmp_path / "raw.h5"
+    with connect(stub):
+        done = CliRunner().invoke(app, [*args, "--device", "cpu", "--out", str(files[0]), "--record", str(files[1])])
+    assert "the stream broke off: the camera stopped: gone" in done.stderr
+    for path in files:
+        recording = open_recording(path)
+        assert len(recording.events) == 200 * 150
+        assert ",region=100:50:300:200,trigger=on,counts_per_turn=40" in str(recording.metadata["camera_settings"])
+    raw = open_recording(files[1]).events.slice(0, 200 * 150)
+    assert (raw.x.min(), raw.y.min(), raw.x.max(), raw.y.max()) == (100, 50, 299, 199)
+
+
+def test_a_davis_is_given_the_region_and_the_masked_pixels() -> None:
+    """Not only are their events left out: the camera does not send them."""
+    camera, connect, _ = stand_in("camera:davis")
+    with connect(camera):
+        open_source("camera:davis,region=10:20:30:60,masked=0:0+12:21").close()
+    configuration = camera.opened[0]["configuration"]
+    region = configuration.region_of_interest
+    assert (region.left, region.top, region.width, region.height) == (10, 20, 20, 40)
+    assert [int(code) for code in configuration.pixel_mask] == [1, 1 + 12 + 21 * 346, 0, 0, 0, 0, 0, 0]

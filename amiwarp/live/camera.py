@@ -36,7 +36,8 @@ class CameraPackets:
         """Sensor size (width, height) [px]."""
         self.metadata = dict(getattr(source, "metadata", {}))
         """Model and settings of the camera, as a recording stores them."""
-        self._source, self._packets = source, source.packets()
+        self._source = source
+        self._packets = source.packets()
 
     def __iter__(self) -> Iterator[Packet]:
         return self

@@ -86,7 +86,8 @@ def difference(settings: CameraSettings, applied: CameraSettings) -> str:
     """Return which given settings the camera has otherwise than given; empty if none."""
     changes = []
     for each in fields(settings):
-        given, got = getattr(settings, each.name), getattr(applied, each.name)
+        given = getattr(settings, each.name)
+        got = getattr(applied, each.name)
         if each.name != "biases" and given not in (None, (), 0) and given != got:
             one = CameraSettings(**{each.name: got})
             changes.append(str(one) or f"no {each.name}")

@@ -32,8 +32,13 @@ LARGEST_THRESHOLD = 255
 """Largest contrast threshold that is passed on to a DVXplorer. The camera's own limits are the library's to say."""
 THRESHOLDS = ("ContrastThresholdOn", "ContrastThresholdOff")
 """Biases of a DVXplorer."""
-DAVIS_KINDS = {"DAVIS240A": "Davis240", "DAVIS240B": "Davis240", "DAVIS240C": "Davis240", "DAVIS346": "Davis346",
-               "CDAVIS": "CDavis"}  # fmt: skip
+DAVIS_KINDS = {
+    "DAVIS240A": "Davis240",
+    "DAVIS240B": "Davis240",
+    "DAVIS240C": "Davis240",
+    "DAVIS346": "Davis346",
+    "CDAVIS": "CDavis",
+}
 """Prefix of the library's methods for the biases of each sensor."""
 ELSEWHERE = {"masked": "open a DAVIS346 as camera: through neuromorphic-drivers"}
 """How another driver reaches settings."""
@@ -84,10 +89,13 @@ class DvSource(CameraSource):
         """Yield packets, see :meth:`CameraSource.packets`."""
         yielded_s = time.monotonic()
         while self.problem is None:
-            store, triggers, running = None, np.zeros(0, np.int64), False
+            store = None
+            triggers = np.zeros(0, np.int64)
+            running = False
             with self._stopping():
                 running = self._camera.isRunning()
-                store, triggers = self._camera.getNextEventBatch(), self._triggers()
+                store = self._camera.getNextEventBatch()
+                triggers = self._triggers()
             if store is not None or triggers.size:
                 yield self._make_packet(_dv_events(store), triggers)
                 yielded_s = time.monotonic()
@@ -105,8 +113,10 @@ class DvSource(CameraSource):
 
     def _apply(self, model: str) -> CameraSettings:
         """Check the settings, give them to the camera, and return those that it then has."""
-        camera, settings = self._camera, self.settings
-        biases, detects = _biases(camera), hasattr(camera, "setDetectorRunning")
+        camera = self._camera
+        settings = self.settings
+        biases = _biases(camera)
+        detects = hasattr(camera, "setDetectorRunning")
         can = ("region", *(["biases"] if biases else []), *(["trigger"] if detects else []))
         refuse_others(self.name, model, settings, can, ELSEWHERE)
         check_on_sensor(self.name, settings, self.size, 0)
@@ -153,7 +163,8 @@ def _biases(camera: Any) -> Mapping[str, _Bias]:
     if kind is None:
         return {}
     members = getattr(camera, f"{kind}BiasCF").__members__
-    read, write = getattr(camera, f"get{kind}BiasCoarseFine"), getattr(camera, f"set{kind}BiasCoarseFine")
+    read = getattr(camera, f"get{kind}BiasCoarseFine")
+    write = getattr(camera, f"set{kind}BiasCoarseFine")
     return {
         name: _Bias(partial(_coarse_fine, read, bias), partial(_set_coarse_fine, write, bias), LARGEST_COARSE_FINE)
         for name, bias in members.items()

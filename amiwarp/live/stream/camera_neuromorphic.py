@@ -25,9 +25,13 @@ from amiwarp.live.stream.sockets import Unreachable
 
 RAW_PACKETS = 8
 """Largest number of USB packets, of 128 KiB each, that the camera's driver decodes at once: about a million events."""
-RATE_US, MOST_PER_PERIOD = 200, (1 << 22) - 1
+RATE_US = 200
+MOST_PER_PERIOD = (1 << 22) - 1
 """Period in which the rate limiter counts events, the longest that the driver documents [us], and its largest count."""
-EVK4, EVK3, DAVIS, DVXPLORER = "PROPHESEE_EVK4", "PROPHESEE_EVK3_HD", "INIVATION_DAVIS346", "INIVATION_DVXPLORER"
+EVK4 = "PROPHESEE_EVK4"
+EVK3 = "PROPHESEE_EVK3_HD"
+DAVIS = "INIVATION_DAVIS346"
+DVXPLORER = "INIVATION_DVXPLORER"
 """Names of the models that have more than biases."""
 CAN = {
     EVK4: ("biases", "region", "masked", "most_per_s", "trigger"),
@@ -95,8 +99,11 @@ class NeuromorphicSource(CameraSource):
     ) -> None:
         super().__init__(request, say, packet_us=packet_us)
         found = _find_camera(request.which)
-        drivers, model, settings = import_module("neuromorphic_drivers"), found.name.value, self.settings
-        self.name, self._model = request.name(found.serial), found.name.name
+        drivers = import_module("neuromorphic_drivers")
+        model = found.name.value
+        settings = self.settings
+        self.name = request.name(found.serial)
+        self._model = found.name.name
         configuration = _configuration(self.name, found.name, drivers, settings)
         with opening(self.name):
             self._device = drivers.open(
@@ -104,7 +111,8 @@ class NeuromorphicSource(CameraSource):
             )
         try:
             with opening(self.name):
-                properties, bounds = self._device.properties(), self._device.biases_bounds()
+                properties = self._device.properties()
+                bounds = self._device.biases_bounds()
             self.size = int(properties.width), int(properties.height)
             for bias, value in settings.biases.items():
                 limits = getattr(bounds, bias, None)  # those of the device; equal if they are unknown
@@ -153,10 +161,11 @@ class NeuromorphicSource(CameraSource):
         self.lost = lost
 
     def _packet(self, packet: Any) -> Packet:
-        rows, edges = packet.polarity_events, packet.trigger_events
+        rows = packet.polarity_events
+        edges = packet.trigger_events
         events = None if rows is None else copied_events(rows["x"], rows["y"], rows["t"], rows["on"])
-        if events is not None and self._model == DAVIS and self.settings.region is not None:
-            events = _inside(events, self.settings.region)
+        if events is not None and self._model == DAVIS:
+            events = _without_others(events, self.settings)
         if edges is None:
             return self._make_packet(events, NO_TIMES)
         # The polarity of an edge of the DAVIS346 is 0 for a falling edge, 1 for a rising one, and 2 for a pulse.
@@ -164,16 +173,25 @@ class NeuromorphicSource(CameraSource):
         return self._make_packet(events, edges["t"][rising].astype(np.int64))
 
 
-def _inside(events: Events, region: tuple[int, int, int, int]) -> Events:
-    """Return the events within the region: the driver of the DAVIS346 keeps one column and one row too many."""
-    left, top, right, bottom = region
-    inside = (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
-    return events if inside.all() else events[inside]
+def _without_others(events: Events, settings: CameraSettings) -> Events:
+    """Return the events within the region, without those of the masked pixels.
+
+    The driver of the DAVIS346 keeps one column and one row too many, and ignores both settings, without a word, if the
+    camera's logic does not have the filters.
+    """
+    kept = np.ones(len(events), bool)
+    if settings.region is not None:
+        left, top, right, bottom = settings.region
+        kept &= (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
+    for x, y in settings.masked:
+        kept &= (events.x != x) | (events.y != y)
+    return events if kept.all() else events[kept]
 
 
 def _configuration(name: str, model: Any, drivers: Any, settings: CameraSettings) -> Any:
     """Return the configuration of the library for these settings, all of which are checked as far as they can be."""
-    module, kind = getattr(drivers, model.name.lower()), model.name
+    module = getattr(drivers, model.name.lower())
+    kind = model.name
     properties = module.Properties()
     size = int(properties.width), int(properties.height)
     refuse_others(name, model.value, settings, CAN.get(kind, ("biases",)), ELSEWHERE.get(kind, {}))

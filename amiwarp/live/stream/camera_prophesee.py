@@ -54,7 +54,8 @@ class PropheseeSource(CameraSource):
             device = raw_reader.initiate_device(path=request.which)
             if device is None:
                 raise Unreachable(f"{self.name}: no such camera; plug the camera in")
-            identity, geometry = device.get_i_hw_identification(), device.get_i_geometry()
+            identity = device.get_i_hw_identification()
+            geometry = device.get_i_geometry()
             serial = request.which or str(identity.get_serial())
             self.name = request.name(serial)
             self.size = int(geometry.get_width()), int(geometry.get_height())
@@ -68,7 +69,8 @@ class PropheseeSource(CameraSource):
         """Yield packets, see :meth:`CameraSource.packets`."""
         slices = iter(self._iterator)
         while True:
-            events, rising = None, NO_TIMES
+            events = None
+            rising = NO_TIMES
             with self._stopping():
                 events = next(slices, None)
                 rising = self._rising()
@@ -84,18 +86,22 @@ class PropheseeSource(CameraSource):
 
     def _apply(self, model: str) -> None:
         """Check the settings and give them to the camera."""
-        facilities, hal, settings = self._facilities, self._hal, self.settings
+        facilities = self._facilities
+        hal = self._hal
+        settings = self.settings
         can = [name for name, facility in facilities.items() if facility is not None]
         refuse_others(self.name, model, settings, can, {})
         masks = facilities["masked"].get_pixel_masks() if "masked" in can else ()
         check_on_sensor(self.name, settings, self.size, len(masks))
         if settings.most_per_s:
             limiter = facilities["most_per_s"]
-            lowest, highest = limiter.get_min_supported_cd_event_rate(), limiter.get_max_supported_cd_event_rate()
+            lowest = limiter.get_min_supported_cd_event_rate()
+            highest = limiter.get_max_supported_cd_event_rate()
             check_rate(self.name, settings.most_per_s, lowest, highest)
         if settings.flicker_hz is not None:
             filter_ = facilities["flicker_hz"]
-            lowest, highest = filter_.get_min_supported_frequency(), filter_.get_max_supported_frequency()
+            lowest = filter_.get_min_supported_frequency()
+            highest = filter_.get_max_supported_frequency()
             check_band(self.name, settings.flicker_hz, lowest, highest)
         if settings.counts_per_turn and "trigger" not in can:
             raise AmiwarpError(f"{self.name}: {model} has no trigger input; leave counts_per_turn out")
@@ -149,21 +155,28 @@ class PropheseeSource(CameraSource):
         if facilities["masked"] is not None:
             states = [mask.get_mask() for mask in facilities["masked"].get_pixel_masks()]
             masked = tuple((int(x), int(y)) for x, y, enabled in states if enabled)
-        biases, limiter, filter_ = facilities["biases"], facilities["most_per_s"], facilities["flicker_hz"]
-        limited, filtering = limiter is not None and limiter.is_enabled(), filter_ is not None and filter_.is_enabled()
+        biases = facilities["biases"]
+        limiter = facilities["most_per_s"]
+        filter_ = facilities["flicker_hz"]
+        limited = limiter is not None and limiter.is_enabled()
+        filtering = filter_ is not None and filter_.is_enabled()
         band = (int(filter_.get_band_low_frequency()), int(filter_.get_band_high_frequency())) if filtering else None
-        trigger, channel = facilities["trigger"], self._hal.I_TriggerIn.Channel.MAIN
+        trigger = facilities["trigger"]
+        channel = self._hal.I_TriggerIn.Channel.MAIN
         return replace(
             self.settings,
-            biases={} if biases is None else {
-                str(name): int(value) for name, value in biases.get_all_biases().items()
+            biases={}
+            if biases is None
+            else {
+                str(name): int(value)
+                for name, value in biases.get_all_biases().items()
                 if biases.get_bias_info(name).is_modifiable()
             },
             masked=masked,
             most_per_s=int(limiter.get_cd_event_rate()) if limited else 0,
             flicker_hz=band,
             trigger=None if trigger is None else bool(trigger.is_enabled(channel)),
-        )  # fmt: skip
+        )
 
     def _rising(self) -> NDArray[np.int64]:
         reader = self._iterator.reader

@@ -38,7 +38,9 @@ class CameraSource:
     def __init__(
         self, request: CameraRequest, say: Callable[[str], None] = lambda _: None, *, packet_us: int = 1000
     ) -> None:
-        self.request, self._say, self._packet_us = request, say, packet_us
+        self.request = request
+        self._say = say
+        self._packet_us = packet_us
         self.settings = request.settings
         self.encoders = int(self.settings.counts_per_turn != 0)
         self.name = request.name()
@@ -70,14 +72,16 @@ class CameraSource:
 
         ``applied``: the settings that the camera has; ``reported``: where they are from, for the recording.
         """
-        self.serial, self.name = serial, self.request.name(serial)
+        self.serial = serial
+        self.name = self.request.name(serial)
         self.metadata = {"camera_name": model, SAVED: str(applied), f"{SAVED}_from": reported}
         if changed := difference(self.settings, applied):
             self._say(f"{self.name}: the camera has {changed}")
 
     def _make_packet(self, events: Events | None, rising: NDArray[np.int64]) -> Packet:
         """Return the packet of events and of rising edges at the trigger input [us]."""
-        now, counts = monotonic_us(), self.settings.counts_per_turn
+        now = monotonic_us()
+        counts = self.settings.counts_per_turn
         if self.settings.trigger is False:
             rising = rising[:0]
         if not counts:

@@ -263,7 +263,9 @@ class ReturningSource:
                 f"{spec}: --wait-for-source applies to sockets and cameras only, because other sources cannot be "
                 f"reopened; {what}"
             )
-        self._wait_s, self._say, self._restarts = wait_s, say, spec.partition(":")[0] in CAMERAS
+        self._wait_s = wait_s
+        self._say = say
+        self._restarts = spec.partition(":")[0] in CAMERAS
         self._source: StreamSource | CameraSource = (
             open_camera_source(spec, say, packet_us=packet_us) if self._restarts else open_stream(spec)
         )
