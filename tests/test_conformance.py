@@ -68,6 +68,15 @@ def test_the_emulator_passes(rpm: float, at_first: float) -> None:
     assert controller.rotor.target_rpm(10**9) == 0.0
 
 
+def test_settings_of_before_are_those_after_the_suite() -> None:
+    """Also a time-out that is shorter than the silence of the suite, and limits that are off."""
+    controller = emulated()
+    controller.settings |= {"host-timeout": 1, "undervoltage": 0, "overvoltage": 0, "kp": 0, "most-rpm": 13_000}
+    before = dict(controller.settings)
+    assert failures(VirtualWire(controller)) == []
+    assert controller.settings == before
+
+
 @pytest.mark.parametrize("rpm", [240.0, -240.0, 60.0])
 def test_a_perfectly_steady_controller_passes(rpm: float) -> None:
     """Its index pulses are whole milliseconds apart, as if its clock had such steps."""

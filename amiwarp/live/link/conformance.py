@@ -162,6 +162,7 @@ class _Suite:
         self._latest = -math.inf  # time of the latest sample or index pulse
         self._newest = -math.inf  # latest time in any message
         self._disorder, self._apart, self._stray = 0, 0, 0
+        self._timeout_s = 0  # setting host-timeout before the suite
         self._older = False  # whether it does not know the messages of firmware 1.1
         self._first: protocol.FrameCounters | None = None  # opening the port cuts the first frame
 
@@ -448,7 +449,8 @@ class _Suite:
             if value is None or not setting.contains(value):
                 wrong.append(f"{setting.name} is {value}")
                 continue
-            other = value - 1 if setting.contains(value - 1) else value + 1
+            harmless = setting.most if setting.name == "overvoltage" else setting.least
+            other = next(v for v in (value - 1, value + 1, harmless) if setting.contains(v))
             below = setting.least - 2 if setting.contains(setting.least - 1) else setting.least - 1
             steps = [(setting.most + 1, 2, value), (below, 2, value), (-(1 << 31), 2, value)]
             steps += [(other, 0, other), (value, 0, value)]
@@ -462,6 +464,8 @@ class _Suite:
         counts = self._now.counts_per_turn
         if self._setting(0) != counts:
             wrong.append(f"counts-per-turn is not the status's {counts:,}")
+        self._timeout_s = self._setting(HOST_TIMEOUT) or 0
+        self._command(protocol.SetSetting(HOST_TIMEOUT, 0))  # else the motor stops in the silence of later checks
         what = "; ".join(wrong[:3]) or f"{len(protocol.SETTINGS)} settings read, changed, and changed back"
         return Check(name, not wrong, what, remedy)
 
@@ -470,7 +474,7 @@ class _Suite:
         name = "stops for a lost host, if told so"
         if self._older:
             return Check(name, None, "older than firmware 1.1", "")
-        before, rpm = self._setting(HOST_TIMEOUT), self._rpm / 2.0
+        rpm = self._rpm / 2.0
         start = self._ask(protocol.Condition)
         self._run(SLICE_S)
         taken = self._command(protocol.SetSetting(HOST_TIMEOUT, LOST_HOST_S))
@@ -488,7 +492,7 @@ class _Suite:
         self._command(protocol.Stop())
         self._run(STOP_S, until=lambda: self._now.state == 0)
         self._run(SLICE_S)
-        restored = self._command(protocol.SetSetting(HOST_TIMEOUT, before or 0))
+        restored = self._command(protocol.SetSetting(HOST_TIMEOUT, self._timeout_s))
         counted = (
             isinstance(start, protocol.Condition)
             and isinstance(end, protocol.Condition)
