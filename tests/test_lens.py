@@ -257,8 +257,9 @@ def test_the_index_is_where_the_cost_of_the_poses_is_least(
 ) -> None:
     """Costs with a minimum at an index of 1.57, which differs between poses by ``scatter``; or flat ones."""
     least = 1.57 + scatter * np.random.default_rng(2).standard_normal(12)
-    maps = SimpleNamespace(copy_unknowns=lambda: None)
-    cost = SimpleNamespace(brightness=maps, replace_map=lambda unknowns: None, space="fit")
+    maps = SimpleNamespace(copy_unknowns=lambda: "map")
+    replaced: list[object] = []
+    cost = SimpleNamespace(brightness=maps, replace_map=replaced.append)
     equations = {str(k): SimpleNamespace(cost=cost) for k in range(12)}
     joint = JointPrism(equations, SimpleNamespace(start={}), {"apex": 0.0175, "index": 1.5168})
     joint.costs = {"0": 0.15}
@@ -267,13 +268,15 @@ def test_the_index_is_where_the_cost_of_the_poses_is_least(
     def refine(*_: object) -> None:
         joint.costs = {k: 0.15 + bend * (joint.values["index"] - least[int(k)]) ** 2 for k in joint.equations}
         sizes.append(joint.values["apex"] * (joint.values["index"] - 1.0))
-        cost.space = joint.space = "another"
+        joint.space = "another"
+        replaced.append("fitted")
 
     monkeypatch.setattr(joint, "refine", refine)
     joint.space = "fit"
     index, off = joint.index(CAMERA, [*equations])
     assert joint.values == {"apex": 0.0175, "index": 1.5168}
-    assert (joint.costs, joint.space, cost.space) == ({"0": 0.15}, "fit", "fit")  # the fit stays as it was
+    assert (joint.costs, joint.space) == ({"0": 0.15}, "fit")  # the fit stays as it was
+    assert replaced[-13:] == ["fitted", *["map"] * 12]
     assert sizes == pytest.approx([0.0175 * 0.5168] * 3)  # the orbit stays as large
     if not bend:
         assert off == math.inf
