@@ -58,7 +58,7 @@ def motion_slopes(space: ParameterSpace, v: Vector) -> Vector:
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, COLUMNS), np.linspace(0, camera.height - 1, ROWS))
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
     turns = TURNS[MODELS[space.model].ANGLES]
-    theta = np.arange(turns * ANGLES) * (math.tau / ANGLES)
+    theta = np.arange(turns * ANGLES, dtype=np.float64) * (math.tau / ANGLES)
     steps = [space.to_values(v + FOLLOW_PX * unit) for unit in np.eye(len(v))]
     here = space.build(space.to_values(v))
     at, *ends = _motions([here, *map(space.build, steps)], xy, theta)
