@@ -310,8 +310,11 @@ def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest
     feed = session._feed
     assert feed._waiting_samples == sum(len(update.t_us) + len(update.index_t_us) for update in feed._waiting)
     assert 900 <= feed._waiting_samples <= 1000
-    assert [message for message in said if "clock is not known" in message] == said
-    assert len(said) == 1
+    # On a slow machine it also says that events wait.
+    waits = "the clocks of controller and camera are not known yet"
+    dropped = [message for message in said if not message.startswith(waits)]
+    assert len(dropped) == 1
+    assert "clock is not known yet: dropping the oldest encoder samples" in dropped[0]
 
 
 def test_a_motor_remembers_a_bounded_past() -> None:
