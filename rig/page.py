@@ -26,6 +26,7 @@ def tables() -> dict[str, str]:
         "connectors": rows(
             ("connector", "pin", "net", "goes to, belt", "goes to, hollow-shaft motor"), wires.connector_rows()
         ),
+        "wires": rows(("wire", "net", "from", "hole", "to", "hole"), perfboard.wire_rows("rp2040", "belt")),
         "power": rows(("from", "to, belt", "to, hollow-shaft motor"), wires.POWER),
     }
 
@@ -40,6 +41,4 @@ def updated(page: str) -> str:
 
 if __name__ == "__main__":
     PAGE.write_text(updated(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
-    for kind in wires.CONTROLLERS:
-        for drive in wires.DRIVES:
-            (IMAGES / f"board_{kind}_{drive}.svg").write_text(perfboard.drawing(kind, drive), encoding="utf-8")
+    perfboard.write(IMAGES)

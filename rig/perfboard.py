@@ -134,6 +134,15 @@ def name(hole: Hole) -> str:
     return f"{letters}{row}"
 
 
+def wire_rows(kind: str, drive: str) -> list[tuple[str, ...]]:
+    """Return number, net, and both ends of each wire, with their holes."""
+    out = [("bare", net, "rail", name((2, row)), "rail", name((COLUMNS - 1, row))) for net, row in RAILS.items()]
+    for number, (old, new) in enumerate(links(kind, drive), 1):
+        start = "rail" if old.ref.startswith("rail") else f"{old.ref}.{old.pin}"
+        out.append((str(number), new.net, f"{new.ref}.{new.pin}", name(new.hole), start, name(old.hole)))
+    return out
+
+
 def as_csv(kind: str, drive: str) -> str:
     """Return where each lead goes, and all wires, as CSV."""
     out = io.StringIO()
@@ -144,10 +153,8 @@ def as_csv(kind: str, drive: str) -> str:
         write((lead.ref, whats[lead.ref], lead.pin, name(lead.hole), lead.net))
     write(())
     write(("wire", "net", "from", "hole", "to", "hole"))
-    for net, row in RAILS.items():
-        write(("bare", net, "rail", name((2, row)), "rail", name((COLUMNS - 1, row))))
-    for number, (old, new) in enumerate(links(kind, drive), 1):
-        write((number, new.net, f"{new.ref}.{new.pin}", name(new.hole), f"{old.ref}.{old.pin}", name(old.hole)))
+    for row in wire_rows(kind, drive):
+        write(row)
     return out.getvalue()
 
 

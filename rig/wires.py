@@ -187,7 +187,7 @@ FAR = {
     ("J5", "DIR"): ("DRV8874: PH / IN2", "brushless driver: direction"),
     ("J5", "EN"): ("DRV8874: nSLEEP", "brushless driver: enable, high is on"),
     ("J5", "FLT"): ("DRV8874: nFAULT", "brushless driver: fault, open drain, low is a fault"),
-    ("J5", "GND"): ("DRV8874: GND, PMODE, IMODE", "brushless driver: GND of its logic"),
+    ("J5", "GND"): ("DRV8874: GND; its PMODE and IMODE go to its GND, too", "brushless driver: GND of its logic"),
     ("J5", "VIO"): ("open", "brushless driver: level of its logic, if it asks for one"),
     ("J5", "VREF"): ("DRV8874: VREF; leave R14 out if the board has a pull-up there", ""),
     ("J6", "TRIG"): ("camera: trigger input", "camera: trigger input"),
@@ -208,7 +208,7 @@ POWER = (
     ("fuse", "emergency stop", "emergency stop"),
     ("emergency stop", "DRV8874: VM (VIN on Pololu's board)", "brushless driver: supply"),
     ("12 V supply −", "DRV8874: GND, the star point", "brushless driver: GND, the star point"),
-    ("470 µF 25 V", "VM and GND of the driver, at the driver", "supply and GND of the driver, at the driver"),
+    ("470 µF 25 V", "+ at VM, − at GND of the driver, at the driver", "+ at its supply, − at its GND, at the driver"),
     (
         "driver, outputs",
         "OUT1, OUT2: the motor's two wires, 100 nF across",

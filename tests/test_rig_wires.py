@@ -226,6 +226,8 @@ def test_the_drawing_shows_each_lead_in_its_hole(kind: str, drive: str) -> None:
 def test_pictures_of_the_page_are_those_of_the_code(kind: str, drive: str) -> None:
     folder = ROOT / "docs" / "images"
     assert (folder / f"board_{kind}_{drive}.svg").read_text() == perfboard.drawing(kind, drive)
+    assert (folder / f"board_{kind}_{drive}.csv").read_text() == perfboard.as_csv(kind, drive)
+    assert (folder / "wires.csv").read_text() == wires.as_csv()
 
 
 def table(head: str) -> set[tuple[str, ...]]:
