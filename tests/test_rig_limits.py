@@ -90,6 +90,7 @@ def test_what_cannot_be_built_is_refused(options: str, says: str) -> None:
     assert not Path("never-written").exists()
 
 
+@pytest.mark.slow
 def test_an_unbalanced_wedge_is_refused_with_the_apex_and_the_speed_that_can_be_balanced() -> None:
     text = refused("--rig", "two-inch", "--apex-deg", "4")
     found = re.search(r"the rotor has G ([\d.]+) at 1440 rpm.* at most ([\d.]+), .* --rpm (\d+)$", text)
@@ -114,6 +115,7 @@ NEAREST: list[tuple[Callable[[float], Rig], float, float]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("own", "nearest", "beyond"), NEAREST, ids=range(len(NEAREST)))
 def test_the_nearest_that_is_named_is_buildable(own: Callable[[float], Rig], nearest: float, beyond: float) -> None:
     """Also as solids, which know nothing of the formulas; a little beyond it is refused."""
@@ -122,6 +124,7 @@ def test_the_nearest_that_is_named_is_buildable(own: Callable[[float], Rig], nea
     assert limits.refusals(own(nearest + beyond)) != []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rig", "wedge"), [(ONE_INCH, 12.5), (ONE_INCH, 35.8), (TWO_INCH, 38.1), (TWO_INCH, 55.8)])
 def test_other_wedges_fit(rig: Rig, wedge: float) -> None:
     own = parts.for_wedge(rig, wedge, teeth=None, belt=None)
@@ -176,6 +179,7 @@ def test_distance_from_a_hull() -> None:
     assert numbers.to_hull((7.0, 0.0), circles) == pytest.approx(2.0, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_what_was_not_given_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command.main([str(tmp_path), "--rig", "one-inch", "--edges-mm", "3", "3.6", "--wedge-mm", "30"])
     text = capsys.readouterr().out
