@@ -187,8 +187,8 @@ def test_an_accepted_delay_of_the_read_out_is_reported_and_no_error_of_the_encod
 @pytest.mark.slow
 def test_a_very_wrong_camera_is_no_error_of_the_encoder(wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     """A false error of the angle is found first; the camera is corrected with it and without it."""
-    errors = iter([np.array([0.004, 0.002, 0.0, 0.006, 0.0, 0.0])])
-    monkeypatch.setattr(angles, "find_angle_error", lambda *_: next(errors, None))
+    errors = iter([dict(zip(angles.harmonics_of(0), (0.004, 0.002, 0.0, 0.006), strict=True))])
+    monkeypatch.setattr(angles, "find_angle_errors", lambda *_: next(errors, None))
     found = calibrated(replace(wide, camera=replace(wide.camera, cx=wide.camera.cx + 3.0)), density=1.0)
     assert next(errors, None) is None
     assert found.harmonics is None

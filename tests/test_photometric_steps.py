@@ -140,11 +140,10 @@ def test_angles_of_the_pairs_are_the_given_ones_after_a_stop(
         raise Stopped
 
     monkeypatch.setattr(AnswerSearch, "descend", stop)
-    error = angles.AngleFit(angles.HARMONICS, np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.1)
-    monkeypatch.setattr(angles, "fit_angles", lambda *_: error)
+    monkeypatch.setattr(angles, "fit_angles", lambda *_: {"cos 1 of angle 0": 0.05})
     search, v = first.search, first.answer.x
     changing = {
-        "angle": lambda: angles.find_angle_error(search, v),
+        "angle": lambda: angles.find_angle_errors(search, v),
         "refractory": lambda: timing.find_refractory(search, v, 0.05, 1.0),
     }
     with pytest.raises(Stopped):

@@ -478,7 +478,7 @@ class Calibrator:
             rival = self.attempt(angles_hold=True)
             if rival.accepted and rival.cost <= again.cost:
                 return self, rival
-        said = f"{harmonics_in_words(harmonics)}: it was corrected"
+        said = f"{harmonics_in_words(MODELS[self.settings.model], harmonics)}: it was corrected"
         return calibrator, Attempt(_warning(again.calibration, said))
 
     def with_straight_path(self, tried: Attempt) -> Attempt:

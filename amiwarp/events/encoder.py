@@ -633,7 +633,8 @@ class Encoder:
         Parameters
         ----------
         harmonics : array_like
-            Factors of cos e, sin e, cos 2e and sin 2e in the correction of the angle e [rad], shape (4,).
+            Factors of cos e, sin e, cos 2e and sin 2e in the correction of the angle e [rad], shape (4,). For a pair
+            of prisms or a mirror, the same for the second angle may follow, shape (8,).
 
         Returns
         -------
@@ -643,7 +644,7 @@ class Encoder:
         Raises
         ------
         AmiwarpError
-            If there are not four finite numbers.
+            If there are not four finite numbers for one or both angles.
 
         Examples
         --------
@@ -651,6 +652,9 @@ class Encoder:
         >>> encoder.with_harmonics([0.0, 0.1, 0.0, 0.0]).angle_at([1000]).round(4)
         array([1.5997])
         """
+        if self.second is not None and np.size(harmonics) == 8:
+            first, second = np.split(np.ravel(harmonics), 2)
+            return dataclasses.replace(self.with_harmonics(first), second=self.second.with_harmonics(second))
         factors = vector(harmonics, 4, "harmonics", real)
         given, angle = self.t, self.angle
         # added samples must not shorten the intervals by which the angle is extended at both ends
@@ -1090,7 +1094,10 @@ class EncoderStream:
         capacity: int = 1 << 16,
     ) -> None:
         capacity = whole(capacity, "capacity", 16, 1 << 28, " samples")
-        self._harmonics = None if harmonics is None else vector(harmonics, 4, "harmonics", real)
+        self._harmonics = None
+        if harmonics is not None:
+            both = second is not None and np.size(harmonics) == 8
+            self._harmonics = vector(harmonics, 8 if both else 4, "harmonics", real)
         self.clock_offset_us = real(clock_offset_us, "clock_offset_us")
         self.second = _second_stream(second, self.clock_offset_us)
         """Stream of the second encoder, or the speed of the second prism relative to the first; None for one prism."""

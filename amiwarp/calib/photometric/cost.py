@@ -18,6 +18,8 @@ from amiwarp.brightness.solver import BrightnessMap
 from amiwarp.calib.parameters import ParameterSpace
 from amiwarp.calib.photometric.descent import Slopes
 from amiwarp.calib.photometric.tile_paths import TilePaths
+from amiwarp.kernels.equations import by_shift
+from amiwarp.kernels.launch import launch
 from amiwarp.optics.models import MODELS
 
 if TYPE_CHECKING:
@@ -66,8 +68,8 @@ class SharedMap:
         self.columns: dict[str, tuple[Any, Any]] = {}
         """Derivatives of the residuals at the last solution, on the device, by name; each with the part of it that no
         change of the map explains, or None if that was not needed yet."""
-        self.by_angle: list[tuple[Any, Any]] = []
-        """Derivatives of the residuals by each angle of the model at the last solution; empty if they are unknown."""
+        self.by_angle: dict[int, tuple[Any, Any]] = {}
+        """Derivatives of the residuals by the angles of the model at the last solution, by the number of the angle."""
         self._user: Cost | None = None
 
     def used_by(self, cost: Cost) -> SharedMap:
@@ -82,7 +84,7 @@ class SharedMap:
         """Note at which search vector the map was solved, and forget the derivatives of earlier residuals."""
         self.solved_at = at
         self.columns = {}
-        self.by_angle = []
+        self.by_angle = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,28 +190,45 @@ class Cost:
         if not self._is_solved_at(v):
             self.residuals(v, rounds=2)
 
-    def by_angle(self, v: Vector) -> tuple[Any, Any]:
-        """Return the derivatives of the residuals by the prism's angle at the first and at the second event of a pair.
+    def by_angle(self, v: Vector, angle: int = 0) -> tuple[Any, Any]:
+        """Return the derivatives of the residuals by an angle of the model at the first and second events of the pairs.
 
-        They are on the device, shape (padded pairs,) each. The map must be solved at ``v``.
+        They are on the device, shape (padded pairs,) each. The map must be solved at ``v``. ``angle`` is the number of
+        the angle, for a model with several.
         """
-        shared = self.shared.used_by(self)
-        if not shared.by_angle:
-            arrays, at = self.brightness.pairs.arrays, self.at(v)
-            ends = {**at, "drift": STEP_RAD}, {**at, "drift": -STEP_RAD}
-            given = arrays.slope
+        known = self.shared.used_by(self).by_angle
+        if angle not in known:
+            known[angle] = self._find_by_angle(v, angle)
+        return known[angle]
 
-            def by(end: int) -> Any:
-                shift = wp.zeros((2, arrays.stride), dtype=float, device=self.brightness.device)
-                shift[end].fill_(1.0)
-                arrays.slope = shift.flatten()
-                return self.brightness.find_slope(*ends, 2.0 * STEP_RAD)
+    def _find_by_angle(self, v: Vector, angle: int) -> tuple[Any, Any]:
+        if MODELS[self.space.model].ANGLES == 1:
+            return self._by_drift(self.at(v))
+        # a drift turns the second angle by the ratio of the speeds
+        values = self.space.to_values(v)
+        if angle == 0:
+            return self._by_drift(place_arguments(self.space, {**values, "ratio": 0.0}))
+        both = self._by_drift(place_arguments(self.space, {**values, "ratio": 1.0}))
+        first = self.by_angle(v, 0)
+        return _difference(both[0], first[0]), _difference(both[1], first[1])
 
-            try:
-                shared.by_angle = [(by(0), by(1))]
-            finally:
-                arrays.slope = given
-        return shared.by_angle[0]
+    def _by_drift(self, at: dict[str, Any]) -> tuple[Any, Any]:
+        """Return the derivatives by a drift of the angles at the first and second events of the pairs."""
+        arrays = self.brightness.pairs.arrays
+        up = {**at, "drift": STEP_RAD}
+        down = {**at, "drift": -STEP_RAD}
+        given = arrays.slope
+
+        def by(end: int) -> Any:
+            shift = wp.zeros((2, arrays.stride), dtype=float, device=self.brightness.device)
+            shift[end].fill_(1.0)
+            arrays.slope = shift.flatten()
+            return self.brightness.find_slope(up, down, 2.0 * STEP_RAD)
+
+        try:
+            return by(0), by(1)
+        finally:
+            arrays.slope = given
 
     def column(self, name: str, find: Callable[[], Any]) -> Any:
         """Return a derivative of the residuals by name, which is found once for each solution of the map."""
@@ -317,6 +336,14 @@ class Cost:
             return Slopes(hessian, sums[-n:], clusters())
 
         return result
+
+
+def _difference(column: Any, other: Any) -> Any:
+    """Return the difference of two columns on the device."""
+    out = wp.empty_like(column)
+    factors = wp.array(np.repeat([1.0, -1.0], len(column)), dtype=float, device=column.device)
+    launch(by_shift, len(column), [column, other, factors], [out], device=column.device)
+    return out
 
 
 def size_and_phase_directions(space: ParameterSpace, best: Vector) -> list[Vector]:

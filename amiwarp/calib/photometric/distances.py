@@ -60,9 +60,11 @@ def distance(model: Model, other: Model) -> float:
     return predicted_error(model, other, remove_lag=True, grid=8).rms
 
 
-def px_per_rad(space: ParameterSpace, best: Vector) -> float:
-    """Return how far events move per angle of the prism [px rms/rad]."""
-    return float(np.linalg.norm(best[:2])) if space.cartesian else space.pixels.get("phase", 0.0)
+def px_per_rad(space: ParameterSpace, best: Vector, angle: int = 0) -> float:
+    """Return how far events move per angle of the model, the one with the number ``angle`` [px rms/rad]."""
+    size, phase = MODELS[space.model].ORBITS[angle]
+    at = space.names.index(size) if size in space.names else -1
+    return float(np.linalg.norm(best[at : at + 2])) if at in space.orbits else space.pixels.get(phase, 0.0)
 
 
 def fastest_px_per_rad(space: ParameterSpace, v: Vector) -> float:

@@ -45,12 +45,28 @@ class MovingParts(Finding):
 class AngleError(Finding):
     """The angles of the events are wrong by what repeats every turn, or by a delay of the read-out."""
 
+    model: str
+    """Name of the model."""
     harmonics: tuple[float, ...]
-    """Correction of the encoder's angle, in the form of :attr:`Calibration.harmonics`; empty for none."""
+    """Correction of each angle, in the form of :attr:`Calibration.harmonics`; empty for none."""
     late_us: tuple[float, float]
     """Time by which events come later from column to column, and from row to row [us]."""
     late_px: float
     """How far this delay moves events [px rms]."""
+
+
+@dataclass(frozen=True)
+class SectorError(Finding):
+    """An error is left that repeats with an angle of the model."""
+
+    model: str
+    """Name of the model."""
+    angle: int
+    """Number of the angle."""
+    at_rad: float
+    """Angle at which it is largest [rad]."""
+    moved_px: float
+    """How far it moves events [px rms]."""
 
 
 @dataclass(frozen=True)

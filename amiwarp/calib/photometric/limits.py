@@ -67,6 +67,9 @@ NOTABLE_DOUBT_PX, LARGEST_DOUBT_PX = 0.008, 0.015
 NOTABLE_SKEW_PX, LARGEST_SKEW_PX = 0.02, 0.04
 """Errors by pixels that are read one after another, from which on they are reported and refused [px rms]. Compensation
 does not correct them."""
+NOTABLE_SECTOR_PX = 0.02
+"""Error that repeats with an angle and is not corrected, from which on it is reported [px rms]. Right angles of a wedge
+and of a pair leave 0.007 at most."""
 NOTABLE_RIVAL_PX, LARGEST_RIVAL_PX = 0.02, 0.06
 """Distance of the models of two explanations from which on both are reported, and from which on the answer is refused
 [px rms]. A wobble of 2 degrees and cylinder power are 0.05 px apart."""

@@ -42,17 +42,19 @@ def see_what_can_be_examined(state: Refinement) -> Refinement:
     space = state.space
     drifts = bool(cost.brightness.pairs.arrays.slope.shape[0])
     is_explained = state.answer.cost <= limits.LARGEST_EXAMINED_COST
-    one_angle = MODELS[space.model].ANGLES == 1
     turns = bool(state.problem.rpm)
-    if not (one_angle and turns and space.sized and is_explained) or space.moving or drifts:
+    if not (turns and space.sized and is_explained) or space.moving or drifts:
         return state
-    return replace(state, are_angles_examined=True, missing_step=missing_step(cost))
+    state = replace(state, are_angles_examined=True)
+    if MODELS[space.model].ANGLES > 1:
+        return state
+    return replace(state, is_timing_examined=True, missing_step=missing_step(cost))
 
 
 def count_lost_events(state: Refinement) -> Refinement:
     """Note how many events are missing, for a while or between others."""
     state = state.noticing(Silence(state.equations.silent_share))
-    return state.noticing(MissingEvents(state.missing_step)) if state.are_angles_examined else state
+    return state.noticing(MissingEvents(state.missing_step)) if state.is_timing_examined else state
 
 
 def moving_parts(cost: Cost) -> tuple[tuple[bool, ...], ...]:

@@ -39,6 +39,8 @@ class Refinement:
     """Standard deviations of the camera's motion by name, if it was found before the paths of the tiles."""
     are_angles_examined: bool = False
     """Whether the events tell errors of their angles: for a still camera, if a map explains most of them."""
+    is_timing_examined: bool = False
+    """Whether they also tell the timing of the sensor: for one angle."""
     missing_step: float = 0.0
     """Median change of brightness beyond one threshold between the events of a pair [thresholds]."""
     pause_rad: float = 0.0

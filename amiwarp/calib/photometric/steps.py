@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from amiwarp.calib.parameters import ParameterSpace
-from amiwarp.calib.photometric.angles import examine_the_angle_first, examine_the_angle_last
+from amiwarp.calib.photometric.angles import examine_the_angles_first, examine_the_angles_last
 from amiwarp.calib.photometric.camera_motion import follow_a_fast_camera, follow_a_slow_camera
 from amiwarp.calib.photometric.corrections import (
     correct_camera_and_prism,
@@ -27,6 +27,7 @@ from amiwarp.calib.photometric.losses import (
     see_what_can_be_examined,
 )
 from amiwarp.calib.photometric.refinement import Refinement, Step, first_answer
+from amiwarp.calib.photometric.sectors import note_what_sectors_leave
 from amiwarp.calib.photometric.timing import estimate_the_timing, find_slow_pixels, find_the_refractory_period
 from amiwarp.calib.photometric.verdicts import accepted_in_words, warnings
 from amiwarp.calib.result import PhotometricSummary, StageSummary
@@ -37,7 +38,7 @@ STEPS: tuple[Step, ...] = (
     give_up_a_worse_answer,
     refuse_moving_parts,
     see_what_can_be_examined,
-    examine_the_angle_first,
+    examine_the_angles_first,
     estimate_the_timing,
     find_the_refractory_period,
     find_slow_pixels,
@@ -45,9 +46,10 @@ STEPS: tuple[Step, ...] = (
     correct_camera_and_prism,
     judge_the_consistency,
     name_the_corrections,
+    note_what_sectors_leave,
     weigh_the_refractory_doubt,
     count_lost_events,
-    examine_the_angle_last,
+    examine_the_angles_last,
 )
 """The stage, in order. Each step returns the state unchanged if it does not apply."""
 

@@ -37,7 +37,7 @@ but a smaller lag does less harm than its correction, whose light is estimated."
 
 def estimate_the_timing(state: Refinement) -> Refinement:
     """Estimate the refractory period and the time constant of slow pixels by a linearised fit."""
-    if not state.are_angles_examined:
+    if not state.is_timing_examined:
         return state
     pause, lag = timing_steps(state.search.cost, state.answer.x, state.problem.direction)
     return replace(state, pause_rad=pause, lag_rad=lag, before_timing=state.answer.x)

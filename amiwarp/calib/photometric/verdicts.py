@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Sequence
 from functools import singledispatch
 
+import numpy as np
+
 from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib.parameters import units
 from amiwarp.calib.photometric import limits
@@ -24,6 +26,7 @@ from amiwarp.calib.photometric.findings import (
     RefractoryDoubt,
     RefractoryPeriod,
     RivalCauses,
+    SectorError,
     Shake,
     Silence,
     SlowPixels,
@@ -31,6 +34,7 @@ from amiwarp.calib.photometric.findings import (
     UnsteadySpeed,
 )
 from amiwarp.optics.camera import LENS
+from amiwarp.optics.models import MODELS, Model
 
 REFUSED_IN_ORDER: tuple[type[Finding], ...] = (
     LensBeyondCorrection,
@@ -58,6 +62,7 @@ SAID_IN_ORDER: tuple[type[Finding], ...] = (
     ParameterCorrected,
     RivalCauses,
     Consistency,
+    SectorError,
     StatedError,
     RefractoryDoubt,
     BlindTime,
@@ -139,7 +144,8 @@ def _(found: AngleError) -> str:
     if found.late_px >= limits.LARGEST_SKEW_PX:
         return _skew_in_words(found)
     if found.harmonics:
-        return f"{harmonics_in_words(found.harmonics)}, and its correction was not confirmed: check how it is mounted"
+        said = harmonics_in_words(MODELS[found.model], found.harmonics)
+        return f"{said}, and its correction was not confirmed: check how it is mounted"
     return ""
 
 
@@ -157,12 +163,38 @@ def _skew_in_words(found: AngleError) -> str:
     )
 
 
-def harmonics_in_words(harmonics: Sequence[float]) -> str:
-    """Return the error of an encoder in words: its amplitude, and whether it repeats once or twice a turn."""
-    sizes = [math.degrees(math.hypot(*harmonics[:2])), math.degrees(math.hypot(*harmonics[2:]))]
-    often = ("once a turn", "twice a turn")
-    named = [f"{x:.2g} deg {how}" for x, how in zip(sizes, often, strict=True) if x >= 0.2 * max(sizes)]
-    return f"the encoder's angle is wrong by {' and '.join(named)}"
+@warned.register
+def _(found: SectorError) -> Sequence[str]:
+    if found.moved_px < limits.NOTABLE_SECTOR_PX:
+        return []
+    name = _angle_names(MODELS[found.model])[found.angle]
+    return [
+        f"an error of about {found.moved_px:.2f} px rms is left that repeats with {name}, most at "
+        f"{math.degrees(found.at_rad):.0f} deg: it is not corrected; check the angle there, or calibrate again with a "
+        "camera and a scene that stay still"
+    ]
+
+
+def harmonics_in_words(kind: type[Model], harmonics: Sequence[float]) -> str:
+    """Return the error of the angles of a model in words: its size, and how often it repeats."""
+    turn = "turn" if kind.PRISM else "period"
+    said = []
+    for name, of_angle in zip(_angle_names(kind), np.reshape(harmonics, (-1, 4)), strict=False):
+        sizes = [math.degrees(math.hypot(*of_angle[:2])), math.degrees(math.hypot(*of_angle[2:]))]
+        often = (f"once a {turn}", f"twice a {turn}")
+        named = [f"{x:.2g} deg {how}" for x, how in zip(sizes, often, strict=True) if x and x >= 0.2 * max(sizes)]
+        if named:
+            said.append(f"{name} is wrong by {' and '.join(named)}")
+    return ", ".join(said)
+
+
+def _angle_names(kind: type[Model]) -> tuple[str, ...]:
+    """Return what each angle of a model is called."""
+    if kind.ANGLES == 1:
+        return ("the encoder's angle",)
+    if kind.PRISM:
+        return "the first encoder's angle", "the second encoder's angle"
+    return "the angle of the first command", "the angle of the second command"
 
 
 # Timing of the sensor.
