@@ -107,7 +107,7 @@ def picture(width: int, height: int, *, gravel: bool = False) -> NDArray[np.floa
         return leaves(rng, width, height)
     from scipy.ndimage import gaussian_filter
 
-    rough = gaussian_filter(rng.normal(size=(height, width)), 1.5)
+    rough = gaussian_filter(rng.normal(size=(height, width)), 1.0)
     return np.asarray(np.clip(0.55 + 0.18 * rough / rough.std(), 0.2, 1.0), np.float32)
 
 
@@ -206,9 +206,9 @@ def with_burst(trouble: Trouble, count: int, stamps: int = 1, before_us: int = 0
 
 def noisy(share: float, size: tuple[int, int], **given: Any) -> Trouble:
     """Return a recording of which a share of the events is noise."""
-    clean = recorded(size, steady(), **given)
-    count = len(clean.recording.events)
-    hz = count * share / (1.0 - share) / (size[0] * size[1] * 1.0)
+    clean = recorded(size, steady(), **given).recording.events
+    seconds = 1e-6 * (clean.t_last - clean.t_first)
+    hz = len(clean) * share / (1.0 - share) / (size[0] * size[1] * seconds)
     return recorded(size, steady(), sensor=SensorModel(shot_noise_hz=hz), **given)
 
 

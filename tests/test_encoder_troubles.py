@@ -13,6 +13,8 @@ import pytest
 from amiwarp import AmiwarpError, Calibration, EncoderModel, Events, MemoryEvents, Prism, PrismMotion, calibrate
 from amiwarp.calib import checks
 from amiwarp.calib.lost_counts import Step, changes_of_mean, lost_counts, steps_in_events, without_steps
+from amiwarp.calib.photometric import limits
+from amiwarp.calib.photometric.losses import step_if_missing
 from amiwarp.calib.prism_path import PathFit
 from amiwarp.calib.pulses import pulses_only, smooth_path
 from amiwarp.calib.start_burst import without_start_burst
@@ -233,3 +235,31 @@ def test_swapped_encoders_of_a_pair_are_named() -> None:
     with pytest.raises(AmiwarpError, match=said):
         calibrate(swapped, photometric=COARSE)
     assert not any("swapped" in w for w in calibrate(encoder_troubles.pair(SIZE, swapped=False).recording).warnings)
+
+
+def test_noise_is_not_taken_for_missing_events() -> None:
+    rng = np.random.default_rng(0)
+    right = rng.normal(0.05, 0.05, 1000)
+    noise = rng.uniform(0.5, 1.5, 800)
+    lost = rng.normal(-0.9, 0.1, 100)
+    assert step_if_missing(np.concatenate([right, noise])) == 0.0
+    assert step_if_missing(np.concatenate([right + 0.2, lost])) > limits.NOTABLE_STEP
+    assert step_if_missing(np.zeros(0)) == 0.0
+
+
+@pytest.mark.slow
+def test_a_noisy_recording_of_gravel_is_answered() -> None:
+    trouble = encoder_troubles.noisy(0.35, (120, 90), apex_deg=2.0, gravel=True, seconds=0.4)
+    found = found_in(trouble)
+    assert compensation_error(trouble, found)[0] < 0.02
+    assert not any("missing" in w for w in found.warnings)
+
+
+@pytest.mark.slow
+def test_half_of_the_events_of_gravel_are_missed() -> None:
+    trouble = recorded((120, 90), steady(), apex_deg=2.0, gravel=True, seconds=0.4)
+    events = trouble.recording.events[:]
+    kept = np.random.default_rng(0).uniform(size=len(events)) >= 0.5
+    lossy = replace(trouble.recording, events=MemoryEvents(events[kept], 120, 90), truth=None)
+    found = calibrate(lossy, model="exact", photometric=COARSE)
+    assert any("a fifth or more of the events are missing" in w for w in found.warnings)

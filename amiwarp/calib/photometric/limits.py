@@ -82,7 +82,8 @@ NOTABLE_STEP, LARGEST_STEP = 0.12, 0.2
 reported, and from which on the answer is rejected [thresholds].
 
 It is 0.03 for a sensor that loses nothing, 0.07 for one that loses a fifth of its events, 0.2 for a third, 0.3 for half
-of them; then the answer is off by 0.06 px. Slow pixels leave 0.1.
+of them; then the answer is off by 0.06 px. Slow pixels leave 0.1, a third of noise 0.2: only the residuals of pairs
+between which an event is missing tell loss from noise, see ``losses.py``.
 """
 
 
