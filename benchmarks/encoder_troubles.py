@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -53,8 +53,37 @@ LONGEST_LAG_US = 3000.0
 """Longest constant lag that is removed from an error [us]."""
 GRID = 8
 """Rows of the grid of pixels on which an error is measured."""
+FRAME_US = 2000
+"""Time between two pictures of one that grows [us]."""
 TIMES = 400
 """Number of times at which an error is measured."""
+
+
+@dataclass(frozen=True)
+class Growing:
+    """Picture that grows about its middle, as if the focal length drifted."""
+
+    light: NDArray[np.float32]
+    per_s: float
+    """Growth [1/s]."""
+    duration_us: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.light.shape[1], self.light.shape[0]
+
+    @property
+    def interval_us(self) -> float | None:
+        return FRAME_US
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        from scipy.ndimage import affine_transform
+
+        middle = (np.array(self.light.shape) - 1.0) / 2.0
+        for t in range(0, self.duration_us + 2 * FRAME_US, FRAME_US):
+            shrink = 1.0 / (1.0 + self.per_s * 1e-6 * t)
+            grown = affine_transform(self.light, np.eye(2) * shrink, middle * (1.0 - shrink), order=3, mode="nearest")
+            yield t, np.clip(grown, 0.01, 1.0).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -119,11 +148,12 @@ def recorded(
     second_deg: float = 0.0,
     seconds: float = 1.0,
     gravel: bool = False,
+    growth: float = 0.0,
     encoder: EncoderModel | None = None,
     sensor: SensorModel | None = None,
     seed: int = 1,
 ) -> Trouble:
-    """Return a recording of a still picture without a trouble."""
+    """Return a recording of a picture without a trouble of the encoder; the picture grows by ``growth`` [1/s]."""
     camera = Camera.from_fov(*size, math.radians(60.0))
     prism = Prism(math.radians(apex_deg))
     if second_deg:
@@ -134,8 +164,9 @@ def recorded(
     width = 2 * math.ceil(focal * math.tan(half)) + 2
     height = math.ceil(width * camera.height / camera.width) + 2 * math.ceil(focal * turned)
     light = picture(width, height, gravel=gravel)
+    frames = Growing(light, growth, math.ceil(1e6 * seconds)) if growth else Still(light)
     recording = simulate(
-        Scene(Still(light), 2.0 * math.atan(width / 2.0 / focal)), camera, prism, duration_s=seconds, motion=motion,
+        Scene(frames, 2.0 * math.atan(width / 2.0 / focal)), camera, prism, duration_s=seconds, motion=motion,
         encoder=encoder or EncoderModel(counts_per_turn=4096), sensor=sensor, seed=seed,
     )  # fmt: skip
     if prism.second is None:
@@ -245,6 +276,7 @@ ROWS: dict[str, Callable[[tuple[int, int]], Trouble]] = {
     "index only, hunts 5 % at 3 Hz": lambda size: pulses_only(recorded(size, hunting(0.05, 3.0))),
     "pair": lambda size: pair(size, swapped=False),
     "pair, encoders swapped": lambda size: pair(size, swapped=True),
+    "focal length drifts by 2 %": lambda size: recorded(size, steady(), growth=0.02),
     "gravel, 2 deg, 35 % noise": lambda size: noisy(0.35, size, apex_deg=2.0, gravel=True),
 }
 """Maker of each recording by name."""

@@ -344,4 +344,5 @@ def test_what_is_said_and_refused() -> None:
         reason = refused(found)
         assert (reason == "") == (error == 0.0)
         assert (likeliest(found) in reason) == (error != 0.0)
-    assert warned(outcome()) == []
+    small = replace(lens, moved_px=0.02)
+    assert warned(outcome()) == warned(outcome(likely=(small,))) == []

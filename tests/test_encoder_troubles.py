@@ -263,3 +263,14 @@ def test_half_of_the_events_of_gravel_are_missed() -> None:
     lossy = replace(trouble.recording, events=MemoryEvents(events[kept], 120, 90), truth=None)
     found = calibrate(lossy, model="exact", photometric=COARSE)
     assert any("a fifth or more of the events are missing" in w for w in found.warnings)
+
+
+@pytest.mark.slow
+def test_a_focal_length_that_drifts_is_no_turning_camera() -> None:
+    trouble = recorded(SIZE, steady(), seconds=0.6, growth=0.06)
+    found = found_in(trouble)
+    assert compensation_error(trouble, found)[0] < 0.02
+    assert not any("camera turned" in w for w in found.warnings)
+    [said] = [w for w in found.warnings if "the image grew by" in w]
+    assert float(said.split()[4]) == pytest.approx(6.0, abs=0.5)
+    assert "growth" not in found.parameters

@@ -191,6 +191,8 @@ LEAST_LONGER = 1.5
 calm span. Each end then begins half a turn from the middle span."""
 QUADRATURE, NEAR_QUADRATURE = (0.25, 0.5, 2.0, 4.0), 0.03
 """Scales of a quadrature encoder of which other edges are counted than stated, and how near a found one must be."""
+LEAST_GROWTH_DEVIATIONS = 5.0
+"""Smallest growth of the image that is taken for one [standard deviations]."""
 GRADUAL_US = 5000
 """Duration of a step of an encoder's angle from which on the events must tell how it came about [us]."""
 LEAST_SCALE_ERROR = 0.003
@@ -615,6 +617,9 @@ class Calibrator:
         if restless and many:
             return self.turn_by_turn(tried, turns) or (tried if tried.accepted else too_fast)
         again = self._turning(rival) if span is None else self._turning_in(span)
+        growing = self._growing(tried, again) if calm and span is None else None
+        if growing is not None:
+            return growing
         if not again.accepted or again.cost > limits.LARGEST_COST_RATIO * tried.cost:
             # a rotation makes the image sharper, or the attempt would have failed
             if restless and not tried.accepted and rival is not None and again.calibration is not None:
@@ -626,21 +631,36 @@ class Calibrator:
             mean = self.turn_by_turn(tried, turns) if many else None
             if mean is not None or not calm:
                 return mean or too_fast
-        found = again.found()
-        speed = math.degrees(math.hypot(*(found.parameters[n] for n in RATES)))
-        # only the prism's parameters are kept: the rotation holds for two turns of the recording
-        still = replace(
-            found,
-            parameters={n: x for n, x in found.parameters.items() if n not in MOTION},
-            uncertainty={n: x for n, x in found.uncertainty.items() if n not in MOTION},
-            free=tuple(n for n in found.free if n not in MOTION),
-            middle_us=None,
-        )
+        speed = math.degrees(math.hypot(*(again.found().parameters[n] for n in RATES)))
         said = f"the camera turned at {speed:.1f} deg/s; its rotation was calibrated together with the prism"
         if span is not None:
             since = ((t - self.recording.events.t_first) * 1e-6 for t in span)
             said += ", from {:.2f} to {:.2f} s, where the camera is calmest".format(*since)
-        return Attempt(_warning(still, said))
+        return Attempt(_warning(_without_motion(again.found()), said))
+
+    def _growing(self, tried: Attempt, turning: Attempt) -> Attempt | None:
+        """Return the attempt with a growing image, if that explains the events better than a rotation; else None.
+
+        ``turning`` is the attempt with a free rotation, of the same two turns. Those hold less of any slow change than
+        the whole recording, so that a rotation seems to explain it.
+        """
+        encoder = self.recording.encoder
+        assert encoder is not None
+        free = (*MODELS[self.settings.model].freed(encoder.ratio), GROWTH)
+        growing = replace(self, settings=replace(self.settings, free=free)).attempt()
+        most_cost = limits.LARGEST_COST_RATIO * tried.cost
+        if not growing.accepted or growing.cost > min(most_cost, turning.cost if turning.accepted else math.inf):
+            return None
+        found = growing.found()
+        growth, std = found.parameters[GROWTH], found.uncertainty[GROWTH]
+        if abs(growth) < LEAST_GROWTH_DEVIATIONS * std:
+            return None
+        how = "grew" if growth > 0.0 else "shrank"
+        said = (
+            f"the image {how} by {100.0 * abs(growth):.2g} % a second, which was calibrated together with the prism: "
+            "the focal length drifts, or the camera moves along its axis"
+        )
+        return Attempt(_warning(_without_motion(found), said))
 
     def _turns(self) -> list[tuple[int, int]]:
         """Return the time spans [us] of :meth:`turn_by_turn`, which begin one turn after another, about the middle.
@@ -792,6 +812,17 @@ def _mean(
         warnings=(),
     )  # fmt: skip
     return found, stated_px(space, v, covariance)
+
+
+def _without_motion(found: Calibration) -> Calibration:
+    """Return the calibration with the prism's parameters only: the camera's motion holds for two turns."""
+    return replace(
+        found,
+        parameters={n: x for n, x in found.parameters.items() if n not in MOTION},
+        uncertainty={n: x for n, x in found.uncertainty.items() if n not in MOTION},
+        free=tuple(n for n in found.free if n not in MOTION),
+        middle_us=None,
+    )
 
 
 def _warning(found: Calibration, *said: str) -> Calibration:

@@ -370,7 +370,8 @@ def _(check: Consistency) -> str:
 @warned.register
 def _(check: Consistency) -> Sequence[str]:
     out = []
-    if check.likely:
+    # what was tried and did not lower the cost is no cause of a small error
+    if check.likely and check.likely[0].moved_px >= limits.NOTABLE_PX:
         first = check.likely[0]
         out.append(
             f"the answer does not hold everywhere in the image: {first.cause.words} seems to be wrong, which amounts "
