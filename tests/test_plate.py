@@ -13,6 +13,7 @@ import amiwarp
 from amiwarp.brightness.depths import SMALLEST_PX, contrast, find_depths, lowest, orbit_px
 from amiwarp.brightness.pixel_costs import SCALE, PixelCosts
 from amiwarp.calib import plate as plate_phase
+from amiwarp.calib.plate import check_known_phase, inverse_depth_by_wedge, phase_by_wedge
 from amiwarp.cli.app import app
 from reference import optics as reference
 
@@ -216,6 +217,62 @@ def test_phase_is_calibrated_and_stored(calibration: amiwarp.Calibration, tmp_pa
     calibration.save(tmp_path / "c.json")
     again = amiwarp.Calibration.load(tmp_path / "c.json")
     assert (again.prism, again.parameters, again.model_name) == (PLATE, calibration.parameters, "plate")
+
+
+WEDGE = math.radians(6.0 / 60.0)
+
+
+@pytest.mark.slow
+def test_an_angle_between_the_faces_is_found_across_the_tilt() -> None:
+    """Faces at an angle move near and far points alike, so that their orbits are out of step."""
+    motion = amiwarp.PrismMotion(720.0, PHASE, wedge=(0.0, WEDGE))
+    recording = walls(motion=motion).run(truth_times_us=[0])
+    assert recording.truth is not None
+    assert recording.truth.parameters["wedge_y"] == WEDGE
+    found = amiwarp.calibrate(recording)
+    assert abs(found.parameters["wedge_y"] - WEDGE) < min(0.2 * WEDGE, 3.0 * found.uncertainty["wedge_y"])
+    assert abs(found.parameters["phase"] - PHASE) < 0.03
+    assert found.uncertainty["wedge_x"] == pytest.approx(found.parameters["wedge_y"])
+    assert any("the faces of the plate are not parallel: 6 ± 0.2 arcmin" in w for w in found.warnings)
+    given = amiwarp.calibrate(recording, start={"wedge_y": 0.0})
+    assert given.parameters["wedge_y"] == 0.0
+    assert abs(given.parameters["phase"] - PHASE) > 0.04
+
+
+def test_the_phase_by_a_wedge_is_that_of_points_that_move_alike() -> None:
+    camera = amiwarp.Camera.from_fov(96, 72, math.radians(50.0))
+    middle, theta = np.array([[camera.cx, camera.cy]]), np.array([0.4])
+    wedge = WEDGE / 5.0
+    for depth in (0.5, 2.0):
+        model = amiwarp.PlateModel(camera, PLATE, PHASE, inverse_depth=1.0 / depth)
+        turned = replace(model, phase=PHASE + wedge * float(phase_by_wedge(model, np.array([1.0 / depth]))[0]))
+        bent = replace(model, wedge=(0.0, wedge))
+        away = bent.compensate_points(middle, theta) - model.compensate_points(middle, theta)
+        assert np.linalg.norm(away) > 0.02  # px
+        places = turned.compensate_points(middle, theta), bent.compensate_points(middle, theta)
+        np.testing.assert_allclose(*places, rtol=0, atol=0.05 * np.linalg.norm(away))
+        along = replace(model, wedge=(wedge, 0.0))
+        nearer = replace(model, inverse_depth=1.0 / depth - wedge * inverse_depth_by_wedge(model))
+        np.testing.assert_allclose(
+            along.compensate_points(middle, theta), nearer.compensate_points(middle, theta), rtol=0, atol=1e-3
+        )
+
+
+def test_an_unknown_phase_is_refused() -> None:
+    check_known_phase(0.1, "desk")
+    with pytest.raises(amiwarp.AmiwarpError, match="desk: the events determine the phase of the plate within 105 deg"):
+        check_known_phase(math.radians(105.0), "desk")
+
+
+def test_the_angle_between_the_faces_that_no_event_shows_is_part_of_the_deviations(
+    seen: amiwarp.Recording, calibration: amiwarp.Calibration
+) -> None:
+    doubtful = replace(calibration, uncertainty={**calibration.uncertainty, "wedge_x": 1e-3})
+    plain, wide = amiwarp.depth(seen, calibration), amiwarp.depth(seen, doubtful)
+    both = plain.known & wide.known
+    assert both.sum() > 300
+    added = np.sqrt(wide.std[both] ** 2 - plain.std[both] ** 2)
+    np.testing.assert_allclose(added, 1e-3 * inverse_depth_by_wedge(calibration.model), rtol=0.02)  # type: ignore[arg-type]
 
 
 def test_a_pair_of_events_that_leaves_the_map_costs_as_much_as_without_a_map() -> None:

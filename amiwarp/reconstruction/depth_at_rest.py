@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from amiwarp.brightness.depths import SMALLEST_PX, find_depths, orbit_px
-from amiwarp.calib.plate import LARGEST_INVERSE, check_still, costs_at_rest
+from amiwarp.calib.plate import LARGEST_INVERSE, check_still, costs_at_rest, inverse_depth_by_wedge
 from amiwarp.calib.result import Calibration
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
@@ -95,15 +95,18 @@ def depth(
 
     found = find_depths(costs, model, 1.0 / nearest, report)
     check_still(found, name)
+    # faces at an angle along the tilt change all inverse depths alike, which no event shows
+    std = np.hypot(found.std, inverse_depth_by_wedge(model) * calibration.uncertainty.get("wedge_x", 0.0))
     seen = found.count >= LEAST_PAIRS
-    known = seen & (found.std < KNOWN_SHARE * found.inverse_depth)
+    known = seen & (std < KNOWN_SHARE * found.inverse_depth)
     if known.sum() < max(1.0, LEAST_KNOWN * seen.sum()):
         raise AmiwarpError(
             f"{name}: the events determine no depth: too little texture, or everything is beyond "
             f"{orbit_limit_m(model):.2g} m; record a nearer scene with more texture, or a longer time"
         )
     inverse = np.where(known, found.inverse_depth, np.float32(np.nan))
-    return DepthMap(inverse, np.where(known, found.std, np.float32(np.nan)), _points(model, inverse))
+    std = np.where(known, std, np.nan).astype(np.float32)
+    return DepthMap(inverse, std, _points(model, inverse))
 
 
 def orbit_limit_m(model: PlateModel) -> float:

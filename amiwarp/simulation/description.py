@@ -703,7 +703,7 @@ class SimulationValues:
         """The same values with a prism that bends no ray, or a mirror that is not tilted."""
         if isinstance(self.prism, Mirror):
             return replace(self, prism=replace(self.prism, amplitude=(0.0, 0.0)))
-        motion = replace(self.prism_motion, cylinder=(0.0, 0.0), second=None)
+        motion = replace(self.prism_motion, cylinder=(0.0, 0.0), second=None, wedge=(0.0, 0.0))
         return replace(self, prism=replace(self.glass, apex=0.0, second=None), motion=motion)
 
     @property
