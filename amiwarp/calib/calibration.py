@@ -59,6 +59,7 @@ from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, 
 from amiwarp.calib.settings import AUTO, CalibrationOptions, Settings
 from amiwarp.calib.sharpness_search import Search, bound_warnings
 from amiwarp.calib.start_burst import reaching_back, without_start_burst
+from amiwarp.calib.uneven_prism import uneven_in_words
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
 from amiwarp.events.encoder import Encoder, check_prisms
@@ -307,6 +308,7 @@ class Calibrator:
                 f"{recording.name}: {'; '.join(reasons)}; the result of the sharpness stage alone may be off by "
                 "several tenths of a pixel: accept it with --stages sharpness, or record a scene that stays still"
             )
+        found = _warning(found, *uneven_in_words(found, self.settings.free))
         given = {*self.settings.bounds, *self.settings.start}
         if isinstance(recording.prism, Prism) and not size_names() & given:
             found = calibrator.with_order_examined(found)

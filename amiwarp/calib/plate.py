@@ -154,8 +154,8 @@ def check_known_phase(std: float, name: str) -> None:
     if std > LARGEST_STD_RAD:
         raise AmiwarpError(
             f"{name}: the events determine the phase of the plate within {math.degrees(std):.0f} deg only (at most "
-            f"{math.degrees(LARGEST_STD_RAD):.0f} deg are of use): record for longer, or near things with more texture, "
-            "or use a thicker plate; faces that are not parallel, or a wrong thickness or tilt, are another cause"
+            f"{math.degrees(LARGEST_STD_RAD):.0f} deg are of use): record for longer, or nearer things with more "
+            "texture, or use a thicker plate; faces that are not parallel, or a wrong thickness or tilt, do this too"
         )
 
 
