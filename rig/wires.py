@@ -53,11 +53,39 @@ SIGNALS = (
 )
 
 PICO = {
-    "GP0": 1, "GP1": 2, "GP2": 4, "GP3": 5, "GP4": 6, "GP5": 7, "GP6": 9, "GP7": 10, "GP8": 11, "GP9": 12, "GP10": 14,
-    "GP11": 15, "GP12": 16, "GP13": 17, "GP14": 19, "GP15": 20, "GP16": 21, "GP17": 22, "GP18": 24, "GP19": 25,
-    "GP20": 26, "GP21": 27, "GP22": 29, "RUN": 30, "GP26": 31, "GP27": 32, "GP28": 34, "ADC_VREF": 35, "3V3": 36,
-    "3V3_EN": 37, "VSYS": 39, "VBUS": 40,
-}  # fmt: skip
+    "GP0": 1,
+    "GP1": 2,
+    "GP2": 4,
+    "GP3": 5,
+    "GP4": 6,
+    "GP5": 7,
+    "GP6": 9,
+    "GP7": 10,
+    "GP8": 11,
+    "GP9": 12,
+    "GP10": 14,
+    "GP11": 15,
+    "GP12": 16,
+    "GP13": 17,
+    "GP14": 19,
+    "GP15": 20,
+    "GP16": 21,
+    "GP17": 22,
+    "GP18": 24,
+    "GP19": 25,
+    "GP20": 26,
+    "GP21": 27,
+    "GP22": 29,
+    "RUN": 30,
+    "GP26": 31,
+    "GP27": 32,
+    "GP28": 34,
+    "ADC_VREF": 35,
+    "3V3": 36,
+    "3V3_EN": 37,
+    "VSYS": 39,
+    "VBUS": 40,
+}
 """Pins of a Raspberry Pi Pico by their names; those in between are ground."""
 PICO_GROUND = (18, 23)
 """Pins of its ground that are wired; the other six are joined to them on the Pico."""
