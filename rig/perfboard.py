@@ -84,11 +84,12 @@ def holes_of(part: Component, kind: str) -> list[Hole]:
 
 
 def leads(kind: str, drive: str) -> list[Lead]:
-    """Return all leads, those without a net too."""
+    """Return all leads; those that meet no other have no net."""
     out = []
+    joined = wires.nets(kind, drive)
     for part in wires.components(kind, drive):
         for pin, net, hole in zip(part.pins, part.nets, holes_of(part, kind), strict=True):
-            out.append(Lead(part.ref, pin, net, hole))
+            out.append(Lead(part.ref, pin, net if net in joined else "", hole))
     return out
 
 
