@@ -342,7 +342,9 @@ def optics_of(rig: Rig, given: argparse.Namespace) -> Rig:
     if given.lens_mm is not None and given.lens_thread is None:
         # a lens with M12 thread is slimmer than the thread of C-mount
         of_lens = "m12" if lens < limits.THREAD else "c"
-    flange = given.flange_mm or limits.FLANGES.get(of_camera, rig.flange)
+    flange = given.flange_mm
+    if flange is None:
+        flange = limits.FLANGES.get(of_camera, rig.flange)
     return replace(
         rig,
         lens=lens,

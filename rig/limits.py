@@ -17,6 +17,8 @@ from rig.parts import BEARINGS, HEADS, LEAST_WALL, SLIDE, Rig
 
 LEAST_EDGE = 0.5
 """Smallest thickness of the wedge at its thin edge. Thinner glass chips."""
+LEAST_HEIGHT = 10.0
+"""Smallest height of a hollow-shaft motor."""
 LEAST_GRIP = 3.0
 """Smallest width of the ring that the holder grips. On a shorter one the camera tilts."""
 FLANGES = {"c": 17.526, "cs": 12.526}
@@ -162,7 +164,7 @@ def motor(rig: Rig) -> Iterator[str]:
             f"a camera of at most {widest:.1f}" if widest else "",
             f"a lens of at most {slimmest:.1f}" if slimmest and slimmest < rig.lens - 0.1 else "",
             f"a motor of at most {thickest:.1f}" if thickest else "",
-            f"a belt longer than {rig.belt:g} mm (--belt-mm)",
+            longer_belt(rig),
         ]
         nearest = ", or ".join(way for way in ways if way)
         yield (
@@ -185,9 +187,17 @@ def hollow(rig: GimbalRig, rpm: float) -> Iterator[str]:
             if not (math.isfinite(value) and value > 0.0):
                 yield f"{option} {value:g}: give a number above 0"
                 return
+    if own.height < LEAST_HEIGHT:
+        yield f"--hollow-mm, height {own.height:g}: too flat for stator and bell; give at least {LEAST_HEIGHT:g}"
+        return
     sunk = gimbal.SUNK + LEAST_WALL
     inner, outer = own.bore + 2.0 * sunk, own.outer - 14.0
-    if not inner - 1e-9 <= own.stator_circle <= outer + 1e-9:
+    if inner > outer:
+        yield (
+            f"--hollow-mm, bore {own.bore:g}: beside it, a motor of {own.outer:g} mm has no room for the housing's "
+            f"screws; give at most {outer - 2.0 * sunk:.1f}, or a motor of at least {inner + 14.0:.1f}"
+        )
+    elif not inner - 1e-9 <= own.stator_circle <= outer + 1e-9:
         yield (
             f"--hollow-screws-mm, stator {own.stator_circle:g}: beside a bore of {own.bore:g} mm and within the motor "
             f"of {own.outer:g} mm, the housing's screws need a circle of {inner:.1f} to {outer:.1f}; give one of them"
@@ -195,7 +205,12 @@ def hollow(rig: GimbalRig, rpm: float) -> Iterator[str]:
     head = HEADS[3.0][0] / 2 + 0.15
     widest = rig.wedge + 2.0 * (rig.seat - head)
     least = own.bore + 3.0 + 2.0 * LEAST_WALL
-    if not least - 1e-9 <= own.rotor_circle <= widest + 1e-9:
+    if least > widest:
+        yield (
+            f"--wedge-mm {rig.wedge:g}: under it there is no room for the cell's screws beside a bore of {own.bore:g} "
+            f"mm; give at least {rig.wedge + least - widest:.1f}, or a narrower bore (--hollow-mm)"
+        )
+    elif not least - 1e-9 <= own.rotor_circle <= widest + 1e-9:
         yield (
             f"--hollow-screws-mm, rotor {own.rotor_circle:g}: the heads of the cell's screws must lie under the wedge "
             f"of {rig.wedge:g} mm, and beside the bore of {own.bore:g} mm; give {least:.1f} to {widest:.1f}, or "
@@ -203,9 +218,16 @@ def hollow(rig: GimbalRig, rpm: float) -> Iterator[str]:
         )
     if beside_motor(rig) < 0.0:
         widest = largest(lambda size: replace(rig, hollow=replace(own, outer=size)), own.outer)
+        camera_width = largest(lambda width: replace(rig, camera=(width, *rig.camera[1:])), rig.camera[0])
+        ways = [
+            f"a motor of at most {widest:.1f}" if widest else "",
+            f"a camera of at most {camera_width:.1f}" if camera_width else "",
+            longer_belt(rig),
+        ]
+        nearest = ", or ".join(way for way in ways if way)
         yield (
-            f"--hollow-mm, outer diameter {own.outer:g}: the motor's housing or the index flag touches the encoder "
-            f"shaft; give at most {widest:.1f}, or a belt longer than {rig.belt:g} mm (--belt-mm)"
+            f"--hollow-mm, outer diameter {own.outer:g}, and --camera-mm, width {rig.camera[0]:g}: camera, housing or "
+            f"index flag touches the encoder shaft's side; give {nearest}"
         )
     slim = 2.0 * (own.bore / 2 - 2.0 - LEAST_WALL - 1.0)
     if rig.lens > slim + 1e-9:
@@ -213,7 +235,8 @@ def hollow(rig: GimbalRig, rpm: float) -> Iterator[str]:
             f"--lens-mm, diameter {rig.lens:g}: the bore of {own.bore:g} mm (--hollow-mm) is too narrow for it and the "
             f"holder's spigot; give at most {slim:.1f}, or a wider bore"
         )
-    if own.friction < 0.0 or own.cogging < 0.0 or own.slots < 1 or own.poles < 2:
+    torques = own.friction, own.cogging
+    if not all(math.isfinite(value) and value >= 0.0 for value in torques) or own.slots < 1 or own.poles < 2:
         yield "--friction-mnm, --cogging-mnm, --slots-poles: give numbers that are not negative"
         return
     engine = Drive(own, 1.0)  # its speed does not depend on the inertia
@@ -250,6 +273,13 @@ def beside_motor(rig: Rig) -> float:
         at - rig.pitch(rig.teeth[1]) - 1.2 - rig.flag - rig.clearance + STILL,
     )
     return min(gaps) - STILL
+
+
+def longer_belt(rig: Rig) -> str:
+    """Return the shortest belt that leaves room beside the motor, as words; nothing if none up to 600 mm does."""
+    lengths = (float(length) for length in range(2 * math.ceil(rig.belt / 2), 602, 2))
+    length = next((each for each in lengths if beside_motor(replace(rig, belt=each)) >= 0.0), None)
+    return "" if length is None else f"a belt of at least {length:g} mm (--belt-mm)"
 
 
 def largest(of: Callable[[float], Rig], value: float) -> float:

@@ -62,8 +62,11 @@ def test_what_is_not_refused_fits(own: GimbalRig) -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ("--hollow-mm 110 22 36", "--hollow-mm, outer diameter 110: the motor's housing or the index flag touches the"),
-        ("--hollow-mm 110 22 36", "give at most 90.8, or a belt longer than 300 mm"),
+        (
+            "--hollow-mm 110 22 36",
+            "--hollow-mm, outer diameter 110, and --camera-mm, width 40: camera, housing or index flag touches",
+        ),
+        ("--hollow-mm 110 22 36", "give a motor of at most 90.8, or a belt of at least 320 mm (--belt-mm)"),
         (
             "--hollow-mm 80 22 40",
             "beside a bore of 40 mm and within the motor of 80 mm, the housing's screws need a circle",
@@ -79,6 +82,14 @@ def test_what_is_not_refused_fits(own: GimbalRig) -> None:
         ("--kv 17", "--rpm 1440: with --kv 17, 12 V and its friction, the motor reaches 203 rpm"),
         ("--kv 17 --rpm 720", "give at most that, or --kv 64"),
         ("--current-a 0.2", "--current-a 0.2: 14 mN m do not overcome the friction of 20 mN m"),
+        ("--camera-mm 120 60 30", "give a camera of at most "),
+        ("--hollow-mm 80 1 36", "--hollow-mm, height 1: too flat for stator and bell; give at least 10"),
+        (
+            "--hollow-mm 50 22 36",
+            "--hollow-mm, bore 36: beside it, a motor of 50 mm has no room for the housing's screws",
+        ),
+        ("--wedge-mm 20", "--wedge-mm 20: under it there is no room for the cell's screws beside a bore of 36 mm"),
+        ("--friction-mnm nan", "--friction-mnm, --cogging-mnm, --slots-poles: give numbers that are not negative"),
         ("--kv 0", "--kv 0: give a number above 0"),
         ("--hollow-mm 80 nan 36", "--hollow-mm nan: give a number above 0"),
         ("--motor-mm 20 20 5", "the gimbal has no such motor; give --hollow-mm"),

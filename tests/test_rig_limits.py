@@ -14,6 +14,7 @@ pytest.importorskip("trimesh", reason="the rig's parts need trimesh: pip install
 
 from rig import __main__ as command
 from rig import limits, numbers, parts
+from rig.gimbal import GIMBAL
 from rig.numbers import View
 from rig.parts import ONE_INCH, TWO_INCH, Rig
 
@@ -52,12 +53,12 @@ def test_default_dimensions_can_be_built() -> None:
         ("--motor-screws-mm 17 3", "--motor-screws-mm, boss 3: it is thinner than the shaft; give at least 4"),
         (
             "--motor-mm 40 40 4",
-            "touches camera, holder or housing; give a motor of at most 28.6, or a belt longer than 180 mm",
+            "touches camera, holder or housing; give a motor of at most 28.6, or a belt of at least 192 mm",
         ),
         ("--camera-mm 52 60 30", "--camera-mm, width 52, --lens-mm, diameter 17, and --motor-mm, diameter 28"),
         ("--camera-mm 40 90 30", "--camera-mm, height 90: the camera touches the base; give at most 81.5"),
         ("--lens-mm 60 30 --motor-mm 20 40 4 --belt-mm 220", "no wall left beside its screws; give at most 53.6"),
-        ("--lens-mm 50 30", "give a lens of at most 43.3, or a motor of at most 21.3, or a belt longer"),
+        ("--lens-mm 50 30", "give a lens of at most 43.3, or a motor of at most 21.3, or a belt of at least"),
         ("--camera-thread m12", "--camera-thread m12: the thread is on the camera's board"),
         (
             "--camera-thread c --lens-thread cs --flange-mm 17.526",
@@ -74,6 +75,8 @@ def test_default_dimensions_can_be_built() -> None:
         ),
         ("--grip-mm 26 5", "a ring around the thread of 25.4 mm has no wall; give at least 27.8"),
         ("--grip-mm 30 2", "--grip-mm, width 2: the clamp needs 3 mm or more"),
+        ("--flange-mm 0", "--flange-mm 0: give a number above 0"),
+        ("--belt-mm 50", "give a belt of at least 180 mm (--belt-mm)"),
         ("--pupil-mm -1", "--pupil-mm -1: the entrance pupil is said to lie outside the lens"),
         ("--pupil-mm 23", "0 to 22.5"),
         ("--lens-mm 0 5", "--lens-mm 0: give a number above 0"),
@@ -112,6 +115,8 @@ NEAREST: list[tuple[Callable[[float], Rig], float, float]] = [
     (lambda v: replace(ONE_INCH, motor=(28.0, 40.0, v), motor_screws=(20.5, 11.0)), 10.6, 0.1),
     (lambda v: replace(ONE_INCH, belt=220.0, lens=v, threads=("cs", "c")), 53.6, 0.1),
     (lambda v: replace(ONE_INCH, motor_screws=(v, 7.0)), 15.4, -0.1),
+    (lambda v: replace(ONE_INCH, motor=(40.0, 40.0, 4.0), belt=v), 192.0, -2.0),
+    (lambda v: replace(GIMBAL, hollow=replace(GIMBAL.hollow, outer=110.0), belt=v), 320.0, -2.0),
 ]
 
 
@@ -120,7 +125,7 @@ NEAREST: list[tuple[Callable[[float], Rig], float, float]] = [
 def test_the_nearest_that_is_named_is_buildable(own: Callable[[float], Rig], nearest: float, beyond: float) -> None:
     """Also as solids, which know nothing of the formulas; a little beyond it is refused."""
     assert limits.refusals(own(nearest)) == []
-    assert parts.problems(own(nearest), parts.assembly(own(nearest))) == []
+    assert parts.problems(own(nearest), numbers.assembly(own(nearest))) == []
     assert limits.refusals(own(nearest + beyond)) != []
 
 
