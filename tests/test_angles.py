@@ -92,6 +92,20 @@ def test_derivatives_by_each_angle_are_those_of_its_change(solved: tuple[Cost, n
     cost.residuals(v)
 
 
+def test_both_angles_drift_by_the_ratio_of_their_speeds(solved: tuple[Cost, np.ndarray]) -> None:
+    cost, v = solved
+    n = len(cost.brightness.pairs)
+    for end in (0, 1):
+        drifting, first, second = (
+            each[end].numpy()[:n] for each in (cost.by_drift(v), cost.by_angle(v, 0), cost.by_angle(v, 1))
+        )
+        known = np.isfinite(drifting) & np.isfinite(first) & np.isfinite(second)
+        expected = (first + SPEEDS[1] / SPEEDS[0] * second)[known]
+        assert np.corrcoef(drifting[known], expected)[0, 1] > 0.99
+        assert np.std(drifting[known] - expected) < 0.2 * np.std(drifting[known])
+        assert np.std(drifting[known] - first[known]) > 0.3 * np.std(drifting[known])
+
+
 def test_patterns_belong_to_their_angle(solved: tuple[Cost, np.ndarray]) -> None:
     cost, v = solved
     n = len(cost.brightness.pairs)

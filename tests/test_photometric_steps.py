@@ -10,7 +10,7 @@ import pytest
 
 from amiwarp import Camera, PhotometricSettings, Prism, Recording, Settings, simulate
 from amiwarp.calib.calibration import prepare
-from amiwarp.calib.photometric import angles, losses, steps, timing
+from amiwarp.calib.photometric import angles, losses, sectors, steps, timing
 from amiwarp.calib.photometric.answers import AnswerSearch
 from amiwarp.calib.photometric.causes import FOCAL_LENGTH, SIDE
 from amiwarp.calib.photometric.equations import Problem
@@ -21,6 +21,7 @@ from amiwarp.calib.photometric.findings import (
     MissingEvents,
     Optimum,
     RefractoryPeriod,
+    SectorError,
     Silence,
     SlowPixels,
 )
@@ -185,3 +186,13 @@ def test_every_finding_is_said_or_refused() -> None:
         assert (refused.dispatch(kind) is not refused.dispatch(object)) == (kind in verdicts.REFUSED_IN_ORDER)
         assert (warned.dispatch(kind) is not warned.dispatch(object)) == (kind in verdicts.SAID_IN_ORDER)
         assert kind in (*verdicts.REFUSED_IN_ORDER, *verdicts.SAID_IN_ORDER)
+
+
+def test_sectors_are_not_examined_where_pixels_are_slow(first: Refinement, monkeypatch: pytest.MonkeyPatch) -> None:
+    offsets = np.tile([0.05, -0.05], sectors.SECTORS // 2)[None]
+    monkeypatch.setattr(sectors, "sector_offsets", lambda *_: (offsets, np.array([9.0])))
+    seen = losses.see_what_can_be_examined(first)
+    [found] = sectors.note_what_sectors_leave(seen).findings
+    assert isinstance(found, SectorError)
+    assert found.moved_px == pytest.approx(0.05 / sectors.FOUND_SHARE * np.linalg.norm(first.answer.x[:2]))
+    assert sectors.note_what_sectors_leave(replace(seen, time_constant_us=2000.0)).findings == ()

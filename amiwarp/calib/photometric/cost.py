@@ -68,8 +68,8 @@ class SharedMap:
         self.columns: dict[str, tuple[Any, Any]] = {}
         """Derivatives of the residuals at the last solution, on the device, by name; each with the part of it that no
         change of the map explains, or None if that was not needed yet."""
-        self.by_angle: dict[int, tuple[Any, Any]] = {}
-        """Derivatives of the residuals by the angles of the model at the last solution, by the number of the angle."""
+        self.by_angle: dict[str, tuple[Any, Any]] = {}
+        """Derivatives of the residuals by the angles at the last solution, by the number of the angle or ``all``."""
         self._user: Cost | None = None
 
     def used_by(self, cost: Cost) -> SharedMap:
@@ -190,30 +190,39 @@ class Cost:
         if not self._is_solved_at(v):
             self.residuals(v, rounds=2)
 
-    def by_angle(self, v: Vector, angle: int = 0) -> tuple[Any, Any]:
-        """Return the derivatives of the residuals by an angle of the model at the first and second events of the pairs.
+    def by_drift(self, v: Vector) -> tuple[Any, Any]:
+        """Return the derivatives of the residuals by the angle at the first and at the second events of the pairs.
 
-        They are on the device, shape (padded pairs,) each. The map must be solved at ``v``. ``angle`` is the number of
-        the angle, for a model with several.
+        A second angle of the model turns with the first one by the ratio of their speeds, as in a time that passes. The
+        derivatives are on the device, shape (padded pairs,) each. The map must be solved at ``v``.
         """
+        return self._by_angle("all", lambda: self._find_by_drift(self.at(v)))
+
+    def by_angle(self, v: Vector, angle: int = 0) -> tuple[Any, Any]:
+        """Return the derivatives as :meth:`by_drift` does, by one of the model's angles while the others stay.
+
+        ``angle`` is its number.
+        """
+        if MODELS[self.space.model].ANGLES == 1:
+            return self.by_drift(v)
+        return self._by_angle(str(angle), lambda: self._find_by_angle(v, angle))
+
+    def _by_angle(self, name: str, find: Callable[[], tuple[Any, Any]]) -> tuple[Any, Any]:
+        """Return derivatives by an angle, which are found once for each solution of the map."""
         known = self.shared.used_by(self).by_angle
-        if angle not in known:
-            known[angle] = self._find_by_angle(v, angle)
-        return known[angle]
+        if name not in known:
+            known[name] = find()
+        return known[name]
 
     def _find_by_angle(self, v: Vector, angle: int) -> tuple[Any, Any]:
-        if MODELS[self.space.model].ANGLES == 1:
-            return self._by_drift(self.at(v))
-        # a drift turns the second angle by the ratio of the speeds
         values = self.space.to_values(v)
         if angle == 0:
-            return self._by_drift(place_arguments(self.space, {**values, "ratio": 0.0}))
-        both = self._by_drift(place_arguments(self.space, {**values, "ratio": 1.0}))
+            return self._find_by_drift(place_arguments(self.space, {**values, "ratio": 0.0}))
+        both = self._find_by_drift(place_arguments(self.space, {**values, "ratio": 1.0}))
         first = self.by_angle(v, 0)
         return _difference(both[0], first[0]), _difference(both[1], first[1])
 
-    def _by_drift(self, at: dict[str, Any]) -> tuple[Any, Any]:
-        """Return the derivatives by a drift of the angles at the first and second events of the pairs."""
+    def _find_by_drift(self, at: dict[str, Any]) -> tuple[Any, Any]:
         arrays = self.brightness.pairs.arrays
         up = {**at, "drift": STEP_RAD}
         down = {**at, "drift": -STEP_RAD}

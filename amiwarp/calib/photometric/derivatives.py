@@ -67,12 +67,14 @@ def slopes(cost: Cost, space: ParameterSpace, v: Vector, names: Iterable[str]) -
     return {name: cost.column(name, partial(by, name)) for name in names}
 
 
-def shifted(cost: Cost, v: Vector, shift: Any, angle: int = 0) -> Any:
-    """Return the derivative of the residuals by a factor of ``shift``, changes of an angle at the ends of pairs.
+def shifted(cost: Cost, v: Vector, shift: Any, angle: int | None = None) -> Any:
+    """Return the derivative of the residuals by a factor of ``shift``, changes of the angle at the ends of pairs.
+
+    ``angle`` is the number of the only angle that changes; None for a drift of all.
 
     ``shift`` is a Warp array of shape (2 · padded pairs,), or (2, padded pairs). The map must be solved at ``v``.
     """
-    first, second = cost.by_angle(v, angle)
+    first, second = cost.by_drift(v) if angle is None else cost.by_angle(v, angle)
     out = wp.empty_like(first)
     launch(by_shift, len(first), [first, second, shift.flatten()], [out], device=first.device)
     return out

@@ -59,7 +59,7 @@ def by_refractory(cost: Cost, best: Vector) -> Vector:
     The period sets the reference of a pair, its first event, later. The map must be solved at ``best``.
     """
     columns = slopes(cost, cost.space, best, cost.space.names)
-    columns["refractory"], _ = cost.by_angle(best)
+    columns["refractory"], _ = cost.by_drift(best)
     hessian = linear_fit(cost, columns).hessian.sum(axis=0)
     return np.asarray(-pseudo_inverse(hessian[:-1, :-1]) @ hessian[:-1, -1])
 

@@ -33,8 +33,11 @@ LEAST_RATIO = 3.0
 
 
 def note_what_sectors_leave(state: Refinement) -> Refinement:
-    """Note the angle with the largest error that is left in some of its sectors."""
-    if not state.are_angles_examined:
+    """Note the angle with the largest error that is left in some of its sectors.
+
+    Slow pixels leave a part of their lags, which looks alike and is reported already.
+    """
+    if not state.are_angles_examined or state.time_constant_us:
         return state
     space = state.space
     kind = MODELS[space.model]
