@@ -212,14 +212,14 @@ def shifts_of_turns(recording: Recording, encoder: Encoder, starts: NDArray[np.i
     cells = columns * -(-height // side)
     wave = np.arange(ANGLE_BINS // 2 + 1)
     shifts, correlation = [0.0], [1.0]
-    total = np.zeros(0)
+    total: NDArray[np.complex128] | None = None
     for begin, end in pairwise(starts.tolist()):
         e = recording.events.between(begin, end)
         turned = (encoder.angle_at(e.t) - encoder.angle_at([begin])) * (sign * ANGLE_BINS / math.tau)
         at = (np.floor(turned).astype(np.int64) % ANGLE_BINS) * cells + e.y // side * columns + e.x // side
         counts = np.bincount(at, 2.0 * e.p - 1.0, ANGLE_BINS * cells).reshape(ANGLE_BINS, cells)
         spectrum = np.fft.rfft(counts - counts.mean(axis=0), axis=0)
-        if not len(total):
+        if total is None:
             total = spectrum
             continue
         product = np.fft.irfft((np.conj(total) * spectrum).sum(axis=1), FINE_BINS)
