@@ -91,6 +91,14 @@ def test_a_drift_is_no_step() -> None:
     assert changes_of_mean(np.where(np.arange(40) < 17, 0.0, 0.3) + noise) == [(17, pytest.approx(0.3, abs=0.002))]
 
 
+def test_events_show_counts_that_were_lost_backwards() -> None:
+    slipped = losing(recorded(SIZE, PrismMotion(-720.0, 1.0), seconds=0.68), 100, LOST_AT, index=False).recording
+    assert slipped.encoder is not None
+    [step] = steps_in_events(slipped, slipped.encoder)
+    assert step.angle == pytest.approx(-STEP, abs=math.radians(0.5))
+    assert step.first_us <= LOST_AT <= step.last_us
+
+
 def test_events_show_counts_that_were_lost(still: Trouble) -> None:
     encoder = still.recording.encoder
     assert encoder is not None
