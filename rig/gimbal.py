@@ -2,7 +2,7 @@
 
 The light passes the motor's bore, so no magnet can stand on the prism's axis, where an AS5047P needs it (see
 :mod:`rig.magnet`). A belt turns an encoder shaft beside the motor, twice per turn of the prism, and the magnet stands
-on its end. The index on the prism tells the two turns apart. Frame and units are those of :mod:`rig.parts`.
+on its end. The index on the prism tells the two turns apart. Frame and units are as in :mod:`rig.parts`.
 """
 
 from dataclasses import dataclass, field

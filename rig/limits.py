@@ -349,7 +349,7 @@ def beam(rig: Rig, view: View) -> Iterator[str]:
     """Refuse views of which an aperture cuts off a part.
 
     From the rim of the entrance pupil, the outermost rays are r = p + (z - z₀) tan β off the axis at z, with the
-    pupil's radius p = f / 2N at z₀; behind the wedge their direction is that of :class:`amiwarp.ExactModel`. See
+    pupil's radius p = f / 2N at z₀; behind the wedge, :class:`amiwarp.ExactModel` gives their direction. See
     :func:`rig.numbers.clear_of_stops`.
     """
     short = -numbers.clear_of_stops(rig, view.sensor, view.focal, view.number)
