@@ -39,7 +39,7 @@
 #endif
 
 #ifdef __AVR__
-typedef uint8_t ring_index; /* read and written at once; rings of 128 items at most, 256 of bytes to send */
+typedef uint8_t ring_index; /* read and written at once; rings of 256 items at most, of which one stays free */
 #else
 typedef uint16_t ring_index;
 #endif
@@ -117,7 +117,7 @@ void controller_poll(struct controller *c, uint32_t now);
 
 #define PUT(c, ring, n, ...) do { \
         ring_index head_ = (ring).head; \
-        if ((ring_index)(head_ - (ring).tail) >= (n)) { (c)->overruns++; break; } \
+        if ((ring_index)(head_ - (ring).tail) >= (n) - 1u) { (c)->overruns++; break; } /* 256 items are none in 8 bits */ \
         (ring).items[head_ & ((n) - 1u)] = __VA_ARGS__; \
         __asm__ volatile("" ::: "memory"); /* the item is written before the head */ \
         (ring).head = (ring_index)(head_ + 1u); \

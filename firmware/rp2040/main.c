@@ -294,7 +294,7 @@ int main(void) {
         c.driver_fault = !(now & BIT(PIN_DRIVER_FAULT));
         c.supply_low = !(now & BIT(PIN_SUPPLY));
         read_supply();
-        usb_poll(RX_BYTES - WAITING(c.rx));
+        usb_poll(RX_BYTES - 1u - WAITING(c.rx)); /* one place stays free */
         controller_poll(&c, REG(TIMERAWL));
         if (chosen_link == LINK_UNKNOWN && c.decoder.frames) chosen_link = latest_link;
         save();
