@@ -21,6 +21,8 @@ FOLLOW_PX = 0.05
 """Step of the parameters for that comparison [px]."""
 MOST_TURNS = 12
 """Turns of the first of two angles in which the largest speed is looked for."""
+STEPS_PER_TURN = 96
+"""Number of steps of a turn for that."""
 
 
 def over_a_turn(models: Sequence[Model], xy: NDArray[Any]) -> Vector:
@@ -29,8 +31,10 @@ def over_a_turn(models: Sequence[Model], xy: NDArray[Any]) -> Vector:
     The result has the shape (models, n, TURN, 2).
     """
     theta = np.linspace(0.0, math.tau, TURN, endpoint=False)
-    points, angles = np.repeat(xy, TURN, axis=0).astype(np.float32), np.tile(theta, len(xy))
-    return np.asarray(compensate_by_each(models, points, angles).reshape(len(models), len(xy), TURN, 2))
+    points = np.repeat(xy, TURN, axis=0).astype(np.float32)
+    angles = np.tile(theta, len(xy))
+    moved = compensate_by_each(models, points, angles)
+    return np.asarray(moved.reshape(len(models), len(xy), TURN, 2))
 
 
 def displacements(models: Sequence[Model], xy: NDArray[Any] | None = None) -> Vector:
@@ -41,18 +45,25 @@ def displacements(models: Sequence[Model], xy: NDArray[Any] | None = None) -> Ve
     """
     if xy is None:
         camera = models[0].camera
-        x, y = np.meshgrid(np.linspace(0, camera.width - 1, COLUMNS), np.linspace(0, camera.height - 1, ROWS))
+        columns = np.linspace(0, camera.width - 1, COLUMNS)
+        rows = np.linspace(0, camera.height - 1, ROWS)
+        x, y = np.meshgrid(columns, rows)
         xy = np.stack([x.ravel(), y.ravel()], axis=1)
     away = over_a_turn(models, xy) - xy[:, None]
-    return np.asarray((away - away.mean(axis=2, keepdims=True)).reshape(len(models), -1))
+    mean = away.mean(axis=2, keepdims=True)
+    return np.asarray((away - mean).reshape(len(models), -1))
 
 
 def stated_px(space: ParameterSpace, v: Vector, covariance: Vector) -> float:
     """Return the error of the model at ``v`` that its covariance states, constant lag removed [px rms]."""
     variances, axes = np.linalg.eigh(covariance)
-    at = space.build(space.to_values(v))
-    ends = (v + math.sqrt(max(0.0, x)) * axis for x, axis in zip(variances, axes.T, strict=True))
-    return math.hypot(*(distance(space.build(space.to_values(end)), at) for end in ends))
+    here = space.build(space.to_values(v))
+    errors: list[float] = []
+    for variance, axis in zip(variances, axes.T, strict=True):
+        end = v + math.sqrt(max(0.0, variance)) * axis
+        there = space.build(space.to_values(end))
+        errors.append(distance(there, here))
+    return math.hypot(*errors)
 
 
 def distance(model: Model, other: Model) -> float:
@@ -63,15 +74,20 @@ def distance(model: Model, other: Model) -> float:
 def px_per_rad(space: ParameterSpace, best: Vector, angle: int = 0) -> float:
     """Return how far events move per angle of the model, the one with the number ``angle`` [px rms/rad]."""
     size, phase = MODELS[space.model].ORBITS[angle]
-    at = space.names.index(size) if size in space.names else -1
-    return float(np.linalg.norm(best[at : at + 2])) if at in space.orbits else space.pixels.get(phase, 0.0)
+    if size in space.names:
+        first = space.names.index(size)
+        if first in space.orbits:
+            return float(np.linalg.norm(best[first : first + 2]))
+    return space.pixels.get(phase, 0.0)
 
 
 def fastest_px_per_rad(space: ParameterSpace, v: Vector) -> float:
     """Return the largest motion of the image's middle per angle, the first of two, at a search vector [px/rad]."""
-    camera, steps = space.camera, 96
+    camera = space.camera
     middle = np.array([[0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]])
     turns = MOST_TURNS if MODELS[space.model].ANGLES > 1 else 1
-    theta = np.linspace(0.0, math.tau * turns, steps * turns + 1)
-    path = space.build(space.to_values(v)).compensate_points(np.repeat(middle, len(theta), axis=0), theta)
-    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()) * steps / math.tau
+    theta = np.linspace(0.0, math.tau * turns, STEPS_PER_TURN * turns + 1)
+    model = space.build(space.to_values(v))
+    path = model.compensate_points(np.repeat(middle, len(theta), axis=0), theta)
+    longest = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max())
+    return longest * STEPS_PER_TURN / math.tau

@@ -73,11 +73,16 @@ def sector_offsets(cost: Cost, v: Vector) -> tuple[Vector, Vector]:
     residual = _on_host(cost.brightness.residuals.values, n)
     weight = _on_host(cost.brightness.residuals.weight, n)
     # the column of each angle's sector, and the slope by that angle, at both events of a pair
-    column = [SECTORS * angle + sector for angle in range(angles) for sector in _sectors_of(cost, angle)]
-    slope = [_on_host(end, n) for angle in range(angles) for end in cost.by_angle(v, angle)]
+    column: list[NDArray[np.int64]] = []
+    slope: list[Vector] = []
+    for angle in range(angles):
+        column += [SECTORS * angle + sector for sector in _sectors_of(cost, angle)]
+        slope += [_on_host(end, n) for end in cost.by_angle(v, angle)]
+    # squares of pixels, of which only those with pairs are numbered
     width = -(-cost.space.camera.width // SQUARE_PX)
     row_of_squares = pairs.column("y").astype(np.int64) // SQUARE_PX
-    used, square = np.unique(row_of_squares * width + pairs.column("x") // SQUARE_PX, return_inverse=True)
+    column_of_squares = pairs.column("x").astype(np.int64) // SQUARE_PX
+    used, square = np.unique(row_of_squares * width + column_of_squares, return_inverse=True)
     count = angles * SECTORS
     hessian = np.zeros((count, count))
     parts = np.zeros((len(used), count))

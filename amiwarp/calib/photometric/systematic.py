@@ -58,9 +58,10 @@ def map_errors(space: ParameterSpace, best: Vector, fit: LinearFit, pairs: int, 
     others = [n for n in path_of(space) if n not in orbit_of(space)]
     units = [np.eye(len(best))[space.names.index(n)] for n in others]
     along = np.array([*size_and_phase_directions(space, best), *units]).reshape(-1, len(best))
-    names = (*orbit_of(space), *others)
-    error = np.array([MAP_ERROR["phase" if n in phase_names() else "size"] / density**2 for n in names])
-    variances = error**2 * pairs * np.einsum("ki,ij,kj->k", along, fit.fit(space.names).inverse, along)
+    kinds = ["phase" if name in phase_names() else "size" for name in (*orbit_of(space), *others)]
+    error = np.array([MAP_ERROR[kind] / density**2 for kind in kinds])
+    inverse = fit.fit(space.names).inverse
+    variances = error**2 * pairs * np.einsum("ki,ij,kj->k", along, inverse, along)
     return np.asarray(along.T * variances @ along)
 
 
@@ -77,14 +78,19 @@ def lens_errors(space: ParameterSpace, best: Vector, fit: LinearFit, least_gain:
     names = [name for name in LENS if name not in space.names]
     if space.model != "exact" or not space.cartesian or not names:
         return covariance
+    # what moves points at the border of the image by as much as the doubt says
     scale = {"focal_length": camera.fx, "k1": (2.0 * camera.fx / camera.width) ** 2, "fy_over_fx": 1.0}
     given = {**given_lens(camera), **values}
-    doubts = [{**values, name: given[name] + LENS_DOUBT * scale.get(name, 0.5 * camera.width)} for name in names]
+    doubts = []
+    for name in names:
+        error = LENS_DOUBT * scale.get(name, 0.5 * camera.width)
+        doubts.append({**values, name: given[name] + error})
     steps = [space.to_values(best + FOLLOW_PX * unit) for unit in np.eye(n)]
-    at, *ends = displacements([space.build(each) for each in (values, *steps, *doubts)])
-    moved = np.stack(ends, axis=1) - at[:, None]
+    here, *ends = displacements([space.build(each) for each in (values, *steps, *doubts)])
+    moved = np.stack(ends, axis=1) - here[:, None]
     moved = moved[np.isfinite(moved).all(axis=1)]
-    unseen = np.full(len(names), math.inf)  # largest error that the check would not find, in those of the lens
+    # largest error that the check would not find, as a multiple of the doubt
+    unseen = np.full(len(names), math.inf)
     for k, name in enumerate(names):
         if name in fit.names:
             found = least_gain * fit.squares_sum * float(fit.fit((*space.names, name)).inverse[-1, -1])
