@@ -106,8 +106,9 @@ def test_a_direction_has_no_bounds_but_given_ones() -> None:
     turned = {**space.start, "direction": 2.5, "second_direction": -1.8, "fold": 6.0, "amplitude": 0.01}
     assert space.to_values(space.to_vector(turned))["direction"] == pytest.approx(2.5)
     assert bound_warnings(space, {**turned, "second_amplitude": 0.01}) == ()
-    tilted = {**turned, "second_amplitude": 0.01, "incidence": space.high["incidence"]}
-    assert len(bound_warnings(space, tilted)) == 1
+    tilted = {**turned, "second_amplitude": 0.01, "incidence": 0.0}
+    assert bound_warnings(space, tilted) == ()  # there is no incidence below
+    assert len(bound_warnings(space_with(incidence=(0.1, 1.0)), {**tilted, "incidence": 0.1})) == 1
     coarse = globally_searched(space)
     for name, middle in (("direction", 0.0), ("second_direction", 0.5 * math.pi)):
         assert middle - math.pi < coarse.low[name] < middle - 0.5 * math.pi
@@ -244,6 +245,35 @@ def test_it_is_calibrated_without_start_values(calibrated: amiwarp.Calibration) 
     for name in ("amplitude", "second_amplitude", "fold", "incidence"):
         assert abs(calibrated.parameters[name] - true[name]) < 6.0 * calibrated.uncertainty[name]
     assert set(calibrated.free) == set(amiwarp.MirrorModel.FREED) == set(calibrated.uncertainty)
+
+
+@pytest.mark.slow
+def test_two_mirrors_of_one_tilt_each_are_found_as_one(texture: np.ndarray) -> None:
+    """Neither turns the image about its middle."""
+    from scipy.spatial.transform import Rotation
+
+    from tests.test_steadiness import Shaken
+
+    camera, hz, tilts = amiwarp.Camera.from_fov(128, 96, math.radians(35.0)), (60.0, 77.0), (0.016, 0.012)
+
+    def swing(k: int, t: np.ndarray) -> np.ndarray:
+        return np.asarray(tilts[k] * np.cos(math.tau * hz[k] * t + k))
+
+    def path(t: np.ndarray) -> np.ndarray:
+        about_x, about_y = swing(1, t), swing(0, t)
+        second = Rotation.from_rotvec(np.outer(about_x, (1.0, 0.0, 0.0)))
+        turned = (second * Rotation.from_rotvec(np.outer(about_y, (0.0, -1.0, 0.0)))).as_rotvec()
+        return np.asarray(turned[:, 0] + 1j * turned[:, 1])
+
+    still = amiwarp.Simulation(amiwarp.Scene.from_picture(texture), camera, NO_PRISM, 0.1, sensor=PROMPT,
+                               camera_motion=Shaken(path=path)).without_prism().run()  # fmt: skip
+    t = np.arange(-3000, 103_001, 500)
+    first, second = (amiwarp.Encoder(t, math.tau * each * t * 1e-6) for each in hz)
+    recording = amiwarp.Recording(still.events, camera, first.with_second(second), metadata={"optic": "mirror"})
+    found = amiwarp.calibrate(recording, model="mirror", stages=("sharpness",)).parameters
+    assert found["incidence"] < 0.1
+    assert 2.0 * found["amplitude"] == pytest.approx(tilts[0], rel=0.05)
+    assert 2.0 * found["second_amplitude"] == pytest.approx(tilts[1], rel=0.05)
 
 
 def test_a_known_mount_need_not_be_found(recording: amiwarp.Recording) -> None:

@@ -23,6 +23,7 @@ from amiwarp.calib.parameters import (
     kept_by_global_search,
     like_size,
     of_orbit,
+    optical_parameters,
     phase_names,
     units,
 )
@@ -529,12 +530,19 @@ class Search:
 
 
 def bound_warnings(space: ParameterSpace, values: Mapping[str, float]) -> tuple[str, ...]:
-    """Return a warning for each free parameter whose value lies on one of its bounds."""
+    """Return a warning for each free parameter whose value lies on one of its bounds.
+
+    A bound beyond which there are no values is none.
+    """
     unit = units()
+    known = optical_parameters()
     at_bound = []
     for name in space.names:
-        inside = min(values[name] - space.low[name], space.high[name] - values[name])
-        if name not in phase_names() and inside * space.pixels[name] < LEAST_INSIDE_PX:
+        least, most = known[name].limits if name in known else (-math.inf, math.inf)
+        scale = math.radians(1.0) if unit[name] == "rad" else 1.0
+        below = values[name] - space.low[name] if space.low[name] > scale * least else math.inf
+        above = space.high[name] - values[name] if space.high[name] < scale * most else math.inf
+        if name not in phase_names() and min(below, above) * space.pixels[name] < LEAST_INSIDE_PX:
             at_bound.append(name)
     return tuple(f"{n} = {values[n]:.6g} {unit[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)
 

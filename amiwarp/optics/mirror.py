@@ -72,7 +72,7 @@ class MirrorModel(Model):
         Parameter("direction", "rad", 0.6 * math.pi, period=math.pi),
         Parameter("second_direction", "rad", 0.6 * math.pi, period=math.pi),
         Parameter("fold", "rad", math.pi, fine=True, period=math.tau),
-        Parameter("incidence", "rad", 0.6, fine=True),
+        Parameter("incidence", "rad", limits=(0.0, math.degrees(LARGEST_INCIDENCE)), fine=True),
     )
     ORBITS = (("amplitude", "phase"), ("second_amplitude", "second_phase"))
     TOGETHER = (("amplitude", "phase", "direction"), ("second_amplitude", "second_phase", "second_direction"))
@@ -126,6 +126,8 @@ class MirrorModel(Model):
     def default_bounds(cls, name: str, value: float, camera: Camera, prism: Prism | Plate) -> tuple[float, float]:
         if one_of(name, cls.FREE, "name") in dict(cls.ORBITS):
             return 0.0, min(0.5 * LARGEST_PX / camera.fx, LARGEST_TILT)
+        if name == "incidence":  # two mirrors of one tilt each turn no image about its middle, as one at 0
+            return 0.0, LARGEST_INCIDENCE
         return super().default_bounds(name, value, camera, prism)
 
     @classmethod

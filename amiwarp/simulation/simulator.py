@@ -248,7 +248,8 @@ class TruthRenderer:
             ends = self._plate_pixels(plate, rays, depth, later)
             known = np.isfinite(ends).all(axis=1, keepdims=True)
             rays = np.where(known, camera.pixels_to_rays(ends), self._rays)
-            centres, rays = self._behind_plate(rays, later)
+            centres, behind = self._behind_plate(rays, later)
+            rays = behind.astype(np.float64)
         elif prism:
             ends = self._simulation.moving_model.deflect_points(ends, self._angles(next_us))
         (rotation,), (position,) = self._poses([later])

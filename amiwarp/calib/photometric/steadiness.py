@@ -1,0 +1,150 @@
+"""What a vibration may do beyond its model: more harmonics, another amplitude or another speed over the recording.
+
+Each is a few unknowns of a linearised fit about the answer, as the causes of ``consistency.py``. A fit finds a share of
+what is there only, because the map absorbs the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.calib.photometric.consistency import linear_fit, masked, once, px_per_rad, shifted, slopes, telling
+from amiwarp.calib.photometric.cost import place_arguments
+from amiwarp.optics.camera import CameraRotation
+
+if TYPE_CHECKING:
+    from amiwarp.calib.photometric.cost import Cost
+
+    Vector = NDArray[np.float64]
+
+HIGHER = (4, 5)
+"""Multiples of the frequency that the model does not have."""
+WAVES = 8
+"""Number of half oscillations over the recording up to which amplitude and speed may change."""
+STEP_PX, STEP_SHARE = 0.02, 0.005
+"""Steps of the finite differences: a rotation of the camera [px], and a share of the amplitude."""
+SIGNIFICANT, LEAST_GAIN = 5.0, 0.015
+"""Standard deviations and share of the squared residuals from which on one of these is there. A steady ellipse left
+0.004, an amplitude that varied by 15 % 0.16, a triangle 0.12."""
+LEAST_PX = 0.01
+"""Motion of events by it from which on an answer is refused [px rms]."""
+
+
+@dataclass(frozen=True)
+class Unsteady:
+    """What the motion does beyond its model."""
+
+    kind: str
+    """``harmonics``, ``amplitude`` or ``speed``."""
+    moved_px: float
+    """Motion of events by it, as far as a linearised fit finds it [px rms]."""
+    gain: float
+    """Share of the squared residuals that it explains."""
+
+    def in_words(self) -> str:
+        """Return what the motion does, and what to do."""
+        if self.kind == "harmonics":
+            return (
+                f"the vibration is no sum of three harmonics: the fourth and fifth move events by {self.moved_px:.2f} "
+                "px or more, as those of a triangle do; drive it by a sine, or damp what rattles"
+            )
+        changes = "amplitude" if self.kind == "amplitude" else "frequency"
+        return (
+            f"the {changes} of the vibration changes during the recording, which moves events by {self.moved_px:.2f} "
+            "px or more; record while it is steady, or a shorter time"
+        )
+
+
+def find_unsteady(cost: Cost, best: Vector) -> Unsteady | None:
+    """Return what a vibration does beyond its model at the answer ``best`` [px]; None if it keeps to it.
+
+    The map must be solved at ``best``, whose speed is known.
+    """
+    groups = {
+        "harmonics": _harmonics(cost, best),
+        "amplitude": _amplitude(cost, best),
+        "speed": _speed(cost, best),
+    }
+    told = telling(cost, [*groups.values()], LEAST_GAIN)
+    groups = {kind: group for kind, group in groups.items() if any(group is each for each in told)}
+    if not groups:
+        return None
+    names = cost.space.names
+    columns = slopes(cost, cost.space, best, names)
+    for group in groups.values():
+        columns |= group
+    fit = linear_fit(cost, columns)
+    found = []
+    for kind, group in groups.items():
+        estimate, significance, gain = fit.adding(names, (*group,))
+        moved_px = _moved_px(cost, best, kind, estimate.change[len(names) :])
+        if significance >= SIGNIFICANT and gain >= LEAST_GAIN and moved_px >= LEAST_PX:
+            found.append(Unsteady(kind, moved_px, gain))
+    return max(found, key=lambda each: each.gain, default=None)
+
+
+def _moved_px(cost: Cost, best: Vector, kind: str, change: Vector) -> float:
+    """Return how far the changes of a group move events [px rms]."""
+    if kind == "harmonics":  # amplitudes of a rotation about x and y
+        return float(np.linalg.norm(change)) / math.sqrt(2.0)
+    size = float(np.linalg.norm(best)) if kind == "amplitude" else px_per_rad(cost.space, best)
+    return size * float(np.linalg.norm(change)) / math.sqrt(2.0)
+
+
+def _harmonics(cost: Cost, best: Vector) -> dict[str, Any]:
+    """Return the derivatives of the residuals by rotations about x and y at multiples of the frequency [px]."""
+    pairs, camera, at = cost.brightness.pairs, cost.space.camera, cost.at(best)
+    cosine, sine = pairs.angle_patterns((0.0, 0.0)).numpy()[:2]
+    times, columns = pairs.arrays.time, {}
+    for multiple in HIGHER:
+        wave = (cosine + 1j * sine) ** multiple
+        for part, values in (("cos", wave.real), ("sin", wave.imag)):
+            for axis, (x, y) in zip("xy", np.eye(2) * (STEP_PX / camera.fx), strict=True):
+                pairs.arrays.time = wp.array(values.astype(np.float32), dtype=float, device=cost.brightness.device)
+                turns = (CameraRotation((s * x, s * y, 0.0), middle_us=cost.brightness.middle_us) for s in (1.0, -1.0))
+                up, down = ({**at, "camera_rotation": turn} for turn in turns)
+                columns[f"harmonic {multiple} {part} {axis}"] = cost.brightness.find_slope(up, down, 2.0 * STEP_PX)
+    pairs.arrays.time = times
+    return columns
+
+
+def _waves(cost: Cost) -> dict[int, Vector]:
+    """Return cosines over the recording by their number of half oscillations, at both ends of each pair, (2, pairs)."""
+    times = cost.brightness.pairs.time.astype(np.float64)
+    share = (times - times.min()) / max(float(np.ptp(times)), 1e-9)
+    return {k: np.cos(math.pi * k * share) for k in range(1, WAVES + 1)}
+
+
+def _amplitude(cost: Cost, best: Vector) -> dict[str, Any]:
+    """Return the derivatives of the residuals by changes of the amplitude over time, as shares of it."""
+    space, pairs = cost.space, cost.brightness.pairs
+
+    def by_size() -> Any:
+        up, down = (place_arguments(space, space.to_values(best * (1.0 + s * STEP_SHARE))) for s in (1.0, -1.0))
+        return cost.brightness.find_slope(up, down, 2.0 * STEP_SHARE)
+
+    column = once(cost, "size of the motion", partial(by_size))
+    columns = {}
+    for k, wave in _waves(cost).items():
+        factor = np.zeros(pairs.arrays.stride, np.float32)
+        factor[: len(pairs)] = wave.mean(axis=0)
+        columns[f"amplitude {k}"] = masked(column, wp.array(factor, dtype=float, device=cost.brightness.device))
+    return columns
+
+
+def _speed(cost: Cost, best: Vector) -> dict[str, Any]:
+    """Return the derivatives of the residuals by changes of the angle over time that no constant speed makes [rad]."""
+    pairs, columns = cost.brightness.pairs, {}
+    for k, wave in _waves(cost).items():
+        if k > 1:
+            shift = np.zeros((2, pairs.arrays.stride), np.float32)
+            shift[:, : len(pairs)] = wave
+            columns[f"speed {k}"] = shifted(cost, best, wp.array(shift, dtype=float, device=cost.brightness.device))
+    return columns
