@@ -90,6 +90,18 @@ class SlowPixels(Finding):
 
 
 @dataclass(frozen=True)
+class UnsteadyMotion(Finding):
+    """A vibration does more than its model says."""
+
+    kind: str
+    """What: ``harmonics``, ``amplitude`` or ``speed``."""
+    moved_px: float
+    """Motion of events by it, as far as a linearised fit finds it [px rms]."""
+    gain: float
+    """Share of the squared residuals that it explains."""
+
+
+@dataclass(frozen=True)
 class UnsteadySpeed(Finding):
     """The speed of a vibration changes over the recording."""
 

@@ -1,4 +1,4 @@
-"""What a vibration may do beyond its model: more harmonics, another amplitude or another speed over the recording.
+"""Step of the stage that looks for what a vibration does beyond its model: harmonics, changes of amplitude or speed.
 
 Each is a few unknowns of a linearised fit about the answer, as the causes of ``consistency.py``. A fit finds a share of
 what is there only, because the map absorbs the rest.
@@ -7,17 +7,20 @@ what is there only, because the map absorbs the rest.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.calib.photometric.consistency import linear_fit, masked, once, px_per_rad, shifted, slopes, telling
 from amiwarp.calib.photometric.cost import place_arguments
+from amiwarp.calib.photometric.derivatives import masked, shifted, slopes
+from amiwarp.calib.photometric.distances import px_per_rad
+from amiwarp.calib.photometric.findings import UnsteadyMotion
+from amiwarp.calib.photometric.linear_fit import linear_fit, telling
+from amiwarp.calib.photometric.refinement import Refinement
 from amiwarp.optics.camera import CameraRotation
+from amiwarp.optics.models import MODELS
 
 if TYPE_CHECKING:
     from amiwarp.calib.photometric.cost import Cost
@@ -37,32 +40,18 @@ LEAST_PX = 0.01
 """Motion of events by it from which on an answer is refused [px rms]."""
 
 
-@dataclass(frozen=True)
-class Unsteady:
-    """What the motion does beyond its model."""
-
-    kind: str
-    """``harmonics``, ``amplitude`` or ``speed``."""
-    moved_px: float
-    """Motion of events by it, as far as a linearised fit finds it [px rms]."""
-    gain: float
-    """Share of the squared residuals that it explains."""
-
-    def in_words(self) -> str:
-        """Return what the motion does, and what to do."""
-        if self.kind == "harmonics":
-            return (
-                f"the vibration is no sum of three harmonics: the fourth and fifth move events by {self.moved_px:.2f} "
-                "px or more, as those of a triangle do; drive it by a sine, or damp what rattles"
-            )
-        changes = "amplitude" if self.kind == "amplitude" else "frequency"
-        return (
-            f"the {changes} of the vibration changes during the recording, which moves events by {self.moved_px:.2f} "
-            "px or more; record while it is steady, or a shorter time"
-        )
+def refuse_unsteady_motion(state: Refinement) -> Refinement:
+    """Note what a vibration does beyond its model."""
+    of_encoder = state.problem.recording.encoder is not None
+    if MODELS[state.space.model].PRISM or of_encoder or not state.are_angles_examined:
+        return state
+    cost = state.search.cost
+    cost.converge(state.answer.x)
+    found = find_unsteady(cost, state.answer.x)
+    return state if found is None else state.noticing(found)
 
 
-def find_unsteady(cost: Cost, best: Vector) -> Unsteady | None:
+def find_unsteady(cost: Cost, best: Vector) -> UnsteadyMotion | None:
     """Return what a vibration does beyond its model at the answer ``best`` [px]; None if it keeps to it.
 
     The map must be solved at ``best``, whose speed is known.
@@ -86,7 +75,7 @@ def find_unsteady(cost: Cost, best: Vector) -> Unsteady | None:
         estimate, significance, gain = fit.adding(names, (*group,))
         moved_px = _moved_px(cost, best, kind, estimate.change[len(names) :])
         if significance >= SIGNIFICANT and gain >= LEAST_GAIN and moved_px >= LEAST_PX:
-            found.append(Unsteady(kind, moved_px, gain))
+            found.append(UnsteadyMotion(kind, moved_px, gain))
     return max(found, key=lambda each: each.gain, default=None)
 
 
@@ -130,7 +119,7 @@ def _amplitude(cost: Cost, best: Vector) -> dict[str, Any]:
         up, down = (place_arguments(space, space.to_values(best * (1.0 + s * STEP_SHARE))) for s in (1.0, -1.0))
         return cost.brightness.find_slope(up, down, 2.0 * STEP_SHARE)
 
-    column = once(cost, "size of the motion", partial(by_size))
+    column = by_size()
     columns = {}
     for k, wave in _waves(cost).items():
         factor = np.zeros(pairs.arrays.stride, np.float32)

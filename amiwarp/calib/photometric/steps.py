@@ -28,6 +28,7 @@ from amiwarp.calib.photometric.losses import (
 )
 from amiwarp.calib.photometric.refinement import Refinement, Step, first_answer
 from amiwarp.calib.photometric.sectors import note_what_sectors_leave
+from amiwarp.calib.photometric.steadiness import refuse_unsteady_motion
 from amiwarp.calib.photometric.timing import estimate_the_timing, find_slow_pixels, find_the_refractory_period
 from amiwarp.calib.photometric.verdicts import accepted_in_words, warnings
 from amiwarp.calib.result import PhotometricSummary, StageSummary
@@ -42,6 +43,7 @@ STEPS: tuple[Step, ...] = (
     estimate_the_timing,
     find_the_refractory_period,
     find_slow_pixels,
+    refuse_unsteady_motion,
     bound_what_blind_pixels_hide,
     correct_camera_and_prism,
     judge_the_consistency,

@@ -31,6 +31,7 @@ from amiwarp.calib.photometric.findings import (
     Silence,
     SlowPixels,
     StatedError,
+    UnsteadyMotion,
     UnsteadySpeed,
 )
 from amiwarp.optics.camera import LENS
@@ -41,6 +42,7 @@ REFUSED_IN_ORDER: tuple[type[Finding], ...] = (
     Optimum,
     MovingParts,
     AngleError,
+    UnsteadyMotion,
     UnsteadySpeed,
     BlindTime,
     Shake,
@@ -229,6 +231,20 @@ def _(found: SlowPixels) -> Sequence[str]:
         f"size of the orbit was corrected, by {found.moved_px:.2f} px rms, of which about a tenth may remain. The lag "
         "is part of the phase, which holds at this speed of the prism only"
     ]
+
+
+@refused.register
+def _(found: UnsteadyMotion) -> str:
+    if found.kind == "harmonics":
+        return (
+            f"the vibration is no sum of three harmonics: the fourth and fifth move events by {found.moved_px:.2f} px or "
+            "more, as those of a triangle do; drive it by a sine, or damp what rattles"
+        )
+    changes = "amplitude" if found.kind == "amplitude" else "frequency"
+    return (
+        f"the {changes} of the vibration changes during the recording, which moves events by {found.moved_px:.2f} px "
+        "or more; record while it is steady, or a shorter time"
+    )
 
 
 @refused.register
