@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 import amiwarp
 from amiwarp.calib.parameters import make_space
+from amiwarp.calib.photometric import consistency
 from amiwarp.calib.photometric.causes import THIRD, Cause, doubtful_harmonic
-from amiwarp.calib.photometric.consistency import testable
 from amiwarp.cli.app import app
 from reference import optics as reference
 from tests.conftest import COARSE
@@ -227,8 +227,9 @@ def test_a_third_harmonic_is_looked_for_unless_it_is_given() -> None:
     camera = amiwarp.Camera.from_fov(128, 96, 1.0)
 
     def causes_with(free: tuple[str, ...] | None = None, **start: float) -> list[Cause]:
-        return testable(make_space("vibration", camera, NO_PRISM, free=free, start=start, bounds={}, rad_per_us=1e-3,
-                                   duration_us=1e5))  # fmt: skip
+        space = make_space("vibration", camera, NO_PRISM, free=free, start=start, bounds={}, rad_per_us=1e-3,
+                           duration_us=1e5)  # fmt: skip
+        return consistency.testable(space)
 
     assert causes_with() == [THIRD]
     assert causes_with(third_x=0.0) == []

@@ -539,12 +539,13 @@ def bound_warnings(space: ParameterSpace, values: Mapping[str, float]) -> tuple[
     at_bound = []
     for name in space.names:
         least, most = known[name].limits if name in known else (-math.inf, math.inf)
-        scale = math.radians(1.0) if unit[name] == "rad" else 1.0
+        scale = math.radians(1.0) if unit.get(name) == "rad" else 1.0
         below = values[name] - space.low[name] if space.low[name] > scale * least else math.inf
         above = space.high[name] - values[name] if space.high[name] < scale * most else math.inf
         if name not in phase_names() and min(below, above) * space.pixels[name] < LEAST_INSIDE_PX:
             at_bound.append(name)
-    return tuple(f"{n} = {values[n]:.6g} {unit[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)
+    shown = {n: f"{n} = {values[n]:.6g} {unit.get(n, '')}".rstrip() for n in at_bound}
+    return tuple(f"{text} lies on its bound; widen the bounds of {n}" for n, text in shown.items())
 
 
 def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:
