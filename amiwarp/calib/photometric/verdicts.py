@@ -237,8 +237,8 @@ def _(found: SlowPixels) -> Sequence[str]:
 def _(found: UnsteadyMotion) -> str:
     if found.kind == "harmonics":
         return (
-            f"the vibration is no sum of three harmonics: the fourth and fifth move events by {found.moved_px:.2f} px or "
-            "more, as those of a triangle do; drive it by a sine, or damp what rattles"
+            f"the vibration is no sum of three harmonics: the fourth and fifth move events by {found.moved_px:.2f} px "
+            "or more, as those of a triangle do; drive it by a sine, or damp what rattles"
         )
     changes = "amplitude" if found.kind == "amplitude" else "frequency"
     return (
