@@ -32,8 +32,9 @@ AT_ONCE = 0.5
 """Smallest share of a step that comes between two samples."""
 SAMPLES_PER_TURN = 16
 """Smallest number of samples per turn in which steps can be seen."""
-MOST_STEPS = 8
-"""Largest number of steps. More of them are another trouble, such as a loose wheel."""
+MOST_STEPS, MOST_PER_TURN = 8, 0.5
+"""Largest number of steps, and of steps in a turn. An encoder that slips all the time has another trouble, such as a
+loose wheel, which is refused as a wrong scale."""
 FEWEST_PULSES = 3
 """Smallest number of index pulses on either side of a step that tell its size."""
 STEP_SHARE = 0.7
@@ -78,14 +79,15 @@ def lost_counts(encoder: Encoder) -> tuple[Step, ...]:
     """Return the steps that the index pulses of an encoder show if it has enough of them, else those of its samples."""
     seen = steps_in_samples(encoder)
     if encoder.index_t is None or len(encoder.index_t) < 2 * FEWEST_PULSES:
-        return few(seen)
+        return few(seen, encoder)
     slips, pulses = np.unwrap(encoder.slip()), encoder.index_t
-    return few([_located(pulses, k, size, seen) for k, size in changes_of_mean(slips)])
+    return few([_located(pulses, k, size, seen) for k, size in changes_of_mean(slips)], encoder)
 
 
-def few(steps: Sequence[Step]) -> tuple[Step, ...]:
-    """Return the steps, or nothing if there are too many."""
-    return tuple(steps) if len(steps) <= MOST_STEPS else ()
+def few(steps: Sequence[Step], encoder: Encoder) -> tuple[Step, ...]:
+    """Return the steps of an encoder, or nothing if there are too many."""
+    turns = abs(float(encoder.angle[-1] - encoder.angle[0])) / math.tau
+    return tuple(steps) if len(steps) <= min(MOST_STEPS, max(1.0, MOST_PER_TURN * turns)) else ()
 
 
 def _located(times: NDArray[np.int64], k: int, size: float, seen: Sequence[Step]) -> Step:
@@ -181,7 +183,7 @@ def steps_in_events(recording: Recording, encoder: Encoder) -> tuple[Step, ...]:
         partly = abs(shifts[k - 1] - shifts[k - 2]) > abs(shifts[k] - shifts[min(k + 1, len(shifts) - 1)])
         step = _located(starts + round(encoder.clock_offset_us), k if partly else k + 1, size, seen)
         steps.append(replace(step, angle=seen_size(step, seen)))
-    return few(steps)
+    return few(steps, encoder)
 
 
 def seen_size(step: Step, seen: Sequence[Step]) -> float:
