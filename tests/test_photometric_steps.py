@@ -180,9 +180,9 @@ def kinds(base: type) -> Iterator[type]:
 
 def test_every_finding_is_said_or_refused() -> None:
     from amiwarp.calib.photometric import verdicts
-    from amiwarp.calib.photometric.findings import Finding
+    from amiwarp.calib.photometric.findings import Finding, MotionError
 
-    for kind in kinds(Finding):
+    for kind in {*kinds(Finding)} - {MotionError}:  # which the result itself states
         assert (refused.dispatch(kind) is not refused.dispatch(object)) == (kind in verdicts.REFUSED_IN_ORDER)
         assert (warned.dispatch(kind) is not warned.dispatch(object)) == (kind in verdicts.SAID_IN_ORDER)
         assert kind in (*verdicts.REFUSED_IN_ORDER, *verdicts.SAID_IN_ORDER)
