@@ -6,10 +6,10 @@
 #define PIN_UART_RX 1
 #define PIN_A 2             /* quadrature encoder, pulled up */
 #define PIN_B 3
-#define PIN_INDEX 4         /* index Z, high once per turn, pulled down */
+#define PIN_INDEX 4         /* index of the prism, high once per turn; weakly pulled down, the board's 10 kohm pull up */
 #define PIN_CAMERA_SYNC 5   /* pulses of the camera (PULSES_CAMERA), pulled down */
 #define PIN_TRIGGER 6       /* pulses to the camera's trigger input, 1 to 2 ms high */
-#define PIN_PWM 8           /* motor driver: 25 kHz */
+#define PIN_PWM 8           /* motor driver: 25 kHz (AVR: 27 kHz) */
 #define PIN_DIRECTION 9     /* high: forwards */
 #define PIN_ENABLE 10       /* high: on */
 #define PIN_DRIVER_FAULT 11 /* low: over-current or over-temperature, pulled up */

@@ -2,6 +2,7 @@
 
 import hashlib
 import random
+import re
 import shutil
 import struct
 import subprocess
@@ -21,6 +22,15 @@ pytestmark = [
     ),
 ]
 IMAGES = ("amiwarp-avr.hex", "amiwarp-rp2040.uf2")
+"""With the default settings."""
+PER_RIG = {
+    "amiwarp-avr-500-lines.hex": (4000, 1000),
+    "amiwarp-avr-hollow-shaft.hex": (8000, 560),
+    "amiwarp-rp2040-500-lines.uf2": (4000, 1500),
+    "amiwarp-rp2040-magnetic.uf2": (32768, 1500),
+}
+"""Counts per turn of the prism, and largest speed, of the images for each rig."""
+ALL = sorted([*IMAGES, *PER_RIG])
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +50,50 @@ def test_two_builds_are_the_same_bytes(released: Path, tmp_path: Path) -> None:
     again.mkdir(parents=True)
     run_make(again, "release")
     names = sorted(path.name for path in released.iterdir())
-    assert names == ["SHA256SUMS", *IMAGES, "sizes.txt"]
+    assert names == ["SHA256SUMS", *ALL, "sizes.txt"]
     for name in names:
         assert (again / "release" / name).read_bytes() == (released / name).read_bytes(), name
 
 
+@pytest.mark.parametrize("name", PER_RIG)
+def test_the_image_of_a_rig_has_its_counts_and_speed(released: Path, release: Any, name: str) -> None:
+    """``struct settings`` begins with both, and the file is the one that make built for this encoder."""
+    flash = release.read(released / name)
+    assert struct.pack("<2i", *PER_RIG[name]) in flash
+    for other, numbers in PER_RIG.items():
+        if other != name:
+            assert (struct.pack("<2i", *numbers) in flash) is (numbers == PER_RIG[name])
+    stem = name.removeprefix("amiwarp-").split(".")[0]
+    encoder = "MAGNETIC" if "magnetic" in name else "QUADRATURE"
+    made = {"rp2040": f"prism-{encoder}-PULSES_TIMED.uf2", "avr": "prism-atmega2560-PULSES_TIMED.hex"}
+    built = released.parent / "variants" / stem / made[stem.split("-")[0]]
+    assert built.read_bytes() == (released / name).read_bytes()
+    assert f"{name}: {len(flash):,} bytes of flash" in (released / "sizes.txt").read_text()
+
+
+def test_settings_for_a_release_are_refused(tmp_path: Path) -> None:
+    make = ("make", "-s", "-C", str(FIRMWARE), f"BUILD={tmp_path}", "release", "COUNTS=2000", "ENCODER=MAGNETIC")
+    done = subprocess.run(make, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "make release builds the settings of each rig: leave out ENCODER COUNTS" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_readme_lists_each_file_with_the_settings_of_make() -> None:
+    readme = (FIRMWARE / "README.md").read_text()
+    makefile = (FIRMWARE / "Makefile").read_text()
+    for name, (counts, rpm) in PER_RIG.items():
+        (row,) = (line for line in readme.splitlines() if line.startswith(f"| `{name}`"))
+        settings = row.split("|")[3].strip().strip("`")
+        board, rig = re.fullmatch(r"amiwarp-(rp2040|avr)-(.*)\.\w+", name).groups()
+        assert f"{board}_{rig} := {settings}\n" in makefile
+        assert f"MOST_RPM={rpm}" in settings
+        assert row.endswith(f"| {counts:,} |")
+
+
 def test_the_sums_are_those_of_the_files(released: Path) -> None:
     listed = [line.split("  ") for line in (released / "SHA256SUMS").read_text().splitlines()]
-    assert [name for _, name in listed] == [*IMAGES, "sizes.txt"]
+    assert [name for _, name in listed] == [*ALL, "sizes.txt"]
     for digest, name in listed:
         assert digest == hashlib.sha256((released / name).read_bytes()).hexdigest()
 
