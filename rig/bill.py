@@ -12,6 +12,7 @@ from dataclasses import astuple, dataclass
 import amiwarp
 from rig import gimbal, numbers, parts, wires
 from rig.gimbal import GimbalRig
+from rig.numbers import View
 from rig.parts import Rig
 
 
@@ -45,7 +46,7 @@ SCREWS = {
     "screws of the encoder board": (2, "M2.5×8", "with nuts"),
 }
 """Screws by their names in the assembly: number, size, and what else."""
-MOTOR_SCREWS = {"belt": (2, "M3×8", "countersunk"), "gimbal": (4, "M3×8", "countersunk")}
+MOTOR_SCREWS = {"belt": (2, "M3×6", "countersunk"), "gimbal": (4, "M3×8", "countersunk")}
 
 
 def screws_of(rig: Rig) -> dict[str, tuple[int, str, str]]:
@@ -85,6 +86,7 @@ def mechanics(rig: Rig) -> list[Item]:
         Item("", "set screw M3×5", "1", f"ISO 4026, in the {pulley}"),
         Item("", f"set screw M{rig.screw[1]:g}, 3 to 8 mm", "up to 12", "ISO 4026; which ones, the command prints"),
         Item("", "foot", "4", "soft rubber, higher than 8 mm, with an M4 stud of 10 mm or more and a nut"),
+        Item("", "board of the fork barrier", "1", "perfboard 20 × 16 mm, 1.6 mm thick: see “Two small boards”"),
         Item("", "tape", "", "black, over the slits of the holder"),
         Item("", "glue, thread locker", "", consumables(rig)),
     ]
@@ -98,15 +100,36 @@ def consumables(rig: Rig) -> str:
     return "glue for cup and magnet; thread locker; white spirit and instrument oil for the bearings"
 
 
+FOCALS = (6.0, 8.0, 12.0, 16.0, 25.0, 35.0, 50.0)
+"""Usual focal lengths of fixed lenses [mm]."""
+
+
 def lens_item(rig: Rig) -> Item:
-    """Return the lens."""
+    """Return the lens, with the shortest focal length that this rig allows, at f/2 or else at f/4."""
     thread = rig.threads[1]
+    m12 = thread == "m12"
     name = {"m12": "M12 × 0.5", "c": "C-mount", "cs": "CS-mount"}[thread]
-    example = "M12 lens of 16 mm" if thread == "m12" else "fixed lens of 6 to 16 mm for machine vision"
-    spec = (
-        f"{name}, at most {rig.lens:g} mm wide, {rig.reach:g} mm before its ring; locking screws for focus and "
-        "aperture; no shorter than the page's table allows"
-    )
+    sensor_name, sensor = next(iter(numbers.SENSORS.items()))
+    number = 2.0
+    shortest = numbers.shortest_focal(rig, sensor, number)
+    if not math.isfinite(shortest):
+        number = 4.0
+        shortest = numbers.shortest_focal(rig, sensor, number)
+    limit = "no focal length is free of vignetting, even at f/4"
+    if math.isfinite(shortest):
+        widest = math.floor(10.0 * View(sensor, 1.0, number).degrees(shortest)) / 10.0
+        limit = (
+            f"**focal length at least {shortest:g} mm** for {sensor_name} at f/{number:g} (sees {widest:g}°); for "
+            "another sensor see the numbers"
+        )
+    held = "fixed aperture, and a lock nut or locking screw for the focus" if m12 else "locking screws for both rings"
+    usual = next((focal for focal in FOCALS if focal >= shortest), None)
+    kind = "M12 lens" if m12 else "fixed lens for machine vision"
+    example = ""
+    if usual is not None:
+        sees = View(sensor, 1.0, number).degrees(usual)
+        example = f"{kind}, {usual:g} mm (sees {sees:.1f}°) or longer"
+    spec = f"{name}, at most {rig.lens:g} mm wide, {rig.reach:g} mm before its ring; {limit}; {held}"
     return Item("", "lens", "1", spec, example)
 
 
@@ -152,24 +175,28 @@ def bought_parts(rig: Rig) -> list[Item]:
             "",
             "wedge",
             "1",
-            f"⌀ {rig.wedge:g} mm, N-BK7, antireflection coating, {rig.thickness:g} mm thick on the axis, apex "
-            f"{rig.apex_deg:g}°: shops name the deviation, {math.degrees(deviation):.2f}°",
-            "“wedge prism” or “wedged window”",
+            f"⌀ {rig.wedge:g} mm, + 0 / − 0.1 mm; N-BK7, antireflection coating, {rig.thickness:g} ± 0.1 mm thick on "
+            f"the axis; apex (angle between its faces) {rig.apex_deg:g}°, which deviates by "
+            f"{math.degrees(deviation):.2f}°: shops name either; one face square to the rim within 0.1°",
+            f"“wedge prism” of {math.degrees(deviation):.2f}° deviation, or “wedged window” of "
+            f"{60.0 * rig.apex_deg:.0f} arcmin: ask for the thickness on the axis",
         ),
         Item(
             "",
             "fork barrier",
             "1",
-            "slot 5 mm wide, 7 mm deep, body at most 14 mm wide; phototransistor with 0.5 mA or more at 20 mA; on a "
-            "piece "
-            "of perfboard, 20 × 16 mm, 1.6 mm thick, with two holes of 2.2 mm, 14 mm apart, beside the body's middle",
+            f"slot {parts.FORK_SLOT:g} mm wide, {parts.FORK_SLOT_DEPTH:g} mm deep; body at most "
+            f"{parts.FORK_WIDTH:g} mm wide across the slot, {parts.FORK_LENGTH:g} mm long, {parts.FORK_DEPTH:g} mm "
+            "high above its board; leads 2.54 mm apart on each side; phototransistor with 0.5 mA or more at 20 mA of "
+            "its LED",
             "Omron EE-SX1041 (its data sheet)",
         ),
         Item(
             "",
             "encoder board",
             "1",
-            "14 bit, SPI, at most 22 × 28 mm, chip in its middle, two holes of 2.7 mm 23 mm apart (drill them)",
+            "14 bit, SPI, at most 22 × 28 mm, chip in its middle; two holes of 2.7 mm on its long middle line, 23 mm "
+            "apart: see “Two small boards”",
             "with ams AS5047P",
         ),
         Item(
@@ -184,7 +211,7 @@ def bought_parts(rig: Rig) -> list[Item]:
     if isinstance(rig, GimbalRig):
         return common + gimbal_parts(rig)
     bearing = rig.bearing
-    body, _, shaft = rig.motor
+    body, length, shaft = rig.motor
     spacing, boss = rig.motor_screws
     large = rig.wedge > 30.0
     torque = 30 if large else 10
@@ -196,12 +223,13 @@ def bought_parts(rig: Rig) -> list[Item]:
             "",
             "motor",
             "1",
-            f"12 V DC, {torque} mN m or more at 2,900 rpm, ⌀ at most {body:g} mm, two M3 threads {spacing:g} mm apart "
-            "and 4 mm "
-            f"deep, boss ⌀ {boss:g} mm, shaft ⌀ {shaft:g} × 20 mm (24 mm with an encoder board); encoder with A and B, "
-            "500 "
-            "lines or more, open collector or 3.3 V outputs; or no encoder, and parts 15, 16, 21",
-            f"{example} with an encoder: compare shaft and threads",
+            f"12 V DC, {torque} mN m or more at 2,900 rpm, at most 2 A; ⌀ at most {body:g} mm, at most {length:g} mm "
+            f"long with its encoder, two M3 threads {spacing:g} mm apart and at least {parts.MOTOR_THREAD:g} mm deep, "
+            f"boss ⌀ at most {boss:g} mm and 3 mm high, shaft ⌀ {shaft:g} mm, 20 to 24 mm long (24 mm with an encoder "
+            "board); encoder with A and B, 500 lines, open collector or 3.3 V push-pull outputs; or no encoder, and "
+            "parts 15, 16, 21",
+            f"not decided: {example} is the right class, but its order code with encoder, and shaft and threads of "
+            "that code, were not compared. Ask the maker for these figures; other ones are options of the command",
         ),
         Item("", "rear bearing", "1", spec, f"{bearing.name}, any maker"),
         Item("", "front bearing", "1", spec, f"{bearing.name}, any maker"),
@@ -232,10 +260,10 @@ def gimbal_parts(rig: GimbalRig) -> list[Item]:
             "at least "
             f"{own.bore:g} mm; four M3 threads on ⌀ {own.stator_circle:g} mm behind and on ⌀ {own.rotor_circle:g} mm "
             "in front, "
-            f"3 mm deep; {own.kv:g} rpm/V, {own.resistance:g} Ω between wires, cogging below {own.cogging:g} mN m. "
-            "Motors "
-            "that are sold for gimbals mostly have 15 to 60 rpm/V: with 12 V they end at 200 to 700 rpm",
-            "none found that a public source names with such a bore",
+            f"at least {own.thread:g} mm deep; {own.kv:g} rpm/V or more, {own.resistance:g} Ω between wires, cogging "
+            f"below {own.cogging:g} mN m; sensors as its driver asks for. Motors that are sold for gimbals mostly have "
+            "15 to 60 rpm/V: with 12 V they end at 200 to 700 rpm",
+            "none found that a public source names with such a bore: do not begin without one in hand",
         ),
         Item("", "bell", "", "part of the motor: its front face turns, and carries the cell"),
         Item("", "rear bearing", "1", spec, "625, any maker"),
@@ -252,32 +280,58 @@ def electrics(kind: str, drive: str) -> list[Item]:
     out = [Item("U1", "controller", "1", what, which)]
     if drive == "belt":
         what = "12 V, 2 A, PWM of 25 kHz, direction, enable, open-drain fault output, current limit"
-        out.append(Item("", "motor driver", "1", what, "TI DRV8874 on a board, in PH/EN mode (PMODE to ground)"))
+        which = "Pololu 4035 (carrier of TI's DRV8874), in PH/EN mode (PMODE to ground)"
+        out.append(Item("", "motor driver", "1", what, which))
     else:
         what = (
-            "three phases, 12 V, 2 A, commutates by itself; takes the voltage as PWM of 25 kHz, a direction and an "
-            "enable "
-            "(high: on); open-drain fault output; current limit of 1.5 A"
+            "three phases, 12 V, 2 A, sine commutation; takes the duty (voltage, not a speed) as PWM of 25 kHz, a "
+            "direction that may change while it turns, and an enable that is high for on; open-drain fault output, low "
+            f"for a fault; current limit of 1.5 A; logic of {'3.3' if pico else '5'} V"
         )
-        which = "TI MCF8316A commutates without sensors and has a PWM input (TI's page); compare the other inputs"
+        which = "not decided: none found of which public sources say all this; see “Driver” below"
         out.append(Item("", "motor driver", "1", what, which))
     if pico:
-        out.append(Item("", "USB serial adapter", "1", "3.3 V, 460,800 baud or more", "FT232R, CP2102N"))
+        what = "optional, as the Pico's USB serves: 3.3 V, 460,800 baud or more; never wire an output called VCC or 3V3"
+        out.append(Item("", "USB serial adapter", "0 or 1", what, "FT232R, CP2102N"))
     for value, refs in wires.small_parts(kind, drive):
-        count = refs.count(",") + 1
-        kinds = "ceramic, 50 V, leads 5.08 mm apart" if value.endswith("F") else "metal film, 0207, 0.25 W, 1 %"
-        out.append(Item(refs, value, str(count), kinds))
+        film = "metal film, 0207, 0.25 W, 1 %"
+        kinds = "ceramic, 50 V, leads 5.08 mm apart" if value.endswith("F") else film
+        common = [ref for ref in refs if ref != "R14"]
+        if common:
+            out.append(Item(", ".join(common), value, str(len(common)), kinds))
+        if "R14" in refs:
+            only = f"{film}; only for a driver's board without a pull-up at VREF: **not with Pololu 4035**"
+            out.append(Item("R14", value, "1", only))
     connectors = sorted(
         (part for part in wires.components(kind, drive) if part.ref[0] == "J"), key=lambda part: part.ref
     )
     widths = ", ".join(f"{part.ref} {len(part.pins)}" for part in connectors)
-    strips = "two of 20 pins for the Pico" if pico else f"one of {len(wires.MEGA)} pins for the Mega"
+    strips = "two of 20 pins for the Pico" if pico else f"one of {len(wires.MEGA)} pins for the wires to the Mega"
+    headers = [Item("", "headers", "2", "2.54 mm, 20 pins each, to solder on the Pico, pins downwards")] if pico else []
+    plugs = ", ".join(f"{len(part.pins)}" for part in connectors)
+    pins = sum(len(part.pins) for part in connectors)
     across = [Item("", "capacitor", "1", "100 nF, 50 V, across the motor's wires")] if drive == "belt" else []
     return [
         *out,
         Item(", ".join(part.ref for part in connectors), "pin strips", "1 set", f"2.54 mm; pins: {widths}"),
         Item("", "sockets", "1 set", f"2.54 mm, {strips}"),
+        *headers,
+        Item(
+            "",
+            "plugs for the pin strips",
+            "1 set",
+            f"housings of 2.54 mm with {plugs} places, {pins} crimp contacts for 0.08 to 0.2 mm² (J7: 0.5 mm², or "
+            "solder its wires)",
+        ),
         Item("", "perfboard", "1", "9 × 7 cm, 31 × 26 holes of 1 mm, 2.54 mm apart, single pads"),
+        Item("", "perfboard for a level shifter", "0 or 1", "3 × 3 cm or so, only if the table of levels asks for one"),
+        Item(
+            "",
+            "standoffs",
+            "4 for each board",
+            "M2.5 × 10 mm with screws, plastic, in holes drilled at the corners, beside all pads; boards stand on a "
+            "plate of their own beside the base, not on it",
+        ),
         Item("", "capacitor", "1", "470 µF, 25 V, at the driver"),
         *across,
         Item("", "supply", "1", "12 V with a current limit of 2 A", "laboratory supply"),
@@ -287,7 +341,9 @@ def electrics(kind: str, drive: str) -> list[Item]:
             "",
             "wire",
             "",
-            "insulated 0.14 mm² for the board and signals, bare 0.5 mm for its rails, 0.5 mm² for 12 V and motor",
+            "insulated 0.14 mm² for the board and signals, bare 0.5 mm for its rails, 0.5 mm² for 12 V and motor. "
+            "Lengths, by rule of thumb: SPI (J2) at most 0.2 m, encoder A, B and fork barrier 0.5 m, trigger 2 m, "
+            "12 V and motor 1 m",
         ),
     ]
 

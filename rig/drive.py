@@ -78,7 +78,7 @@ class Drive:
 
     @property
     def gains(self) -> dict[str, int]:
-        """Gains for ``default_settings`` of the firmware."""
+        """Gains of the firmware, in the order of ``struct gains``. ``duty_slew`` is the built one, and no setting."""
         per_rpm = FULL_DUTY / self.no_load
         proportional = CROSSOVER * self.rise * per_rpm
         friction = self.motor.friction * 1e-3 * self.motor.resistance / (self.constant * SUPPLY)
@@ -117,7 +117,8 @@ def text(drive: Drive) -> list[str]:
     """Return the numbers that the command prints."""
     ripples = [f"{100.0 * drive.ripple(rpm):.2g} %" for rpm in numbers.SPEEDS]
     speeds = " / ".join(f"{rpm:g}" for rpm in numbers.SPEEDS)
-    gains = ", ".join(f"{name} {value}" for name, value in drive.gains.items())
+    settings = {name.replace("_", "-"): value for name, value in drive.gains.items() if name != "duty_slew"}
+    changes = " ".join(f"--change {name}={value}" for name, value in settings.items())
     return [
         f"motor: at most {drive.fastest:.0f} rpm at {SUPPLY:g} V (--kv {drive.motor.kv:g}, --resistance-ohm "
         f"{drive.motor.resistance:g}, --friction-mnm {drive.motor.friction:g}), {1e3 * drive.torque:.0f} mN m at "
@@ -127,6 +128,6 @@ def text(drive: Drive) -> list[str]:
         f"{' / '.join(ripples)} at {speeds} rpm",
         f"encoder: AS5047P on a shaft that turns {RATIO} times as fast, not linear to {INL / RATIO:g}° of the prism, "
         f"noise {NOISE / RATIO:.3f}° rms",
-        f"gains for default_settings of the firmware, from this: {gains}",
+        f"gains of the firmware, from this: amiwarp motor settings {changes}",
         "motor and encoder are computed and simulated, never built: measure yours",
     ]

@@ -59,6 +59,8 @@ class HollowMotor:
     """Diameter of the circle of four M3 threads in the rear face."""
     rotor_circle: float = 44.0
     """Diameter of the circle of four M3 threads in the front face."""
+    thread: float = 4.0
+    """Depth of these threads. The check of overlaps finds a screw that reaches their bottom."""
     mass: tuple[float, float] = (110.0, 90.0)
     """Masses of stator and bell [g]."""
     kv: float = 140.0
@@ -164,7 +166,7 @@ def stator(rig: GimbalRig) -> Manifold:
     """Return what of the motor stands still."""
     motor = rig.hollow
     out = ring(motor.bore / 2 + 1.7, motor.outer / 2 - 3.7, PLATE, rig.shoulder_z - 4.0)
-    return out - holes(stator_points(rig), 2.5, PLATE - 1, PLATE + 5)
+    return out - holes(stator_points(rig), 2.5, PLATE - 1, PLATE + motor.thread)
 
 
 def bell(rig: GimbalRig) -> Manifold:
@@ -172,7 +174,7 @@ def bell(rig: GimbalRig) -> Manifold:
     motor, top = rig.hollow, rig.shoulder_z
     out = ring(motor.bore / 2, motor.outer / 2, PLATE + 1.5, top)
     out -= ring(motor.bore / 2 + 1.0, motor.outer / 2 - 3.0, PLATE + 0.5, top - 2.3)
-    return out - holes(rotor_points(rig), 2.5, top - 5, top + 1)
+    return out - holes(rotor_points(rig), 2.5, top - motor.thread, top + 1)
 
 
 def cell(rig: GimbalRig) -> Manifold:

@@ -27,6 +27,7 @@ def tables() -> dict[str, str]:
             ("connector", "pin", "net", "goes to, belt", "goes to, hollow-shaft motor"), wires.connector_rows()
         ),
         "wires": rows(("wire", "net", "from", "hole", "to", "hole"), perfboard.wire_rows("rp2040", "belt")),
+        "left out": rows(("left out", "when", "and these wires"), perfboard.left_out_rows("rp2040", "belt")),
         "power": rows(("from", "to, belt", "to, hollow-shaft motor"), wires.POWER),
     }
 

@@ -40,6 +40,8 @@ LEAST_WALL = 1.2
 """Thinnest printed wall: three lines of a nozzle of 0.4 mm [mm]."""
 ROUNDED = 2e-3
 """How far the surfaces of printed parts may be moved when short edges are removed [mm]."""
+MOTOR_THREAD = 3.0
+"""Depth of the threads in the belt motor's face [mm]. The check of overlaps finds a screw that reaches their bottom."""
 FORK_WIDTH, FORK_DEPTH, FORK_SLOT, FORK_SLOT_DEPTH, FORK_LENGTH = 14.0, 10.0, 5.0, 7.0, 6.0
 """Fork barrier [mm]: width along its beam, depth, width and depth of its slot, and length along the flag's path."""
 
@@ -313,7 +315,7 @@ ONE_INCH = Rig(
     "one-inch",
     25.4,
     3.5,
-    1.0,
+    0.5,
     (60, 30),
     180.0,
     "67",
@@ -838,7 +840,7 @@ def motor(rig: Rig) -> Manifold:
     rear = rig.face_z - PLATE - MOTOR_PLATE
     out = rod(body / 2, rear - length, rear, sides=96)
     out += rod(rig.motor_screws[1] / 2, rear - 1, rear + 3) + rod(shaft / 2, rear, rig.front_z + 3.0)
-    return out.translate((rig.distance, 0, 0)) - holes(motor_points(rig), 2.5, rear - 5.0, rear + 1)
+    return out.translate((rig.distance, 0, 0)) - holes(motor_points(rig), 2.5, rear - MOTOR_THREAD, rear + 1)
 
 
 def motor_pulley(rig: Rig) -> Manifold:
@@ -921,7 +923,7 @@ def screw_solids(rig: Rig) -> list[tuple[str, str, Manifold, tuple[float, float,
         ("screws of the rear ring", "prism", screws(2.0, 8.0, 2.5, rear_at, behind, sunk=True), (0, 0, 12)),
         ("screws of the holder", "", screws(2.5, 8.0, HOLDER, holder_at, behind), (0, 0, -40)),
         ("screw of the clamp", "", clamp, (0, 12, -24)),
-        ("screws of the motor", "", screws(3.0, 8.0, MOTOR_PLATE, motor_at, sunk=True), (0, 0, -8)),
+        ("screws of the motor", "", screws(3.0, 6.0, MOTOR_PLATE, motor_at, sunk=True), (0, 0, -8)),
         ("screws of the motor plate", "", screws(3.0, 8.0, MOTOR_PLATE, plate_at, behind), (0, 0, -20)),
         ("screws of the base", "", screws(4.0, 12.0, 6.0, foot, up), (0, -42, 0)),
         ("screws of the fork barrier", "", fork, (0, 38, 150)),

@@ -40,12 +40,12 @@ SIGNALS = (
     Signal("INDEX", "PIN_INDEX", 4, "PL0", "49", "index of the prism"),
     Signal("SYNC_IN", "PIN_CAMERA_SYNC", 5, "PL1", "48", "pulses of the camera, only with PULSES_CAMERA"),
     Signal("TRIGGER", "PIN_TRIGGER", 6, "PA3", "25", "pulses to the camera"),
-    Signal("PWM", "PIN_PWM", 8, "PE3", "5", "voltage of the motor, 25 kHz"),
+    Signal("PWM", "PIN_PWM", 8, "PE3", "5", "voltage of the motor, 25 kHz (Mega: 27 kHz)"),
     Signal("DIRECTION", "PIN_DIRECTION", 9, "PA0", "22", "high: forwards"),
     Signal("ENABLE", "PIN_ENABLE", 10, "PA1", "23", "high: on"),
     Signal("FAULT", "PIN_DRIVER_FAULT", 11, "PA2", "24", "low: fault of the driver"),
     Signal("SUPPLY", "PIN_SUPPLY", 12, "PA4", "26", "12 V present"),
-    Signal("VOLTS", "PIN_SUPPLY_ADC", 26, "PF0", "A0", "12 V measured, by firmware that reads it"),
+    Signal("VOLTS", "PIN_SUPPLY_ADC", 26, "PF0", "A0", "12 V measured"),
     Signal("MISO", "PIN_SPI_MISO", 16, "", "", "magnetic encoder"),
     Signal("CSN", "PIN_SPI_CS", 17, "", "", "magnetic encoder"),
     Signal("SCK", "PIN_SPI_SCK", 18, "", "", "magnetic encoder"),
@@ -134,8 +134,9 @@ def controller(kind: str) -> Component:
 def components(kind: str, drive: str) -> list[Component]:
     """Return the parts on the board.
 
-    Values: the fork barrier's LED gets 17 mA; the divider of the supply gives a high level at 12 V and a low one
-    without, also against the pin's pull-up; 47 kΩ and 10 kΩ give 2.1 V at 12 V and 3.3 V at 18.8 V.
+    Values: the fork barrier's LED gets 21 mA; the divider of the supply gives a high level from 9 V on, no more than
+    the level of the logic at 15 V (both are the firmware's limits of the voltage), and a low one without supply, also
+    against the pin's pull-up; 47 kΩ and 10 kΩ give 2.1 V at 12 V and 3.3 V at 18.8 V.
     """
     pico = kind == "rp2040"
     out = [
@@ -148,9 +149,9 @@ def components(kind: str, drive: str) -> list[Component]:
         two("R3", "10 kΩ", "INDEX", VIO),
         two("R4", "10 kΩ", "ENABLE", GND),
         two("R5", "10 kΩ", "FAULT", VIO),
-        two("R6", "120 Ω" if pico else "220 Ω", VIO, "LED"),
+        two("R6", "100 Ω" if pico else "180 Ω", VIO, "LED"),
         two("R7", "22 kΩ" if pico else "12 kΩ", VM, "SUPPLY"),
-        two("R8", "6.8 kΩ", "SUPPLY", GND),
+        two("R8", "6.2 kΩ", "SUPPLY", GND),
         two("R9", "47 kΩ", VM, "VOLTS"),
         two("R10", "10 kΩ", "VOLTS", GND),
         two("R11", "100 Ω", "TRIGGER", "TRIG_OUT"),
@@ -191,8 +192,8 @@ def nets(kind: str, drive: str) -> dict[str, list[tuple[str, str]]]:
 
 FAR = {
     ("J1", "V+"): ("motor encoder: supply, if it takes this level", "AS5047P board: 5V (Mega)"),
-    ("J1", "A"): ("motor encoder: A", "AS5047P board: A (Mega)"),
-    ("J1", "B"): ("motor encoder: B", "AS5047P board: B (Mega)"),
+    ("J1", "A"): ("motor encoder: A; 5 V push-pull only through a 74LVC125A", "AS5047P board: A (Mega)"),
+    ("J1", "B"): ("motor encoder: B; 5 V push-pull only through a 74LVC125A", "AS5047P board: B (Mega)"),
     ("J1", "GND"): ("motor encoder: GND", "AS5047P board: GND (Mega)"),
     ("J2", "MISO"): ("AS5047P board, without A and B: MISO (DO)", "AS5047P board: MISO (DO)"),
     ("J2", "CSn"): ("AS5047P board: CSn", "AS5047P board: CSn"),
@@ -208,23 +209,23 @@ FAR = {
     ("J4", "TXD"): ("serial adapter: TXD", "serial adapter: TXD"),
     ("J4", "GND"): ("serial adapter: GND", "serial adapter: GND"),
     ("J4", "VCCIO"): (
-        "serial adapter: input for its level, else open",
-        "serial adapter: input for its level, else open",
+        "serial adapter: input for its level (VCCIO), never an output called VCC or 3V3; else open",
+        "serial adapter: input for its level (VCCIO), never an output called VCC or 3V3; else open",
     ),
     ("J5", "PWM"): ("DRV8874: EN / IN1", "brushless driver: PWM input for the voltage"),
     ("J5", "DIR"): ("DRV8874: PH / IN2", "brushless driver: direction"),
-    ("J5", "EN"): ("DRV8874: nSLEEP", "brushless driver: enable, high is on"),
+    ("J5", "EN"): ("DRV8874: nSLEEP (SLP)", "brushless driver: enable, high is on"),
     ("J5", "FLT"): ("DRV8874: nFAULT", "brushless driver: fault, open drain, low is a fault"),
     ("J5", "GND"): ("DRV8874: GND; its PMODE and IMODE go to its GND, too", "brushless driver: GND of its logic"),
     ("J5", "VIO"): ("open", "brushless driver: level of its logic, if it asks for one"),
-    ("J5", "VREF"): ("DRV8874: VREF; leave R14 out if the board has a pull-up there", ""),
+    ("J5", "VREF"): ("DRV8874: VREF; no R14 with Pololu 4035, which has its own", ""),
     ("J6", "TRIG"): ("camera: trigger input", "camera: trigger input"),
     ("J6", "SYNC"): ("open, or the camera's sync output", "open, or the camera's sync output"),
     ("J6", "GND"): ("camera: ground of the trigger", "camera: ground of the trigger"),
     ("J7", "VM"): ("VM of the driver (VIN on Pololu's board)", "supply of the brushless driver"),
     ("J7", "GND"): ("GND of the driver, the star point", "GND of the driver, the star point"),
     ("J8", "5V"): (
-        "motor encoder or 74AHCT125, if they need 5 V, else open",
+        "motor encoder or level shifter, if they need 5 V, else open",
         "74AHCT125, if the camera needs 5 V, else open",
     ),
     ("J8", "GND"): ("the same: GND", "the same: GND"),
@@ -244,7 +245,7 @@ POWER = (
     ),
     ("DRV8874: IPROPI (CS)", "open if the board has its resistor, else 2.49 kΩ to GND", ""),
     ("USB of the controller", "a port of the computer", "a port of the computer"),
-    ("USB of serial adapter (Pico) and camera", "two more ports", "two more ports"),
+    ("USB of the camera, and of the serial adapter if you have one", "a port each", "a port each"),
 )
 """Wires beside the board: from, and to with a belt and with a hollow-shaft motor."""
 
@@ -281,13 +282,13 @@ def connector_rows() -> Iterator[tuple[str, str, str, str, str]]:
                 yield part.ref, pin, net, belt, gimbal
 
 
-def small_parts(kind: str, drive: str) -> list[tuple[str, str]]:
+def small_parts(kind: str, drive: str) -> list[tuple[str, list[str]]]:
     """Return resistors and capacitors on the board, as value and references."""
     found: dict[str, list[str]] = {}
     for part in components(kind, drive):
         if part.ref[0] in "RC":
             found.setdefault(part.what, []).append(part.ref)
-    return [(value, ", ".join(refs)) for value, refs in found.items()]
+    return list(found.items())
 
 
 def as_csv() -> str:

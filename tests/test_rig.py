@@ -84,6 +84,17 @@ def test_a_screw_head_under_the_flange_is_seen() -> None:
     assert any(text.startswith("rotor and screws of the cap overlap") for text in wrong)
 
 
+def test_motor_screws_that_reach_the_bottom_of_their_threads_are_seen(rig: Rig, made: Sequence[Part]) -> None:
+    """M3×8 through the plate of 4 mm: 4 mm of thread, of which the bill asks for 3. M3×6 has more than four turns."""
+    at = parts.at_z(parts.motor_points(rig), rig.face_z - parts.PLATE)
+    long = parts.screws(3.0, 8.0, parts.MOTOR_PLATE, at, sunk=True)
+    wrong = parts.problems(rig, replaced(made, "screws of the motor", long, "motor"))
+    assert any(text.startswith("motor and screws of the motor overlap") for text in wrong)
+    right = next(part.solid for part in made if part.name == "screws of the motor")
+    inside = rig.face_z - parts.PLATE - parts.MOTOR_PLATE - right.bounding_box()[2]
+    assert 2.0 <= inside <= parts.MOTOR_THREAD - 0.5
+
+
 def test_heads_that_stand_out_are_seen(rig: Rig, made: Sequence[Part]) -> None:
     """Cylinder heads on the rear ring touch the holder, and under the motor's pulley they touch that."""
     behind, low = (180.0, 0.0, 0.0), rig.bearing_z[0] - 2.5

@@ -4,6 +4,7 @@ import csv
 import io
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,3 +99,36 @@ def test_tables_of_the_page_are_up_to_date() -> None:
 def test_no_prices() -> None:
     for rig in gimbal.KINDS:
         assert not re.search(r"[€$£]|EUR|USD", bill.of_rig(rig))
+
+
+@pytest.mark.parametrize("series", ["67", "68"])
+def test_the_lens_of_the_list_is_free_of_vignetting(series: str) -> None:
+    """Its shortest focal length is the one of these dimensions, and the example obeys it: 6806 narrows the view."""
+    own = replace(parts.ONE_INCH, series=series)
+    row = next(row for row in listed(own) if row["part"] == "lens")
+    least = float(re.search(r"focal length at least ([\d.]+) mm", row["specification"])[1])
+    example = float(re.search(r"([\d.]+) mm \(sees", row["part number or example"])[1])
+    sensor = numbers.SENSORS["640×480, 9 µm"]
+    assert least <= example
+    assert numbers.clear_of_stops(own, sensor, least) >= 0.0 > numbers.clear_of_stops(own, sensor, least - 0.1)
+    assert {"67": 13.7, "68": 20.4}[series] == least
+
+
+def test_page_and_list_name_one_apex() -> None:
+    """Of the one-inch rig: its list, the command that makes it, and the command that records."""
+    text = (ROOT / "docs" / "how-to" / "build-a-rig.md").read_text()
+    apex = f"{parts.ONE_INCH.apex_deg:g}"
+    assert f"--rig one-inch --apex-deg {apex} " in text
+    assert set(re.findall(r"--nominal-apex-deg ([\d.]+)", text)) == {apex}
+    row = next(row for row in listed(parts.ONE_INCH) if row["part"] == "wedge")
+    assert f"apex (angle between its faces) {apex}°, which deviates by 0.26°" in row["specification"]
+    assert "30 arcmin" in row["part number or example"]
+
+
+def test_a_driver_that_pulls_vref_up_gets_no_second_resistor() -> None:
+    for kind in wires.CONTROLLERS:
+        rows = {item.number: item for item in bill.electrics(kind, "belt")}
+        assert "**not with Pololu 4035**" in rows["R14"].specification
+        assert any(
+            "Pololu 4035" in item.example for item in bill.electrics(kind, "belt") if item.part == "motor driver"
+        )

@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,7 @@ pytest.importorskip("manifold3d", reason="the rig's parts need manifold3d: pip i
 pytest.importorskip("trimesh", reason="the rig's parts need trimesh: pip install 'amiwarp[rig]'")
 from manifold3d import Manifold
 
+from amiwarp.live.link.protocol import SETTINGS
 from rig import __main__ as command
 from rig import drive, limits, magnet, numbers, parts
 from rig.drive import Drive
@@ -300,3 +302,24 @@ def test_the_page_of_the_firmware_states_what_is_simulated(simulated: tuple[Modu
     own = drive.drive_of(GIMBAL)
     for rpm in (30.0, 720.0):
         assert module.row(module.hold(own, rpm, library=library)) in page
+
+
+def test_motor_screws_end_before_the_bottom_of_their_threads() -> None:
+    """Of housing and cell, with the depth that the bill asks for; they hold by more than four turns."""
+    made = {name: solid.bounding_box() for name, solid in solids().items()}
+    behind = made["screws of the motor"][5] - parts.PLATE
+    before = GIMBAL.shoulder_z - made["screws of the cell"][2]
+    for inside in (behind, before):
+        assert 2.0 <= inside <= GIMBAL.hollow.thread - 0.5
+
+
+def test_the_printed_gains_are_settings_of_the_firmware() -> None:
+    """Each within its range; what is not among them is as the firmware was built."""
+    lines = drive.text(drive.drive_of(GIMBAL))
+    (line,) = (each for each in lines if "amiwarp motor settings" in each)
+    changes = dict(re.findall(r"--change (\S+)=(\d+)", line))
+    ranges = {each.name: each for each in SETTINGS}
+    assert set(changes) == {"no-load-rpm", "friction", "kp", "ki", "rise-ms"}
+    assert all(ranges[name].contains(int(value)) for name, value in changes.items())
+    built = (FIRMWARE / "core" / "settings.c").read_text()
+    assert f".duty_slew = {drive.drive_of(GIMBAL).gains['duty_slew']}" in built

@@ -38,8 +38,8 @@ def test_default_dimensions_can_be_built() -> None:
         ("--apex-deg -1", "one-inch: --apex-deg -1: give an angle above 0"),
         ("--apex-deg 0", "--apex-deg 0: give an angle above 0"),
         ("--apex-deg nan", "--apex-deg nan: give an angle above 0"),
-        ("--thickness-mm 0.2", "the thin edge is -0.02 mm, and 0.5 mm are needed; give 0.8 or more"),
-        ("--thickness-mm 12", "--thickness-mm 12: the thick edge of 12.22 mm leaves the rotor no shoulder"),
+        ("--thickness-mm 0.2 --apex-deg 1", "the thin edge is -0.02 mm, and 0.5 mm are needed; give 0.8 or more"),
+        ("--thickness-mm 12 --apex-deg 1", "--thickness-mm 12: the thick edge of 12.22 mm leaves the rotor no"),
         ("--edges-mm 3 2", "--edges-mm 3 2: the thick edge comes second"),
         ("--edges-mm 0.3 3", "the thin edge is 0.30 mm"),
         ("--edges-mm 3 4 --apex-deg 1", "leave out --thickness-mm and --apex-deg"),
@@ -109,7 +109,7 @@ def test_an_unbalanced_wedge_is_refused_with_the_apex_and_the_speed_that_can_be_
 
 
 NEAREST: list[tuple[Callable[[float], Rig], float, float]] = [
-    (lambda v: replace(ONE_INCH, thickness=v), 0.8, -0.1),
+    (lambda v: replace(ONE_INCH, apex_deg=1.0, thickness=v), 0.8, -0.1),
     (lambda v: replace(ONE_INCH, camera=(v, 60.0, 30.0)), 40.6, 0.1),
     (lambda v: replace(ONE_INCH, motor=(v, 40.0, 4.0)), 28.6, 0.1),
     (lambda v: replace(ONE_INCH, motor=(28.0, 40.0, v), motor_screws=(20.5, 11.0)), 10.6, 0.1),
