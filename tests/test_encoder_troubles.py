@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from amiwarp import AmiwarpError, Calibration, EncoderModel, Events, MemoryEvents, Prism, PrismMotion, calibrate
-from amiwarp.calib import checks
+from amiwarp.calib import calibration, checks
 from amiwarp.calib.lost_counts import Step, changes_of_mean, lost_counts, steps_in_events, without_steps
 from amiwarp.calib.photometric import limits
 from amiwarp.calib.photometric.losses import step_if_missing
 from amiwarp.calib.prism_path import PathFit
 from amiwarp.calib.pulses import pulses_only, smooth_path
+from amiwarp.calib.settings import Settings
 from amiwarp.calib.start_burst import without_start_burst
 from amiwarp.events.encoder import Encoder
 from amiwarp.viewer.inspector import Inspector
@@ -282,3 +283,24 @@ def test_a_focal_length_that_drifts_is_no_turning_camera() -> None:
     [said] = [w for w in found.warnings if "the image grew by" in w]
     assert float(said.split()[4]) == pytest.approx(6.0, abs=0.5)
     assert "growth" not in found.parameters
+
+
+@pytest.mark.parametrize(("ratio", "said"), [(0.85, True), (0.97, False)])
+def test_a_path_between_pulses_that_explains_little_is_said(
+    still: Trouble, monkeypatch: pytest.MonkeyPatch, ratio: float, said: bool
+) -> None:
+    """Neither is it taken."""
+    pulses = Encoder(np.arange(5) * 40_000, np.arange(5) * math.tau)
+    recording = replace(still.recording, encoder=pulses)
+    calibrator = calibration.Calibrator(recording, Settings(model="exact"), "cpu", None)
+    sized = SimpleNamespace(space=SimpleNamespace(sized=True))
+    tried: Any = SimpleNamespace(search=sized, cost=0.25)
+    again = SimpleNamespace(
+        accepted=True, cost=ratio * 0.25, unexplained=True, camera_turned=False, calibration=SimpleNamespace()
+    )
+    other = SimpleNamespace(attempt=lambda: again)
+    monkeypatch.setattr(calibration.Calibrator, "_between_pulses", lambda *_: other)
+    found, kept = calibrator.with_mended_encoder(tried)
+    assert kept is tried
+    assert found.mended is None
+    assert ("gives pulses only" in found.mended_words) == said
