@@ -195,12 +195,12 @@ QUADRATURE, NEAR_QUADRATURE = (0.25, 0.5, 2.0, 4.0), 0.03
 LEAST_GROWTH_DEVIATIONS = 5.0
 """Smallest growth of the image that is taken for one [standard deviations]."""
 DOUBTFUL_PATH_RATIO = 0.9
-"""Ratio of the costs with and without a path between pulses from which on it is said that the speed between them varies,
-although the path does not explain the events. It was 0.85 where a speed that hunted by 3 % left 0.16 px."""
+"""Ratio of the costs with and without a path between pulses up to which the speed between them is said to vary, even if
+the path does not explain the events. It was 0.85 where a speed that hunted by 3 % left 0.16 px."""
 DOUBTFUL_PATH = (
     "the encoder gives pulses only, and the speed between them seems to vary in a way that could not be found: the "
-    "result may be off by a tenth of a pixel or more; let the motor turn more steadily, hold the camera still, or use an "
-    "encoder with more samples a turn"
+    "result may be off by a tenth of a pixel or more; let the motor turn more steadily, hold the camera still, or use "
+    "an encoder with more samples a turn"
 )
 GRADUAL_US = 5000
 """Duration of a step of an encoder's angle from which on the events must tell how it came about [us]."""
