@@ -211,7 +211,7 @@ def bought_parts(rig: Rig) -> list[Item]:
     if isinstance(rig, GimbalRig):
         return common + gimbal_parts(rig)
     bearing = rig.bearing
-    body, length, shaft = rig.motor
+    body, _, shaft = rig.motor
     spacing, boss = rig.motor_screws
     large = rig.wedge > 30.0
     torque = 30 if large else 10
@@ -223,7 +223,7 @@ def bought_parts(rig: Rig) -> list[Item]:
             "",
             "motor",
             "1",
-            f"12 V DC, {torque} mN m or more at 2,900 rpm, at most 2 A; ⌀ at most {body:g} mm, at most {length:g} mm "
+            f"12 V DC, {torque} mN m or more at 2,900 rpm, at most 2 A; ⌀ at most {body:g} mm, at most 80 mm "
             f"long with its encoder, two M3 threads {spacing:g} mm apart and at least {parts.MOTOR_THREAD:g} mm deep, "
             f"boss ⌀ at most {boss:g} mm and 3 mm high, shaft ⌀ {shaft:g} mm, 20 to 24 mm long (24 mm with an encoder "
             "board); encoder with A and B, 500 lines, open collector or 3.3 V push-pull outputs; or no encoder, and "

@@ -84,6 +84,11 @@ def test_a_screw_head_under_the_flange_is_seen() -> None:
     assert any(text.startswith("rotor and screws of the cap overlap") for text in wrong)
 
 
+def test_a_motor_as_long_as_the_bill_allows_fits(rig: Rig) -> None:
+    """80 mm with its encoder: it stands beside the camera, and reaches beyond it."""
+    assert wrong_with(replace(rig, motor=(rig.motor[0], 80.0, rig.motor[2]))) == []
+
+
 def test_motor_screws_that_reach_the_bottom_of_their_threads_are_seen(rig: Rig, made: Sequence[Part]) -> None:
     """M3×8 through the plate of 4 mm: 4 mm of thread, of which the bill asks for 3. M3×6 has more than four turns."""
     at = parts.at_z(parts.motor_points(rig), rig.face_z - parts.PLATE)
