@@ -153,7 +153,7 @@ COMMANDS = {
     ),
     "motor": Command(
         "rig",
-        "Set the speed of the prism's motor, stop it, print the controller's status, or check the controller.",
+        "Set the speed of the prism's motor, stop it, print the controller's status or settings, or check it.",
         "amiwarp motor set --port /dev/ttyACM0 --rpm 720",
     ),
     "record": Command(

@@ -734,7 +734,7 @@ def run_motor(
     ] = False,
     common: cli.Common,
 ) -> None:
-    """Set the speed of the prism's motor, stop it, print the controller's status or settings, or check the controller.
+    """Set the speed of the prism's motor, stop it, print the controller's status or settings, or check it.
 
     The motor keeps its last commanded speed after this command exits, unless the setting host-timeout of the controller
     says otherwise. Settings change while the prism rests, and hold until the controller's next reset unless saved. A
