@@ -122,6 +122,7 @@ def test_steps_come_on_the_encoder_s_clock(still: Trouble) -> None:
     assert "at 0.337 s" in Step(337_000, 338_000, STEP).in_words(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [True, False])
 def test_lost_counts_are_put_back(still: Trouble, index: bool, tmp_path: Path) -> None:
     trouble = losing(still, 100, LOST_AT, index=index)

@@ -166,6 +166,7 @@ def check_tables(evaluation: Any, values: dict[str, Any]) -> None:
     assert all(isinstance(condition, Condition) for condition in evaluation.conditions(QUICK))
 
 
+@pytest.mark.slow
 def test_the_board_is_segmented_in_each_stream(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(segmentation, "VARIED", {"gain": ()})
     values = segmentation.measure(streams, QUICK)
@@ -188,6 +189,7 @@ def test_a_body_is_found_in_the_flow_of_a_rotating_camera() -> None:
     assert segmentation.best_ious([body], [body, ~body]) == [1.0, body.mean()]
 
 
+@pytest.mark.slow
 def test_flow_of_still_objects(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     """The wall moves by 0.4 px per window; the board, which moves by more than 2 px, is left out."""
     monkeypatch.setattr(flow, "QUICK_TURNS", (0.25,))

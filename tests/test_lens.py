@@ -420,6 +420,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration, "FINE_PAIRS", calibration.FINE_PAIRS // 6)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_recordings_of_a_still_board_give_lens_and_prism(recordings: list[amiwarp.Recording], tmp_path: Path) -> None:
     encoder = recordings[0].encoder

@@ -138,6 +138,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 NAMES = sorted(part.name for part in parts.assembly(parts.ONE_INCH) if part.kind == "printed")
 
 
+@pytest.mark.slow
 def test_each_part_has_a_file_of_each_format(folder: Path) -> None:
     wanted = {f"{name.replace(' ', '_')}.{kind}" for name in NAMES for kind in ("stl", "3mf", "step")}
     assert {path.name for path in folder.iterdir()} == wanted | {"bill.csv"}

@@ -45,6 +45,7 @@ def test_pixels_too_slow_are_refused() -> None:
         assert "slower prism" in reason
 
 
+@pytest.mark.slow
 def test_an_unknown_refractory_period_is_found() -> None:
     """Without the correction the error is 0.041 px."""
     found, error = calibrated(replace(SMALL, refractory_us=3000.0))
@@ -53,6 +54,7 @@ def test_an_unknown_refractory_period_is_found() -> None:
     assert 1500.0 < found.photometric.refractory_us < 4000.0
 
 
+@pytest.mark.slow
 def test_a_short_refractory_period_is_found() -> None:
     """It explains 1.7 % of the residual. Without the correction the error is 0.021 px."""
     found, error = calibrated(replace(SMALL, refractory_us=1700.0))
