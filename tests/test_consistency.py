@@ -344,5 +344,7 @@ def test_what_is_said_and_refused() -> None:
         reason = refused(found)
         assert (reason == "") == (error == 0.0)
         assert (likeliest(found) in reason) == (error != 0.0)
-    small = replace(lens, moved_px=0.02)
+    small = replace(lens, moved_px=0.02, gain=0.003)
     assert warned(outcome()) == warned(outcome(likely=(small,))) == []
+    [warning] = warned(outcome(likely=(replace(small, gain=0.006),)))  # it explains much
+    assert "focal length seems to be wrong, which amounts to 0.02 px" in warning

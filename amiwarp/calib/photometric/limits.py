@@ -37,6 +37,9 @@ LARGEST_ROTATION_GAIN = 0.05
 LARGEST_COST_RATIO = 0.75
 """Ratio of the new to the previous cost up to which another explanation is accepted if the previous cost was high: a
 camera rotation, a corrected encoder scale, or a corrected lens."""
+NOTABLE_GAIN = 0.005
+"""Share of the squared residuals from which on a cause is reported, however little it moves. Right answers leave 0.001
+at most; a lens with k1 = -0.06 that was not given left 0.013, moved the model by 0.025 px and was 0.065 px off."""
 NOTABLE_PX = 0.025
 """Smallest drift, or spread over the image, of the orbit's size and phase that is reported [px]."""
 LARGEST_INCONSISTENCY_PX = 0.1

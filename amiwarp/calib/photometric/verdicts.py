@@ -386,9 +386,9 @@ def _(check: Consistency) -> str:
 @warned.register
 def _(check: Consistency) -> Sequence[str]:
     out = []
-    # what was tried and did not lower the cost is no cause of a small error
-    if check.likely and check.likely[0].moved_px >= limits.NOTABLE_PX:
-        first = check.likely[0]
+    # what was tried and did not lower the cost is no cause of a small error, unless it explains much
+    first = check.likely[0] if check.likely else None
+    if first is not None and (first.moved_px >= limits.NOTABLE_PX or first.gain >= limits.NOTABLE_GAIN):
         out.append(
             f"the answer does not hold everywhere in the image: {first.cause.words} seems to be wrong, which amounts "
             f"to {first.moved_px:.2f} px rms"
