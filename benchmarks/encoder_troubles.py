@@ -166,9 +166,15 @@ def recorded(
     light = picture(width, height, gravel=gravel)
     frames = Growing(light, growth, math.ceil(1e6 * seconds)) if growth else Still(light)
     recording = simulate(
-        Scene(frames, 2.0 * math.atan(width / 2.0 / focal)), camera, prism, duration_s=seconds, motion=motion,
-        encoder=encoder or EncoderModel(counts_per_turn=4096), sensor=sensor, seed=seed,
-    )  # fmt: skip
+        Scene(frames, 2.0 * math.atan(width / 2.0 / focal)),
+        camera,
+        prism,
+        duration_s=seconds,
+        motion=motion,
+        encoder=encoder or EncoderModel(counts_per_turn=4096),
+        sensor=sensor,
+        seed=seed,
+    )
     if prism.second is None:
         model: Model = ExactModel(camera, prism, motion.phase)
     else:

@@ -181,9 +181,12 @@ def wedge(rng: np.random.Generator, trouble: str) -> Rig:
         t = np.rint(1e6 * pulses + jitter_us).astype(np.int64)
         turns = math.copysign(math.tau, one.rpm) * np.arange(len(t))
         return replace(
-            rig, place=one.place(angle), encoder=Encoder.from_angles(t, turns), duration_s=duration_s,
+            rig,
+            place=one.place(angle),
+            encoder=Encoder.from_angles(t, turns),
+            duration_s=duration_s,
             needs=("pulse", "index", "speed"),
-        )  # fmt: skip
+        )
     if trouble == "no encoder, unsteady speed":
         angle = hunting(one.rpm, rng.uniform(0.0, 0.05), rng.uniform(1.0, 4.0))
         return replace(rig, place=one.place(angle), encoder=None, needs=("speed",))
@@ -307,10 +310,15 @@ def mirror(rng: np.random.Generator, trouble: str) -> Rig:
     phase = rng.uniform(-math.pi, math.pi, 2)
     direction = np.array([0.0, 0.5 * math.pi]) + rng.uniform(-0.2, 0.2, 2)
     values = {
-        "amplitude": size[0], "phase": 0.0, "second_amplitude": size[1], "second_phase": 0.0,
-        "direction": direction[0], "second_direction": direction[1],
-        "fold": rng.uniform(-math.pi, math.pi), "incidence": math.radians(rng.uniform(35.0, 55.0)),
-    }  # fmt: skip
+        "amplitude": size[0],
+        "phase": 0.0,
+        "second_amplitude": size[1],
+        "second_phase": 0.0,
+        "direction": direction[0],
+        "second_direction": direction[1],
+        "fold": rng.uniform(-math.pi, math.pi),
+        "incidence": math.radians(rng.uniform(35.0, 55.0)),
+    }
     duration_s = 0.12
     bend, skew, across = np.zeros(2), np.zeros(2), np.zeros(2)
     needs: tuple[str, ...] = ()
@@ -428,38 +436,69 @@ def plate(rng: np.random.Generator, trouble: str) -> Rig:
 
     shown = wrong(angle, off_centre(rng, 2.0, 2.0)) if trouble == "encoder off centre" else angle
     return Rig(
-        place, read(shown, duration_s), nominal, "auto", duration_s, needs=needs, inverse_depth=inverse_depth,
+        place,
+        read(shown, duration_s),
+        nominal,
+        "auto",
+        duration_s,
+        needs=needs,
+        inverse_depth=inverse_depth,
         **common(rng),
-    )  # fmt: skip
+    )
 
 
 OPTICS: dict[str, Callable[[np.random.Generator, str], Rig]] = {
-    "wedge": wedge, "pair": pair, "mirror": mirror, "vibration": vibration, "plate": plate,
-}  # fmt: skip
+    "wedge": wedge,
+    "pair": pair,
+    "mirror": mirror,
+    "vibration": vibration,
+    "plate": plate,
+}
 
 DRAWN = {
     "wedge": (
-        "none", "encoder off centre", "wobble", "cylinder", "noise events", "time stamps of 1 ms", "OFF events late",
-        "slow pixels", "lost counts", "index pulses that jitter", "hunting between index pulses",
+        "none",
+        "encoder off centre",
+        "wobble",
+        "cylinder",
+        "noise events",
+        "time stamps of 1 ms",
+        "OFF events late",
+        "slow pixels",
+        "lost counts",
+        "index pulses that jitter",
+        "hunting between index pulses",
         "no encoder, unsteady speed",
     ),
     "pair": ("none", "one encoder off centre", "both encoders off centre", "encoders swapped"),
     "mirror": ("none", "cubic error of the command", "quadratic error of the command"),
     "vibration": ("none", "second harmonic", "third harmonic", "unsteady amplitude"),
     "plate": ("none", "faces not parallel", "another thickness"),
-}  # fmt: skip
+}
 """Troubles from which those of an optic are drawn in turn."""
 
 FRESH = (
-    ("wedge", "third harmonic of the encoder"), ("wedge", "encoder's clock drifts"), ("wedge", "encoder of 64 counts"),
-    ("wedge", "speed changes by 10 % halfway"), ("wedge", "lamp dims by 30 %"), ("wedge", "lamp at 100 Hz"),
-    ("wedge", "another glass"), ("wedge", "lens that was not given"), ("wedge", "encoder silent for 30 ms"),
-    ("wedge", "faint scene in noise"), ("pair", "second encoder 1 ms late"),
-    ("pair", "third harmonic of the second encoder"), ("pair", "axes 1 deg apart"),
-    ("mirror", "tilts late by 0.3 and 0.8 ms"), ("mirror", "axes that leak 3 %"),
-    ("vibration", "roll of 0.2 deg"), ("vibration", "frequency drifts by 1 %"),
-    ("vibration", "another vibration of 0.1 px"), ("plate", "another glass"), ("plate", "encoder off centre"),
-)  # fmt: skip
+    ("wedge", "third harmonic of the encoder"),
+    ("wedge", "encoder's clock drifts"),
+    ("wedge", "encoder of 64 counts"),
+    ("wedge", "speed changes by 10 % halfway"),
+    ("wedge", "lamp dims by 30 %"),
+    ("wedge", "lamp at 100 Hz"),
+    ("wedge", "another glass"),
+    ("wedge", "lens that was not given"),
+    ("wedge", "encoder silent for 30 ms"),
+    ("wedge", "faint scene in noise"),
+    ("pair", "second encoder 1 ms late"),
+    ("pair", "third harmonic of the second encoder"),
+    ("pair", "axes 1 deg apart"),
+    ("mirror", "tilts late by 0.3 and 0.8 ms"),
+    ("mirror", "axes that leak 3 %"),
+    ("vibration", "roll of 0.2 deg"),
+    ("vibration", "frequency drifts by 1 %"),
+    ("vibration", "another vibration of 0.1 px"),
+    ("plate", "another glass"),
+    ("plate", "encoder off centre"),
+)
 """Optic and trouble of the recordings that no code was chosen with."""
 
 
@@ -563,8 +602,14 @@ def measure(optic: str, trouble: str, seed: int, folder: Path | None = None, dev
             said.append(found.photometric.verdict)
         error, largest = errors_px(rig, recording, found)
         accepted = found.photometric is None or found.photometric.accepted
-        row |= {"refused": not accepted, "error_px": error, "largest_px": largest, "model": found.model_name,
-                "stated_px": stated_px(found), "hidden_px": hidden_px(found)}  # fmt: skip
+        row |= {
+            "refused": not accepted,
+            "error_px": error,
+            "largest_px": largest,
+            "model": found.model_name,
+            "stated_px": stated_px(found),
+            "hidden_px": hidden_px(found),
+        }
     row["seconds"] = time.perf_counter() - began
     row["named"] = any(word in text for word in rig.needs for text in said)
     row["said"] = said
@@ -589,12 +634,15 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     error = np.array([row["error_px"] for row in answered])
     stated = np.array([row["stated_px"] for row in answered])
     return {
-        "recordings": len(rows), "answered": len(answered), "within_0.02_px": int(np.count_nonzero(error <= 0.02)),
-        "median_error_px": float(np.median(error)), "median_stated_px": float(np.median(stated)),
+        "recordings": len(rows),
+        "answered": len(answered),
+        "within_0.02_px": int(np.count_nonzero(error <= 0.02)),
+        "median_error_px": float(np.median(error)),
+        "median_stated_px": float(np.median(stated)),
         "within_1_2_3_deviations": [float(np.mean(error <= k * stated)) for k in (1, 2, 3)],
         "rank_correlation": float(spearmanr(error, stated).statistic),
         "silent": sum(row["error_px"] > 0.02 and not row["named"] for row in answered),
-    }  # fmt: skip
+    }
 
 
 def main() -> None:

@@ -61,9 +61,10 @@ def test_samples_show_when_counts_were_lost(motion: PrismMotion, index: bool, co
 
 @pytest.mark.parametrize("index", [True, False])
 @pytest.mark.parametrize(
-    "model", [{}, {"jitter_us": 50.0}, {"dropouts_hz": 10.0}, {"harmonics": (0.05, 0.02, 0.01, 0.0)}, {"rate_hz": 1e4}],
+    "model",
+    [{}, {"jitter_us": 50.0}, {"dropouts_hz": 10.0}, {"harmonics": (0.05, 0.02, 0.01, 0.0)}, {"rate_hz": 1e4}],
     ids=["plain", "late", "gaps", "eccentric", "fast"],
-)  # fmt: skip
+)
 def test_a_right_encoder_has_no_step(index: bool, model: dict[str, Any]) -> None:
     for motion in (steady(), hunting(0.3, 0.7), hunting(0.1, 60.0)):
         assert lost_counts(samples(motion, 0, index=index, **model)) == ()
@@ -180,9 +181,10 @@ def test_pulses_have_a_smooth_path() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("motion", "jitter_us"), [(steady, 500.0), (lambda: hunting(0.06, 17.0), 0.0), (lambda: hunting(0.05, 3.0), 0.0)],
+    ("motion", "jitter_us"),
+    [(steady, 500.0), (lambda: hunting(0.06, 17.0), 0.0), (lambda: hunting(0.05, 3.0), 0.0)],
     ids=["jitter", "17 Hz", "3 Hz"],
-)  # fmt: skip
+)
 def test_the_angle_between_pulses_is_found(motion: Callable[[], PrismMotion], jitter_us: float) -> None:
     trouble = encoder_troubles.pulses_only(recorded(SIZE, motion()), jitter_us)
     found = found_in(trouble)
@@ -198,9 +200,10 @@ def test_even_pulses_keep_their_angles() -> None:
 
 
 @pytest.mark.parametrize(
-    ("tick_us", "stamps", "before_us"), [(1, 1, 0), (1, 20, 0), (1, 20, 100_000), (1000, 1, 0), (1000, 1, 100_000)],
+    ("tick_us", "stamps", "before_us"),
+    [(1, 1, 0), (1, 20, 0), (1, 20, 100_000), (1000, 1, 0), (1000, 1, 100_000)],
     ids=["one stamp", "several", "long before", "coarse clock", "coarse, before"],
-)  # fmt: skip
+)
 def test_a_burst_is_set_aside_whatever_the_clock(still: Trouble, tick_us: int, stamps: int, before_us: int) -> None:
     source = still.recording.events
     given = source.slice(0, len(source))

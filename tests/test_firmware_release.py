@@ -125,15 +125,19 @@ def uf2_changed(released: Path, where: int, value: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("where", "value", "said"),
     [
-        (0, b"x", "block 0: no UF2 block"), (512 + 508, b"x", "block 1: no UF2 block"),
-        (8, struct.pack("<I", 0), "are not those of an RP2040"), (28, struct.pack("<I", 1), "family 0x1 are not"),
+        (0, b"x", "block 0: no UF2 block"),
+        (512 + 508, b"x", "block 1: no UF2 block"),
+        (8, struct.pack("<I", 0), "are not those of an RP2040"),
+        (28, struct.pack("<I", 1), "family 0x1 are not"),
         (512 + 12, struct.pack("<I", 0x10000200), "0x10000200 does not follow 0x10000100"),
         (12, struct.pack("<I", 0x10000104), "the ROM writes pages of 256 bytes"),
         (16, struct.pack("<I", 255), "the ROM writes pages of 256 bytes"),
-        (512 + 20, struct.pack("<I", 2), "block 1: says that it is 2 of"), (24, struct.pack("<I", 3), "is 0 of 3"),
-        (32 + 9, b"\xa5", "CRC of the boot stage"), (32 + 253, b"\xa5", "CRC of the boot stage"),
+        (512 + 20, struct.pack("<I", 2), "block 1: says that it is 2 of"),
+        (24, struct.pack("<I", 3), "is 0 of 3"),
+        (32 + 9, b"\xa5", "CRC of the boot stage"),
+        (32 + 253, b"\xa5", "CRC of the boot stage"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_uf2_is_named(released: Path, release: Any, where: int, value: bytes, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         release.read_uf2(uf2_changed(released, where, value))
@@ -164,10 +168,13 @@ def test_a_wrong_hex_is_named(released: Path, release: Any) -> None:
         with pytest.raises(ValueError, match=f"line {at + 1}:"):
             release.read_hex("\n".join(changed))
     for wrong, said in (
-        (lines[:-1], "the last line is not the end"), ([*lines, lines[0]], "the last line is not the end"),
-        (lines[1:], "begins at 0x10"), ([*lines[:3], *lines[4:]], "0x40 does not follow 0x30"),
-        (["x", *lines], "line 1: does not begin with"), ([":00000006FA", *lines], "unknown record of type 6"),
-    ):  # fmt: skip
+        (lines[:-1], "the last line is not the end"),
+        ([*lines, lines[0]], "the last line is not the end"),
+        (lines[1:], "begins at 0x10"),
+        ([*lines[:3], *lines[4:]], "0x40 does not follow 0x30"),
+        (["x", *lines], "line 1: does not begin with"),
+        ([":00000006FA", *lines], "unknown record of type 6"),
+    ):
         with pytest.raises(ValueError, match=said):
             release.read_hex("\n".join(wrong))
 

@@ -26,7 +26,7 @@ from amiwarp.live.link.protocol import (
     Setting,
     Stop,
     encode,
-)  # fmt: skip
+)
 from tests import test_firmware as base
 from tests.test_firmware import FAULT, FIRMWARE, Host, S, built, load, of
 
@@ -36,10 +36,19 @@ pytestmark = [
 ]
 KEY = {setting.name: key for key, setting in enumerate(protocol.SETTINGS)}
 BUILT = {
-    "counts-per-turn": 4096, "most-rpm": 3000, "most-ramp": 5000, "stop-ramp": 2000, "kp": 5120, "ki": 25_600,
-    "friction": 600, "no-load-rpm": 4000, "rise-ms": 150, "host-timeout": 0, "undervoltage": 9000,
+    "counts-per-turn": 4096,
+    "most-rpm": 3000,
+    "most-ramp": 5000,
+    "stop-ramp": 2000,
+    "kp": 5120,
+    "ki": 25_600,
+    "friction": 600,
+    "no-load-rpm": 4000,
+    "rise-ms": 150,
+    "host-timeout": 0,
+    "undervoltage": 9000,
     "overvoltage": 15_000,
-}  # fmt: skip
+}
 SAVED = {"kp": 4000, "ki": 12_000, "most-rpm": 1500, "host-timeout": 30}
 SAVE_S = 0.05
 """Longest time of a save in the simulated memory [s]."""

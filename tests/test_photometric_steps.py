@@ -167,9 +167,12 @@ def test_warnings_have_one_order() -> None:
     found = (FlatSideCorrected(FlatSide.CAMERA, FlatSide.SCENE), BlindTime(0.42), Silence(0.2), RefractoryPeriod(900.0))
     said = warnings(found)
     assert said == warnings(found[::-1])
-    assert [words for each in said for words in ("refractory period): 900", "20 % of the time", "points to the scene",
-            "by up to 0.42 px") if words in each] == ["refractory period): 900", "20 % of the time",
-                                                      "points to the scene", "by up to 0.42 px"]  # fmt: skip
+    assert [
+        words
+        for each in said
+        for words in ("refractory period): 900", "20 % of the time", "points to the scene", "by up to 0.42 px")
+        if words in each
+    ] == ["refractory period): 900", "20 % of the time", "points to the scene", "by up to 0.42 px"]
 
 
 def kinds(base: type) -> Iterator[type]:

@@ -34,9 +34,11 @@ def test_the_lens_of_a_cylinder_on_one_side_is_that_of_a_prism_that_grows_with_t
 def test_the_rival_is_said_unless_the_user_chose(calibration: amiwarp.Calibration) -> None:
     values = {"wobble_x": math.radians(-1.0), "wobble_y": 0.0}
     found = replace(
-        calibration, model_name="exact", parameters={**calibration.parameters, **values},
+        calibration,
+        model_name="exact",
+        parameters={**calibration.parameters, **values},
         uncertainty={**calibration.uncertainty, "wobble_x": 1e-3, "wobble_y": 1e-3},
-    )  # fmt: skip
+    )
     (said,) = uneven_in_words(found, None)
     assert "instead of the wobble that was found, it may be that its faces are uneven (cylinder, 0." in said
     assert "no event tells" in said.lower()

@@ -413,8 +413,11 @@ class Calibrator:
             mended = self._on(mended)._fitted()
         said = steps_in_words(steps, recording.events.t_first + round(encoder.clock_offset_us))
         shown = "its index pulses" if told_by_index else "the events"
-        return self._on(mended, f"{said}, as {shown} show: it lost counts, or slipped. They were put back for this "
-                                "recording only: check its cable, supply and coupling")  # fmt: skip
+        words = (
+            f"{said}, as {shown} show: it lost counts, or slipped. They were put back for this recording only: check "
+            "its cable, supply and coupling"
+        )
+        return self._on(mended, words)
 
     def _between_pulses(self, search: Search) -> Calibrator | None:
         """Return the calibrator of the recording with a path between its pulses; None if they are evenly spaced.
