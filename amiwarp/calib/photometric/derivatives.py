@@ -117,27 +117,42 @@ def by_shake(cost: Cost, best: Vector) -> dict[str, Any]:
 
     They are rotations about x and about y by the cosine and by the sine of the encoder's angle [px at the centre].
     """
-    pairs = cost.brightness.pairs
-    camera = cost.space.camera
     kind = MODELS[cost.space.model]
     if cost.space.moving or not orbit_of(cost.space) or kind.ANGLES > 1 or not kind.PRISM:
         return {}
+    rows = cost.brightness.pairs.angle_patterns((0.0, 0.0))
+    return {name: by_swing(cost, best, rows[k % 2].flatten(), k // 2) for k, name in enumerate(SHAKE)}
+
+
+def by_swing(cost: Cost, best: Vector, wave: Any, axis: int) -> Any:
+    """Return the derivative of the residuals by a rotation of the camera about x (0) or y (1) that follows a wave [px].
+
+    ``wave`` is a Warp array of its values at the ends of pairs, shape (2 · padded pairs,) or (2, padded pairs).
+    """
+    pairs = cost.brightness.pairs
     at = cost.at(best)
     middle_us = cost.brightness.middle_us
-    rows = pairs.angle_patterns((0.0, 0.0))
-    columns: dict[str, Any] = {}
+    x, y = np.eye(2)[axis] * (SLOPE_PX / cost.space.camera.fx)
+    up = {**at, "camera_rotation": CameraRotation((x, y, 0.0), middle_us=middle_us)}
+    down = {**at, "camera_rotation": CameraRotation((-x, -y, 0.0), middle_us=middle_us)}
     given = pairs.arrays.time
     try:
-        for k, name in enumerate(SHAKE):
-            x, y = np.eye(2)[k // 2] * (SLOPE_PX / camera.fx)
-            # a rotation is linear in time: with the wave as the time, it follows the wave
-            pairs.arrays.time = rows[k % 2].flatten()
-            up = {**at, "camera_rotation": CameraRotation((x, y, 0.0), middle_us=middle_us)}
-            down = {**at, "camera_rotation": CameraRotation((-x, -y, 0.0), middle_us=middle_us)}
-            columns[name] = cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
+        # a rotation is linear in time: with the wave as the time, it follows the wave
+        pairs.arrays.time = wave
+        return cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
     finally:
         pairs.arrays.time = given
-    return columns
+
+
+def by_wave_of_angle(cost: Cost, best: Vector, wave: Vector) -> Any:
+    """Return the derivative of the residuals by a change of all angles, with its values at the ends of pairs [rad].
+
+    ``wave`` has the shape (2, pairs).
+    """
+    pairs = cost.brightness.pairs
+    shift = np.zeros((2, pairs.arrays.stride), np.float32)
+    shift[:, : len(pairs)] = wave
+    return shifted(cost, best, wp.array(shift, dtype=float, device=cost.brightness.device))
 
 
 def by_cause(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:

@@ -6,11 +6,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.calib.photometric.cost import Cost
-from amiwarp.calib.photometric.derivatives import shifted, slopes
+from amiwarp.calib.photometric.derivatives import by_wave_of_angle, slopes
 from amiwarp.calib.photometric.distances import distance, fastest_px_per_rad, px_per_rad
 from amiwarp.calib.photometric.findings import BlindTime, RefractoryDoubt, UnsteadySpeed
 from amiwarp.calib.photometric.limits import REFRACTORY_DOUBT_US
@@ -69,16 +68,13 @@ def change_of_speed_px(cost: Cost, best: Vector) -> float:
 
     It is the estimate of a linearised fit, which finds a share of the change only. The map must be solved at ``best``.
     """
-    pairs = cost.brightness.pairs
     names = cost.space.names
-    times = pairs.time.astype(np.float64)
+    times = cost.brightness.pairs.time.astype(np.float64)
     late = (times - times.mean()) / max(float(times.std()), 1e-9)
     waves = {"late": late, "square": late**2 - np.mean(late**2)}
     columns = slopes(cost, cost.space, best, names)
     for name, wave in waves.items():
-        shift = np.zeros((2, pairs.arrays.stride), np.float32)
-        shift[:, : len(pairs)] = wave
-        columns[name] = shifted(cost, best, wp.array(shift, dtype=float, device=cost.brightness.device))
+        columns[name] = by_wave_of_angle(cost, best, wave)
     estimate, significance, _ = linear_fit(cost, columns).adding((*names, "late"), ("square",))
     moved = px_per_rad(cost.space, best) * abs(float(estimate.change[-1])) * float(waves["square"].std())
     return moved if significance >= SIGNIFICANT else 0.0

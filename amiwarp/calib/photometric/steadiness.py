@@ -14,12 +14,11 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.calib.photometric.cost import place_arguments
-from amiwarp.calib.photometric.derivatives import masked, shifted, slopes
+from amiwarp.calib.photometric.derivatives import by_swing, by_wave_of_angle, masked, slopes
 from amiwarp.calib.photometric.distances import px_per_rad
 from amiwarp.calib.photometric.findings import UnsteadyMotion
 from amiwarp.calib.photometric.linear_fit import linear_fit, telling
 from amiwarp.calib.photometric.refinement import Refinement
-from amiwarp.optics.camera import CameraRotation
 from amiwarp.optics.models import MODELS
 
 if TYPE_CHECKING:
@@ -31,8 +30,8 @@ HIGHER = (4, 5)
 """Multiples of the frequency that the model does not have."""
 WAVES = 8
 """Number of half oscillations over the recording up to which amplitude and speed may change."""
-STEP_PX, STEP_SHARE = 0.02, 0.005
-"""Steps of the finite differences: a rotation of the camera [px], and a share of the amplitude."""
+STEP_SHARE = 0.005
+"""Step of the finite difference: a share of the amplitude."""
 SIGNIFICANT, LEAST_GAIN = 5.0, 0.015
 """Standard deviations and share of the squared residuals from which on one of these is there. A steady ellipse left
 0.004, an amplitude that varied by 15 % 0.16, a triangle 0.12."""
@@ -89,18 +88,14 @@ def _moved_px(cost: Cost, best: Vector, kind: str, change: Vector) -> float:
 
 def _harmonics(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by rotations about x and y at multiples of the frequency [px]."""
-    pairs, camera, at = cost.brightness.pairs, cost.space.camera, cost.at(best)
-    cosine, sine = pairs.angle_patterns((0.0, 0.0)).numpy()[:2]
-    times, columns = pairs.arrays.time, {}
+    cosine, sine = cost.brightness.pairs.angle_patterns((0.0, 0.0)).numpy()[:2]
+    columns = {}
     for multiple in HIGHER:
         wave = (cosine + 1j * sine) ** multiple
         for part, values in (("cos", wave.real), ("sin", wave.imag)):
-            for axis, (x, y) in zip("xy", np.eye(2) * (STEP_PX / camera.fx), strict=True):
-                pairs.arrays.time = wp.array(values.astype(np.float32), dtype=float, device=cost.brightness.device)
-                turns = (CameraRotation((s * x, s * y, 0.0), middle_us=cost.brightness.middle_us) for s in (1.0, -1.0))
-                up, down = ({**at, "camera_rotation": turn} for turn in turns)
-                columns[f"harmonic {multiple} {part} {axis}"] = cost.brightness.find_slope(up, down, 2.0 * STEP_PX)
-    pairs.arrays.time = times
+            swing = wp.array(values.astype(np.float32), dtype=float, device=cost.brightness.device)
+            for axis, name in enumerate("xy"):
+                columns[f"harmonic {multiple} {part} {name}"] = by_swing(cost, best, swing, axis)
     return columns
 
 
@@ -130,10 +125,4 @@ def _amplitude(cost: Cost, best: Vector) -> dict[str, Any]:
 
 def _speed(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by changes of the angle over time that no constant speed makes [rad]."""
-    pairs, columns = cost.brightness.pairs, {}
-    for k, wave in _waves(cost).items():
-        if k > 1:
-            shift = np.zeros((2, pairs.arrays.stride), np.float32)
-            shift[:, : len(pairs)] = wave
-            columns[f"speed {k}"] = shifted(cost, best, wp.array(shift, dtype=float, device=cost.brightness.device))
-    return columns
+    return {f"speed {k}": by_wave_of_angle(cost, best, wave) for k, wave in _waves(cost).items() if k > 1}
