@@ -30,7 +30,9 @@ def resolve(platform: str, python: str) -> tuple[int, str]:
                "--no-annotate", *sys.argv[1:]]  # fmt: skip
     for attempt in range(ATTEMPTS):
         time.sleep(20.0 * attempt)
-        done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
+        done = subprocess.run(
+            command, cwd=Path(__file__).parents[1], capture_output=True, text=True
+        )
         if done.returncode == 0:
             return 0, f"{len(done.stdout.splitlines())} packages"
         if "No solution found" in done.stderr:
@@ -42,7 +44,13 @@ def main() -> int:
     """Print a table of platforms and Python versions, and the reports of those that fail. Return the exit code."""
     cells = [(name, python) for name in PLATFORMS for python in PYTHONS]
     with ThreadPoolExecutor(4) as pool:
-        results = dict(zip(cells, pool.map(lambda cell: resolve(PLATFORMS[cell[0]], cell[1]), cells), strict=True))
+        results = dict(
+            zip(
+                cells,
+                pool.map(lambda cell: resolve(PLATFORMS[cell[0]], cell[1]), cells),
+                strict=True,
+            )
+        )
     words = {1: "no wheels", 2: "not checked"}
     print(f"{'':14}" + "".join(f"{python:>14}" for python in PYTHONS))
     for name in PLATFORMS:

@@ -1,42 +1,24 @@
-"""Options with a fixed set of values, for images, pictures, event clouds and simulated worlds."""
+"""Options with a fixed set of values that several rooms, or commands and settings, use.
 
-import enum
-from typing import NoReturn
+In this order: optical models, images of warped events, costs of a search, corners, films, reconstructed pictures, event
+clouds. An option
+of one room is in the room, such as `amiwarp/simulation/choices.py`.
+"""
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import Option
 
-OPTICAL_MODELS = ("circle", "exact", "radial", "ellipse", "risley", "plate", "mirror", "vibration")
+OPTICAL_MODELS = (
+    "circle",
+    "exact",
+    "radial",
+    "ellipse",
+    "risley",
+    "plate",
+    "steerer",
+    "mirror",
+    "vibration",
+)
 """Names of the optical models, for programs that do not load them."""
-
-
-class Option(enum.StrEnum):
-    """Base of options with a fixed set of values: a value that none of them has is answered with all of them."""
-
-    @classmethod
-    def _missing_(cls, value: object) -> NoReturn:
-        raise AmiwarpError(f"{cls.__name__} is {value!r}; choose among {', '.join(cls)}")
-
-
-class Optic(Option):
-    """What moves the image of a simulated camera.
-
-    Examples
-    --------
-    >>> Optic("plate")
-    <Optic.PLATE: 'plate'>
-    """
-
-    WEDGE = "wedge"
-    """Rotating wedge prism, which moves near and far points alike."""
-    PLATE = "plate"
-    """Rotating tilted plane-parallel plate, which moves near points only."""
-    VIBRATION = "vibration"
-    """No glass: the camera itself vibrates. Its recording has no encoder."""
-    MIRROR = "mirror"
-    """Mirror with two tilts; an encoder records the angles of its two commands."""
-
-
-# Choices for images of warped events: how to vote, what to do with polarity, which sharpness to measure.
 
 
 class Vote(Option):
@@ -94,6 +76,22 @@ class Sharpness(Option):
     """Minus the entropy of the distribution of votes over pixels [nat]."""
 
 
+class SearchCost(Option):
+    """What the search of a calibration optimises.
+
+    Examples
+    --------
+    >>> amiwarp.SearchCost("phase")
+    <SearchCost.PHASE: 'phase'>
+    """
+
+    SHARPNESS = "sharpness"
+    """Sharpness of the image of warped events: every evaluation moves the events."""
+    PHASE = "phase"
+    """Share of the sums of events in phase with the prism that no scene explains. The events are summed once; see
+    ``docs/explanation/phase.md``."""
+
+
 class CornerMethod(Option):
     """Methods that find corners among events.
 
@@ -128,10 +126,25 @@ class FilmMode(Option):
     """Time surface: how long ago the latest event was at each pixel, as an exponential decay."""
 
 
-# Choices for reconstructed pictures: how to fill unknown parts, and how to display intensity.
-
 CONTRAST = 0.25
 """Default value of the ON threshold [natural log intensity]."""
+
+
+class PictureMethod(Option):
+    """How a picture of the scene is made from events.
+
+    Examples
+    --------
+    >>> [method.value for method in PictureMethod]
+    ['solver', 'phase', 'auto']
+    """
+
+    SOLVER = "solver"
+    """Least squares over the pairs of consecutive events of each pixel."""
+    PHASE = "phase"
+    """Sums of each pixel's events in phase with the optic, in closed form: over whole turns of a still scene."""
+    AUTO = "auto"
+    """Sums in phase where optic, camera and window allow them, else the solver."""
 
 
 class Fill(Option):
@@ -158,9 +171,6 @@ class Tone(Option):
     """Mapping for display: the 0.5th percentile of intensity is black, the 99.5th is white, with gamma 2.2."""
     LINEAR = "linear"
     """Mapping proportional to intensity: 0 is black, the 99.5th percentile is the largest pixel value."""
-
-
-# Options of the event clouds: colour, third axis and view.
 
 
 class Colour(Option):
@@ -195,18 +205,3 @@ class View(Option):
     XY = "x-y"
     X_AXIS = "x-θ"
     Y_AXIS = "y-θ"
-
-
-# Options of simulations that have a fixed set of values.
-
-
-class Seeing(Option):
-    """Method by which the simulator computes the light that each pixel receives from a world."""
-
-    MAPS = "maps"
-    """Look up pre-rendered pictures of the world (maps), and blend two successive maps linearly in time.
-
-    A map shows the world without the prism. A new map is rendered after the image has moved by half a pixel.
-    """
-    RAYS = "rays"
-    """Cast rays from every pixel through the prism into the world at every time step: exact, but slow on a CPU."""

@@ -1,4 +1,4 @@
-"""Types of the words of Prophesee's EVT: their upper four bits; of EVT 2.1, those of the half with the time.
+"""Types of the words of Prophesee's EVT: their upper four bits; of EVT 2.1, the upper bits of the half with the time.
 
 The words are described at https://docs.prophesee.ai/stable/data/encoding_formats/index.html. This file imports nothing,
 so that readers that run without Warp share it with the kernels.
@@ -37,5 +37,17 @@ TIME_LOW = 0x6
 """Lower bits of the time."""
 CONTINUED_4 = 0x7
 """Four more bits of the word before."""
-EVT3 = (ROW, SINGLE, VECTOR_BASE, VECTOR_12, VECTOR_8, TIME_LOW, CONTINUED_4, TIME_HIGH, TRIGGER, OTHERS, CONTINUED)
+EVT3 = (
+    ROW,
+    SINGLE,
+    VECTOR_BASE,
+    VECTOR_12,
+    VECTOR_8,
+    TIME_LOW,
+    CONTINUED_4,
+    TIME_HIGH,
+    TRIGGER,
+    OTHERS,
+    CONTINUED,
+)
 """All types of EVT 3.0."""

@@ -13,7 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeAlias, TypeVar
+from typing import Self, TypeAlias, TypeVar
 
 Result = TypeVar("Result")
 
@@ -34,7 +34,9 @@ def works_on_one_core() -> bool:
 
 def cores() -> int:
     """Return the number of CPU cores that this process may use."""
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    available = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    )
     return available if _limit is None else min(available, _limit)
 
 
@@ -42,7 +44,8 @@ def cores() -> int:
 def limited_cpu_threads(most: int | None) -> Iterator[None]:
     """Use at most ``most`` threads within the block, because other processes use the other cores."""
     global _limit
-    before, _limit = _limit, most
+    before = _limit
+    _limit = most
     try:
         yield
     finally:
@@ -65,7 +68,7 @@ def in_order(
 
     A bounded number of jobs is in flight. The exception of a job is raised when its result is due. When the generator
     is closed, waiting jobs are dropped and running jobs are completed. With ``fill_cores``, jobs are such that each
-    keeps a core busy: where there is a thread for each core, kernels of a job are not spread over several cores.
+    keeps a core busy: with a thread for each core, kernels of a job are not spread over several cores.
     """
     threads = min(cpu_threads(), most)
     waiting: deque[Future[Result]] = deque()
@@ -144,7 +147,9 @@ def interrupts_later() -> Iterator[list[int]]:
     Native code that calls Python, or is left half-done by an exception, cannot close its files and windows.
     """
     arrived: list[int] = []
-    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [
+        getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+    ]
     before = {}
     if threading.current_thread() is threading.main_thread():
         for number in numbers:
@@ -158,3 +163,38 @@ def interrupts_later() -> Iterator[list[int]]:
             signal.signal(number, handler)
         if arrived:
             signal.raise_signal(arrived[0])
+
+
+class BackgroundLoop:
+    """Base of what runs :meth:`_run` in a daemon thread, from :meth:`_start_thread` until closed; a context manager."""
+
+    def _start_thread(self, name: str) -> None:
+        """Start the thread. ``name``: the thread's name."""
+        self._ended = threading.Event()
+        """Event on which the loop waits instead of sleeping; it ends soon after the event is set."""
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._guarded_run, name=name, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the loop and wait for it. Raises the error that ended it, once."""
+        self._ended.set()
+        self._thread.join()
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+
+    def _guarded_run(self) -> None:
+        try:
+            self._run()
+        except Exception as error:
+            self._failure = error
+
+    def _run(self) -> None:
+        raise NotImplementedError

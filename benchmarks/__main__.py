@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.studies.cluster import processor
+from amiwarp.studies.machine import processor
 from amiwarp.tasks import cpu_threads
 from benchmarks import report
 from benchmarks.cases import CASES, SCENES, Case
@@ -55,7 +55,9 @@ def seconds_of(job: Job, device: str) -> float:
 
 def wrong(case: Case, errors: dict[str, float]) -> list[str]:
     """Return the errors that exceed the case's limits, as text."""
-    return [f"{k} {errors[k]:.3g} > {bar:g}" for k, bar in case.bars.items() if not errors[k] <= bar]
+    return [
+        f"{k} {errors[k]:.3g} > {bar:g}" for k, bar in case.bars.items() if not errors[k] <= bar
+    ]
 
 
 def row_of(case: Case, scene: str) -> dict[str, Any]:
@@ -82,7 +84,13 @@ def prepared(case: Case, scene: Any, device: str, row: dict[str, Any]) -> Job | 
 
 
 def measured(
-    cases: list[Case], name: str, device: str, *, events: int | None, repeats: int, picture: Path | None
+    cases: list[Case],
+    name: str,
+    device: str,
+    *,
+    events: int | None,
+    repeats: int,
+    picture: Path | None,
 ) -> list[dict[str, Any]]:
     """Measure all cases on one scene, and return the results as rows."""
     rows = [row_of(case, name) for case in cases]
@@ -116,7 +124,11 @@ def line(row: dict[str, Any]) -> str:
     if "skipped" in row:
         return f"{start} skipped: {row['skipped']}"
     low, high = row["quartiles_s"]
-    rate = f"{row['rate_per_s'] / 1e6:10.1f} M{row['unit']}/s" if row["unit"] else f"{row['events']:13,} ev"
+    rate = (
+        f"{row['rate_per_s'] / 1e6:10.1f} M{row['unit']}/s"
+        if row["unit"]
+        else f"{row['events']:13,} ev"
+    )
     results = ", ".join(f"{k} {v:.4g}" for k, v in (row["errors"] | row["also"]).items())
     bad = f"  WRONG: {'; '.join(row['wrong'])}" if row["wrong"] else ""
     note = f"  ({row['note']})" if row["note"] else ""
@@ -125,7 +137,11 @@ def line(row: dict[str, Any]) -> str:
 
 def versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
-    installed = {d.metadata["Name"]: d.version for d in importlib.metadata.distributions() if d.metadata["Name"]}
+    installed = {
+        d.metadata["Name"]: d.version
+        for d in importlib.metadata.distributions()
+        if d.metadata["Name"]
+    }
     for name in LIBRARIES:
         for full in sorted(installed):
             if full == name or full.startswith(f"{name}-cuda"):
@@ -176,19 +192,38 @@ def kind(device: str) -> str:
 
 def chosen(device: str, only: list[str] | None) -> list[Case]:
     return [
-        c for c in CASES if kind(device) in c.devices and (not only or any(o.lower() in c.name.lower() for o in only))
+        c
+        for c in CASES
+        if kind(device) in c.devices
+        and (not only or any(o.lower() in c.name.lower() for o in only))
     ]
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="only cases whose name contains NAME")
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES), metavar="SCENE")
-    parser.add_argument("--events", type=int, help="events per scene; the error limits are for the default")
-    parser.add_argument("--repeats", type=int, default=15, help="passes of each method; complete jobs have fewer")
-    parser.add_argument("--picture", type=Path, help="scene of the recording; default: PyVista's map of the earth")
-    parser.add_argument("--cpu", metavar="NAME", help="older processor to compile for; haswell has AVX2, not AVX-512")
+    parser.add_argument(
+        "--only", nargs="+", metavar="NAME", help="only cases whose name contains NAME"
+    )
+    parser.add_argument(
+        "--scenes", nargs="+", choices=SCENES, default=list(SCENES), metavar="SCENE"
+    )
+    parser.add_argument(
+        "--events", type=int, help="events per scene; the error limits are for the default"
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=15, help="passes of each method; complete jobs have fewer"
+    )
+    parser.add_argument(
+        "--picture", type=Path, help="scene of the recording; default: PyVista's map of the earth"
+    )
+    parser.add_argument(
+        "--cpu",
+        metavar="NAME",
+        help="older processor to compile for; haswell has AVX2, not AVX-512",
+    )
     parser.add_argument("--out", type=Path)
     args = parser.parse_args(arguments)
     if not chosen(args.device, args.only):
@@ -199,7 +234,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def compile_for(cpu: str) -> None:
     """Let Warp, Numba and PyTorch compile for this processor, of which PyTorch only knows whether it has AVX-512."""
-    wp.config.cpu_compiler_flags = str(wp.config.cpu_compiler_flags).replace("-march=native", f"-target-cpu {cpu}")
+    wp.config.cpu_compiler_flags = str(wp.config.cpu_compiler_flags).replace(
+        "-march=native", f"-target-cpu {cpu}"
+    )
     os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = cpu, ""
     os.environ["ATEN_CPU_CAPABILITY"] = "avx2"
 
@@ -212,13 +249,26 @@ def main(arguments: list[str] | None = None) -> int:
     whole = args.only is None and args.events is None and len(args.scenes) == len(SCENES)
     out = args.out or (report.FILES[kind(args.device)] if whole else None)
     picture = args.picture.name if args.picture else "earth"
-    results = about(args.device) | {"repeats": args.repeats, "picture": picture, "cpu": args.cpu, "rows": []}
-    print(json.dumps({k: v for k, v in results.items() if k != "rows"}, ensure_ascii=False), flush=True)
+    results = about(args.device) | {
+        "repeats": args.repeats,
+        "picture": picture,
+        "cpu": args.cpu,
+        "rows": [],
+    }
+    print(
+        json.dumps({k: v for k, v in results.items() if k != "rows"}, ensure_ascii=False),
+        flush=True,
+    )
     for scene in args.scenes:
         of_scene = [case for case in cases if scene in case.scenes]
         if of_scene:
             results["rows"] += measured(
-                of_scene, scene, args.device, events=args.events, repeats=args.repeats, picture=args.picture
+                of_scene,
+                scene,
+                args.device,
+                events=args.events,
+                repeats=args.repeats,
+                picture=args.picture,
             )
         if args.out is not None:
             write(args.out, results)  # so that an interrupted run keeps the scenes before
@@ -227,8 +277,12 @@ def main(arguments: list[str] | None = None) -> int:
     if out is not None:
         write(out, results)
     if out in report.FILES.values():
-        report.write_pages()
-    bad = [f"{row['scene']}, {row['name']}: {'; '.join(row['wrong'])}" for row in results["rows"] if row.get("wrong")]
+        report.write_page()
+    bad = [
+        f"{row['scene']}, {row['name']}: {'; '.join(row['wrong'])}"
+        for row in results["rows"]
+        if row.get("wrong")
+    ]
     print("wrong answers:\n" + "\n".join(bad) if bad else "all answers are correct")
     return 1 if bad else 0
 

@@ -38,22 +38,29 @@ from amiwarp import (
     Simulation,
     compensate_events,
 )
-from amiwarp.io.files import write_text
+from amiwarp.io.outputs import write_text
 from amiwarp.kernels import prism_view as sight
 from amiwarp.kernels.camera import camera_params
 from amiwarp.kernels.launch import launch
-from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path
+from amiwarp.live.stream.adaptive import SpeedController
+from amiwarp.live.stream.coverage import CoverageMeter, prism_orbit, prism_path
 from amiwarp.plotting.figures import save
-from amiwarp.simulation.scenery import MapRing, place_scene, step_us
-from amiwarp.studies.cluster import machine, versions
+from amiwarp.simulation.image_motion import step_us
+from amiwarp.simulation.picture_maps import MapRing, place_scene
 from amiwarp.studies.demo import earth
+from amiwarp.studies.machine import machine, versions
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 PRISM, SMALL, PHASE = Prism(math.radians(1.8)), Prism(math.radians(0.9)), 1.0
 """Two prisms, with orbits of 5.8 and 2.9 px, and the phase of both [rad]."""
 WINDOW_US = 33_000
 FIXED, USUAL = (180.0, 360.0, 540.0, 720.0, 1440.0), 720.0
-MOTIONS = {"still": (0.0, 1.0, 1), "slow": (15.0, 1.0, 1), "fast": (120.0, 1.0, 3), "very fast": (300.0, 0.4, 6)}
+MOTIONS = {
+    "still": (0.0, 1.0, 1),
+    "slow": (15.0, 1.0, 1),
+    "fast": (120.0, 1.0, 3),
+    "very fast": (300.0, 0.4, 6),
+}
 """Camera motions by name: angular speed [deg/s], duration of a circle of the optical axis [s], and number of measured
 circles."""
 SETTLED_S, ADAPTED_S = 0.2, 1.2
@@ -63,7 +70,10 @@ CHANGING = (("still", 2.0), ("slow", 1.0), ("fast", 2.0), ("still", 2.0))
 MOST_RPM, START_RPM = 900.0, 540.0
 """Highest speed that the controller may command, and its initial speed, from which it settles before the measurement
 starts [turns/min]."""
-BANDS: dict[str, dict[str, float]] = {"adaptive": {}, "adaptive, 99 %": {"low": 0.99, "high": 0.996}}
+BANDS: dict[str, dict[str, float]] = {
+    "adaptive": {},
+    "adaptive, 99 %": {"low": 0.99, "high": 0.996},
+}
 """Limits of the coverage that the controller aims at: its default limits, and lower ones of about 99 %."""
 SPARE_S = 0.05
 """Time simulated after the measurement, because the last window extends past its end [s]."""
@@ -120,7 +130,13 @@ class Edges:
         """Return rows and columns of edge pixels: crests of the gradient with a change of at least CONTRAST."""
         out = wp.empty(CAMERA.width * CAMERA.height, dtype=float, device="cpu")
         matrix = self._to_texel @ self.orientation(np.array([seconds]))[0]
-        launch(sight.see_without_prism, len(out), [self._view, wp.mat33(*matrix.ravel().tolist())], [out], device="cpu")
+        launch(
+            sight.see_without_prism,
+            len(out),
+            [self._view, wp.mat33(*matrix.ravel().tolist())],
+            [out],
+            device="cpu",
+        )
         log = out.numpy().reshape(CAMERA.height, CAMERA.width)
         steep = ndimage.maximum_filter(log, 3) - ndimage.minimum_filter(log, 3) >= CONTRAST
         steep[:MARGIN] = steep[-MARGIN:] = steep[:, :MARGIN] = steep[:, -MARGIN:] = False
@@ -129,12 +145,15 @@ class Edges:
         rows, columns = np.nonzero(steep)
         along = np.stack([gy[rows, columns], gx[rows, columns]]) / size[rows, columns]
         ahead, behind = (
-            ndimage.map_coordinates(size, np.stack([rows, columns]) + s * along, order=1) for s in (1.0, -1.0)
+            ndimage.map_coordinates(size, np.stack([rows, columns]) + s * along, order=1)
+            for s in (1.0, -1.0)
         )
         crest = (size[rows, columns] >= ahead) & (size[rows, columns] > behind)
         return rows[crest], columns[crest]
 
-    def seen(self, t_us: NDArray[np.int64], points: NDArray[np.float32], start_us: int, end_us: int) -> float:
+    def seen(
+        self, t_us: NDArray[np.int64], points: NDArray[np.float32], start_us: int, end_us: int
+    ) -> float:
         """Return the share of the edges at the window's middle that have at least LEAST events within NEAR px."""
         middle = 0.5e-6 * (start_us + end_us)
         grid = np.arange(start_us, end_us, 1000)
@@ -143,23 +162,33 @@ class Edges:
         pinhole = np.array([[c.fx, 0.0, c.cx], [0.0, c.fy, c.cy], [0.0, 0.0, 1.0]])
         moves = (pinhole @ turned @ np.linalg.inv(pinhole)).astype(np.float32)
         places = []
-        for move, part in zip(moves, np.split(points, np.searchsorted(t_us, grid[1:])), strict=True):
+        for move, part in zip(
+            moves, np.split(points, np.searchsorted(t_us, grid[1:])), strict=True
+        ):
             x, y, z = move[:, :2] @ part.T + move[:, 2:]
             column, row = np.rint(2.0 * x / z), np.rint(2.0 * y / z)
             inside = (column >= 0) & (row >= 0) & (column < 2 * c.width) & (row < 2 * c.height)
-            places.append(row[inside].astype(np.int64) * (2 * c.width) + column[inside].astype(np.int64))
-        votes = np.bincount(np.concatenate(places), minlength=4 * c.width * c.height).reshape(2 * c.height, -1)
+            places.append(
+                row[inside].astype(np.int64) * (2 * c.width) + column[inside].astype(np.int64)
+            )
+        votes = np.bincount(np.concatenate(places), minlength=4 * c.width * c.height).reshape(
+            2 * c.height, -1
+        )
         rows, columns = self.at(middle)
         reach = range(-round(2 * NEAR), round(2 * NEAR) + 1)
         disc = [(dy, dx) for dy in reach for dx in reach if math.hypot(dy, dx) <= 2 * NEAR]
-        return float(np.mean(sum(votes[2 * rows + dy, 2 * columns + dx] for dy, dx in disc) >= LEAST))
+        return float(
+            np.mean(sum(votes[2 * rows + dy, 2 * columns + dx] for dy, dx in disc) >= LEAST)
+        )
 
 
 def gaze(rates: ArrayLike, t: NDArray[np.float64], circle_s: float = 1.0) -> CameraMotion:
     """Return a camera motion along a closed circle, with speeds [deg/s] at evenly spaced times [s]."""
     turn = math.tau * t / circle_s
     radius = np.radians(np.broadcast_to(rates, t.shape)) * (circle_s / math.tau)
-    faced = Rotation.from_rotvec(np.column_stack([radius * np.sin(turn), radius * (1.0 - np.cos(turn)), 0.0 * t]))
+    faced = Rotation.from_rotvec(
+        np.column_stack([radius * np.sin(turn), radius * (1.0 - np.cos(turn)), 0.0 * t])
+    )
     step = float(t[1] - t[0])
     ways = (faced[:-1].inv() * faced[1:]).as_rotvec() / step
     return CameraMotion(np.column_stack([t[:-1] + 0.5 * step, ways]))
@@ -186,14 +215,22 @@ class Window:
 
 
 def run(
-    motion: CameraMotion, seconds: float, rpm: float, controller: SpeedController | None = None, prism: Prism = PRISM
+    motion: CameraMotion,
+    seconds: float,
+    rpm: float,
+    controller: SpeedController | None = None,
+    prism: Prism = PRISM,
 ) -> Iterator[Window]:
     """Yield the windows of a run that starts at ``rpm``; without a controller, the speed stays constant."""
     largest = rpm if controller is None else max(rpm, controller.most_rpm)
     driven = Driven(rpm, largest)
     scene = Scene.from_picture(earth(), fov=math.radians(100.0))
     made = Simulation(scene, CAMERA, prism, seconds, cast("PrismMotion", driven), motion)
-    edges, model, meter = Edges(made), ExactModel(CAMERA, prism, PHASE), CoverageMeter(CAMERA.width, CAMERA.height)
+    edges, model, meter = (
+        Edges(made),
+        ExactModel(CAMERA, prism, PHASE),
+        CoverageMeter(CAMERA.width, CAMERA.height),
+    )
     step = step_us(made)
     length = WINDOW_US // step * step
     start, target_rpm = 0, rpm
@@ -208,7 +245,15 @@ def run(
         moved = Events(xy[:, 0], xy[:, 1], events.t, events.p)
         coverage = meter(moved, start, end, prism_path(model, encoder, start, end))
         share = edges.seen(events.t, points, start, end)
-        yield Window(0.5e-6 * (start + end), end * 1e-6, length * 1e-6, driven.rpm, len(events), share, coverage.share)
+        yield Window(
+            0.5e-6 * (start + end),
+            end * 1e-6,
+            length * 1e-6,
+            driven.rpm,
+            len(events),
+            share,
+            coverage.share,
+        )
         if controller is not None:
             target_rpm = controller.update(start, end, coverage, len(events) / length) or target_rpm
         start = end
@@ -222,7 +267,9 @@ def summary(name: str, windows: list[Window], start_s: float, end_s: float) -> R
     """Return event rate and shares of a run between two times; windows across a limit count in proportion."""
     chosen = [w for w in windows if start_s < w.t_s <= end_s]
     share = np.array([w.share for w in chosen])
-    events = np.interp([start_s, end_s], [w.end_s for w in windows], np.cumsum([w.events for w in windows]))
+    events = np.interp(
+        [start_s, end_s], [w.end_s for w in windows], np.cumsum([w.events for w in windows])
+    )
     return {
         "name": name,
         "rpm": float(np.mean([w.rpm for w in chosen])),
@@ -248,7 +295,11 @@ def judge(row: Row, usual: Row) -> None:
 
 
 def print_row(row: Row) -> None:
-    fewer = f"  {100 * row['fewer_events']:5.1f} % fewer  {'ok' if row['ok'] else 'NOT ok'}" if "ok" in row else ""
+    fewer = (
+        f"  {100 * row['fewer_events']:5.1f} % fewer  {'ok' if row['ok'] else 'NOT ok'}"
+        if "ok" in row
+        else ""
+    )
     print(f"  {row['name']:15} {row['rpm']:5.0f} rpm  {row['mev_s']:6.3f} Mev/s  {100 * row['share']:7.3f} % "
           f"± {100 * row['share_error']:.3f}, 5th {100 * row['share_p5']:7.3f} %{fewer}", flush=True)  # fmt: skip
 
@@ -284,7 +335,9 @@ def changing() -> tuple[list[Row], dict[str, Any]]:
     rows, course = [], {}
     for name in (f"{USUAL:g} rpm", *BANDS):
         orbit = prism_orbit(ExactModel(CAMERA, PRISM, PHASE))
-        controller = SpeedController(orbit, most_rpm=MOST_RPM, **BANDS[name]) if name in BANDS else None
+        controller = (
+            SpeedController(orbit, most_rpm=MOST_RPM, **BANDS[name]) if name in BANDS else None
+        )
         windows = list(run(motion, float(ends[-1]) + SPARE_S, USUAL, controller))
         rows.append(summary(name, windows, SETTLED_S, float(ends[-1])))
         if controller is not None:
@@ -320,7 +373,11 @@ def draw(path: Path, results: dict[str, Any]) -> None:
 
 
 COLOURS = {"still": "#0072b2", "slow": "#009e73", "fast": "#d55e00", "very fast": "#cc79a7"}
-COURSES = {f"{USUAL:g} rpm": ("#777777", "--"), "adaptive": ("#000000", "-"), "adaptive, 99 %": ("#e69f00", "-")}
+COURSES = {
+    f"{USUAL:g} rpm": ("#777777", "--"),
+    "adaptive": ("#000000", "-"),
+    "adaptive, 99 %": ("#e69f00", "-"),
+}
 ALL = 2e-5
 """Share of missed edges at which zero is drawn, because the axis of the figure is logarithmic."""
 LABELS = {"still": (-26, 8), "slow": (5, -11), "fast": (10, -9), "very fast": (-9, 10)}
@@ -333,13 +390,24 @@ def _against(ax: Any, motions: dict[str, list[Row]]) -> None:
         x = [row["mev_s"] for row in fixed]
         y = [max(1.0 - row["share"], ALL) for row in fixed]
         ax.plot(
-            x, y, "o-", color=COLOURS[motion], markersize=4, linewidth=1.3, label=f"{motion}, {MOTIONS[motion][0]:g}°/s"
+            x,
+            y,
+            "o-",
+            color=COLOURS[motion],
+            markersize=4,
+            linewidth=1.3,
+            label=f"{motion}, {MOTIONS[motion][0]:g}°/s",
         )
         for k, (row, a, b) in enumerate(zip(fixed, x, y, strict=True)):
             if any(abs(a - x[j]) < 0.3 and abs(math.log(b / y[j])) < 0.1 for j in range(k)):
                 continue  # another label is already there
             ax.annotate(
-                f"{row['rpm']:g}", (a, b), LABELS[motion], textcoords="offset points", fontsize=8, color=COLOURS[motion]
+                f"{row['rpm']:g}",
+                (a, b),
+                LABELS[motion],
+                textcoords="offset points",
+                fontsize=8,
+                color=COLOURS[motion],
             )
         for name, marker, size in (("adaptive", "*", 17), ("adaptive, 99 %", "D", 8)):
             row = next(row for row in rows if row["name"] == name)
@@ -351,7 +419,13 @@ def _against(ax: Any, motions: dict[str, list[Row]]) -> None:
         ("adaptive, 99 %", "D", 7),
     ):
         ax.plot(
-            [], [], marker, color="#999999", markersize=size, markeredgecolor="black" if size > 4 else None, label=name
+            [],
+            [],
+            marker,
+            color="#999999",
+            markersize=size,
+            markeredgecolor="black" if size > 4 else None,
+            label=name,
         )
     ax.set_yscale("log")
     ax.margins(x=0.09)
@@ -369,10 +443,20 @@ def _course(ax: Any, course: dict[str, Any], what: str, label: str) -> None:
     start, top = 0.0, 1.18 * max(max(run[what]) for run in course.values())
     for motion, seconds in CHANGING:
         ax.axvspan(start, start + seconds, color=COLOURS[motion], alpha=0.1, linewidth=0)
-        ax.text(start + seconds / 2, 0.97 * top, motion, color=COLOURS[motion], ha="center", va="top", fontsize=10)
+        ax.text(
+            start + seconds / 2,
+            0.97 * top,
+            motion,
+            color=COLOURS[motion],
+            ha="center",
+            va="top",
+            fontsize=10,
+        )
         start += seconds
     for name, (colour, style) in COURSES.items():
-        ax.plot(course[name]["t_s"], course[name][what], style, color=colour, linewidth=1.6, label=name)
+        ax.plot(
+            course[name]["t_s"], course[name][what], style, color=colour, linewidth=1.6, label=name
+        )
     ax.set(xlim=(0.0, start), ylim=(0.0, top), ylabel=label)
 
 
@@ -401,16 +485,23 @@ def measure_ms(events: int = 300_000, repeats: int = 50) -> tuple[float, float]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, help="results to write (JSON)")
     parser.add_argument("--figure", type=Path, help="chart to write (PNG)")
-    parser.add_argument("--again", type=Path, metavar="FILE.json", help="only draw the results of an earlier run")
+    parser.add_argument(
+        "--again", type=Path, metavar="FILE.json", help="only draw the results of an earlier run"
+    )
     args = parser.parse_args()
     if args.again:
         draw(args.figure, json.loads(args.again.read_text()))
         return 0
     began = time.perf_counter()
-    results: dict[str, Any] = {"machine": machine("cpu"), "versions": versions(["warp-lang", "numpy", "scipy"])}
+    results: dict[str, Any] = {
+        "machine": machine("cpu"),
+        "versions": versions(["warp-lang", "numpy", "scipy"]),
+    }
     results |= {"window_ms": WINDOW_US / 1e3, "measure_ms": measure_ms(), "motions": {}}
     for name, (rate, *_) in MOTIONS.items():
         print(f"{name}, {rate:g} deg/s", flush=True)

@@ -39,9 +39,9 @@ from amiwarp import (
     simulate,
     truth_model,
 )
-from amiwarp.calib.model_choice import Places, candidate_space, fit, linear_motions
-from amiwarp.optics.models import rungs
-from amiwarp.studies.cluster import machine
+from amiwarp.calib.model_fit import Places, candidate_space, fit, linear_motions
+from amiwarp.optics.models.registry import rungs
+from amiwarp.studies.machine import machine
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
 NOMINAL = 1.1
@@ -90,7 +90,9 @@ def true_errors(recording: Recording, c: Calibration) -> dict[str, float]:
     found = {"ellipse": places.distance(EllipseModel.from_model(truth), truth), "exact": 0.0}
     for name in ("circle", "radial"):
         space = candidate_space(name, exact, (), rad_per_us=1e-4, duration_us=1e6)
-        ((_, found[name]),) = fit(linear_motions([space], places), places.compensated(truth), places)
+        ((_, found[name]),) = fit(
+            linear_motions([space], places), places.compensated(truth), places
+        )
     return {name: found[name] for name in rungs()}
 
 
@@ -133,15 +135,29 @@ def run_ladder(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         for name in args.pictures:
             for fov in args.fov:
                 for apex in args.apex:
-                    label = {"picture": name, "fov_deg": fov, "apex_deg": apex, "seed": seed, "size": args.size}
-                    yield {**label, **row_of(recorded(args.folder / name, args.size, fov, apex, seed, args), args)}
+                    label = {
+                        "picture": name,
+                        "fov_deg": fov,
+                        "apex_deg": apex,
+                        "seed": seed,
+                        "size": args.size,
+                    }
+                    yield {
+                        **label,
+                        **row_of(
+                            recorded(args.folder / name, args.size, fov, apex, seed, args), args
+                        ),
+                    }
 
 
 CASES: dict[str, dict[str, Any]] = {
     "nothing": {},
     "tilt of 2 degrees": {"tilt": (math.radians(2.0), 0.0)},
     "clock offset of 1.5 ms, speed constant": {"encoder": EncoderModel(clock_offset_us=1500.0)},
-    "clock offset of 1.5 ms, speed doubles": {"encoder": EncoderModel(clock_offset_us=1500.0), "ramp": True},
+    "clock offset of 1.5 ms, speed doubles": {
+        "encoder": EncoderModel(clock_offset_us=1500.0),
+        "ramp": True,
+    },
     "speed doubles": {"ramp": True},
     "index of 1.62 for 1.52": {"index": 1.62},
 }
@@ -152,8 +168,16 @@ def run_parameters(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         for name in args.pictures:
             for fov in args.fov:
                 for apex in args.apex:
-                    recording = recorded(args.folder / name, args.size, fov, apex, 0, args, **changes)
-                    yield {"case": case, "picture": name, "fov_deg": fov, "apex_deg": apex, **row_of(recording, args)}
+                    recording = recorded(
+                        args.folder / name, args.size, fov, apex, 0, args, **changes
+                    )
+                    yield {
+                        "case": case,
+                        "picture": name,
+                        "fov_deg": fov,
+                        "apex_deg": apex,
+                        **row_of(recording, args),
+                    }
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -170,7 +194,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "agreed": sum(r["agreed"] for r in done) / max(len(done), 1),
         "freed": dict(Counter(name for r in done for name in r["freed"])),
         "picked": dict(Counter(r["picked"] for r in done)),
-        "share_of_time_median": float(np.median([r["share_of_time"] for r in done])) if done else None,
+        "share_of_time_median": float(np.median([r["share_of_time"] for r in done]))
+        if done
+        else None,
     }
 
 
@@ -199,7 +225,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=runs)
     parser.add_argument("folder", type=Path, help="folder of pictures")
-    parser.add_argument("--pictures", nargs="+", default=["china.jpg", "brick.png", "astronaut.png", "graf1.png"])
+    parser.add_argument(
+        "--pictures", nargs="+", default=["china.jpg", "brick.png", "astronaut.png", "graf1.png"]
+    )
     parser.add_argument("--fov", nargs="+", type=float, default=FOV_DEG, help="[deg]")
     parser.add_argument("--apex", nargs="+", type=float, default=APEX_DEG, help="[deg]")
     parser.add_argument("--size", nargs=2, type=int, default=(320, 240))
@@ -220,7 +248,9 @@ def main() -> int:
     total = summary(rows)
     if total["refused"] > MOST_REFUSED * total["rows"]:
         return 1
-    return int(args.what == "ladder" and (total["right"] < LEAST_RIGHT or total["over_by_a_tenth"] > 0))
+    return int(
+        args.what == "ladder" and (total["right"] < LEAST_RIGHT or total["over_by_a_tenth"] > 0)
+    )
 
 
 if __name__ == "__main__":

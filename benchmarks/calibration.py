@@ -60,10 +60,10 @@ from amiwarp import (
     model_error,
     truth_model,
 )
-from amiwarp.calib.calibration import prepare
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
-from amiwarp.calib.parameters import RATES
+from amiwarp.calib.preparation import prepare
 from amiwarp.calib.settings import GAUSS_NEWTON, STAGES
+from amiwarp.results.parameters import RATES
 
 APEXES_DEG = (0.5, 1.0, 2.0)
 NOMINAL = 1.15
@@ -113,7 +113,9 @@ def pictures(folder: Path) -> list[Path]:
 def best_of_grid(search: Any, best: np.ndarray) -> dict[str, float]:
     """Compare the optimum with the best points of two dense grids: over the search range, and around the optimum."""
     low, high = search.space.bounds()
-    wide = np.stack(np.meshgrid(*(np.arange(a, b, GRID_PX) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
+    wide = np.stack(
+        np.meshgrid(*(np.arange(a, b, GRID_PX) for a, b in zip(low, high, strict=True))), -1
+    ).reshape(-1, 2)
     wide = wide[np.hypot(*wide.T) <= high[0]]
     near = best + np.stack(np.meshgrid(*[np.arange(-1.0, 1.01, 0.1)] * 2), -1).reshape(-1, 2)
     points = np.concatenate([wide, near])
@@ -135,7 +137,9 @@ def judged(recording: Recording, c: Calibration, device: str) -> dict[str, Any]:
     truth = truth_model(recording.camera, recording.truth, FlatSide.SCENE)
     error = model_error(c.model, truth)
     events = recording.events.slice(0, BLUR_EVENTS)
-    after, best = (compensate_events(events, m, recording.encoder, device=device) for m in (c.model, truth))
+    after, best = (
+        compensate_events(events, m, recording.encoder, device=device) for m in (c.model, truth)
+    )
     raw = np.stack([events.x, events.y], axis=1).astype(np.float32)
     width, height = recording.events.size
     blur, blur_truth = edge_blur(after, width, height), edge_blur(best, width, height)
@@ -178,7 +182,12 @@ def run_pictures(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         for apex in args.apex:
             for seed in range(args.seeds):
                 recording = simulated(scene, camera, apex, seed, args.seconds, args.device)
-                yield {"picture": picture.name, "apex_true_deg": apex, "seed": seed, **row_of(recording, args.device)}
+                yield {
+                    "picture": picture.name,
+                    "apex_true_deg": apex,
+                    "seed": seed,
+                    **row_of(recording, args.device),
+                }
 
 
 def run_photometric(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -187,12 +196,16 @@ def run_photometric(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         scene = Scene.from_picture(picture)
         for apex in args.apex:
             for seed in range(args.seeds):
-                recording = simulated(scene, camera, apex, seed, args.seconds, args.device, every=1, sensor=MISMATCHED)
+                recording = simulated(
+                    scene, camera, apex, seed, args.seconds, args.device, every=1, sensor=MISMATCHED
+                )
                 label = {"picture": picture.name, "apex_true_deg": apex, "seed": seed}
                 yield {**label, **photometric_row(recording, KNOWN, args.device)}
 
 
-def photometric_row(recording: Recording, settings: PhotometricSettings, device: str) -> dict[str, Any]:
+def photometric_row(
+    recording: Recording, settings: PhotometricSettings, device: str
+) -> dict[str, Any]:
     """Calibrate with both stages; return model errors, phase error, times and verdict."""
     assert recording.camera is not None
     assert recording.truth is not None
@@ -249,7 +262,13 @@ def moving_row(recording: Recording, rate: np.ndarray, device: str) -> dict[str,
     assert recording.camera is not None
     assert recording.truth is not None
     try:
-        c = calibrate(recording, model="exact", free=("apex", "phase", "motion"), device=device, photometric=KNOWN)
+        c = calibrate(
+            recording,
+            model="exact",
+            free=("apex", "phase", "motion"),
+            device=device,
+            photometric=KNOWN,
+        )
     except AmiwarpError as error:
         return {"refused": str(error), "ok": False}
     if c.photometric is None:
@@ -267,7 +286,9 @@ def moving_row(recording: Recording, rate: np.ndarray, device: str) -> dict[str,
         "verdict": c.photometric.verdict,
         "calibrate_s": c.seconds,
         "photometric_s": c.stages[-1].seconds,
-        "ok": c.photometric.accepted and row["velocity_error"] <= 0.02 and row["model_error_px"] <= 0.05,
+        "ok": c.photometric.accepted
+        and row["velocity_error"] <= 0.02
+        and row["model_error_px"] <= 0.05,
     }
 
 
@@ -286,16 +307,25 @@ def run_shares(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    from amiwarp.simulation.pictures import open_pictures
+    from amiwarp.simulation.picture_opening import open_pictures
 
     for clip in sorted(p for p in args.folder.iterdir() if p.suffix in (".npy", ".mp4")):
-        frames = open_pictures(clip, fps=240.0 if "240fps" in clip.name else 25.0 if clip.suffix == ".npy" else None)
+        frames = open_pictures(
+            clip, fps=240.0 if "240fps" in clip.name else 25.0 if clip.suffix == ".npy" else None
+        )
         camera = Camera.from_fov(*frames.size, math.radians(60.0))
         seconds = min(args.seconds, frames.duration_us * 1e-6)
         for apex in args.apex:
             for seed in range(args.seeds):
-                recording = simulated(Scene(frames), camera, apex, seed, seconds, args.device, every=1)
-                yield {"clip": clip.name, "apex_true_deg": apex, "seed": seed, **row_of(recording, args.device)}
+                recording = simulated(
+                    Scene(frames), camera, apex, seed, seconds, args.device, every=1
+                )
+                yield {
+                    "clip": clip.name,
+                    "apex_true_deg": apex,
+                    "seed": seed,
+                    **row_of(recording, args.device),
+                }
 
 
 def some(
@@ -306,7 +336,9 @@ def some(
     for k, picture in enumerate(pictures(args.folder)):
         apex = APEXES_DEG[k % len(APEXES_DEG)]
         scene = Scene.from_picture(picture)
-        recording = simulated(scene, camera, apex, k, args.seconds, args.device, every=every, sensor=sensor)
+        recording = simulated(
+            scene, camera, apex, k, args.seconds, args.device, every=every, sensor=sensor
+        )
         yield {"picture": picture.name, "apex_true_deg": apex}, recording
 
 
@@ -314,13 +346,15 @@ def run_algorithms(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Measure how far each global and each local search algorithm ends from the optimum of the default search."""
     for label, recording in some(args):
         search = prepare(recording, Settings(), device=args.device)[0]
-        search.run()
+        search = search.run()
         best = search.space.to_vector(search.best)
         low, high = search.space.bounds()
         for name in GLOBAL_ALGORITHMS:
             for budget in (40, 80, 150, 300):
                 trial = prepare(
-                    recording, Settings(global_algorithm=name, global_evaluations=budget), device=args.device
+                    recording,
+                    Settings(global_algorithm=name, global_evaluations=budget),
+                    device=args.device,
                 )[0]
                 began = time.perf_counter()
                 trial.run()
@@ -331,7 +365,14 @@ def run_algorithms(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             for angle in (0.3, 2.0, 4.5):
                 start = best + np.array([math.cos(angle), math.sin(angle)])
                 stage = maximise(
-                    search.fine, name, low=low, high=high, start=start, evaluations=300, tolerance=0.002, step=0.7
+                    search.fine,
+                    name,
+                    low=low,
+                    high=high,
+                    start=start,
+                    evaluations=300,
+                    tolerance=0.002,
+                    step=0.7,
                 )
                 yield {**label, "stage": "local", "algorithm": name, "away_px": float(np.linalg.norm(stage.x - best)),
                        "evaluations": stage.evaluations, "seconds": stage.seconds, "ok": True}  # fmt: skip
@@ -342,7 +383,11 @@ def run_costs(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         for kind in Sharpness:
             for smoothing in (0.0, 1.0, 2.0):
                 for per_polarity in (False, True):
-                    what = {"cost": kind.value, "smoothing_px": smoothing, "per_polarity": per_polarity}
+                    what = {
+                        "cost": kind.value,
+                        "smoothing_px": smoothing,
+                        "per_polarity": per_polarity,
+                    }
                     try:
                         c = calibrate(
                             recording,
@@ -374,23 +419,35 @@ RUNS = {
 def machine(device: str) -> dict[str, str]:
     from importlib.metadata import version
 
-    name = wp.get_device(device).name if device != "cpu" else platform.processor() or platform.machine()
+    name = (
+        wp.get_device(device).name
+        if device != "cpu"
+        else platform.processor() or platform.machine()
+    )
     packages = {p: version(p) for p in ("numpy", "scipy", "nlopt")}
     return {"device": name, "python": platform.python_version(), "warp": wp.__version__, **packages}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=RUNS)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--apex", type=float, nargs="+", default=list(APEXES_DEG))
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--pictures", nargs="+", default=["china.jpg", "brick.png", "astronaut.png"], help="moving")
-    parser.add_argument("--speeds", type=float, nargs="+", default=[2.0, 10.0, 30.0, 60.0], help="moving [deg/s]")
+    parser.add_argument(
+        "--pictures", nargs="+", default=["china.jpg", "brick.png", "astronaut.png"], help="moving"
+    )
+    parser.add_argument(
+        "--speeds", type=float, nargs="+", default=[2.0, 10.0, 30.0, 60.0], help="moving [deg/s]"
+    )
     parser.add_argument("--seconds", type=float, default=2.0)
-    parser.add_argument("--limit-s", type=float, default=math.inf, help="start no new row after this time [s]")
+    parser.add_argument(
+        "--limit-s", type=float, default=math.inf, help="start no new row after this time [s]"
+    )
     args = parser.parse_args()
     began, rows, complete = time.perf_counter(), [], True
     for row in RUNS[args.what](args):
@@ -399,11 +456,19 @@ def main() -> int:
         if time.perf_counter() - began > args.limit_s:
             complete = False
             break
-    result = {"benchmark": args.what, "machine": machine(args.device), "complete": complete, "rows": rows}
+    result = {
+        "benchmark": args.what,
+        "machine": machine(args.device),
+        "complete": complete,
+        "rows": rows,
+    }
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps(result, indent=1) + "\n")
     missed = [row for row in rows if not row["ok"]]
-    print(f"{len(rows)} rows, {len(missed)} exceed their limits, {time.perf_counter() - began:.0f} s", file=sys.stderr)
+    print(
+        f"{len(rows)} rows, {len(missed)} exceed their limits, {time.perf_counter() - began:.0f} s",
+        file=sys.stderr,
+    )
     return 1 if missed or not complete else 0
 
 

@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 
 from amiwarp import open_recording
-from amiwarp.io.native_format import LiveWriter
+from amiwarp.io.native.live_writer import LiveWriter
 from amiwarp.live.stream.camera_neuromorphic import NeuromorphicSource
 from amiwarp.live.stream.camera_settings import parse_camera
 from amiwarp.live.stream.session import Session
-from amiwarp.studies.cluster import machine
+from amiwarp.studies.machine import machine
 from reference.camera_stub import POLARITY, TRIGGER, Part, StubCamera, connected
 
 BLOCK = 1 << 20
@@ -52,7 +52,9 @@ class Sent:
     def rows(self, first: int, count: int) -> np.ndarray:
         start = first % POOL
         made = self.pool[start : start + count].copy()
-        made["t"] = np.arange(first, first + count, dtype=np.uint64) // np.uint64(MEV_S) + np.uint64(START_US)
+        made["t"] = np.arange(first, first + count, dtype=np.uint64) // np.uint64(
+            MEV_S
+        ) + np.uint64(START_US)
         return made
 
     def edges(self, first_us: int, stop_us: int) -> np.ndarray:
@@ -99,8 +101,17 @@ def altered(path: Path, sent: Sent) -> dict[str, int]:
     edges = sent.edges(0, sent.events // MEV_S)
     t, encoder = edges["t"][edges["rising"]], recording.encoder
     angle = 2.0 * math.pi / 4096 * np.arange(len(t))
-    same = encoder is not None and np.array_equal(encoder.t, t.astype(np.int64)) and np.allclose(encoder.angle, angle)
-    return {"missing": sent.events - first, "altered": differing, "edges": len(t), "edges_right": int(same)}
+    same = (
+        encoder is not None
+        and np.array_equal(encoder.t, t.astype(np.int64))
+        and np.allclose(encoder.angle, angle)
+    )
+    return {
+        "missing": sent.events - first,
+        "altered": differing,
+        "edges": len(t),
+        "edges_right": int(same),
+    }
 
 
 def run(sent: Sent, path: Path) -> dict[str, Any]:
@@ -109,8 +120,12 @@ def run(sent: Sent, path: Path) -> dict[str, Any]:
     with connected(StubCamera(parts=[sent.parts()])):
         source = TimedSource(parse_camera("camera:evk4,counts_per_turn=4096"), messages.append)
         began, cpu = time.perf_counter(), time.process_time()
-        with LiveWriter(path, width=source.size[0], height=source.size[1], metadata=source.metadata) as writer:
-            status = Session(source, raw=[writer], say=messages.append).run(threading.Event(), lambda _: None)
+        with LiveWriter(
+            path, width=source.size[0], height=source.size[1], metadata=source.metadata
+        ) as writer:
+            status = Session(source, raw=[writer], say=messages.append).run(
+                threading.Event(), lambda _: None
+            )
         wall, cpu = time.perf_counter() - began, time.process_time() - cpu
     return {
         "events": status.events, "lost_usb_packets": source.lost, "dropped": status.dropped, "late": status.late,
@@ -122,7 +137,9 @@ def run(sent: Sent, path: Path) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--events", type=int, default=100_000_000)
     parser.add_argument("--packet", type=int, default=50_000, help=f"at most {BLOCK}")
     parser.add_argument("--folder", type=Path)
@@ -137,7 +154,13 @@ def main() -> int:
     print(text)
     if arguments.out is not None:
         arguments.out.write_text(text + "\n")
-    lost = found["missing"] or found["altered"] or found["dropped"] or found["late"] or found["lost_usb_packets"]
+    lost = (
+        found["missing"]
+        or found["altered"]
+        or found["dropped"]
+        or found["late"]
+        or found["lost_usb_packets"]
+    )
     return int(bool(lost) or not found["edges_right"])
 
 

@@ -31,13 +31,18 @@ class SceneKind:
 
 
 def _events(name: str, points: int) -> SceneKind:
-    return SceneKind(lambda n, *_: event_scene(name, n, points=points), {"cpu": 5_000_000, "cuda": 100_000_000})
+    return SceneKind(
+        lambda n, *_: event_scene(name, n, points=points), {"cpu": 5_000_000, "cuda": 100_000_000}
+    )
 
 
 EVENT_SCENES = ("random pixels", "20,000 edge points", "500 edge points")
 RECORDING, FILE = "simulated recording", "recording in a file"
 SCENES = {
-    **{name: _events(name, points) for name, points in zip(EVENT_SCENES, (0, 20_000, 500), strict=True)},
+    **{
+        name: _events(name, points)
+        for name, points in zip(EVENT_SCENES, (0, 20_000, 500), strict=True)
+    },
     RECORDING: SceneKind(recording_scene, {"cpu": RECORDED, "cuda": RECORDED}),
     FILE: SceneKind(lambda n, *_: file_scene(n), {"cpu": 100_000_000, "cuda": 100_000_000}),
 }
@@ -84,16 +89,31 @@ def image_bars(model: str, vote: Vote) -> dict[str, float]:
     Votes in steps of 1/256 px misplace 0.2 % of the votes, less if more events meet in a pixel. A nearest vote at half
     a pixel may go to either side, so a pixel may differ by a few events.
     """
-    return {"misplaced": 4e-3, "local": 6e-3 if vote is Vote.BILINEAR else 0.3, "exact_px": EXACT_PX[model]}
+    return {
+        "misplaced": 4e-3,
+        "local": 6e-3 if vote is Vote.BILINEAR else 0.3,
+        "exact_px": EXACT_PX[model],
+    }
 
 
-def _peer(name: str, way: Callable[..., libraries.Peer], *devices: str, most_repeats: int = 1_000) -> Case:
+def _peer(
+    name: str, way: Callable[..., libraries.Peer], *devices: str, most_repeats: int = 1_000
+) -> Case:
     bars = image_bars("plane circle", Vote.BILINEAR)
-    return Case(IMAGE, name, partial(image, way), devices=devices, bars=bars, most_repeats=most_repeats)
+    return Case(
+        IMAGE, name, partial(image, way), devices=devices, bars=bars, most_repeats=most_repeats
+    )
 
 
 LADDER = tuple(
-    Case(IMAGE, f"amiwarp {model} {vote.value}", ours.image, model, vote, bars=image_bars(model, vote))
+    Case(
+        IMAGE,
+        f"amiwarp {model} {vote.value}",
+        ours.image,
+        model,
+        vote,
+        bars=image_bars(model, vote),
+    )
     for model in ("circle", "radial", "ellipse", "exact")
     for vote in (Vote.BILINEAR, Vote.NEAREST)
 )
@@ -163,7 +183,10 @@ def _whole(device: str, seconds: tuple[float, float, float], mev_per_s: float) -
     names, moved = [case.name for case in WHOLE[:3]], WHOLE[-1].name
     whats = (SHARPNESS, "the same with the photometric stage, to 0.02 px", PICTURE)
     return (
-        *(Aim(what, device, of, {RECORDING: bar}, "s") for what, of, bar in zip(whats, names, seconds, strict=True)),
+        *(
+            Aim(what, device, of, {RECORDING: bar}, "s")
+            for what, of, bar in zip(whats, names, seconds, strict=True)
+        ),
         Aim("compensation of a file, exact model", device, moved, {FILE: mev_per_s}, "Mev/s"),
         Aim("the same, peak memory", device, moved, {FILE: 1024.0}, "MiB"),
     )

@@ -12,14 +12,16 @@ import time
 from pathlib import Path
 
 from amiwarp import AmiwarpError
-from amiwarp.io.files import own_folder
-from amiwarp.studies.chart import Charts, make, simulated
-from amiwarp.studies.chart.measurement import beaten_by, fronts
+from amiwarp.io.outputs import own_folder
+from amiwarp.studies.chart.charts import Charts, make, simulated
+from amiwarp.studies.chart.rows import beaten_by, fronts
 from benchmarks.chart_libraries import library_tasks
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("picture", type=Path, nargs="?")
     source.add_argument("--from", type=Path, dest="data", metavar="chart.json")
@@ -80,13 +82,17 @@ def _print(charts: Charts) -> None:
     for rows in (charts.compensation, charts.calibration):
         for r in sorted(rows, key=lambda r: r.cost):
             spread = f"± {100 * r.spread:.0f} %"
-            print(f"{r.label:44s} {r.mev_per_s:10.1f} Mev/s {r.seconds * 1e3:10.2f} ms {spread:8s} {r.error_px:.5f} px")
+            print(
+                f"{r.label:44s} {r.mev_per_s:10.1f} Mev/s {r.seconds * 1e3:10.2f} ms {spread:8s} {r.error_px:.5f} px"
+            )
         for job, chosen in fronts(rows):
             print(f"front, {job}: {'; '.join(r.label for r in chosen)}")
         for r in rows:
             if r.default:
                 better = ", ".join(b.label for b in beaten_by(r, rows))
-                print(f"default, {r.label}: " + (f"beaten by {better}" if better else "on the front"))
+                print(
+                    f"default, {r.label}: " + (f"beaten by {better}" if better else "on the front")
+                )
     print("\n".join(charts.notes))
     for label, error in charts.failed.items():
         print(f"failed: {label}: {error}")

@@ -11,11 +11,14 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp import Vote
-from amiwarp.studies.chart.measurement import IMAGE, ErrorSample, LibraryTask, Task, Uploads, circle
+from amiwarp.studies.chart.compensation_rows import IMAGE, ErrorSample, LibraryTask, Uploads, circle
+from amiwarp.studies.chart.timing import Task
 from benchmarks import libraries
 
 
-def library_tasks(sample: ErrorSample, uploads: Uploads, device: str) -> tuple[list[LibraryTask], list[str]]:
+def library_tasks(
+    sample: ErrorSample, uploads: Uploads, device: str
+) -> tuple[list[LibraryTask], list[str]]:
     """Make a task for every installed library, with the circle that fits the events best.
 
     Notes name the libraries that are not installed.
@@ -27,7 +30,9 @@ def library_tasks(sample: ErrorSample, uploads: Uploads, device: str) -> tuple[l
         turns = theta + turned
         angle = np.remainder(turns, 2.0 * math.pi, out=turns).astype(np.float32)
         margin = math.ceil(radius) + 2
-        return libraries.PeerEvents(events.x, events.y, angle, radius, camera.width, camera.height, margin)
+        return libraries.PeerEvents(
+            events.x, events.y, angle, radius, camera.width, camera.height, margin
+        )
 
     once = peer_events(known.events, uploads.theta[: len(known.events)])
     repeated = once if uploads.copies == 1 else peer_events(uploads.events, uploads.theta)

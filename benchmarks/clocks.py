@@ -27,11 +27,14 @@ from rich.progress import track
 from amiwarp import EncoderStream, Events
 from amiwarp.live.link.camera_clock import ClockSource
 from amiwarp.live.link.clocks import WRAP
-from amiwarp.live.link.emulator import Controller, EmulatedFault, Motor
-from amiwarp.live.link.link import Follower, LinkUpdate
+from amiwarp.live.link.emulated_faults import EmulatedFault
+from amiwarp.live.link.emulator import Controller
+from amiwarp.live.link.follower import Follower
 from amiwarp.live.link.protocol import Ping, encode
+from amiwarp.live.link.rotors import Motor
+from amiwarp.live.link.updates import LinkUpdate
+from amiwarp.live.stream.encoder_feed import EncoderFeed
 from amiwarp.live.stream.packets import Packet, make_packet
-from amiwarp.live.stream.session import EncoderFeed
 
 STEP_US = 10_000
 """Step of the simulated time, and length of the camera's packets [us]."""
@@ -73,7 +76,10 @@ def draw(seed: int) -> Troubles:
     rng = np.random.default_rng(seed)
     seconds = 30.0
     whole_us = round(seconds * 1e6)
-    delays = [round(float(rng.choice([0.0, rng.uniform(0, 0.1e6), rng.uniform(0, 5e6)]))) for _ in range(2)]
+    delays = [
+        round(float(rng.choice([0.0, rng.uniform(0, 0.1e6), rng.uniform(0, 5e6)])))
+        for _ in range(2)
+    ]
     stalls = []
     for _ in range(int(rng.choice([0, 0, 5, 20]))):  # the loads of the computer
         begin = int(rng.integers(0, whole_us))
@@ -82,7 +88,13 @@ def draw(seed: int) -> Troubles:
     cable = (pulled, pulled + int(rng.choice([0, 0, 2_000_000, 8_000_000])))
     returns_us = int(rng.choice([-1, -1, -1, rng.integers(5_000_000, 20_000_000)]))
     faults = []
-    for name, share in (("unplug", 0.25), ("reset", 0.25), ("clock-jump", 0.15), ("crc", 0.15), ("drop", 0.15)):
+    for name, share in (
+        ("unplug", 0.25),
+        ("reset", 0.25),
+        ("clock-jump", 0.15),
+        ("crc", 0.15),
+        ("drop", 0.15),
+    ):
         if rng.uniform() < share:
             length = "+2" if name in ("unplug", "crc", "drop") else ""
             faults.append(f"{name}@{rng.uniform(3.0, 20.0):.3f}{length}")
@@ -295,7 +307,8 @@ def run(seed: int, troubles: Troubles | None = None) -> Outcome:
                 continue
             world_us = float(controller.time_at(feed.clock.at_us))
             error_us = int(feed.clock(feed.clock.at_us)) - camera.time(world_us)
-            errors.append(abs((error_us + WRAP // 2) % WRAP - WRAP // 2))  # the controller's clock wraps
+            # The controller's clock wraps
+            errors.append(abs((error_us + WRAP // 2) % WRAP - WRAP // 2))
     return Outcome(
         seed=seed,
         wrong=judge.wrong,
@@ -316,15 +329,21 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "wrong_runs": sum(one.wrong > 0 for one in outcomes),
         "worst_us": max(one.worst_us for one in outcomes),
         "paired_runs": len(paired),
-        "seconds_until_paired": {"median": float(np.median(paired)), "longest": max(paired)} if paired else None,
-        "error_at_pulses_us": {"median": float(np.median(errors)), "largest": max(errors)} if errors else None,
+        "seconds_until_paired": {"median": float(np.median(paired)), "longest": max(paired)}
+        if paired
+        else None,
+        "error_at_pulses_us": {"median": float(np.median(errors)), "largest": max(errors)}
+        if errors
+        else None,
         "measured_share": {"median": float(np.median([one.measured for one in outcomes]))},
     }
 
 
 def main() -> None:
     """Read the command line, play the runs, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
     parser.add_argument("--out", type=Path, help="file of all runs with their troubles")
@@ -334,7 +353,9 @@ def main() -> None:
     print(json.dumps(figures, indent=1))
     for one in outcomes:
         if one.wrong:
-            print(f"wrong: seed {one.seed}, {one.wrong} ms, up to {one.worst_us:.0f} us: {draw(one.seed)}")
+            print(
+                f"wrong: seed {one.seed}, {one.wrong} ms, up to {one.worst_us:.0f} us: {draw(one.seed)}"
+            )
     if given.out:
         rows = [{**asdict(draw(one.seed)), **asdict(one)} for one in outcomes]
         given.out.write_text(json.dumps({**figures, "rows": rows}, indent=1) + "\n")

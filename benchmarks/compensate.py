@@ -35,10 +35,21 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp import Calibration, Camera, Encoder, Events, Model, Prism, RecordingWriter, compensate, open_recording
-from amiwarp.compensation.recordings import PIECE, BlockCompensator
+from amiwarp import (
+    Calibration,
+    Camera,
+    Encoder,
+    Events,
+    Model,
+    Prism,
+    RecordingWriter,
+    compensate,
+    open_recording,
+)
+from amiwarp.compensation.blocks import BlockCompensator
+from amiwarp.compensation.gpu_pieces import PIECE
 from amiwarp.events.recording import inside_image
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models.registry import MODELS
 from amiwarp.tasks import cpu_threads, in_order
 from benchmarks.simulate import FOV, HEIGHT, INDEX, WIDTH, blocks_picture
 from reference import optics as oracle
@@ -55,11 +66,14 @@ MOVED = {"x": np.float32, "y": np.float32, "t": np.int64, "p": np.uint8, "inside
 
 
 def half_a_second() -> Events:
-    from amiwarp.simulation.description import EncoderModel, Scene
+    from amiwarp.simulation.description import Scene
+    from amiwarp.simulation.encoder_model import EncoderModel
     from amiwarp.simulation.simulator import Simulation
 
     scene = Scene.from_picture(blocks_picture())
-    simulation = Simulation(scene, CAMERA, PRISM, REPEATED_US * 1e-6, encoder_model=EncoderModel.ideal())
+    simulation = Simulation(
+        scene, CAMERA, PRISM, REPEATED_US * 1e-6, encoder_model=EncoderModel.ideal()
+    )
     events = Events.concatenate([block for block, _points in simulation.blocks()])
     return events[(events.t >= 0) & (events.t < REPEATED_US)]
 
@@ -84,7 +98,9 @@ def make(path: Path, events: int, columns: bool) -> None:
                 for name, file in files.items():
                     getattr(block, name).tofile(file)
         return
-    with RecordingWriter(path, width=WIDTH, height=HEIGHT, camera=CAMERA, prism=PRISM, encoder=encoder) as writer:
+    with RecordingWriter(
+        path, width=WIDTH, height=HEIGHT, camera=CAMERA, prism=PRISM, encoder=encoder
+    ) as writer:
         for block in repeated(once, events):
             writer.append(block)
 
@@ -99,7 +115,9 @@ class Bare:
     def read(self, start: int, dtypes: dict[str, Any], count: int = PIECE) -> dict[str, Any]:
         count = min(count, self.count - start)
         return {
-            name: np.fromfile(self.path / name, dtype, count, offset=start * np.dtype(dtype).itemsize)
+            name: np.fromfile(
+                self.path / name, dtype, count, offset=start * np.dtype(dtype).itemsize
+            )
             for name, dtype in dtypes.items()
         }
 
@@ -114,7 +132,9 @@ class Bare:
             return {name: getattr(events, name) for name in COLUMNS} | {"inside": inside}
 
         with contextlib.ExitStack() as stack:
-            files = {name: stack.enter_context((out / name).open("wb", buffering=0)) for name in MOVED}
+            files = {
+                name: stack.enter_context((out / name).open("wb", buffering=0)) for name in MOVED
+            }
             for columns in in_order(partial(job, start) for start in range(0, self.count, PIECE)):
                 for name, file in files.items():
                     file.write(columns[name])
@@ -122,7 +142,9 @@ class Bare:
 
 def calibrated(name: str, phase: float = PHASE) -> Calibration:
     """Return a calibration with the true parameters."""
-    size = {"apex": PRISM.apex} if name in ("exact", "ellipse") else {"deflection": PRISM.deflection}
+    size = (
+        {"apex": PRISM.apex} if name in ("exact", "ellipse") else {"deflection": PRISM.deflection}
+    )
     return Calibration(
         model_name=name, camera=CAMERA, prism=PRISM, parameters={**size, "phase": phase}, uncertainty={}, free=(),
         sharpness_name="variance", sharpness_before=0.0, sharpness_after=0.0, stages=(), events=0, seconds=0.0,
@@ -135,7 +157,9 @@ def seconds(work: Callable[[], Any]) -> float:
     return time.perf_counter() - began
 
 
-def truth(name: str, model: Any, xy: Any, theta: Any, prism: Prism = PRISM, phase: float = PHASE) -> Any:
+def truth(
+    name: str, model: Any, xy: Any, theta: Any, prism: Prism = PRISM, phase: float = PHASE
+) -> Any:
     """Return the true positions by the float64 oracle of the tests; for the ellipse, by its own tables in float64."""
     if name == "ellipse":
         phi = (theta + PHASE)[:, None]
@@ -151,7 +175,9 @@ def error_of(
     """Return the largest distance to the truth [px]; infinite if times, polarities or flags differ."""
     xy = np.stack([raw.x, raw.y], axis=1).astype(np.float64)
     found = np.stack([moved.x, moved.y], axis=1)
-    away = np.linalg.norm(found - truth(name, model, xy, encoder.angle_at(raw.t), prism, phase), axis=1)
+    away = np.linalg.norm(
+        found - truth(name, model, xy, encoder.angle_at(raw.t), prism, phase), axis=1
+    )
     same = np.array_equal(raw.t, moved.t) and np.array_equal(raw.p, moved.p)
     same &= np.array_equal(inside.astype(bool), inside_image(*found.T, WIDTH, HEIGHT))
     return float(away.max()) if same and np.isfinite(away).all() else math.inf
@@ -179,8 +205,14 @@ def plain_copy(source: Path, result: Path, folder: Path) -> float:
         (folder / "copy").unlink()
 
 
-def moved_again(events: Events, inside: Any, piece: int) -> tuple[Events, Any, dict[str, list[bytes]]]:
-    return Events(events.x, events.y, events.t + piece * int(events.t[-1] - events.t[0]), events.p), inside, {}
+def moved_again(
+    events: Events, inside: Any, piece: int
+) -> tuple[Events, Any, dict[str, list[bytes]]]:
+    return (
+        Events(events.x, events.y, events.t + piece * int(events.t[-1] - events.t[0]), events.p),
+        inside,
+        {},
+    )
 
 
 def stages_alone(recording: Any, mover: BlockCompensator, folder: Path) -> dict[str, float]:
@@ -191,9 +223,12 @@ def stages_alone(recording: Any, mover: BlockCompensator, folder: Path) -> dict[
     moved, inside = mover(held[0])
 
     def write() -> None:
-        with RecordingWriter(folder / "alone.h5", width=WIDTH, height=HEIGHT, overwrite=True) as writer:
+        with RecordingWriter(
+            folder / "alone.h5", width=WIDTH, height=HEIGHT, overwrite=True
+        ) as writer:
             pieces = (partial(moved_again, moved, inside, k) for k in range(len(reads)))
-            writer.fill(pieces, count=PIECE, t_first=int(moved.t[0]), done=lambda _events, _inside: None)
+            for _ in writer.fill(pieces, count=PIECE, t_first=int(moved.t[0])):
+                pass
 
     def drain(jobs: Iterator[Callable[[], Any]]) -> None:
         for _ in in_order(jobs):
@@ -204,7 +239,9 @@ def stages_alone(recording: Any, mover: BlockCompensator, folder: Path) -> dict[
         "move": lambda: drain(partial(mover, held[k % len(held)]) for k in range(len(reads))),
         "write": write,
     }
-    rates = {name: count / 1e6 / min(seconds(work) for _ in range(2)) for name, work in stages.items()}
+    rates = {
+        name: count / 1e6 / min(seconds(work) for _ in range(2)) for name, work in stages.items()
+    }
     (folder / "alone.h5").unlink()
     return rates
 
@@ -219,13 +256,23 @@ def peak_mib() -> float:
 
 def row(source: Path, name: str, device: str, repeats: int, columns: bool) -> dict[str, Any]:
     folder, calibration = source.parent, calibrated(name)
-    result: dict[str, Any] = {"model": name, "device": device, "layout": "columns" if columns else "native"}
+    result: dict[str, Any] = {
+        "model": name,
+        "device": device,
+        "layout": "columns" if columns else "native",
+    }
     out = folder / ("moved" if columns else "moved.h5")
     times, copies, cpu = [], [], []
     bare = Bare(source) if columns else None
     recording = None if columns else open_recording(source)
-    encoder = Encoder.constant_speed(RPM, 0, int(bare.piece(bare.count - 1).t[0])) if bare else recording.encoder
-    first, last = (0, int(encoder.t[-1])) if bare else (recording.events.t_first, recording.events.t_last)
+    encoder = (
+        Encoder.constant_speed(RPM, 0, int(bare.piece(bare.count - 1).t[0]))
+        if bare
+        else recording.encoder
+    )
+    first, last = (
+        (0, int(encoder.t[-1])) if bare else (recording.events.t_first, recording.events.t_last)
+    )
     began = time.perf_counter()
     mover = BlockCompensator(calibration.model, encoder, first, last, device)
     mover(bare.piece(0) if bare else recording.events.slice(0, PIECE))
@@ -245,7 +292,13 @@ def row(source: Path, name: str, device: str, repeats: int, columns: bool) -> di
         copies.append(plain_copy(source, out, folder))
     n = bare.count if bare else len(recording.events)
     middle, copy = float(np.median(times)), float(np.median(copies))
-    result |= {"events": n, "seconds": times, "mev_per_s": n / middle / 1e6, "copy_s": copies, "of_copy": middle / copy}
+    result |= {
+        "events": n,
+        "seconds": times,
+        "mev_per_s": n / middle / 1e6,
+        "copy_s": copies,
+        "of_copy": middle / copy,
+    }
     result["cpu_ns"] = [spent / n * 1e9 for spent in cpu]
     for key, path in (("bytes_in", source), ("bytes_out", out)):
         result[key] = sum(p.stat().st_size for p in (path.iterdir() if columns else [path]))
@@ -262,7 +315,14 @@ def pieces(n: int) -> list[tuple[int, int]]:
 
 
 def errors(
-    name: str, model: Model, encoder: Encoder, recording: Any, source: Path, out: Path, n: int, phase: float = PHASE
+    name: str,
+    model: Model,
+    encoder: Encoder,
+    recording: Any,
+    source: Path,
+    out: Path,
+    n: int,
+    phase: float = PHASE,
 ) -> Iterator[float]:
     """Yield the error of short pieces spread over the written file."""
     written = None if recording is None else open_recording(out).events
@@ -282,7 +342,7 @@ def errors(
 
 
 def about(device: str) -> dict[str, Any]:
-    from amiwarp.studies.cluster import processor
+    from amiwarp.studies.machine import processor
 
     wp.init()
     found = {"python": platform.python_version()}
@@ -294,13 +354,19 @@ def about(device: str) -> dict[str, Any]:
 
 
 def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--events", type=int, default=100_000_000)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--models", nargs="+", choices=list(MODELS), default=["circle", "exact"])
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--columns", action="store_true", help="plain binary columns instead of HDF5")
-    parser.add_argument("--folder", type=Path, help="folder for the files (default: a temporary folder)")
+    parser.add_argument(
+        "--columns", action="store_true", help="plain binary columns instead of HDF5"
+    )
+    parser.add_argument(
+        "--folder", type=Path, help="folder for the files (default: a temporary folder)"
+    )
     parser.add_argument("--out", type=Path, help="JSON file to write")
     parser.add_argument("--row", type=Path, help=argparse.SUPPRESS)
     return parser.parse_args()
@@ -314,11 +380,21 @@ def main() -> None:
     result = about(a.device) | {"rows": []}
     with tempfile.TemporaryDirectory(dir=a.folder) as folder:
         source = Path(folder) / ("recording" if a.columns else "recording.h5")
-        child = [sys.executable, "-m", "benchmarks.compensate", "--device", a.device, "--repeats", str(a.repeats)]
+        child = [
+            sys.executable,
+            "-m",
+            "benchmarks.compensate",
+            "--device",
+            a.device,
+            "--repeats",
+            str(a.repeats),
+        ]
         child += ["--columns"] * a.columns
         make(source, a.events, a.columns)
         for name in a.models:
-            ran = subprocess.run([*child, "--row", str(source), "--models", name], stdout=subprocess.PIPE, check=True)
+            ran = subprocess.run(
+                [*child, "--row", str(source), "--models", name], stdout=subprocess.PIPE, check=True
+            )
             result["rows"].append(json.loads(ran.stdout.splitlines()[-1]))
             print(json.dumps(result["rows"][-1]), flush=True)
     if a.out:

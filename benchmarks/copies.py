@@ -24,8 +24,27 @@ def make_copies(folder: Path, count: int) -> list[Path]:
     Programs that run in the background ignore interrupts, and so would the tests, which interrupt themselves.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    unneeded = shutil.ignore_patterns(".*", "_build", "results")
-    return [Path(shutil.copytree(ROOT, folder / str(k), ignore=unneeded)) for k in range(count)]
+    return [Path(shutil.copytree(ROOT, folder / str(k), ignore=_unneeded)) for k in range(count)]
+
+
+def _unneeded(folder: str, names: list[str]) -> set[str]:
+    """Return those among the names in a folder of the repository that tests do not need."""
+    unneeded = shutil.ignore_patterns(".*", "_build")(folder, names)
+    if Path(folder) == ROOT / "benchmarks":
+        unneeded |= {"results"}
+    return unneeded
+
+
+def files_of_tests(root: Path, names: Sequence[str]) -> list[str]:
+    """Return the paths in a copy of the repository of test files, each named without its folder and ``test_``."""
+    paths = {
+        path.stem.removeprefix("test_"): path.relative_to(root).as_posix()
+        for path in (root / "tests").rglob("test_*.py")
+    }
+    missing = [name for name in names if name not in paths]
+    if missing:
+        raise SystemExit(f"no file test_{missing[0]}.py in {root / 'tests'}")
+    return [paths[name] for name in names]
 
 
 def write_code(path: Path, code: str) -> None:

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp import CornerDetector, CornerMethod, DeviceEvents, Events, open_recording
-from amiwarp.studies.cluster import machine, versions
+from amiwarp.studies.machine import machine, versions
 from amiwarp.tasks import cpu_threads, limited_cpu_threads
 from reference import corners as oracle
 
@@ -72,11 +72,16 @@ def moving_tiles(n: int, seed: int = 0) -> Events:
     y = 240.0 + 40.0 * np.sin(phase) + np.where(upright, along, line)
     p = np.where(upright, -np.sin(phase), np.cos(phase)) > 0.0
     noise = rng.random(n) < 0.05
-    x, y = np.where(noise, rng.uniform(0, WIDTH - 1, n), x), np.where(noise, rng.uniform(0, HEIGHT - 1, n), y)
+    x, y = (
+        np.where(noise, rng.uniform(0, WIDTH - 1, n), x),
+        np.where(noise, rng.uniform(0, HEIGHT - 1, n), y),
+    )
     return Events.from_arrays(np.rint(x).astype(np.int64), np.rint(y).astype(np.int64), t + 1, p)
 
 
-def ours(events: Events, size: tuple[int, int], method: CornerMethod, device: str, threads: int) -> Program:
+def ours(
+    events: Events, size: tuple[int, int], method: CornerMethod, device: str, threads: int
+) -> Program:
     given = events
     if device != "cpu":
         given = DeviceEvents.from_arrays(events.x, events.y, events.t, events.p, device=device)
@@ -88,7 +93,13 @@ def ours(events: Events, size: tuple[int, int], method: CornerMethod, device: st
 
     where = f"{threads} threads" if device == "cpu" else device
     expected = np.flatnonzero(oracle.corners(events[:JUDGED], *size, method))
-    return Program(f"amiwarp {method.value}, {where}", run, expected, len(events), threads if device == "cpu" else 0)
+    return Program(
+        f"amiwarp {method.value}, {where}",
+        run,
+        expected,
+        len(events),
+        threads if device == "cpu" else 0,
+    )
 
 
 def by_dv_processing(events: Events, size: tuple[int, int]) -> Program:
@@ -99,7 +110,9 @@ def by_dv_processing(events: Events, size: tuple[int, int]) -> Program:
         store.push_back(t, x, y, bool(p))
 
     def run() -> Any:
-        return dv.features.ArcCornerDetector(size, RANGE_US, False).detect(store, (0, 0, *size), mask)
+        return dv.features.ArcCornerDetector(size, RANGE_US, False).detect(
+            store, (0, 0, *size), mask
+        )
 
     few = events[:JUDGED]
     expected = oracle.table(few)[oracle.corners_of_dv_processing(few, *size, RANGE_US)]
@@ -122,13 +135,16 @@ def rows_of(found: Any) -> NDArray[np.int64]:
         return found
     if hasattr(found, "numpy"):
         return np.asarray(found.numpy(), np.int64)
-    return np.array([(int(c.pt[0]), int(c.pt[1]), c.timestamp) for c in found], np.int64).reshape(-1, 3)
+    return np.array([(int(c.pt[0]), int(c.pt[1]), c.timestamp) for c in found], np.int64).reshape(
+        -1, 3
+    )
 
 
 def judged(program: Program, found: NDArray[np.int64], events: Events) -> float:
     """Return the share of the first events whose result differs from the reference."""
     judged_events = min(JUDGED, len(events))
-    last = judged_events if found.ndim == 1 else int(events.t[judged_events - 1])  # later events may have the same time
+    # Later events may have the same time
+    last = judged_events if found.ndim == 1 else int(events.t[judged_events - 1])
     sets = []
     for corners in (found, program.expected):
         early = corners[(corners if corners.ndim == 1 else corners[:, 2]) < last]
@@ -179,7 +195,9 @@ def programs(events: Events, size: tuple[int, int], device: str) -> list[Program
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--events", type=int, default=2_000_000)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--recording", type=Path, nargs="*", default=[])

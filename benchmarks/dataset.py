@@ -33,13 +33,17 @@ import warp as wp
 from PIL import Image
 
 from amiwarp import DatasetSummary, ToTensor, make_dataset, open_recording, voxel_grid
-from amiwarp.io.json_files import read_journal
-from amiwarp.kernels.launch import start_quietly
-from amiwarp.simulation.simulator import Engine
-from amiwarp.studies.cluster import ANY_GPU, machine, threads_of_worker, versions
-from amiwarp.studies.dataset import making
-from amiwarp.studies.dataset.making import Item, list_items, simulation_of, write_recording
-from amiwarp.studies.dataset.specification import content_digest, load_specification
+from amiwarp.io import recorded_dataset
+from amiwarp.io.finished_work import read_journal
+from amiwarp.kernels.quiet_start import start_quietly
+from amiwarp.learning.dataset import files, making
+from amiwarp.learning.dataset.items import Item, list_items
+from amiwarp.learning.dataset.sources import content_digest
+from amiwarp.learning.dataset.specification import load_specification
+from amiwarp.learning.dataset.worker import simulation_of, write_recording
+from amiwarp.simulation.engine import Engine
+from amiwarp.studies.cluster import ANY_GPU, threads_of_worker
+from amiwarp.studies.machine import machine, versions
 from amiwarp.tasks import cpu_threads, limited_cpu_threads
 
 RESULTS = Path(__file__).parent / "results"
@@ -75,11 +79,17 @@ def write_inputs(folder: Path, seeds: int, duration: float) -> dict[str, Path]:
     rng = np.random.default_rng(0)
     (folder / "pictures").mkdir(parents=True)
     for k in range(PICTURES):
-        light = sum(np.kron(rng.integers(0, 64, (480 // n, 640 // n)), np.ones((n, n))) for n in (8, 20, 40, 80))
+        light = sum(
+            np.kron(rng.integers(0, 64, (480 // n, 640 // n)), np.ones((n, n)))
+            for n in (8, 20, 40, 80)
+        )
         Image.fromarray(np.asarray(light, np.uint8)).save(folder / "pictures" / f"{k}.png")
     paths = {}
     for name, source, output in (
-        *(("pictures" if not line else name, 'pictures = "pictures/*.png"', line) for name, line in OUTPUTS.items()),
+        *(
+            ("pictures" if not line else name, 'pictures = "pictures/*.png"', line)
+            for name, line in OUTPUTS.items()
+        ),
         ("world", 'worlds = ["room"]', ""),
     ):
         some = 1 if name == "world" else seeds
@@ -111,23 +121,30 @@ class BusyMeter:
             self._process.wait()
         found = [share for at, share in self._samples if at >= began]
         visible = max(1, wp.get_cuda_device_count() if wp.is_cuda_available() else 1)
-        return float(np.mean(found)) * visible / gpus if found else None  # idle GPUs are in the mean
+        # Idle GPUs are in the mean
+        return float(np.mean(found)) * visible / gpus if found else None
 
 
-def measure(specification: Path, out: Path, device: str, workers: int) -> tuple[dict[str, Any], dict[str, str]]:
+def measure(
+    specification: Path, out: Path, device: str, workers: int
+) -> tuple[dict[str, Any], dict[str, str]]:
     """Make the data set in a new folder. Return the row, and the checksums by file."""
     finished: list[float] = []
     gpus = 0 if device == "cpu" else wp.get_cuda_device_count() if device == ANY_GPU else 1
     meter = BusyMeter(gpu=gpus > 0)
     began = time.perf_counter()
     done: DatasetSummary = make_dataset(
-        specification, out, workers=workers, device=device, progress=lambda *_: finished.append(time.perf_counter())
+        specification,
+        out,
+        workers=workers,
+        device=device,
+        progress=lambda *_: finished.append(time.perf_counter()),
     )
     warm = min(2 * workers, len(finished) - 2)
     steady_s = finished[-1] - finished[warm]
-    found = json.loads((out / making.MANIFEST).read_text())
+    found = json.loads((out / recorded_dataset.MANIFEST).read_text())
     # the median leaves out each worker's first recording, which imports and compiles
-    times = [line["processor_s"] for line in read_journal(out / making.JOURNAL, dict, [])]
+    times = [line["processor_s"] for line in read_journal(out / files.JOURNAL, dict, [])]
     per_s = (len(finished) - 1 - warm) / steady_s
     row = {
         "device": device, "gpus": gpus, "workers": workers, "items": done.made, "failed": len(done.failed),
@@ -145,12 +162,18 @@ def measure(specification: Path, out: Path, device: str, workers: int) -> tuple[
 def equal_tensors(recordings: Path, tensors: Path) -> bool:
     """Return whether tensors are those of the events of the recordings in the other folder, bit for bit."""
     to_grid = ToTensor(voxel_grid, bins=5)
-    items = [json.loads((folder / making.MANIFEST).read_text())["items"] for folder in (recordings, tensors)]
+    items = [
+        json.loads((folder / recorded_dataset.MANIFEST).read_text())["items"]
+        for folder in (recordings, tensors)
+    ]
     events = {item["seed"]: item for item in items[0]}
     for item in items[1][:CHECKED]:
         expected = to_grid(open_recording(recordings / events[item["seed"]]["file"]))
         with np.load(tensors / item["file"]) as arrays:
-            if not (arrays["tensor"].dtype == expected.dtype and np.array_equal(arrays["tensor"], expected)):
+            if not (
+                arrays["tensor"].dtype == expected.dtype
+                and np.array_equal(arrays["tensor"], expected)
+            ):
                 return False
     return True
 
@@ -182,9 +205,15 @@ def add_scaling(rows: list[dict[str, Any]]) -> None:
             row["scaling_of_processor_time"] = (
                 row["workers"] * base[0]["processor_s_per_item"] / row["processor_s_per_item"]
             )
-        same = [r for r in rows if all(r[k] == row[k] for k in ("gpus", "workers")) and r["output"] == "recordings"]
+        same = [
+            r
+            for r in rows
+            if all(r[k] == row[k] for k in ("gpus", "workers")) and r["output"] == "recordings"
+        ]
         row["speed_up"] = row["items_per_s"] / same[0]["items_per_s"]
-        row["speed_up_by_processor_time"] = same[0]["processor_s_per_item"] / row["processor_s_per_item"]
+        row["speed_up_by_processor_time"] = (
+            same[0]["processor_s_per_item"] / row["processor_s_per_item"]
+        )
 
 
 def stages(item: Item, folder: Path, device: str) -> dict[str, float]:
@@ -201,11 +230,17 @@ def stages(item: Item, folder: Path, device: str) -> dict[str, float]:
             simulation = simulation_of(item, device)
             times["prepare"] = clock() - began
             times["simulate"] = passed(simulation, device, clock, to_host=False)
-            to_host = 0.0 if item.output else passed(simulation, device, clock, to_host=True) - times["simulate"]
+            to_host = (
+                0.0
+                if item.output
+                else passed(simulation, device, clock, to_host=True) - times["simulate"]
+            )
             times["copy to the host"] = to_host
             began = clock()
             write_recording(item, path, device)
-            rest = clock() - began - times["prepare"] - times["simulate"] - times["copy to the host"]
+            rest = (
+                clock() - began - times["prepare"] - times["simulate"] - times["copy to the host"]
+            )
             times["encode and write"] = rest
             began = clock()
             content_digest(path)
@@ -233,10 +268,17 @@ def plan(rows: list[dict[str, Any]], of: list[dict[str, Any]], kind: str) -> dic
     units = PLANNED_DEVICES[kind]
     rows = [row for row in rows if row["output"] == "recordings"]
     most = max(row["gpus"] or row["workers"] for row in rows)
-    best = max((row for row in rows if (row["gpus"] or row["workers"]) == most), key=lambda row: row["items_per_s"])
-    rate = units * (best["items_per_s"] / best["gpus"] if best["gpus"] else 1.0 / best["processor_s_per_item"])
+    best = max(
+        (row for row in rows if (row["gpus"] or row["workers"]) == most),
+        key=lambda row: row["items_per_s"],
+    )
+    rate = units * (
+        best["items_per_s"] / best["gpus"] if best["gpus"] else 1.0 / best["processor_s_per_item"]
+    )
     (one,) = (row for row in of if row["source"] == "pictures")
-    slowest = max((name for name in one if isinstance(one[name], float)), key=lambda name: one[name])
+    slowest = max(
+        (name for name in one if isinstance(one[name], float)), key=lambda name: one[name]
+    )
     return {
         "recordings": PLANNED, "devices": units, "unit": "GPUs" if kind == "cuda" else "CPU cores",
         "workers_per_device": best["workers"] // max(1, best["gpus"]) if kind == "cuda" else 1,
@@ -249,15 +291,25 @@ def plan(rows: list[dict[str, Any]], of: list[dict[str, Any]], kind: str) -> dic
 def leave_out_tables() -> None:
     """Leave out the Parquet tables on a machine without pyarrow."""
     making.require_pyarrow = lambda: None
-    making._write_table = lambda path, rows: None
+    files._write_table = lambda path, rows: None
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu", choices=("cpu", ANY_GPU))
-    parser.add_argument("--items", type=int, help="recordings of a row, rounded up to a multiple of 20")
-    parser.add_argument("--limit-s", type=float, default=240.0, help="start no new row after this time [s]")
-    parser.add_argument("--folder", type=Path, help="folder on the disk to measure; default: that of temporary files")
+    parser.add_argument(
+        "--items", type=int, help="recordings of a row, rounded up to a multiple of 20"
+    )
+    parser.add_argument(
+        "--limit-s", type=float, default=240.0, help="start no new row after this time [s]"
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        help="folder on the disk to measure; default: that of temporary files",
+    )
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     try:
@@ -280,7 +332,9 @@ def main() -> int:
         reference: dict[str, dict[str, str]] = {}
         for where, workers in runs(args.device):
             if rows and time.perf_counter() - began > args.limit_s:
-                print(f"left out after {args.limit_s:g} s: {workers} workers on {where}", flush=True)
+                print(
+                    f"left out after {args.limit_s:g} s: {workers} workers on {where}", flush=True
+                )
                 continue
             for output in OUTPUTS:
                 path = inputs["pictures" if output == "recordings" else output]

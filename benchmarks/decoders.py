@@ -32,9 +32,17 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp import Events, EvtDecoder, MemoryEvents, Recording, convert, open_recording, save_recording
-from amiwarp.io.prophesee import read_evt_header
-from amiwarp.studies.cluster import machine, versions
+from amiwarp import (
+    Events,
+    EvtDecoder,
+    MemoryEvents,
+    Recording,
+    convert,
+    open_recording,
+    save_recording,
+)
+from amiwarp.io.prophesee.raw import read_evt_header
+from amiwarp.studies.machine import machine, versions
 from benchmarks.corners import moving_tiles
 
 RESULTS = Path(__file__).parent / "results"
@@ -152,7 +160,12 @@ def by_evlib(path: Path, _: str) -> Callable[[], Columns]:
     def read() -> Columns:
         frame = evlib.load_events(str(path), sort=False).collect()
         t = frame["t"].dt.total_microseconds()
-        return frame["x"].to_numpy(), frame["y"].to_numpy(), t.to_numpy(), frame["polarity"].to_numpy()
+        return (
+            frame["x"].to_numpy(),
+            frame["y"].to_numpy(),
+            t.to_numpy(),
+            frame["polarity"].to_numpy(),
+        )
 
     return read
 
@@ -197,7 +210,16 @@ READERS: dict[str, tuple[Callable[[Path, str], Callable[[], Any]], tuple[str, ..
 """Function of each reader, and the endings of the files that it reads."""
 ON_GPU = {"words on the GPU": by_amiwarp_gpu, "page-locked words": by_amiwarp_page_locked}
 """Rows of a GPU."""
-PACKAGES = ("warp-lang", "numpy", "faery", "evt3", "eventcv", "evlib", "expelliarmus", "dv-processing")
+PACKAGES = (
+    "warp-lang",
+    "numpy",
+    "faery",
+    "evt3",
+    "eventcv",
+    "evlib",
+    "expelliarmus",
+    "dv-processing",
+)
 
 
 def columns_of(found: Any) -> Columns:
@@ -228,7 +250,9 @@ def run_reader(name: str, path: Path, device: str, known: Path) -> None:
     columns = columns_of(found)
     written = np.load(known)
     differs = compared(columns, tuple(written[each] for each in "xytp"))  # type: ignore[arg-type]
-    print(json.dumps({"events": len(columns[2]), "seconds": wall, "busy": busy, "differs": differs}))
+    print(
+        json.dumps({"events": len(columns[2]), "seconds": wall, "busy": busy, "differs": differs})
+    )
 
 
 def write_evt2(path: Path, events: Events) -> None:
@@ -240,7 +264,9 @@ def write_evt2(path: Path, events: Events) -> None:
     high = events.t >> 6
     changes = np.flatnonzero(np.diff(high, prepend=-1))
     words = np.insert(words, changes, (0x8 << 28 | high[changes]).astype(np.uint32))
-    path.write_bytes(b"% evt 2.0\n% format EVT2;height=480;width=640\n% end\n" + words.astype("<u4").tobytes())
+    path.write_bytes(
+        b"% evt 2.0\n% format EVT2;height=480;width=640\n% end\n" + words.astype("<u4").tobytes()
+    )
 
 
 def write_files(folder: Path, count: int) -> list[tuple[Path, Path]]:
@@ -280,10 +306,22 @@ def measure(path: Path, known: Path, device: str) -> list[dict[str, Any]]:
         for name in names:
             if name in missing:
                 continue
-            command = [sys.executable, "-m", "benchmarks.decoders", "--one", name, str(path), str(known)]
-            done = subprocess.run([*command, "--device", device], capture_output=True, text=True, timeout=900)
+            command = [
+                sys.executable,
+                "-m",
+                "benchmarks.decoders",
+                "--one",
+                name,
+                str(path),
+                str(known),
+            ]
+            done = subprocess.run(
+                [*command, "--device", device], capture_output=True, text=True, timeout=900
+            )
             if done.returncode:
-                missing[name] = (done.stderr.strip().splitlines() or ["ended without a message"])[-1][:200]
+                missing[name] = (done.stderr.strip().splitlines() or ["ended without a message"])[
+                    -1
+                ][:200]
             else:
                 results[name].append(json.loads(done.stdout.splitlines()[-1]))
     rows: list[dict[str, Any]] = []
@@ -297,20 +335,33 @@ def measure(path: Path, known: Path, device: str) -> list[dict[str, Any]]:
         rate = events / min(run["seconds"] for run in runs) * 1e-6
         spread = events / max(run["seconds"] for run in runs) * 1e-6
         cpu_ns = min(run["busy"] for run in runs) / events * 1e9
-        row = {"reader": name, "events": events, "mev_per_s": rate, "slowest_mev_per_s": spread, "cpu_ns": cpu_ns}
+        row = {
+            "reader": name,
+            "events": events,
+            "mev_per_s": rate,
+            "slowest_mev_per_s": spread,
+            "cpu_ns": cpu_ns,
+        }
         rows.append({**row, "differs": runs[0]["differs"]})
         differs = f"differs: {runs[0]['differs']}" if runs[0]["differs"] else "all events right"
-        print(f"  {name:20} {rate:9.1f} Mev/s {cpu_ns:8.2f} ns/event on the CPU, {differs}", flush=True)
+        print(
+            f"  {name:20} {rate:9.1f} Mev/s {cpu_ns:8.2f} ns/event on the CPU, {differs}",
+            flush=True,
+        )
     return rows
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--events", type=int, default=20_000_000)
     parser.add_argument("--recording", type=Path, nargs="*", default=[])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--one", nargs=3, metavar=("READER", "FILE", "KNOWN"), help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--one", nargs=3, metavar=("READER", "FILE", "KNOWN"), help=argparse.SUPPRESS
+    )
     args = parser.parse_args()
     if args.one:
         run_reader(args.one[0], Path(args.one[1]), args.device, Path(args.one[2]))
@@ -321,7 +372,9 @@ def main() -> int:
         files = write_files(Path(folder), args.events)
         for k, path in enumerate(args.recording):
             known = Path(folder) / f"recording{k}.npz"
-            np.savez(known, **dict(zip("xytp", columns_of(by_amiwarp_file(path, "cpu")()), strict=True)))
+            np.savez(
+                known, **dict(zip("xytp", columns_of(by_amiwarp_file(path, "cpu")()), strict=True))
+            )
             files.append((path, known))
         if args.device != "cpu":
             files = [(path, known) for path, known in files if path.suffix == ".raw"]
@@ -329,11 +382,20 @@ def main() -> int:
             size = path.stat().st_size
             print(f"{path.name}: {size / 1e6:.1f} MB", flush=True)
             results[path.name] = {"bytes": size, "rows": measure(path, known, args.device)}
-    report = {"machine": machine(args.device), "cpu": machine("cpu"), "load": [before, os.getloadavg()[0]]}
+    report = {
+        "machine": machine(args.device),
+        "cpu": machine("cpu"),
+        "load": [before, os.getloadavg()[0]],
+    }
     report |= {"versions": versions(PACKAGES), "files": results}
     kind = "cpu" if args.device == "cpu" else "cuda"
     (args.out or RESULTS / f"decoders_{kind}.json").write_text(json.dumps(report, indent=1) + "\n")
-    ours = [row for file in results.values() for row in file["rows"] if row["reader"].startswith(("amiwarp", *ON_GPU))]
+    ours = [
+        row
+        for file in results.values()
+        for row in file["rows"]
+        if row["reader"].startswith(("amiwarp", *ON_GPU))
+    ]
     return int(any(row.get("differs", "missing") for row in ours))
 
 

@@ -37,9 +37,9 @@ from amiwarp import (
     calibrate,
     simulate,
 )
-from amiwarp.optics.models import Model
+from amiwarp.optics.models.base import Model
 from amiwarp.simulation.description import Still
-from amiwarp.studies.stability.cells import leaves
+from amiwarp.studies.stability.scenes import leaves
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,9 @@ class Growing:
         middle = (np.array(self.light.shape) - 1.0) / 2.0
         for t in range(0, self.duration_us + 2 * FRAME_US, FRAME_US):
             shrink = 1.0 / (1.0 + self.per_s * 1e-6 * t)
-            grown = affine_transform(self.light, np.eye(2) * shrink, middle * (1.0 - shrink), order=3, mode="nearest")
+            grown = affine_transform(
+                self.light, np.eye(2) * shrink, middle * (1.0 - shrink), order=3, mode="nearest"
+            )
             yield t, np.clip(grown, 0.01, 1.0).astype(np.float32)
 
 
@@ -109,7 +111,9 @@ def compensation_error(trouble: Trouble, found: Calibration) -> tuple[float, flo
     begin, end = (int(source.slice(k, k + 1).t[0]) for k in (len(source) // 40, len(source) - 1))
     t = np.sort(rng.integers(begin + spare, end - spare, TIMES))
     columns = round(GRID * camera.width / camera.height)
-    x, y = np.meshgrid(np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, GRID))
+    x, y = np.meshgrid(
+        np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, GRID)
+    )
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
     pixels = np.tile(xy, (len(t), 1))
     times = np.repeat(t, len(xy))
@@ -125,7 +129,9 @@ def compensation_error(trouble: Trouble, found: Calibration) -> tuple[float, flo
         return float(np.sqrt(np.mean(distance(lag_us) ** 2)))
 
     start = min(np.linspace(-0.9, 0.9, 19) * LONGEST_LAG_US, key=rms)
-    best = minimize_scalar(rms, bounds=(start - 300.0, start + 300.0), method="bounded", options={"xatol": 0.5})
+    best = minimize_scalar(
+        rms, bounds=(start - 300.0, start + 300.0), method="bounded", options={"xatol": 0.5}
+    )
     return rms(float(best.x)), float(distance(float(best.x)).max())
 
 
@@ -200,7 +206,9 @@ def turns_of(motion: PrismMotion, first_us: int, last_us: int) -> NDArray[np.int
     t = np.arange(first_us, last_us + 1, 50, dtype=np.float64)
     angle = motion.angle(t)
     turned = angle * math.copysign(1.0, float(angle[-1] - angle[0]))
-    turns = np.arange(math.ceil(float(turned[0]) / math.tau), math.floor(float(turned[-1]) / math.tau) + 1)
+    turns = np.arange(
+        math.ceil(float(turned[0]) / math.tau), math.floor(float(turned[-1]) / math.tau) + 1
+    )
     return np.rint(np.interp(turns * math.tau, turned, t)).astype(np.int64)
 
 
@@ -211,10 +219,14 @@ def pulses_only(trouble: Trouble, jitter_us: float = 0.0) -> Trouble:
     t = turns_of(trouble.motion, -spare, last + spare)
     turns = np.rint(trouble.motion.angle(t) / math.tau)
     t = t + np.rint(np.random.default_rng(3).normal(0.0, jitter_us, len(t))).astype(np.int64)
-    return replace(trouble, recording=replace(trouble.recording, encoder=Encoder(t, turns * math.tau)))
+    return replace(
+        trouble, recording=replace(trouble.recording, encoder=Encoder(t, turns * math.tau))
+    )
 
 
-def losing(trouble: Trouble, counts: int, at_us: int, *, index: bool, within_us: int = 0) -> Trouble:
+def losing(
+    trouble: Trouble, counts: int, at_us: int, *, index: bool, within_us: int = 0
+) -> Trouble:
     """Return the recording whose encoder loses counts of 4096 at a time, or evenly ``within_us`` from then on."""
     encoder = trouble.recording.encoder
     assert encoder is not None
@@ -238,7 +250,9 @@ def with_burst(trouble: Trouble, count: int, stamps: int = 1, before_us: int = 0
     merged = Events.concatenate([burst, events])
     order = np.argsort(merged.t, kind="stable")
     merged = MemoryEvents(merged[order], *source.size)
-    return replace(trouble, recording=replace(trouble.recording, events=merged, encoder=None, truth=None))
+    return replace(
+        trouble, recording=replace(trouble.recording, events=merged, encoder=None, truth=None)
+    )
 
 
 def noisy(share: float, size: tuple[int, int], **given: Any) -> Trouble:
@@ -263,8 +277,12 @@ def pair(size: tuple[int, int], *, swapped: bool) -> Trouble:
 
 ROWS: dict[str, Callable[[tuple[int, int]], Trouble]] = {
     "no trouble": lambda size: recorded(size, steady()),
-    "loses 100 of 4096 counts, index": lambda size: losing(recorded(size, steady()), 100, 437_300, index=True),
-    "loses 100 of 4096 counts, no index": lambda size: losing(recorded(size, steady()), 100, 437_300, index=False),
+    "loses 100 of 4096 counts, index": lambda size: losing(
+        recorded(size, steady()), 100, 437_300, index=True
+    ),
+    "loses 100 of 4096 counts, no index": lambda size: losing(
+        recorded(size, steady()), 100, 437_300, index=False
+    ),
     "loses 100 counts within 40 ms, index": lambda size: losing(
         recorded(size, steady()), 100, 437_300, index=True, within_us=40_000
     ),
@@ -272,7 +290,9 @@ ROWS: dict[str, Callable[[tuple[int, int]], Trouble]] = {
         recorded(size, steady()), 100, 437_300, index=False, within_us=40_000
     ),
     "varying speed, burst": lambda size: with_burst(recorded(size, hunting(0.3, 0.7)), 6139),
-    "varying speed, burst over 20 us": lambda size: with_burst(recorded(size, hunting(0.3, 0.7)), 6139, stamps=20),
+    "varying speed, burst over 20 us": lambda size: with_burst(
+        recorded(size, hunting(0.3, 0.7)), 6139, stamps=20
+    ),
     "varying speed, burst 50 ms before": lambda size: with_burst(
         recorded(size, hunting(0.3, 0.7)), 6139, before_us=50_000
     ),
@@ -289,9 +309,15 @@ ROWS: dict[str, Callable[[tuple[int, int]], Trouble]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", default=[*ROWS], choices=[*ROWS], help="names of the rows")
-    parser.add_argument("--size", default="320x240", help="size of the image [px] (default: 320x240)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--only", nargs="+", default=[*ROWS], choices=[*ROWS], help="names of the rows"
+    )
+    parser.add_argument(
+        "--size", default="320x240", help="size of the image [px] (default: 320x240)"
+    )
     args = parser.parse_args()
     width, height = (int(side) for side in args.size.split("x"))
     for name in args.only:

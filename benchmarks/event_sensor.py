@@ -32,7 +32,9 @@ def waves(cameras: int, side: int) -> np.ndarray:
     """Return log intensities, shape (IMAGES, cameras, side, side): in a period, waves move by their length."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:side, :side] / side
-    turn, contrast = (rng.uniform(low, high, (cameras, 1, 1)) for low, high in ((0.0, 2.0 * math.pi), (0.2, 0.45)))
+    turn, contrast = (
+        rng.uniform(low, high, (cameras, 1, 1)) for low, high in ((0.0, 2.0 * math.pi), (0.2, 0.45))
+    )
     phase = 2.0 * math.pi * 4.0 * (x * np.cos(turn) + y * np.sin(turn))
     images = np.empty((IMAGES, cameras, side, side), np.float32)
     for k in range(IMAGES):
@@ -55,7 +57,12 @@ def differing(images: np.ndarray, cameras: int, device: str) -> int:
             if len(own) != len(other):
                 wrong += abs(len(own) - len(other))
                 continue
-            wrong += int(sum(np.count_nonzero(getattr(own, n) != getattr(other, n)) for n in ("x", "y", "t", "p")))
+            wrong += int(
+                sum(
+                    np.count_nonzero(getattr(own, n) != getattr(other, n))
+                    for n in ("x", "y", "t", "p")
+                )
+            )
     return wrong
 
 
@@ -77,10 +84,14 @@ def ramp_error_us(cameras: int, side: int, device: str) -> float:
     if not np.array_equal(np.bincount(pixel, minlength=rise.size), count):
         return math.inf
     number = np.arange(len(pixel)) - np.repeat(np.cumsum(count) - count, count) + 1
-    return float(np.abs(host.t[order] - number * contrast / rise.ravel()[pixel[order]] * length).max())
+    return float(
+        np.abs(host.t[order] - number * contrast / rise.ravel()[pixel[order]] * length).max()
+    )
 
 
-def timed(images: list[Any], cameras: int, side: int, steps: int, device: str, grids: bool) -> tuple[float, int]:
+def timed(
+    images: list[Any], cameras: int, side: int, steps: int, device: str, grids: bool
+) -> tuple[float, int]:
     """Return the time of a step [s] and the number of events of all steps."""
     sensor, count = EventSensor(cameras, side, side, device=device), 0
 
@@ -115,7 +126,9 @@ def row(cameras: int, side: int, steps: int, device: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--cameras", type=int, nargs="+", default=[1, 16, 256])
     parser.add_argument("--side", type=int, default=128)
@@ -127,7 +140,9 @@ def main() -> None:
         result = row(cameras, arguments.side, arguments.steps, arguments.device)
         print(json.dumps(result), flush=True)
         if result["differing"] or not result["ramp_error_us"] <= 1.0:
-            raise SystemExit("wrong answer: events differ from those of one camera, or come at wrong times")
+            raise SystemExit(
+                "wrong answer: events differ from those of one camera, or come at wrong times"
+            )
 
 
 if __name__ == "__main__":

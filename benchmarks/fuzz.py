@@ -56,7 +56,9 @@ def files(count: int | None, until: float | None, seed: int, keep: Path) -> dict
     return outcomes
 
 
-def _files(numbers: range, until: float | None, seed: int, folder: Path, keep: Path) -> dict[str, Counter[str]]:
+def _files(
+    numbers: range, until: float | None, seed: int, folder: Path, keep: Path
+) -> dict[str, Counter[str]]:
     """Check the mutated files with these numbers in one supervised process."""
     from reference import mutation_files as mutation
 
@@ -68,7 +70,9 @@ def _files(numbers: range, until: float | None, seed: int, folder: Path, keep: P
                 break
             kind = kinds[number % len(kinds)]
             path = folder / f"{kind}-{seed}-{number}{mutation.KINDS[kind][0]}"
-            path.write_bytes(mutation.mutated(mutation.sample(kind), random.Random(f"{kind} {seed} {number}")))
+            path.write_bytes(
+                mutation.mutated(mutation.sample(kind), random.Random(f"{kind} {seed} {number}"))
+            )
             try:
                 outcomes[kind]["read" if checker.check(path, kind) is None else "refused"] += 1
             except AssertionError as finding:
@@ -97,10 +101,14 @@ def _event_files(numbers: range, folder: Path, keep: Path) -> dict[str, Counter[
     from reference.mutation_events import DECODERS, count_outcomes, event_checker
 
     with contextlib.closing(event_checker()) as checker:
-        return {decoder: count_outcomes(checker, decoder, numbers, folder, keep) for decoder in DECODERS}
+        return {
+            decoder: count_outcomes(checker, decoder, numbers, folder, keep) for decoder in DECODERS
+        }
 
 
-def frames(count: int | None, until: float | None, seed: int, keep: Path) -> dict[str, Counter[str]]:
+def frames(
+    count: int | None, until: float | None, seed: int, keep: Path
+) -> dict[str, Counter[str]]:
     """Feed ``count`` mutated packets and messages to their decoders, or as many as fit into the time limit."""
     from reference import mutation_frames as mutation
 
@@ -124,7 +132,11 @@ def frames(count: int | None, until: float | None, seed: int, keep: Path) -> dic
                 outcomes[wire]["refused" if "\n" not in str(error) else "defects"] += 1
             except Exception as finding:
                 outcomes[wire]["defects"] += 1
-                print(f"{wire} {number}: {type(finding).__name__}: {finding}", file=sys.stderr, flush=True)
+                print(
+                    f"{wire} {number}: {type(finding).__name__}: {finding}",
+                    file=sys.stderr,
+                    flush=True,
+                )
                 keep.mkdir(parents=True, exist_ok=True)
                 (keep / f"{wire}-{number}").write_bytes(data)
             faulthandler.cancel_dump_traceback_later()
@@ -173,7 +185,9 @@ def _targets() -> Iterator[tuple[str, Callable[[bytes], Any]]]:
 
 
 def _from_file(kind: tuple[str, Any, Callable[[Path], object]], data: bytes) -> None:
-    with tempfile.NamedTemporaryFile(suffix=kind[0], dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as file:
+    with tempfile.NamedTemporaryFile(
+        suffix=kind[0], dir="/dev/shm" if Path("/dev/shm").is_dir() else None
+    ) as file:
         file.write(data)
         file.flush()
         kind[2](Path(file.name))
@@ -192,11 +206,17 @@ def _samples(target: str) -> Iterator[bytes]:
 
 def summary(outcomes: dict[str, Counter[str]], seconds: float) -> dict[str, Any]:
     total = sum(outcomes.values(), Counter())
-    return {"total": dict(total), "seconds": seconds, "kinds": {name: dict(found) for name, found in outcomes.items()}}
+    return {
+        "total": dict(total),
+        "seconds": seconds,
+        "kinds": {name: dict(found) for name, found in outcomes.items()},
+    }
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=float, help="time limit: half for files, half for frames")
     parser.add_argument("--files", type=int)
     parser.add_argument("--frames", type=int)
@@ -218,8 +238,13 @@ def main() -> int:
         print(json.dumps({name: data[name]}), flush=True)
     if args.events is not None:
         began = time.monotonic()
-        data["events"] = summary(event_files(args.events, args.seed, args.keep), time.monotonic() - began)
-    largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+        data["events"] = summary(
+            event_files(args.events, args.seed, args.keep), time.monotonic() - began
+        )
+    largest = max(
+        resource.getrusage(who).ru_maxrss
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
     data["most_memory_mib"] = largest / 1024.0
     if args.out is not None:
         args.out.write_text(json.dumps(data, indent=1) + "\n")

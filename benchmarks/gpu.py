@@ -16,6 +16,8 @@ import sys
 import time
 from pathlib import Path
 
+from benchmarks.copies import ROOT, files_of_tests
+
 PICTURE = "china.jpg"
 TESTS = (
     "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "compensator",
@@ -29,7 +31,7 @@ PLUGIN = () if importlib.util.find_spec("hdf5plugin") else ("test_file_keeps",)
 
 def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
     """Return the commands to run, by name."""
-    tests = [f"tests/test_{name}.py" for name in TESTS]
+    tests = files_of_tests(ROOT, TESTS)
     module = [sys.executable, "-m"]
     calibration = [*module, "benchmarks.calibration"]
     picture, device = str(folder / PICTURE), ["--device", "cuda:0"]
@@ -57,10 +59,17 @@ def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--limit-s", type=float, default=500.0, help="start no new row of a table after this time [s]")
+    parser.add_argument(
+        "--limit-s",
+        type=float,
+        default=500.0,
+        help="start no new row of a table after this time [s]",
+    )
     parser.add_argument("--only", nargs="+")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)

@@ -39,17 +39,11 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.choices import Axis, Colour
-from amiwarp.studies.cluster import machine
-from amiwarp.viewer.drawing import (
-    ImageKind,
-    cloud_state,
-    make_images,
-    picture_state,
-    prepare,
-    scale_state,
-)
+from amiwarp.studies.machine import machine
 from amiwarp.viewer.filters import Selection
+from amiwarp.viewer.images import ImageKind, make_images, prepare
 from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector
+from amiwarp.viewer.page_state import cloud_state, picture_state, scale_state
 from amiwarp.viewer.window import LEAST_POINTS, Window
 
 WIDTH, HEIGHT = 640, 480
@@ -101,7 +95,9 @@ def write_long(path: Path, n: int) -> int:
     block, seconds = min(n, 5_000_000), 0.5
     camera = Camera.from_fov(WIDTH, HEIGHT, 1.0)
     encoder = Encoder.constant_speed(720.0, 0, round(n / block * seconds * 1e6))
-    with RecordingWriter(path, width=WIDTH, height=HEIGHT, camera=camera, encoder=encoder, prism=Prism(0.02)) as writer:
+    with RecordingWriter(
+        path, width=WIDTH, height=HEIGHT, camera=camera, encoder=encoder, prism=Prism(0.02)
+    ) as writer:
         for k in range(n // block):
             e = made(block, seconds, k)
             writer.append(Events(e.x, e.y, e.t + round(k * seconds * 1e6), e.p))
@@ -149,7 +145,12 @@ def update(device: str, region: tuple[int, int, int, int] | None) -> dict[str, A
     expected = compensate_events(shown.events, inspector.model, inspector.encoder)
     error = float(np.nanmax(np.abs(expected - shown.after)))
     most = TARGETS_MS["cuda" if "cuda" in device else "cpu"]["update"]
-    return {"events": shown.selected, **found, "error_px": error, "ok": error < 0.01 and found["ms"] <= most}
+    return {
+        "events": shown.selected,
+        **found,
+        "error_px": error,
+        "ok": error < 0.01 and found["ms"] <= most,
+    }
 
 
 def window(device: str) -> dict[str, Any]:
@@ -167,7 +168,12 @@ def window(device: str) -> dict[str, Any]:
     expected = compensate_events(shown.shown.events, inspector.model, inspector.encoder)
     places = np.asarray(shown.scene._clouds[1].mapper.dataset.points)
     error = float(np.nanmax(np.abs(expected - places[:, :2] * (1.0, -1.0))))
-    out = {"events": len(shown.shown.events), **found, "error_px": error, "drawing": timed(lambda _: draw(), 3)}
+    out = {
+        "events": len(shown.shown.events),
+        **found,
+        "error_px": error,
+        "drawing": timed(lambda _: draw(), 3),
+    }
     shown.scene.stride = len(shown.shown.events) // LEAST_POINTS
     slide(-1)
     out["drawing_moving"] = timed(lambda _: draw(), 3)
@@ -178,23 +184,35 @@ def window(device: str) -> dict[str, Any]:
 
 def images(device: str) -> dict[str, Any]:
     """Measure each kind of image of a region, and a log intensity of the whole image (simulated texture)."""
-    texture = np.kron(np.random.default_rng(0).integers(0, 255, (75, 100), dtype=np.uint8), np.ones((16, 16), np.uint8))
-    recording = simulate(texture, Camera.from_fov(WIDTH, HEIGHT, 1.0), Prism(0.02), duration_s=0.1, seed=1)
+    texture = np.kron(
+        np.random.default_rng(0).integers(0, 255, (75, 100), dtype=np.uint8),
+        np.ones((16, 16), np.uint8),
+    )
+    recording = simulate(
+        texture, Camera.from_fov(WIDTH, HEIGHT, 1.0), Prism(0.02), duration_s=0.1, seed=1
+    )
     inspector = Inspector(recording, device=device)
     inspector.take_truth()
     inspector.open(*inspector.first_window(), Selection(region=REGION))
-    out: dict[str, Any] = {"preparation": once(lambda: prepare(inspector))}  # as the page does after the first cloud
+    # As the page does after the first cloud
+    out: dict[str, Any] = {"preparation": once(lambda: prepare(inspector))}
     for name, selection in (("region", Selection(region=REGION)), ("whole", Selection())):
         inspector.open(*inspector.first_window(), selection)
         # the first one also chooses the smoothness
-        out[f"log_intensity_{name}_first"] = once(lambda: make_images(inspector, ImageKind.LOG_INTENSITY))
+        out[f"log_intensity_{name}_first"] = once(
+            lambda: make_images(inspector, ImageKind.LOG_INTENSITY)
+        )
         for kind in ImageKind:
-            out[f"{kind.name.lower()}_{name}"] = timed(lambda _, kind=kind: make_images(inspector, kind), 3)
+            out[f"{kind.name.lower()}_{name}"] = timed(
+                lambda _, kind=kind: make_images(inspector, kind), 3
+            )
         counts = make_images(inspector, ImageKind.COUNT).before
         assert counts is not None
         out[f"events_{name}"] = {"n": inspector.loaded.selected, "counted": float(counts.sum())}
     most = TARGETS_MS["cuda" if "cuda" in device else "cpu"]["log_intensity"]
-    counted = all(math.isclose(*out[f"events_{n}"].values(), rel_tol=0.02) for n in ("region", "whole"))
+    counted = all(
+        math.isclose(*out[f"events_{n}"].values(), rel_tol=0.02) for n in ("region", "whole")
+    )
     slowest = max(out[f"log_intensity_{n}"]["ms"] for n in ("region", "whole"))
     return {**out, "ok": counted and slowest <= most}
 
@@ -202,7 +220,10 @@ def images(device: str) -> dict[str, Any]:
 def opening(path: Path, device: str, n: int, length_us: int) -> dict[str, Any]:
     """Measure the time from the start of a process to its first cloud of the suggested region; median of three runs."""
     command = [sys.executable, "-c", OPENED, str(path), device, str(length_us)]
-    runs = [subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-6:] for _ in range(3)]
+    runs = [
+        subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-6:]
+        for _ in range(3)
+    ]
     took, cpu, gib, window, read, count = (float(np.median(v)) for v in np.array(runs, float).T)
     return {"events": int(count), "window_events": int(window), "window_read": int(read), "s": took, "cpu_s": cpu,
             "gib": gib, "ok": count == n and took <= MOST_S and gib <= MOST_GIB}  # fmt: skip
@@ -217,24 +238,34 @@ def rates(path: Path, n: int) -> dict[str, Any]:
     counted, began, cpu = EventRates(source), time.perf_counter(), time.process_time()
     while not counted.fill(0.2):
         pass
-    out: dict[str, Any] = {"fill_s": time.perf_counter() - began, "fill_cpu_s": time.process_time() - cpu}
+    out: dict[str, Any] = {
+        "fill_s": time.perf_counter() - began,
+        "fill_cpu_s": time.process_time() - cpu,
+    }
     edges, whole = counted.curve(source.t_first, source.t_last + 1, 1000)
     for length_us in (source.t_last - source.t_first, 1_000_000, 100_000, 10_000):
         start = source.t_first + (source.t_last - source.t_first - length_us) // 2
-        out[f"curve_{length_us}_us"] = timed(lambda _, a=start, b=start + length_us: counted.curve(a, b, 1000))
+        out[f"curve_{length_us}_us"] = timed(
+            lambda _, a=start, b=start + length_us: counted.curve(a, b, 1000)
+        )
     total = float((whole * np.diff(edges)).sum() * 1e-6)
     slowest = max(each["ms"] for name, each in out.items() if name.startswith("curve"))
     return {**out, "ok": math.isclose(total, n, rel_tol=1e-6) and slowest <= MOST_RATE_MS}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--events", type=int, default=100_000_000)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     found: dict[str, Any] = {"machine": machine(args.device), "device": args.device}
-    found["update_whole"], found["update_region"] = update(args.device, None), update(args.device, REGION)
+    found["update_whole"], found["update_region"] = (
+        update(args.device, None),
+        update(args.device, REGION),
+    )
     found["window"] = window(args.device)
     found["images"] = images(args.device)
     with tempfile.TemporaryDirectory() as folder:
@@ -247,7 +278,9 @@ def main() -> int:
     print(json.dumps(found, indent=1))
     if args.out:
         args.out.write_text(json.dumps(found, indent=1) + "\n")
-    return int(not all(each["ok"] for each in found.values() if isinstance(each, dict) and "ok" in each))
+    return int(
+        not all(each["ok"] for each in found.values() if isinstance(each, dict) and "ok" in each)
+    )
 
 
 if __name__ == "__main__":

@@ -138,18 +138,26 @@ def measure(args: argparse.Namespace, folder: Path, way: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as home, log.open("wb") as messages:
         command = [args.chromium, *OPTIONS, f"--user-data-dir={home}", *WAYS[way], url]
         environment = {**os.environ, "HOME": home}
-        chromium = subprocess.Popen(command, env=environment, stdout=messages, stderr=messages, start_new_session=True)
+        chromium = subprocess.Popen(
+            command, env=environment, stdout=messages, stderr=messages, start_new_session=True
+        )
         ended = server.done.wait(LONGEST_S)
         os.killpg(chromium.pid, signal.SIGKILL)
         chromium.wait()
     server.shutdown()
     (args.out / f"{way}.png").write_bytes(server.picture)
-    found = json.loads(server.result) if ended else {"error": f"no answer in {LONGEST_S:g} s; see {log}"}
+    found = (
+        json.loads(server.result)
+        if ended
+        else {"error": f"no answer in {LONGEST_S:g} s; see {log}"}
+    )
     return {"way": way, **found}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--points", type=int, default=1_000_000)
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--chromium", default=shutil.which("chromium"))

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.studies.cluster import machine
+from amiwarp.studies.machine import machine
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.layout import SETTABLE
 from amiwarp.viewer.panel import Panel
@@ -63,7 +63,9 @@ def measure(url: str) -> dict[str, Any]:
 
     with sync_playwright() as playwright:
         arguments = ["--no-sandbox", "--disable-gpu"]
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=arguments)
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), args=arguments
+        )
         page = browser.new_page(viewport={"width": 1366, "height": 768})
         page.goto(url)
         page.locator("#events").filter(has_text="drawn").wait_for()
@@ -80,11 +82,16 @@ def measure(url: str) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    recording, found = recorded(made(1_000_000, 0.2)), {"machine": machine(args.device), "device": args.device}
+    recording, found = (
+        recorded(made(1_000_000, 0.2)),
+        {"machine": machine(args.device), "device": args.device},
+    )
 
     def inspector() -> Inspector:
         opened = Inspector(recording, device=args.device)
@@ -114,7 +121,11 @@ def main() -> int:
     known.set(replace(known.knobs, apex=float(np.radians(1.03 + 0.05 * (CHANGES - 1)))))
     known.open(0, 200_000)
     error = abs(known.show().sharpness_after - found["sharpness"])
-    found |= {"ok": error < 2e-3 and found["change_ms"] <= MOST_MS and found["frames_per_s"] >= LEAST_FRAMES}
+    found |= {
+        "ok": error < 2e-3
+        and found["change_ms"] <= MOST_MS
+        and found["frames_per_s"] >= LEAST_FRAMES
+    }
     print(json.dumps(found, indent=1))
     if args.out:
         args.out.write_text(json.dumps(found, indent=1) + "\n")

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from amiwarp import compensate_events
-from amiwarp.studies.cluster import machine
+from amiwarp.studies.machine import machine
 from amiwarp.viewer import window as inspector_window
 from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector
 from amiwarp.viewer.window import Window
@@ -44,7 +44,9 @@ MOST_ERROR_PX = 0.01
 def renderer_name(window: Window) -> str:
     """Return the name of the renderer that OpenGL gives."""
     lines = window.plotter.render_window.ReportCapabilities().splitlines()
-    return next((line.partition(":")[2].strip() for line in lines if "renderer string" in line), "unknown")
+    return next(
+        (line.partition(":")[2].strip() for line in lines if "renderer string" in line), "unknown"
+    )
 
 
 def mouse(window: Window, event: str, place: tuple[float, float]) -> None:
@@ -140,7 +142,12 @@ def turning(window: Window, least_fps: float) -> dict[str, Any]:
     follows = bool((steps > 0.0).all()) and bool((pixels[0] != pixels[1]).any())
     mouse(window, "LeftButtonRelease", (x, y))
     drawn_points, fps = len(window.scene._meshes[1].points), 1e3 / found["ms_mean"]
-    return {**found, "frames_per_s": fps, "points_drawn": drawn_points, "ok": follows and fps >= least_fps}
+    return {
+        **found,
+        "frames_per_s": fps,
+        "points_drawn": drawn_points,
+        "ok": follows and fps >= least_fps,
+    }
 
 
 def resting(window: Window) -> dict[str, Any]:
@@ -159,11 +166,15 @@ def resting(window: Window) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    inspector = Inspector(recorded(made(EVENTS, 1e-6 * LENGTH_US)), device=args.device, most_points=WINDOW_POINTS)
+    inspector = Inspector(
+        recorded(made(EVENTS, 1e-6 * LENGTH_US)), device=args.device, most_points=WINDOW_POINTS
+    )
     inspector.window = 0, LENGTH_US
     began = time.perf_counter()
     window = Window(inspector, off_screen=True)

@@ -24,7 +24,8 @@ from scipy.spatial.transform import Rotation
 
 import amiwarp
 from amiwarp.lens.board import Corners
-from amiwarp.lens.corner_fit import Projection, first_pose, fit_lens
+from amiwarp.lens.corner_fit import fit_lens
+from amiwarp.lens.projection import Projection, first_pose
 
 BOARD = amiwarp.Board(9, 6, 0.03)
 LENSES = {
@@ -33,7 +34,10 @@ LENSES = {
     ),
     "fisheye": amiwarp.Camera(640, 480, 305.0, 305.6, 322.0, 236.0, amiwarp.Fisheye(-0.02, 0.004)),
 }
-SEEING: dict[str, dict[str, Any]] = {"radial-tangential": {}, "fisheye": {"seeing": "rays", "samples": 16}}
+SEEING: dict[str, dict[str, Any]] = {
+    "radial-tangential": {},
+    "fisheye": {"seeing": "rays", "samples": 16},
+}
 """A map of what is seen covers 151 deg. The diagonal of a fisheye of 120 deg has more."""
 DISTANCE_M = {"radial-tangential": (0.35, 0.7), "fisheye": (0.2, 0.4)}
 FINE = 4
@@ -42,28 +46,40 @@ FRAME_NOISE = 0.02
 """Standard deviation of the noise of frames, as a share of white: a usual camera at ISO 400."""
 
 
-def poses(rng: np.random.Generator, lens: str, count: int) -> list[tuple[Rotation, NDArray[np.float64]]]:
+def poses(
+    rng: np.random.Generator, lens: str, count: int
+) -> list[tuple[Rotation, NDArray[np.float64]]]:
     """Return orientations and middles [m] of boards that lie wholly in the image."""
     camera, half, out = LENSES[lens], BOARD.points.max(axis=0) / 2.0, []
     while len(out) < count:
-        ray = np.asarray(camera.pixels_to_rays(rng.uniform([60, 60], [580, 420])[None]), np.float64)[0]
+        ray = np.asarray(
+            camera.pixels_to_rays(rng.uniform([60, 60], [580, 420])[None]), np.float64
+        )[0]
         middle = ray * rng.uniform(*DISTANCE_M[lens])
         turn, about = math.radians(rng.uniform(10.0, 40.0)), rng.uniform(0.0, math.tau)
         facing, _ = Rotation.align_vectors(ray[None], [[0.0, 0.0, 1.0]])
-        rotation = facing * Rotation.from_rotvec([turn * math.cos(about), turn * math.sin(about), 0.0])
+        rotation = facing * Rotation.from_rotvec(
+            [turn * math.cos(about), turn * math.sin(about), 0.0]
+        )
         xy = corners(camera, rotation, middle - rotation.apply(half))
         if np.isfinite(xy).all() and (xy > 12).all() and (xy < [627, 467]).all():
             out.append((rotation, middle))
     return out
 
 
-def corners(camera: amiwarp.Camera, rotation: Rotation, origin: NDArray[np.float64]) -> NDArray[np.float64]:
+def corners(
+    camera: amiwarp.Camera, rotation: Rotation, origin: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the true corners [px] of a board whose first corner is at ``origin`` [m]."""
     points = rotation.apply(BOARD.points) + origin
-    return np.asarray(camera.rays_to_pixels(points / np.linalg.norm(points, axis=1, keepdims=True)), np.float64)
+    return np.asarray(
+        camera.rays_to_pixels(points / np.linalg.norm(points, axis=1, keepdims=True)), np.float64
+    )
 
 
-def errors(camera: amiwarp.Camera, true: amiwarp.Camera, held: list[NDArray[np.float64]]) -> dict[str, float]:
+def errors(
+    camera: amiwarp.Camera, true: amiwarp.Camera, held: list[NDArray[np.float64]]
+) -> dict[str, float]:
     """Return the errors of a camera; ``held`` are true corners of other poses [px]."""
     off = []
     for xy in held:
@@ -71,7 +87,10 @@ def errors(camera: amiwarp.Camera, true: amiwarp.Camera, held: list[NDArray[np.f
         lens, pose = Projection(camera), first_pose(camera, BOARD, seen)
         for _ in range(5):  # the pose that fits best in pixels
             at, by = lens.of(pose, BOARD.points)
-            pose = pose - np.linalg.lstsq(by[:, :, -6:].reshape(-1, 6), (at - xy).ravel(), rcond=None)[0]
+            pose = (
+                pose
+                - np.linalg.lstsq(by[:, :, -6:].reshape(-1, 6), (at - xy).ravel(), rcond=None)[0]
+            )
         off.append(((lens.of(pose, BOARD.points)[0] - xy) ** 2).sum(axis=1))
     return {
         "focal": abs(camera.fx / true.fx - 1.0),
@@ -83,21 +102,28 @@ def errors(camera: amiwarp.Camera, true: amiwarp.Camera, held: list[NDArray[np.f
 def one(lens: str, seed: int, count: int, device: str, index: float) -> dict[str, Any]:
     """Return the row of a seed."""
     rng, true = np.random.default_rng(seed), LENSES[lens]
-    half, placed = BOARD.points.max(axis=0) / 2.0, poses(np.random.default_rng(seed), lens, count + 4)
+    half, placed = (
+        BOARD.points.max(axis=0) / 2.0,
+        poses(np.random.default_rng(seed), lens, count + 4),
+    )
     xy = [corners(true, r, m - r.apply(half)) for r, m in placed]
     motion = amiwarp.PrismMotion(720.0, rng.uniform(-math.pi, math.pi))
     prism, recordings = amiwarp.Prism(math.radians(1.0), index), []
     for k, (rotation, middle) in enumerate(placed[:count]):
         world = BOARD.world(rotation.as_quat(), middle, seed=seed)
         scene = amiwarp.WorldScene(world, amiwarp.Trajectory.still([0, 0, 0]), **SEEING[lens])
-        made = amiwarp.simulate(scene, true, prism, duration_s=0.25, motion=motion, seed=100 * seed + k, device=device)
+        made = amiwarp.simulate(
+            scene, true, prism, duration_s=0.25, motion=motion, seed=100 * seed + k, device=device
+        )
         nominal = amiwarp.Prism(prism.apex * (1.1 if seed % 2 else 0.9))
         recordings.append(replace(made, camera=None, name=f"pose {k}", prism=nominal))
     fov = 640.0 / (0.9 * true.fx) if lens == "fisheye" else 2.0 * math.atan(320.0 / (0.9 * true.fx))
     row: dict[str, Any] = {"lens": lens, "seed": seed, "index": index}
     began = time.perf_counter()
     try:
-        found = amiwarp.calibrate_lens(recordings, BOARD, fov=fov, fisheye=lens == "fisheye", device=device)
+        found = amiwarp.calibrate_lens(
+            recordings, BOARD, fov=fov, fisheye=lens == "fisheye", device=device
+        )
     except amiwarp.AmiwarpError as error:
         return {**row, "refused": str(error), "seconds": time.perf_counter() - began}
     apex, std = found.prism.parameters["apex"], found.prism.uncertainty["apex"]
@@ -115,7 +141,9 @@ def one(lens: str, seed: int, count: int, device: str, index: float) -> dict[str
     return row
 
 
-def on_frame(xy: NDArray[np.float64], camera: amiwarp.Camera, noise: float, rng: np.random.Generator) -> Corners:
+def on_frame(
+    xy: NDArray[np.float64], camera: amiwarp.Camera, noise: float, rng: np.random.Generator
+) -> Corners:
     """Return the corners that OpenCV finds in a frame of a board whose true corners are ``xy`` [px].
 
     The frame is the board's picture, warped by the lens between the corners, with a blur of 0.5 px.
@@ -126,7 +154,10 @@ def on_frame(xy: NDArray[np.float64], camera: amiwarp.Camera, noise: float, rng:
     pose = first_pose(camera, BOARD, Corners(np.arange(len(xy)), xy))
     turn = Rotation.from_rotvec(pose[:3])
     normal, origin = turn.apply([0.0, 0.0, 1.0]), pose[3:]
-    at = turn.inv().apply(rays * ((origin @ normal) / (rays @ normal))[:, None] - origin) / BOARD.square_m
+    at = (
+        turn.inv().apply(rays * ((origin @ normal) / (rays @ normal))[:, None] - origin)
+        / BOARD.square_m
+    )
     u, v = at[:, 0] + 1.0, at[:, 1] + 1.0
     inside = (u > 0) & (u < BOARD.columns + 1) & (v > 0) & (v < BOARD.rows + 1) & np.isfinite(u)
     picture = np.where(inside & ((np.floor(u) + np.floor(v)) % 2 == 0), 0.04, 0.9)
@@ -136,7 +167,9 @@ def on_frame(xy: NDArray[np.float64], camera: amiwarp.Camera, noise: float, rng:
     found = BOARD.find(frame)
     assert found is not None
     until = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-    fine = cv2.cornerSubPix(frame, found.xy.astype(np.float32).reshape(-1, 1, 2), (5, 5), (-1, -1), until)
+    fine = cv2.cornerSubPix(
+        frame, found.xy.astype(np.float32).reshape(-1, 1, 2), (5, 5), (-1, -1), until
+    )
     found = replace(found, xy=fine.reshape(-1, 2).astype(np.float64))
     flipped = np.linalg.norm(found.xy[0] - xy[0]) > np.linalg.norm(found.xy[-1] - xy[0])
     return replace(found, xy=found.xy[::-1]) if flipped else found

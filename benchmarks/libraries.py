@@ -94,7 +94,13 @@ def library(name: str) -> Any:
 
 def with_numpy(events: PeerEvents, device: str, *, block: int | None = None) -> Peer:
     """Prepare NumPy: four calls of ``add.at`` (faster than ``bincount`` in NumPy 2) over whole arrays or blocks."""
-    x, y, angle, radius, margin = events.x, events.y, events.angle, np.float32(events.radius), np.float32(events.margin)
+    x, y, angle, radius, margin = (
+        events.x,
+        events.y,
+        events.angle,
+        np.float32(events.radius),
+        np.float32(events.margin),
+    )
     rows, columns = events.shape
     image = np.zeros(rows * columns, np.float32)
 
@@ -134,13 +140,19 @@ def numba_kernels() -> tuple[Any, Any]:
 
     cast = nb.njit(fastmath=True, inline="always")(vote)
 
-    def by_sine(x: Any, y: Any, angle: Any, radius: Any, margin: Any, images: Any, total: Any) -> None:
+    def by_sine(
+        x: Any, y: Any, angle: Any, radius: Any, margin: Any, images: Any, total: Any
+    ) -> None:
         n, parts = len(x), len(images)
         for k in nb.prange(parts):
             images[k] = 0.0
             for e in range(n * k // parts, n * (k + 1) // parts):
                 c, s = np.cos(angle[e]), np.sin(angle[e])
-                cast(images[k], np.float32(x[e]) - radius * c + margin, np.float32(y[e]) - radius * s + margin)
+                cast(
+                    images[k],
+                    np.float32(x[e]) - radius * c + margin,
+                    np.float32(y[e]) - radius * s + margin,
+                )
         for row in nb.prange(total.shape[0]):
             total[row] = images[:, row].sum(axis=0)
 
@@ -175,10 +187,14 @@ def with_numba_table(events: PeerEvents, device: str) -> Peer:
     _, kernel = numba_kernels()
     images, total = _numba_images(events)
     angle = np.arange(65536) * (2.0 * np.pi / 65536)
-    turn = np.rint(events.angle * np.float64(65536 / (2.0 * np.pi))).astype(np.int64).astype(np.uint16)
+    turn = (
+        np.rint(events.angle * np.float64(65536 / (2.0 * np.pi))).astype(np.int64).astype(np.uint16)
+    )
     dx = (events.margin - events.radius * np.cos(angle)).astype(np.float32)
     dy = (events.margin - events.radius * np.sin(angle)).astype(np.float32)
-    return Peer(lambda: kernel(events.x, events.y, turn, dx, dy, images, total), lambda: total, events)
+    return Peer(
+        lambda: kernel(events.x, events.y, turn, dx, dy, images, total), lambda: total, events
+    )
 
 
 def _in_torch(events: PeerEvents, device: str) -> tuple[Any, list[Any]]:
@@ -188,7 +204,8 @@ def _in_torch(events: PeerEvents, device: str) -> tuple[Any, list[Any]]:
         raise Missing("this PyTorch has no CUDA")
     arrays = (events.x, events.y, events.angle)
     return torch, events.keep(
-        ("torch", device), lambda: [torch.from_numpy(a.astype(np.float32)).to(device) for a in arrays]
+        ("torch", device),
+        lambda: [torch.from_numpy(a.astype(np.float32)).to(device) for a in arrays],
     )
 
 
@@ -248,7 +265,11 @@ def _cupy_events(events: PeerEvents, device: str) -> tuple[Any, list[Any]]:
 def with_cupy(events: PeerEvents, device: str) -> Peer:
     """Prepare CuPy: array operations and four calls of ``add.at``."""
     cupy, (x, y, angle) = _cupy_events(events, device)
-    radius, margin, (rows, columns) = np.float32(events.radius), np.float32(events.margin), events.shape
+    radius, margin, (rows, columns) = (
+        np.float32(events.radius),
+        np.float32(events.margin),
+        events.shape,
+    )
     image = cupy.zeros(rows * columns, cupy.float32)
 
     def run() -> None:

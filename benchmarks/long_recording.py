@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from amiwarp import Calibration, Events, ExactModel, Prism, model_error, open_recording
-from amiwarp.studies.cluster import processor
+from amiwarp.studies.machine import processor
 from amiwarp.tasks import cpu_threads
 from benchmarks.compensate import CAMERA, PRISM, SAMPLE, SAMPLES, error_of, make, pieces
 from benchmarks.simulate import blocks_picture
@@ -64,7 +64,10 @@ def same_events(folder: Path, name: str, *, start_only: bool = False) -> float:
 
     ``start_only``: compare the first events only. A file without an index is read from its start to any event.
     """
-    source, made = open_recording(folder / "recording.h5").events, open_recording(folder / name).events
+    source, made = (
+        open_recording(folder / "recording.h5").events,
+        open_recording(folder / name).events,
+    )
 
     def differ(a: Events, b: Events) -> int:
         return int(np.count_nonzero((a.x != b.x) | (a.y != b.y) | (a.t != b.t) | (a.p != b.p)))
@@ -72,18 +75,25 @@ def same_events(folder: Path, name: str, *, start_only: bool = False) -> float:
     spans = pieces(SAMPLES * SAMPLE if start_only else len(source))
     if not start_only and len(source) != len(made):
         return 1.0
-    return sum(differ(source.slice(*span), made.slice(*span)) for span in spans) / sum(b - a for a, b in spans)
+    return sum(differ(source.slice(*span), made.slice(*span)) for span in spans) / sum(
+        b - a for a, b in spans
+    )
 
 
 def apex_away(folder: Path) -> float:
     """Return the error of the calibrated model [px rms over the image and a turn, constant lag removed]."""
     found = Calibration.load(folder / "calibration.json")
-    return model_error(found.model, ExactModel.from_prism(CAMERA, PRISM, found.parameters["phase"])).rms
+    return model_error(
+        found.model, ExactModel.from_prism(CAMERA, PRISM, found.parameters["phase"])
+    ).rms
 
 
 def moved_away(folder: Path) -> float:
     """Return the largest error of compensated positions [px]; infinite if times, polarities or flags differ."""
-    source, made = open_recording(folder / "recording.h5"), open_recording(folder / "moved.h5").events
+    source, made = (
+        open_recording(folder / "recording.h5"),
+        open_recording(folder / "moved.h5").events,
+    )
     assert source.encoder is not None
     found = Calibration.load(folder / "calibration.json")
     prism, phase = Prism(found.parameters["apex"], PRISM.index), found.parameters["phase"]
@@ -137,7 +147,9 @@ def commands(device: str) -> list[Command]:
 def measured(command: Command, folder: Path, events: int) -> dict[str, Any]:
     """Run a command and return its time, memory and error."""
     call = [sys.executable, "-m", "amiwarp", *command.arguments]
-    ran = subprocess.run([sys.executable, "-S", "-c", MEASURE, *call], cwd=folder, capture_output=True, check=False)
+    ran = subprocess.run(
+        [sys.executable, "-S", "-c", MEASURE, *call], cwd=folder, capture_output=True, check=False
+    )
     if ran.returncode:
         raise SystemExit(f"{command.name} failed: {ran.stderr.decode(errors='replace')[-2000:]}")
     seconds, cpu_s, mib = map(float, ran.stdout.splitlines()[-1].split())
@@ -153,10 +165,14 @@ def measured(command: Command, folder: Path, events: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--events", type=int, default=1_000_000_000)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--folder", type=Path, help="folder for the files (default: a temporary folder)")
+    parser.add_argument(
+        "--folder", type=Path, help="folder for the files (default: a temporary folder)"
+    )
     parser.add_argument("--out", type=Path, help="JSON file to write")
     a = parser.parse_args()
     result: dict[str, Any] = {
@@ -166,12 +182,21 @@ def main() -> None:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=a.folder)))
         make(folder / "recording.h5", a.events, columns=False)
-        print(f"recording: {(folder / 'recording.h5').stat().st_size / a.events:.2f} bytes per event", flush=True)
+        print(
+            f"recording: {(folder / 'recording.h5').stat().st_size / a.events:.2f} bytes per event",
+            flush=True,
+        )
         for command in commands(a.device):
             row = measured(command, folder, a.events)
             result["rows"].append(row)
-            speed = f"{row['seconds']:7.1f} s {row['mev_per_s']:8.1f} Mev/s {row['peak_mib']:6.0f} MiB"
-            print(f"{command.name:22} {speed}  error {row['error']:.4g} {row['unit']}", *row["wrong"], flush=True)
+            speed = (
+                f"{row['seconds']:7.1f} s {row['mev_per_s']:8.1f} Mev/s {row['peak_mib']:6.0f} MiB"
+            )
+            print(
+                f"{command.name:22} {speed}  error {row['error']:.4g} {row['unit']}",
+                *row["wrong"],
+                flush=True,
+            )
         result["bytes"] = {p.name: p.stat().st_size for p in sorted(folder.iterdir())}
     if a.out:
         a.out.write_text(json.dumps(result, indent=1) + "\n")

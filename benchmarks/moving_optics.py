@@ -71,21 +71,35 @@ def pair(rng: np.random.Generator, seed: int, picture: str) -> Case:
 def pair_of(apexes_deg: Any, rpm: Any, phases: Any) -> tuple[Prism, PrismMotion]:
     """Return two prisms and their motion."""
     first, second = (Prism(math.radians(float(apex))) for apex in apexes_deg)
-    motion, other = (PrismMotion(float(speed), float(phase)) for speed, phase in zip(rpm, phases, strict=True))
+    motion, other = (
+        PrismMotion(float(speed), float(phase)) for speed, phase in zip(rpm, phases, strict=True)
+    )
     return replace(first, second=second), replace(motion, second=other)
 
 
 def mirror(rng: np.random.Generator, seed: int, picture: str) -> Case:
     """Return a mirror with random tilts and mount; both tilts of every third one make a circle at one frequency."""
     hz = np.exp(rng.uniform(math.log(20.0), math.log(150.0), 2)) * rng.choice([-1.0, 1.0], 2)
-    amplitude, phase = rng.uniform(1.0, 8.0, 2) / (2.0 * CAMERA.fx), rng.uniform(-math.pi, math.pi, 2)
+    amplitude, phase = (
+        rng.uniform(1.0, 8.0, 2) / (2.0 * CAMERA.fx),
+        rng.uniform(-math.pi, math.pi, 2),
+    )
     if seed % 3 == 0:
         hz[1], amplitude[1], phase[1] = hz[0], amplitude[0], phase[0] + 0.5 * math.pi
     direction = np.array([0.0, 0.5 * math.pi]) + rng.uniform(-0.2, 0.2, 2)
     fold, incidence = rng.uniform(-math.pi, math.pi), math.radians(rng.uniform(30.0, 60.0))
-    first, second, third, fourth = ((float(a), float(b)) for a, b in (hz, amplitude, phase, direction))
+    first, second, third, fourth = (
+        (float(a), float(b)) for a, b in (hz, amplitude, phase, direction)
+    )
     duration = min(0.4, max(0.1, 6.0 / float(np.abs(hz).min())))
-    return Case("seed", seed, picture, Mirror(first, second, third, fourth, float(fold), incidence), None, duration)
+    return Case(
+        "seed",
+        seed,
+        picture,
+        Mirror(first, second, third, fourth, float(fold), incidence),
+        None,
+        duration,
+    )
 
 
 def vibration(rng: np.random.Generator, seed: int, picture: str) -> Case:
@@ -99,15 +113,22 @@ def shaken(hz: Any, amplitude_px: float, shape: str, second: float, seed: int) -
     """Return a vibration. ``amplitude_px`` is the largest displacement by the first harmonic at the centre."""
     rng = np.random.default_rng([seed, 1])
     forward = amplitude_px / CAMERA.fx / (1.0 + SHAPES[shape])
-    parts = [size * np.exp(2j * math.pi * rng.random()) for size in (SHAPES[shape] * forward, second * forward)]
+    parts = [
+        size * np.exp(2j * math.pi * rng.random())
+        for size in (SHAPES[shape] * forward, second * forward)
+    ]
     (bx, by), (sx, sy) = ((z.real, z.imag) for z in parts)
     return Vibration(hz, forward, math.tau * rng.random(), (bx, by), (0.0, 0.0), (sx, sy))
 
 
 USUAL = {
     "pair": Case("usual", 0, PICTURES[0], *pair_of((1.0, 0.8), (720.0, -500.0), (0.4, -1.3)), 0.4),
-    "mirror": Case("usual", 0, PICTURES[0], Mirror((60.0, 77.0), (0.0045, 0.0036), (0.3, -1.0)), duration_s=0.2),
-    "vibration": Case("usual", 0, PICTURES[0], shaken(100.0, 4.0, "ellipse", 0.1, 0), duration_s=0.1),
+    "mirror": Case(
+        "usual", 0, PICTURES[0], Mirror((60.0, 77.0), (0.0045, 0.0036), (0.3, -1.0)), duration_s=0.2
+    ),
+    "vibration": Case(
+        "usual", 0, PICTURES[0], shaken(100.0, 4.0, "ellipse", 0.1, 0), duration_s=0.1
+    ),
 }
 OPTICS: dict[str, Callable[[np.random.Generator, int, str], Case]] = {
     "pair": pair, "mirror": mirror, "vibration": vibration,
@@ -117,7 +138,10 @@ OPTICS: dict[str, Callable[[np.random.Generator, int, str], Case]] = {
 def seeds(optic: str, first: int, count: int) -> list[Case]:
     """Return cases with random values."""
     numbers = range(first, first + count)
-    return [OPTICS[optic](np.random.default_rng([s, 0]), s, PICTURES[s % len(PICTURES)]) for s in numbers]
+    return [
+        OPTICS[optic](np.random.default_rng([s, 0]), s, PICTURES[s % len(PICTURES)])
+        for s in numbers
+    ]
 
 
 def atlas(optic: str) -> list[Case]:
@@ -125,7 +149,11 @@ def atlas(optic: str) -> list[Case]:
     usual = USUAL[optic]
     noises: dict[str, dict[str, Any]] = {"usual noise": {}, "10 Hz": {"shot_noise_hz": 10.0},
                                          "30 Hz": {"shot_noise_hz": 30.0}}  # fmt: skip
-    counts = {"all events": (1.0, 1.0), "a third of the time": (1.0 / 3.0, 1.0), "thresholds 0.6": (1.0, 0.6)}
+    counts = {
+        "all events": (1.0, 1.0),
+        "a third of the time": (1.0 / 3.0, 1.0),
+        "thresholds 0.6": (1.0, 0.6),
+    }
     textures = {"texture": usual.picture, "little texture": "Dune.jpg"}
     off: Any = {"nominal": (1.25, 0.8)} if optic == "pair" else {"refractory_known": False}
     known: dict[str, dict[str, Any]] = {"known": {}, next(iter(off)) + " off": off}
@@ -133,10 +161,19 @@ def atlas(optic: str) -> list[Case]:
     for (a, noise), (b, (share, contrast)), (c, picture), (d, changes) in product(
         noises.items(), counts.items(), textures.items(), known.items()
     ):
-        sensor = noise | ({"contrast_on": contrast, "contrast_off": contrast} if contrast < 1.0 else {})
+        sensor = noise | (
+            {"contrast_on": contrast, "contrast_off": contrast} if contrast < 1.0 else {}
+        )
         name = ", ".join((a, b, c, d))
         cells.append(
-            replace(usual, name=name, picture=picture, sensor=sensor, duration_s=share * usual.duration_s, **changes)
+            replace(
+                usual,
+                name=name,
+                picture=picture,
+                sensor=sensor,
+                duration_s=share * usual.duration_s,
+                **changes,
+            )
         )
     return cells + specials(optic, usual)
 
@@ -144,7 +181,11 @@ def atlas(optic: str) -> list[Case]:
 def specials(optic: str, usual: Case) -> list[Case]:
     """Return cases with a difficulty that only this optic has."""
     if optic == "pair":
-        speeds = {"equal speeds": 720.0, "speeds that differ by 2 %": 734.0, "second prism at rest": 1e-3}
+        speeds = {
+            "equal speeds": 720.0,
+            "speeds that differ by 2 %": 734.0,
+            "second prism at rest": 1e-3,
+        }
         return [
             replace(usual, name=name, motion=pair_of((1.0, 0.8), (720.0, rpm), (0.4, -1.3))[1])
             for name, rpm in speeds.items()
@@ -152,8 +193,16 @@ def specials(optic: str, usual: Case) -> list[Case]:
     if optic == "mirror":
         assert isinstance(usual.optic, Mirror)
         return [
-            replace(usual, name="second tilt small: 0.3 px", optic=replace(usual.optic, amplitude=(0.0045, 0.00027))),
-            replace(usual, name="frequencies that differ by 2 %", optic=replace(usual.optic, hz=(60.0, 61.2))),
+            replace(
+                usual,
+                name="second tilt small: 0.3 px",
+                optic=replace(usual.optic, amplitude=(0.0045, 0.00027)),
+            ),
+            replace(
+                usual,
+                name="frequencies that differ by 2 %",
+                optic=replace(usual.optic, hz=(60.0, 61.2)),
+            ),
         ]
     rising = shaken([(0.0, 100.0), (usual.duration_s, 102.0)], 4.0, "ellipse", 0.1, 0)
     return [
@@ -171,7 +220,9 @@ def measure(case: Case, pictures: Path, device: str, pairs: int | None = None) -
         assert optic.second is not None
         assert case.motion is not None
         assert case.motion.second is not None
-        first, second = (k * one.apex for k, one in zip(case.nominal, (optic, optic.second), strict=True))
+        first, second = (
+            k * one.apex for k, one in zip(case.nominal, (optic, optic.second), strict=True)
+        )
         given["nominal_prism"] = Prism(first, second=Prism(second))
         true: Any = amiwarp.RisleyModel(CAMERA, optic, case.motion.phase, case.motion.second.phase)
         row |= {"apexes_deg": [math.degrees(one.apex) for one in (optic, optic.second)],
@@ -183,7 +234,9 @@ def measure(case: Case, pictures: Path, device: str, pairs: int | None = None) -
         **given,
     )  # fmt: skip
     row["events"] = len(recording.events)
-    known = amiwarp.SensorTiming(refractory_us=sensor.refractory_us if case.refractory_known else 0.0)
+    known = amiwarp.SensorTiming(
+        refractory_us=sensor.refractory_us if case.refractory_known else None
+    )
     model = {Prism: "risley", Mirror: "mirror", Vibration: "vibration"}[type(optic)]
     began = time.perf_counter()
     try:
@@ -202,9 +255,15 @@ def measure(case: Case, pictures: Path, device: str, pairs: int | None = None) -
     )
     share = 0.0
     if isinstance(optic, Vibration):
-        theta, values, rpm = rng.uniform(-math.pi, math.pi, len(xy)), optic.parameters(), found.parameters["rpm"]
+        theta, values, rpm = (
+            rng.uniform(-math.pi, math.pi, len(xy)),
+            optic.parameters(),
+            found.parameters["rpm"],
+        )
         true = amiwarp.VibrationModel.from_values(
-            CAMERA, Prism(0.0), amiwarp.VibrationModel.reversed_values(values) if rpm < 0.0 else values
+            CAMERA,
+            Prism(0.0),
+            amiwarp.VibrationModel.reversed_values(values) if rpm < 0.0 else values,
         )
         if isinstance(optic.hz, float):
             share = row["frequency_error"] = abs(abs(rpm) / (60.0 * optic.hz) - 1.0)
@@ -222,9 +281,15 @@ def measure(case: Case, pictures: Path, device: str, pairs: int | None = None) -
         return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
 
     # a vibration has no encoder that says where its angle begins
-    about = min(np.linspace(-math.pi, math.pi, 64), key=distance) if isinstance(optic, Vibration) else 0.0
+    about = (
+        min(np.linspace(-math.pi, math.pi, 64), key=distance)
+        if isinstance(optic, Vibration)
+        else 0.0
+    )
     bounds = about - 0.3, about + 0.3
-    lag = float(minimize_scalar(distance, bounds=bounds, method="bounded", options={"xatol": 1e-5}).x)
+    lag = float(
+        minimize_scalar(distance, bounds=bounds, method="bounded", options={"xatol": 1e-5}).x
+    )
     error, warnings = distance(lag), list(found.warnings)
     if isinstance(optic, Prism):
         apexes = dict(zip(("apex", "second_apex"), np.radians(row["apexes_deg"]), strict=True))
@@ -236,19 +301,25 @@ def measure(case: Case, pictures: Path, device: str, pairs: int | None = None) -
     }  # fmt: skip
 
 
-def rows_of(work: Callable[..., dict[str, Any]], calls: list[tuple[Any, ...]], processes: int) -> list[dict[str, Any]]:
+def rows_of(
+    work: Callable[..., dict[str, Any]], calls: list[tuple[Any, ...]], processes: int
+) -> list[dict[str, Any]]:
     """Return what ``work`` returns for each tuple of arguments, computed by processes that share the cores."""
     rows: dict[int, dict[str, Any]] = {}
     threads = max(1, cpu_threads() // processes)
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as workers:
-        jobs = {workers.submit(_with_threads, threads, work, call): k for k, call in enumerate(calls)}
+        jobs = {
+            workers.submit(_with_threads, threads, work, call): k for k, call in enumerate(calls)
+        }
         for job in as_completed(jobs):
             rows[jobs[job]] = job.result()
             print(json.dumps(rows[jobs[job]]), flush=True)
     return [rows[k] for k in sorted(rows)]
 
 
-def _with_threads(threads: int, work: Callable[..., dict[str, Any]], call: tuple[Any, ...]) -> dict[str, Any]:
+def _with_threads(
+    threads: int, work: Callable[..., dict[str, Any]], call: tuple[Any, ...]
+) -> dict[str, Any]:
     """Call a function with a limited number of threads."""
     with limited_cpu_threads(threads):
         return work(*call)
@@ -261,7 +332,11 @@ def optics(t: np.ndarray) -> dict[str, tuple[amiwarp.Model, Encoder, Callable[[A
     """Return model, encoder and float64 trace of each optic."""
     last = int(t[-1]) + 1
     one, two = (Encoder.constant_speed(rpm, 0, last) for rpm in (720.0, 500.0))
-    prism, plate, both = Prism(math.radians(1.0)), Plate(0.01, math.radians(45.0)), one.with_second(two)
+    prism, plate, both = (
+        Prism(math.radians(1.0)),
+        Plate(0.01, math.radians(45.0)),
+        one.with_second(two),
+    )
     twice = replace(prism, second=Prism(math.radians(0.8)))
     mirror_optic, shaking = USUAL["mirror"].optic, USUAL["vibration"].optic
     assert isinstance(mirror_optic, Mirror)
@@ -285,9 +360,14 @@ def speed(device: str, count: int, repeats: int = 9) -> list[dict[str, Any]]:
     rng = np.random.default_rng(0)
     t = np.sort(rng.integers(0, 400_000, count))
     x, y = (rng.integers(0, size, count).astype(np.uint16) for size in SIZE)
-    events = amiwarp.DeviceEvents.from_arrays(x, y, t, rng.integers(0, 2, count).astype(np.uint8), device=device)
+    events = amiwarp.DeviceEvents.from_arrays(
+        x, y, t, rng.integers(0, 2, count).astype(np.uint8), device=device
+    )
     given, times, results = optics(t), {}, {}
-    rows = {name: {"optic": name, "device": wp.get_device(device).name, "events": count} for name in given}
+    rows = {
+        name: {"optic": name, "device": wp.get_device(device).name, "events": count}
+        for name in given
+    }
     for _ in range(repeats):
         for name, (model, encoder, _) in given.items():
             for work in ("compensate", "iwe"):
@@ -301,9 +381,13 @@ def speed(device: str, count: int, repeats: int = 9) -> list[dict[str, Any]]:
                 times.setdefault((name, work), []).append(time.perf_counter() - began)
     for name, (_, encoder, trace) in given.items():
         expected = trace(np.stack([x, y], axis=1).astype(np.float64), encoder.angles_at(t))
-        moved = amiwarp.Events.from_arrays(*expected.T.astype(np.float32), t, np.ones(count, np.uint8))
+        moved = amiwarp.Events.from_arrays(
+            *expected.T.astype(np.float32), t, np.ones(count, np.uint8)
+        )
         away = results[name, "iwe"].numpy() - amiwarp.iwe(moved, *SIZE)
-        rows[name]["error_px"] = float(np.nanmax(np.abs(results[name, "compensate"].numpy() - expected)))
+        rows[name]["error_px"] = float(
+            np.nanmax(np.abs(results[name, "compensate"].numpy() - expected))
+        )
         rows[name]["wrong_votes_share"] = float(0.5 * np.abs(away).sum() / count)
     for (name, work), seconds in times.items():
         rows[name][f"{work}_mev_per_s"] = count / float(np.median(seconds[1:])) / 1e6
@@ -318,7 +402,9 @@ def speed(device: str, count: int, repeats: int = 9) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Run the cases and write their rows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=[*OPTICS, "speed"])
     parser.add_argument("pictures", type=Path, nargs="?")
     parser.add_argument("--out", type=Path, required=True)
@@ -334,8 +420,12 @@ def main() -> None:
     if options.what == "speed":
         options.out.write_text(json.dumps(speed(options.device, options.events), indent=1) + "\n")
         return
-    cases = seeds(options.what, options.first, options.seeds) + ([] if options.no_atlas else atlas(options.what))
-    calls = [(case, options.pictures, options.device, options.pairs) for case in cases[:: options.every]]
+    cases = seeds(options.what, options.first, options.seeds) + (
+        [] if options.no_atlas else atlas(options.what)
+    )
+    calls = [
+        (case, options.pictures, options.device, options.pairs) for case in cases[:: options.every]
+    ]
     options.out.write_text(json.dumps(rows_of(measure, calls, options.processes), indent=1) + "\n")
 
 

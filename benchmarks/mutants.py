@@ -43,7 +43,15 @@ from cosmic_ray.mutating import MutationVisitor
 from cosmic_ray.operators.operator import Operator
 from parso.python.tree import Name, PythonNode
 
-from benchmarks.copies import PATIENCE, ROOT, START_S, make_copies, run_python, write_code
+from benchmarks.copies import (
+    PATIENCE,
+    ROOT,
+    START_S,
+    files_of_tests,
+    make_copies,
+    run_python,
+    write_code,
+)
 
 CONFIG = ROOT / "benchmarks" / "mutants.toml"
 
@@ -72,7 +80,11 @@ class DropCall(Operator):
     def mutation_positions(self, node: Any) -> Iterator[Any]:
         """Yield the position of a statement that is a call."""
         call = node.children[0] if node.type == "simple_stmt" else node
-        if call is not node and call.type == "atom_expr" and call.children[-1].get_code().startswith("("):
+        if (
+            call is not node
+            and call.type == "atom_expr"
+            and call.children[-1].get_code().startswith("(")
+        ):
             yield call.start_pos, call.end_pos
 
     def mutate(self, node: PythonNode, index: int) -> PythonNode:
@@ -119,8 +131,14 @@ def places_of(area: str, module: str) -> list[Place]:
 
 
 def _operators() -> dict[str, Any]:
-    classes = {name: plugins.get_operator(name) for name in plugins.operator_names() if OPERATORS.fullmatch(name)}
-    return {"amiwarp/DropCall": DropCall()} | {name: operator() for name, operator in classes.items()}
+    classes = {
+        name: plugins.get_operator(name)
+        for name in plugins.operator_names()
+        if OPERATORS.fullmatch(name)
+    }
+    return {"amiwarp/DropCall": DropCall()} | {
+        name: operator() for name, operator in classes.items()
+    }
 
 
 def _skipped(tree: ast.AST) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
@@ -133,7 +151,9 @@ def _skipped(tree: ast.AST) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]
             parts.append(node)
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             parts.append(node)
-        if isinstance(node, ast.Assign) and re.fullmatch(r"[A-Z]\w+( \| [A-Z]\w+)+", ast.unparse(node.value)):
+        if isinstance(node, ast.Assign) and re.fullmatch(
+            r"[A-Z]\w+( \| [A-Z]\w+)+", ast.unparse(node.value)
+        ):
             parts.append(node.value)
         for part in filter(None, parts):
             yield (part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)
@@ -147,14 +167,17 @@ def sample(areas: list[dict[str, Any]], count: int, seed: int) -> list[Mutant]:
     rng = random.Random(seed)
     places: list[Place] = []
     for area in areas:
-        for module in sorted({str(p.relative_to(ROOT)) for glob in area["modules"] for p in ROOT.glob(glob)}):
+        for module in sorted(
+            {str(p.relative_to(ROOT)) for glob in area["modules"] for p in ROOT.glob(glob)}
+        ):
             found = places_of(area["name"], module)
             places += rng.sample(found, len(found))
     step = len(places) / count
     start = rng.uniform(0, step)
     print(f"{count} of {len(places)} places", flush=True)
     return [
-        next(filter(None, (_mutant(place, rng) for place in places[int(start + k * step) :]))) for k in range(count)
+        next(filter(None, (_mutant(place, rng) for place in places[int(start + k * step) :])))
+        for k in range(count)
     ]
 
 
@@ -166,7 +189,10 @@ def _mutant(place: Place, rng: random.Random) -> Mutant | None:
         try:
             code = MutationVisitor.mutate_code(source, _operators()[name], occurrence)
             ast.parse(code)
-        except (SyntaxError, AttributeError):  # ExceptionReplacer cannot change a dotted name among others
+        except (
+            SyntaxError,
+            AttributeError,
+        ):  # ExceptionReplacer cannot change a dotted name among others
             continue
         changed = [k for k in difflib.ndiff(source.splitlines(), code.splitlines()) if k[0] in "+-"]
         before, after = (" ".join(k[2:].strip() for k in changed if k[0] == sign) for sign in "-+")
@@ -192,21 +218,39 @@ class Map:
         Those of files that name the module come first, then those that run the line, then the fastest. Tests that call
         the module in the reading process may run it, too. If nothing is known, all tests of the area are taken.
         """
-        own = {test for test in self.seconds if Path(_file_of(test)).stem.removeprefix("test_") in files}
+        own = {
+            test
+            for test in self.seconds
+            if Path(_file_of(test)).stem.removeprefix("test_") in files
+        }
         lines: dict[int, list[str]] = {}
         for name in self._data.measured_files():
             if name.endswith(mutant.module):
                 lines = self._data.contexts_by_lineno(name)
         first, last, _ = _function(ast.parse((ROOT / mutant.module).read_text()), mutant.line)
-        near = {test for line in range(first, last + 1) for test in lines.get(line, ()) if test in self.seconds}
+        near = {
+            test
+            for line in range(first, last + 1)
+            for test in lines.get(line, ())
+            if test in self.seconds
+        }
         dotted = mutant.module.removesuffix(".py").replace("/", ".")
-        near |= {test for test, called in self._called.items() if any(dotted in _imported(name) for name in called)}
+        near |= {
+            test
+            for test, called in self._called.items()
+            if any(dotted in _imported(name) for name in called)
+        }
         near = near or own
         here, naming = set(lines.get(mutant.line, ())), _files_naming(dotted)
 
         def affordable(tests: set[str]) -> list[str]:
             ordered = sorted(
-                tests, key=lambda test: (_file_of(test) not in naming, test not in here, self.seconds[test])
+                tests,
+                key=lambda test: (
+                    _file_of(test) not in naming,
+                    test not in here,
+                    self.seconds[test],
+                ),
             )
             totals = itertools.accumulate(self.seconds[test] for test in ordered)
             return [test for test, total in zip(ordered, totals, strict=True) if total < most_s]
@@ -222,17 +266,34 @@ def _file_of(test: str) -> str:
 def _imported(dotted: str) -> frozenset[str]:
     """Return a module of ``amiwarp.io`` and those that it imports there, directly or not."""
     path = ROOT / f"{dotted.replace('.', '/')}.py"
-    names = re.findall(r"^from (amiwarp\.io\.\w+) import", path.read_text(), re.MULTILINE) if path.exists() else ()
+    names = (
+        re.findall(r"^from (amiwarp\.io\.\w+) import", path.read_text(), re.MULTILINE)
+        if path.exists()
+        else ()
+    )
     return frozenset({dotted}).union(*map(_imported, names))
 
 
 @functools.cache
 def _files_naming(dotted: str) -> set[str]:
-    """Return the test files that import a module by its name, or one of its public names from ``amiwarp``."""
-    stub = (ROOT / "amiwarp" / "__init__.pyi").read_text()
-    public = re.findall(rf"^from {dotted.removeprefix('amiwarp')} import (\w+) as", stub, re.MULTILINE)
-    names = {dotted, *(f"amiwarp.{name}" for name in public)}
-    return {str(path.relative_to(ROOT)) for path in ROOT.glob("tests/test_*.py") if names & _imports(path)}
+    """Return the test files that import a module, or a name that a package's stub takes from it."""
+    names = {dotted}
+    packages = dotted.split(".")[:-1]
+    for depth in range(1, len(packages) + 1):
+        package = ".".join(packages[:depth])
+        stub = ROOT.joinpath(*packages[:depth], "__init__.pyi")
+        module = dotted.removeprefix(package)
+        listed = re.findall(
+            rf"^from {re.escape(module)} import (\w+) as",
+            stub.read_text() if stub.exists() else "",
+            re.MULTILINE,
+        )
+        names |= {f"{package}.{name}" for name in listed}
+    return {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "tests").rglob("test_*.py")
+        if names & _imports(path)
+    }
 
 
 @functools.cache
@@ -241,7 +302,9 @@ def _imports(path: Path) -> set[str]:
     nodes = list(ast.walk(ast.parse(path.read_text())))
     modules = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
     given = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
-    return modules.union(*({node.module, *(f"{node.module}.{a.name}" for a in node.names)} for node in given))
+    return modules.union(
+        *({node.module, *(f"{node.module}.{a.name}" for a in node.names)} for node in given)
+    )
 
 
 def _function(tree: ast.AST, line: int, prefix: str = "") -> tuple[int, int, str]:
@@ -279,11 +342,12 @@ def record(folder: Path, copy: Path, files: list[str]) -> None:
         f"--rcfile={options}",
         "-m",
         "pytest",
-        *(f"tests/test_{name}.py" for name in files),
+        *files_of_tests(copy, files),
     ]
     code, output = run_python(copy, [*command, *PYTEST], None, environment)
     if code:
-        (folder / "tests.json").unlink(missing_ok=True)  # the next run would take it for the record of all tests
+        # The next run would take it for the record of all tests
+        (folder / "tests.json").unlink(missing_ok=True)
         raise SystemExit(f"{output[-3000:]}\nthe tests do not pass without a change")
 
 
@@ -309,14 +373,17 @@ class Worker:
         self._requests.close()
         self._process.wait()
 
-    def judge(self, mutant: Mutant, tests: list[list[str]], seconds: dict[str, float]) -> tuple[str, str]:
+    def judge(
+        self, mutant: Mutant, tests: list[list[str]], seconds: dict[str, float]
+    ) -> tuple[str, str]:
         """Run the tests on a mutant. Return ``killed`` or ``survived``, and what killed it."""
         path = self.copy / mutant.module
         if not self._ready and self._replies.readline() != "ready\n":
             raise SystemExit("the tests cannot be collected")
         self._ready = True
         original, changed = path.read_text(), path.stat().st_mtime
-        write_code(path, mutant.code)  # also if the function is replaced: other processes import the file
+        # Also if the function is replaced: other processes import the file
+        write_code(path, mutant.code)
         try:
             for some in filter(None, tests):
                 limit_s = PATIENCE * sum(seconds[test] for test in some) + START_S
@@ -333,7 +400,13 @@ class Worker:
     def _replaced(self, mutant: Mutant, tests: list[str], limit_s: float) -> str | None:
         """Run the tests with the changed function. Return what failed, or None if it cannot be changed."""
         path = str(self.copy / mutant.module)
-        request = {"path": path, "function": mutant.function, "code": mutant.code, "tests": tests, "limit_s": limit_s}
+        request = {
+            "path": path,
+            "function": mutant.function,
+            "code": mutant.code,
+            "tests": tests,
+            "limit_s": limit_s,
+        }
         self._requests.write(json.dumps(request) + "\n")
         self._requests.flush()
         cause: str | None = json.loads(self._replies.readline())
@@ -345,14 +418,21 @@ class Worker:
         if code == 4 and "not found:" in output:  # the change renames parametrised tests
             files = sorted({_file_of(test) for test in tests})
             code, output = run_python(self.copy, ["-m", "pytest", *files, *PYTEST], 4 * limit_s, {})
-        reasons = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR", "E  ", "timeout"))]
+        reasons = [
+            line
+            for line in output.splitlines()
+            if line.startswith(("FAILED", "ERROR", "E  ", "timeout"))
+        ]
         return "" if code == 0 else reasons[-1] if reasons else output.strip()[-200:]
 
 
 def explained(row: dict[str, Any], equivalents: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the outcome of a mutant. A survivor that changes nothing which a test can see is equivalent."""
     for known in equivalents if row["outcome"] == "survived" else ():
-        if all(known[name] == row[name] for name in ("module", "before")) and row["after"] in known["after"]:
+        if (
+            all(known[name] == row[name] for name in ("module", "before"))
+            and row["after"] in known["after"]
+        ):
             return row | {"outcome": "equivalent", "cause": known["reason"]}
     return row
 
@@ -366,15 +446,26 @@ def score(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def main() -> None:
     """Read the command line, judge the sample and print the survivors and the score."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=200, help="number of mutants")
     parser.add_argument("--seed", type=int, default=1, help="another seed gives another sample")
     parser.add_argument("--only", nargs="+", metavar="AREA", help="names of areas")
     parser.add_argument("--jobs", type=int, default=2, help="mutants at the same time")
-    parser.add_argument("--seconds", type=float, default=TESTS_S, help="duration of the tests of one mutant")
-    parser.add_argument("--map", type=Path, metavar="FOLDER", help="folder that keeps which test runs which line")
+    parser.add_argument(
+        "--seconds", type=float, default=TESTS_S, help="duration of the tests of one mutant"
+    )
+    parser.add_argument(
+        "--map", type=Path, metavar="FOLDER", help="folder that keeps which test runs which line"
+    )
     parser.add_argument("--out", type=Path, help="file of all mutants and their outcomes")
-    parser.add_argument("--again", type=Path, metavar="FILE.json", help="judge only the survivors of an earlier --out")
+    parser.add_argument(
+        "--again",
+        type=Path,
+        metavar="FILE.json",
+        help="judge only the survivors of an earlier --out",
+    )
     given = parser.parse_args()
     config = tomllib.loads(CONFIG.read_text())
     areas = [area for area in config["area"] if given.only is None or area["name"] in given.only]
@@ -387,7 +478,11 @@ def main() -> None:
         before = earlier.get("before", score(known_rows))
         rows = [row for row in known_rows if row["outcome"] != "survived"]
         settled = {(row["module"], row["before"], row["after"]) for row in rows}
-        mutants = [mutant for mutant in mutants if (mutant.module, mutant.before, mutant.after) not in settled]
+        mutants = [
+            mutant
+            for mutant in mutants
+            if (mutant.module, mutant.before, mutant.after) not in settled
+        ]
     names = list(dict.fromkeys(name for area in areas for name in area["tests"]))
     files_of = {area["name"]: area["tests"] for area in areas}
     with tempfile.TemporaryDirectory() as scratch, contextlib.ExitStack() as opened:
@@ -408,18 +503,27 @@ def main() -> None:
                 outcome, cause = worker.judge(mutant, tests, known.seconds)
             finally:
                 workers.put(worker)
-            row = {key: value for key, value in asdict(mutant).items() if key not in ("function", "code")}
+            row = {
+                key: value
+                for key, value in asdict(mutant).items()
+                if key not in ("function", "code")
+            }
             cause = re.sub(r"(?<![\w.])(/[\w.-]+){2,}/", "", cause)  # folders of this machine
-            row = explained(row | {"outcome": outcome, "cause": cause}, config.get("equivalent", []))
+            row = explained(
+                row | {"outcome": outcome, "cause": cause}, config.get("equivalent", [])
+            )
             rows.append(row)
             change = f"{mutant.module}:{mutant.line} {mutant.before}  ->  {mutant.after}"
             print(f"{row['outcome']:10} {change}  [{row['cause']}]", flush=True)
 
         with ThreadPoolExecutor(given.jobs) as pool:
-            list(pool.map(one, sorted(mutants, key=lambda mutant: not mutant.function)))  # the slow ones last
+            # The slow ones last
+            list(pool.map(one, sorted(mutants, key=lambda mutant: not mutant.function)))
     rows.sort(key=lambda row: (row["module"], row["line"]))
     total = score(rows)
-    print(f"{total['outcomes']}: {100 * total['score']:.1f} % of those that are not equivalent are killed")
+    print(
+        f"{total['outcomes']}: {100 * total['score']:.1f} % of those that are not equivalent are killed"
+    )
     if given.out:
         by_area = {name: score([row for row in rows if row["area"] == name]) for name in files_of}
         result = {"seed": given.seed, "before": before, **total, "areas": by_area, "mutants": rows}

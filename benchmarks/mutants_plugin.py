@@ -62,7 +62,9 @@ def pytest_sessionstart() -> None:
 
         send = ReadingProcess.send
 
-        def noted(process: ReadingProcess, function: Function, *arguments: object, **options: object) -> None:
+        def noted(
+            process: ReadingProcess, function: Function, *arguments: object, **options: object
+        ) -> None:
             named = [name_of(function), *(text for text in arguments if isinstance(text, str))]
             _modules.update(text.partition(":")[0] for text in named if text.startswith("amiwarp."))
             send(process, function, *arguments, **options)  # type: ignore[arg-type]
@@ -100,7 +102,9 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
     return True
 
 
-def _in_child(session: pytest.Session, request: dict[str, str], tests: list[pytest.Item]) -> str | None:
+def _in_child(
+    session: pytest.Session, request: dict[str, str], tests: list[pytest.Item]
+) -> str | None:
     """Fork, change the function in the child and run the tests there. Return None if the function cannot be changed."""
     reading, writing = os.pipe()
     child = os.fork()
@@ -133,11 +137,20 @@ def _replace(path: str, name: str, source: str) -> bool:
                 yield constant
                 yield from codes(constant)
 
-    new = {code.co_firstlineno: code for code in codes(compile(source, path, "exec")) if code.co_qualname == name}
+    new = {
+        code.co_firstlineno: code
+        for code in codes(compile(source, path, "exec"))
+        if code.co_qualname == name
+    }
     gc.unfreeze()  # conftest.py hides all that exists from the collector, and so from the next line
-    functions = [one for one in gc.get_objects() if type(one) is FunctionType and one.__code__.co_filename == path]
+    functions = [
+        one
+        for one in gc.get_objects()
+        if type(one) is FunctionType and one.__code__.co_filename == path
+    ]
     changed = [function for function in functions if function.__code__.co_qualname == name]
     for function in changed:
         function.__code__ = new[function.__code__.co_firstlineno]
     loaded = any(getattr(module, "__file__", None) == path for module in list(sys.modules.values()))
-    return bool(changed) or not loaded  # a module that is not loaded yet will be imported with the change
+    # A module that is not loaded yet will be imported with the change
+    return bool(changed) or not loaded

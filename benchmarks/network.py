@@ -12,7 +12,7 @@ picture of a video.
 The network in the package was trained for 380 s, then for 250 s with ``--start`` and ``--first 100000 --rate 1e-3
 --cameras 96 --side 224 --pool 6144 --batch 24 --repeats 12``.
 
-The inputs are those of :func:`amiwarp.imaging.networks.sums_of_parts`.
+The inputs are those of :func:`amiwarp.learning.quarter_turn.sums_of_parts`.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from amiwarp import (
     windows,
 )
 from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
-from amiwarp.imaging.networks import BINS, INPUTS, chords_of, sums_of_parts
+from amiwarp.learning.quarter_turn import BINS, INPUTS, chords_of, sums_of_parts
 from benchmarks.reconstruct import CAMERA, PHASE, PRISM, textured
 
 STEPS = 4
@@ -84,7 +84,9 @@ class UNet(nn.Module):  # type: ignore[misc]
             here = layer(functional.avg_pool2d(here, 2))
             kept.append(here)
         for k, layer in enumerate(self.up):
-            wide = functional.interpolate(here, scale_factor=2.0, mode="bilinear", align_corners=False)
+            wide = functional.interpolate(
+                here, scale_factor=2.0, mode="bilinear", align_corners=False
+            )
             here = functional.leaky_relu(layer(wide + kept[-2 - k]), 0.1)
         return self.last(here)
 
@@ -105,18 +107,30 @@ def leaves(n: int, side: int, rng: torch.Generator, device: str) -> Tensor:
         return torch.rand(*shape, generator=rng, device=device)
 
     frequency = torch.fft.fftfreq(side, device=device)
-    radius = torch.hypot(frequency[:, None], frequency[None, : side // 2 + 1].abs()).clamp_min(1.0 / side)
+    radius = torch.hypot(frequency[:, None], frequency[None, : side // 2 + 1].abs()).clamp_min(
+        1.0 / side
+    )
     noise = torch.fft.rfft2(torch.randn(n, side, side, generator=rng, device=device))
     texture = torch.fft.irfft2(noise * radius ** -(0.6 + random(n, 1, 1)), s=(side, side))
     texture = texture / texture.std((1, 2), keepdim=True)
-    y, x = (torch.linspace(-1.0, 1.0, side, device=device).view(*shape) for shape in ((1, side, 1), (1, 1, side)))
+    y, x = (
+        torch.linspace(-1.0, 1.0, side, device=device).view(*shape)
+        for shape in ((1, side, 1), (1, 1, side))
+    )
     level = 0.5 + 0.5 * x * (random(n, 1, 1) - 0.5) + 0.5 * y * (random(n, 1, 1) - 0.5)
     picture = level + 0.3 * random(n, 1, 1) * texture
     count = int(8 + 72 * torch.rand(1, generator=rng, device=device).item())
     for k in range(count):
         size = 0.6 * random(n, 1, 1) ** 2 * (1.0 - 0.7 * k / count) + 0.02
-        cx, cy, turn = 2.4 * random(n, 1, 1) - 1.2, 2.4 * random(n, 1, 1) - 1.2, math.tau * random(n, 1, 1)
-        u, v = (x - cx) * turn.cos() + (y - cy) * turn.sin(), (y - cy) * turn.cos() - (x - cx) * turn.sin()
+        cx, cy, turn = (
+            2.4 * random(n, 1, 1) - 1.2,
+            2.4 * random(n, 1, 1) - 1.2,
+            math.tau * random(n, 1, 1),
+        )
+        u, v = (
+            (x - cx) * turn.cos() + (y - cy) * turn.sin(),
+            (y - cy) * turn.cos() - (x - cx) * turn.sin(),
+        )
         slim = 0.1 + 0.9 * random(n, 1, 1)
         disc = torch.hypot(u, v / slim) < size
         box = (u.abs() < size) & (v.abs() < size * slim)
@@ -148,11 +162,14 @@ class World:
 
     def view(self, x: Tensor, y: Tensor, t_s: float) -> Tensor:
         """Return log intensity at places of the scene [px from its middle], shape (H, W) each, at a time."""
-        scale = 4.0 / self.background.shape[-1]  # canvases have two pixels per pixel, and coordinates from -1 to 1
+        # Canvases have two pixels per pixel, and coordinates from -1 to 1
+        scale = 4.0 / self.background.shape[-1]
 
         def sampled(picture: Tensor, u: Tensor, v: Tensor) -> Tensor:
             where = torch.stack([u * scale, v * scale], -1)
-            return functional.grid_sample(picture, where, padding_mode="reflection", align_corners=False)[:, 0]
+            return functional.grid_sample(
+                picture, where, padding_mode="reflection", align_corners=False
+            )[:, 0]
 
         drift = self.drift.view(-1, 2, 1, 1) * t_s
         seen = sampled(self.background, x - drift[:, 0], y - drift[:, 1])
@@ -170,7 +187,9 @@ class World:
         return torch.log(seen + WHITE)
 
 
-def world(pictures: Tensor, side: tuple[int, int], still: Tensor, px_per_s: float, rng: torch.Generator) -> World:
+def world(
+    pictures: Tensor, side: tuple[int, int], still: Tensor, px_per_s: float, rng: torch.Generator
+) -> World:
     """Return a world that moves by up to ``px_per_s``, at rest where ``still``. Bodies have each other's pictures."""
     n, device = len(pictures), pictures.device
 
@@ -200,7 +219,9 @@ def recorded(
     rows, columns = np.mgrid[: camera.height, : camera.width]
     pixels = np.stack([columns.ravel(), rows.ravel()], 1).astype(np.float64)
     for t in times:
-        seen = np.asarray(model.compensate_points(pixels, np.full(len(pixels), encoder.angles_at([t])[0])))
+        seen = np.asarray(
+            model.compensate_points(pixels, np.full(len(pixels), encoder.angles_at([t])[0]))
+        )
         x, y = torch.tensor((seen - [camera.cx, camera.cy]).T, dtype=torch.float32, device=device)
         size = camera.height, camera.width
         yield sensor.step(scene.view(x.view(size), y.view(size), t * 1e-6).contiguous(), int(t))
@@ -209,8 +230,13 @@ def recorded(
 def truth(scene: World, camera: Camera, t_us: float) -> Tensor:
     """Return log intensity without the prism, shape (n, H, W)."""
     device = scene.background.device
-    x, y = torch.arange(camera.width, device=device) - camera.cx, torch.arange(camera.height, device=device) - camera.cy
-    return scene.view(x[None, :].expand(camera.height, -1), y[:, None].expand(-1, camera.width), t_us * 1e-6)
+    x, y = (
+        torch.arange(camera.width, device=device) - camera.cx,
+        torch.arange(camera.height, device=device) - camera.cy,
+    )
+    return scene.view(
+        x[None, :].expand(camera.height, -1), y[:, None].expand(-1, camera.width), t_us * 1e-6
+    )
 
 
 # Training.
@@ -230,16 +256,27 @@ def samples(cameras: int, side: int, seed: int, device: str) -> Iterator[tuple[T
     """Yield inputs and truth of two successive quarter turns of random worlds, half of them at rest."""
     rng, generator = np.random.default_rng([seed, 5]), torch.Generator(device).manual_seed(seed)
     camera = Camera(side, side, 300.0, 300.0, 0.5 * (side - 1), 0.5 * (side - 1))
-    radius, quarter = float(rng.uniform(1.5, 6.0)), int(rng.uniform(10_000, 30_000)) // (BINS * STEPS)
+    radius, quarter = (
+        float(rng.uniform(1.5, 6.0)),
+        int(rng.uniform(10_000, 30_000)) // (BINS * STEPS),
+    )
     quarter *= BINS * STEPS
     begin = math.tau * float(rng.random())
     model = CircleModel(camera, radius / camera.fx, begin)
     last = 4 * quarter
     encoder = Encoder.constant_speed(15e6 / quarter, 0, last, direction=int(rng.choice([-1, 1])))
     sensor_model, contrast = random_sensor(rng)
-    sensor = EventSensor(cameras, side, side, sensor_model, seed=seed * cameras % (1 << 30), device=device)
+    sensor = EventSensor(
+        cameras, side, side, sensor_model, seed=seed * cameras % (1 << 30), device=device
+    )
     still = torch.arange(cameras, device=device) % 2 == 0
-    scene = world(leaves(cameras, 2 * (side + 32), generator, device), (side, side), still, 12e6 / quarter, generator)
+    scene = world(
+        leaves(cameras, 2 * (side + 32), generator, device),
+        (side, side),
+        still,
+        12e6 / quarter,
+        generator,
+    )
     step = quarter // (BINS * STEPS)
     times = np.arange(0, 3 * quarter + 1, step)
     seen = recorded(scene, model, encoder, sensor, times)
@@ -250,11 +287,16 @@ def samples(cameras: int, side: int, seed: int, device: str) -> Iterator[tuple[T
         for b in range(BINS):
             for _ in range(STEPS):
                 events, found = next(seen)
-                counts = polarity_histogram(events, side, side, windows=found, model=model, encoder=encoder)
+                counts = polarity_histogram(
+                    events, side, side, windows=found, model=model, encoder=encoder
+                )
                 parts[:, b] += torch.from_dlpack(counts)
         ends = np.arange(BINS + 1) * quarter // BINS + k * quarter
         target = truth(scene, camera, (k + 0.5) * quarter) / contrast
-        yield sums_of_parts(parts, chords_of(model, encoder, ends)), target - target.mean((1, 2), keepdim=True)
+        yield (
+            sums_of_parts(parts, chords_of(model, encoder, ends)),
+            target - target.mean((1, 2), keepdim=True),
+        )
 
 
 def similarity(found: Tensor, true: Tensor) -> Tensor:
@@ -267,7 +309,9 @@ def similarity(found: Tensor, true: Tensor) -> Tensor:
 
     ma, mb = mean(a), mean(b)
     va, vb, cov = mean(a * a) - ma**2, mean(b * b) - mb**2, mean(a * b) - ma * mb
-    return (((2 * ma * mb + 1e-4) * (2 * cov + 9e-4)) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))[:, 0]
+    return (
+        ((2 * ma * mb + 1e-4) * (2 * cov + 9e-4)) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
+    )[:, 0]
 
 
 def loss(found: Tensor, true: Tensor) -> Tensor:
@@ -355,14 +399,20 @@ def by_network(network: Network, recording: Recording, model: Model) -> Tensor:
     assert isinstance(recording.events, DeviceMemoryEvents)
     end = START_US + TURN_US // 4
     events, size = recording.events.between_on_device(START_US, end), recording.events.size
-    out = network(events, *size, t_start=START_US, t_end=end, model=model, encoder=recording.encoder)
+    out = network(
+        events, *size, t_start=START_US, t_end=end, model=model, encoder=recording.encoder
+    )
     return torch.from_dlpack(out)[0]
 
 
 def by_solver(recording: Recording, model: Model, device: str) -> Tensor:
     """Return the solver's log intensity of the same events, shape (H, W)."""
     found = Reconstruction(recording, model=model, device=device).window(START_US, TURN_US // 4)
-    return torch.from_dlpack(found.log) if isinstance(found.log, wp.array) else torch.from_numpy(found.log)
+    return (
+        torch.from_dlpack(found.log)
+        if isinstance(found.log, wp.array)
+        else torch.from_numpy(found.log)
+    )
 
 
 def timed(work: Callable[[], Tensor], repeats: int = 5) -> tuple[np.ndarray, float]:
@@ -381,11 +431,17 @@ def judged(log: np.ndarray, true: np.ndarray, areas: dict[str, np.ndarray]) -> d
     fitted = quality.gain * log + quality.offset
     span = float(np.ptp(np.percentile(true, TRUTH_PERCENTILES)))
     _, similar = structural_similarity(true, fitted, data_range=span, full=True)
-    return {name: float(similar[where].mean()) for name, where in areas.items()} | {"correlation": quality.correlation}
+    return {name: float(similar[where].mean()) for name, where in areas.items()} | {
+        "correlation": quality.correlation
+    }
 
 
 def compared(
-    network: Network, recording: Recording, model: Model, true: np.ndarray, moving: np.ndarray | None = None
+    network: Network,
+    recording: Recording,
+    model: Model,
+    true: np.ndarray,
+    moving: np.ndarray | None = None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return what both methods measure, and their pictures."""
     assert isinstance(recording.events, DeviceMemoryEvents)
@@ -411,16 +467,26 @@ def compared(
     return row, pictures
 
 
-def at_rest(picture: Path, contrast: float, noise_hz: float, device: str) -> tuple[Recording, Model, np.ndarray]:
+def at_rest(
+    picture: Path, contrast: float, noise_hz: float, device: str
+) -> tuple[Recording, Model, np.ndarray]:
     """Return a recording of a picture at rest, by the simulator and the exact model, and its true log intensity."""
     sensor = SensorModel(contrast_on=contrast, contrast_off=contrast, shot_noise_hz=noise_hz)
     motion = PrismMotion(60e6 / TURN_US, PHASE)
     scene = Scene.from_picture(picture)
-    through = Simulation(scene, CAMERA, PRISM, 1.3 * TURN_US * 1e-6, motion, sensor=sensor, device=device)
-    return on_device(through.run(), device), ExactModel(CAMERA, PRISM, PHASE), through.log_view().astype(np.float64)
+    through = Simulation(
+        scene, CAMERA, PRISM, 1.3 * TURN_US * 1e-6, motion, sensor=sensor, device=device
+    )
+    return (
+        on_device(through.run(), device),
+        ExactModel(CAMERA, PRISM, PHASE),
+        through.log_view().astype(np.float64),
+    )
 
 
-def in_motion(pictures: Tensor, seed: int, device: str) -> tuple[Recording, Model, np.ndarray, np.ndarray]:
+def in_motion(
+    pictures: Tensor, seed: int, device: str
+) -> tuple[Recording, Model, np.ndarray, np.ndarray]:
     """Return a recording of bodies that move over a picture, and where bodies are in the middle of the quarter turn."""
     model = CircleModel(CAMERA, PRISM.deflection, PHASE)
     encoder = Encoder.constant_speed(60e6 / TURN_US, 0, 2 * TURN_US)
@@ -432,10 +498,14 @@ def in_motion(pictures: Tensor, seed: int, device: str) -> tuple[Recording, Mode
                 [z[:1] for z in both.motions], both.drift[:1])  # fmt: skip
     for motion in one.motions:  # bodies are near the middle of the image during the quarter turn
         motion[:, :2] = 0.6 * motion[:, :2] - motion[:, 2:4] * 1.125e-6 * TURN_US
-    sensor = EventSensor(1, CAMERA.height, CAMERA.width, SensorModel(shot_noise_hz=1.0), seed=seed, device=device)
+    sensor = EventSensor(
+        1, CAMERA.height, CAMERA.width, SensorModel(shot_noise_hz=1.0), seed=seed, device=device
+    )
     times = np.arange(0, TURN_US * 5 // 4 + 1, TURN_US // 96)
     seen = [events.to_host() for events, _ in recorded(one, model, encoder, sensor, times)]
-    columns = [np.concatenate([getattr(part, name) for part in seen]) for name in ("x", "y", "t", "p")]
+    columns = [
+        np.concatenate([getattr(part, name) for part in seen]) for name in ("x", "y", "t", "p")
+    ]
     events = DeviceEvents.from_arrays(*columns, device=device)
     recording = Recording(DeviceMemoryEvents(events, CAMERA.width, CAMERA.height), encoder=encoder)
     true = truth(one, CAMERA, 1.125 * TURN_US)[0].double().cpu().numpy()
@@ -464,7 +534,9 @@ def evaluate(options: argparse.Namespace) -> None:
         rows.append({"seed": seed} | row)
         print(json.dumps(rows[-1]), flush=True)
         shown += [pictures] if seed < 4 else []
-    options.out.write_text(json.dumps({"device": str(wp.get_device(device).name), "rows": rows}, indent=1) + "\n")
+    options.out.write_text(
+        json.dumps({"device": str(wp.get_device(device).name), "rows": rows}, indent=1) + "\n"
+    )
     if options.figure:
         draw(shown, options.figure)
 
@@ -495,7 +567,9 @@ def draw(shown: list[dict[str, np.ndarray]], path: Path) -> None:
 
 def main() -> None:
     """Train or evaluate."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, required=True)
     commands = parser.add_subparsers(dest="command", required=True)

@@ -1,4 +1,4 @@
-"""Print the tables of docs/explanation/optics.md: errors of the models, and rounding errors of the exact model.
+"""Print the tables of benchmarks/results/optics.md: errors of the models, and rounding errors of the exact model.
 
     python -m benchmarks.optics_table
 
@@ -47,7 +47,9 @@ def fitted_circle(exact: ExactModel) -> ModelError:
         model = CircleModel(exact.camera, deflection, flat_side=exact.prism.flat_side)
         return predicted_error(model, exact, grid=GRID)
 
-    best = minimize_scalar(lambda d: error(d).rms, bounds=(0.8 * start, 2.0 * start), options={"xatol": 1e-6}).x
+    best = minimize_scalar(
+        lambda d: error(d).rms, bounds=(0.8 * start, 2.0 * start), options={"xatol": 1e-6}
+    ).x
     return error(float(best))
 
 
@@ -59,9 +61,14 @@ def ladder_rows() -> Iterator[str]:
         camera = Camera.from_fov(640, 480, math.radians(fov))
         for deflection in (0.5, 1.0, 2.0):
             for side in FlatSide:
-                prism = Prism(apex_from_deflection(math.radians(deflection), INDEX, side), INDEX, side)
+                prism = Prism(
+                    apex_from_deflection(math.radians(deflection), INDEX, side), INDEX, side
+                )
                 exact = ExactModel(camera, prism)
-                rungs = [predicted_error(CircleModel.from_prism(camera, prism), exact, grid=GRID), fitted_circle(exact)]
+                rungs = [
+                    predicted_error(CircleModel.from_prism(camera, prism), exact, grid=GRID),
+                    fitted_circle(exact),
+                ]
                 rungs += [predicted_error(m.from_prism(camera, prism), exact, grid=GRID)
                           for m in (RadialCircleModel, EllipseModel)]  # fmt: skip
                 cells = [f"{e.rms:.2f}/{e.worst:.2f}" for e in rungs[:2]]
@@ -72,7 +79,9 @@ def ladder_rows() -> Iterator[str]:
 def lens_camera(width: int, height: int, fov: float, lens: Distortion | None) -> Camera:
     """Return a camera whose horizontal field of view, including the lens distortion, is ``fov`` [rad]."""
     bare = Camera(width, height, float(width), float(width), 0.0, 0.0, lens)
-    edge = oracle.rays_to_pixels(bare, np.array([[math.sin(fov / 2), 0.0, math.cos(fov / 2)]]))[0, 0]
+    edge = oracle.rays_to_pixels(bare, np.array([[math.sin(fov / 2), 0.0, math.cos(fov / 2)]]))[
+        0, 0
+    ]
     focal = width**2 / (2.0 * float(edge))
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, lens)
 
@@ -95,7 +104,9 @@ def rounding(camera: Camera, *, count: int = 20_000) -> tuple[float, float]:
             for to_scene, got in ((True, seen), (False, model.deflect_points(xy, theta))):
                 expected = oracle.move(camera, prism, xy, theta, to_scene=to_scene, tilt=tilt)
                 deviation = max(deviation, float(np.linalg.norm(got - expected, axis=1).max()))
-            back = max(back, float(np.linalg.norm(model.deflect_points(seen, theta) - xy, axis=1).max()))
+            back = max(
+                back, float(np.linalg.norm(model.deflect_points(seen, theta) - xy, axis=1).max())
+            )
     return deviation, back
 
 
@@ -105,7 +116,10 @@ def rounding_rows() -> Iterator[str]:
     yield "|---|---|---|---|---|"
     for width, height in ((346, 260), (640, 480), (1280, 720), (2560, 1440)):
         for fov in (40, 60, 90):
-            pairs = [rounding(lens_camera(width, height, math.radians(fov), lens)) for lens in LENSES.values()]
+            pairs = [
+                rounding(lens_camera(width, height, math.radians(fov), lens))
+                for lens in LENSES.values()
+            ]
             cells = " | ".join(f"{a * 1e3:.2f} / {b * 1e3:.2f}" for a, b in pairs)
             yield f"| {width}×{height} | {fov}° | {cells} |"
 

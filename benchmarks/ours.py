@@ -12,9 +12,12 @@ import numpy as np
 import warp as wp
 
 from amiwarp import Calibration, Model, Picture, Reconstruction, Vote, calibrate, model_error
-from amiwarp.imaging.iwe import TURNS, CanvasShape, Image, TileVotes, Votes, upload_events
+from amiwarp.imaging.canvas import CanvasShape, Image
 from amiwarp.imaging.metrics import PictureQuality, picture_quality
-from amiwarp.optics.models import MODELS
+from amiwarp.imaging.tile_votes import TileVotes
+from amiwarp.imaging.uploaded_events import TURNS, upload_events
+from amiwarp.imaging.votes import Votes
+from amiwarp.optics.models.registry import MODELS
 from benchmarks import peers, truth
 from benchmarks.job import Job
 from benchmarks.libraries import Peer
@@ -29,11 +32,15 @@ FILE_PASSES = 3
 
 
 def model_of(scene: EventScene, name: str) -> Model:
-    return scene.keep(("model", name), lambda: MODELS[name].from_prism(scene.camera, scene.prism, PHASE))
+    return scene.keep(
+        ("model", name), lambda: MODELS[name].from_prism(scene.camera, scene.prism, PHASE)
+    )
 
 
 def uploaded(scene: EventScene, device: str) -> Any:
-    return scene.keep(("uploaded", device), lambda: upload_events(scene.events, scene.theta, device))
+    return scene.keep(
+        ("uploaded", device), lambda: upload_events(scene.events, scene.theta, device)
+    )
 
 
 def image(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
@@ -60,7 +67,9 @@ def errors(scene: EventScene, model: str, vote: Vote, result: Image) -> dict[str
     """
     xy, theta = scene.sample()
     angle = np.rint(theta * (TURNS / (2.0 * np.pi))) * (2.0 * np.pi / TURNS)
-    return truth.iwe_errors(scene, model, vote, result.numpy()[0], model_of(scene, model).compensate_points(xy, angle))
+    return truth.iwe_errors(
+        scene, model, vote, result.numpy()[0], model_of(scene, model).compensate_points(xy, angle)
+    )
 
 
 def prepared(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
@@ -73,7 +82,9 @@ def prepared(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
     result = Image(canvas, 1, device)
     votes = TileVotes(result, canvas, uploaded(scene, device), true, candidates=CANDIDATES)
     for k in range(CANDIDATES):
-        votes.set(k, replace(true, deflection=true.deflection * (1.0 - 0.02 * (CANDIDATES - 1 - k))))
+        votes.set(
+            k, replace(true, deflection=true.deflection * (1.0 - 0.02 * (CANDIDATES - 1 - k)))
+        )
 
     def found() -> dict[str, float]:
         votes.read(CANDIDATES - 1, result)
@@ -123,7 +134,9 @@ def warp_atomics(scene: EventScene, device: str, model: str, vote: Vote) -> Job:
     return peers.job(scene, vote, Peer(run, result.numpy, events))
 
 
-def calibration(scene: RecordingScene, device: str, model: str, vote: Vote, *, stages: tuple[str, ...]) -> Job:
+def calibration(
+    scene: RecordingScene, device: str, model: str, vote: Vote, *, stages: tuple[str, ...]
+) -> Job:
     """Prepare a calibration of a recording in host memory, with default settings and no initial guess."""
     found: list[Calibration] = []
 
@@ -149,7 +162,9 @@ def picture(scene: RecordingScene, device: str, model: str, vote: Vote) -> Job:
     def run() -> None:
         work = Reconstruction(scene.recording, model=scene.model, device=device)
         _, turn = work.span()
-        found[:] = [work.window(max(events.t_first, (events.t_first + events.t_last - turn) // 2), turn)]
+        found[:] = [
+            work.window(max(events.t_first, (events.t_first + events.t_last - turn) // 2), turn)
+        ]
 
     def quality() -> PictureQuality:
         return picture_quality(found[0].log, scene.view)
@@ -167,12 +182,28 @@ def picture(scene: RecordingScene, device: str, model: str, vote: Vote) -> Job:
 
 def file(scene: FileScene, device: str, model: str, vote: Vote) -> Job:
     """Prepare the compensation of a file into a file, in a separate process so that its peak memory can be measured."""
-    command = [sys.executable, "-m", "benchmarks.compensate", "--row", str(scene.source), "--models", model]
-    command += ["--device", device, "--repeats", str(FILE_PASSES + 1), *["--columns"] * bool(scene.missing)]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.compensate",
+        "--row",
+        str(scene.source),
+        "--models",
+        model,
+    ]
+    command += [
+        "--device",
+        device,
+        "--repeats",
+        str(FILE_PASSES + 1),
+        *["--columns"] * bool(scene.missing),
+    ]
     ran = subprocess.run(command, stdout=subprocess.PIPE, cwd=Path(__file__).parents[1], check=True)
     row = json.loads(ran.stdout.splitlines()[-1])
     also = {"peak_mib": row["peak_mib"], "of_copy": row["of_copy"]}
-    also |= {f"{name}_alone_mev_per_s": rate for name, rate in row.get("alone_mev_per_s", {}).items()}
+    also |= {
+        f"{name}_alone_mev_per_s": rate for name, rate in row.get("alone_mev_per_s", {}).items()
+    }
     note = f"bare columns, without {' and '.join(scene.missing)}" if scene.missing else ""
     places = {"places_px": row["error_px"]}
     return Job(lambda: None, lambda: places, len(scene), lambda: also, iter(row["seconds"]), note)

@@ -33,6 +33,8 @@ def job(scene: EventScene, vote: Vote, peer: Peer, model: str = "plane circle") 
     return Job(peer.run, errors, len(scene))
 
 
-def image(way: Callable[[PeerEvents, str], Peer], scene: EventScene, device: str, model: str, vote: Vote) -> Job:
+def image(
+    way: Callable[[PeerEvents, str], Peer], scene: EventScene, device: str, model: str, vote: Vote
+) -> Job:
     """Prepare the timed job of one of the functions of :mod:`benchmarks.libraries`."""
     return job(scene, vote, way(peer_events(scene), device), model)

@@ -48,7 +48,12 @@ def panels(seed: int, contrast: float = 0.8) -> amiwarp.WorldScene:
 
 
 def measure(
-    name: str, scene: amiwarp.WorldScene, seed: int, size: list[int], device: str, changes: dict[str, Any]
+    name: str,
+    scene: amiwarp.WorldScene,
+    seed: int,
+    size: list[int],
+    device: str,
+    changes: dict[str, Any],
 ) -> dict[str, Any]:
     """Return the errors of phase and depth of one simulation. ``nominal``: plate that the recording states."""
     values = {"duration_s": 0.42, "sensor": amiwarp.SensorModel(), "nominal": PLATE} | changes
@@ -75,7 +80,9 @@ def measure(
     relative, away = np.abs(error * truth[known]), np.abs(error) / found.std[known]
     latency = simulation.sensor.latency_us * 1e-6 * 720.0 / 60.0 * math.tau
     turned = math.remainder(calibration.parameters["phase"] - (PHASE - latency), math.tau)
-    radius = orbit_px(replace(calibration.model, plate=PLATE)) * float(np.median(1.0 / truth[known]))  # type: ignore[type-var,arg-type]
+    radius = orbit_px(replace(calibration.model, plate=PLATE)) * float(
+        np.median(1.0 / truth[known])
+    )  # type: ignore[type-var,arg-type]
     return row | {
         "known": int(known.sum()), "median_relative_error": float(np.median(relative)),
         "bias": float(np.median(error * truth[known])), "p95_relative_error": float(np.percentile(relative, 95)),
@@ -109,9 +116,13 @@ def atlas() -> list[tuple[str, float, dict[str, Any]]]:
 
 def main() -> None:
     """Measure all cases and write them to a file."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--desk", action="store_true", help="also simulate the desk, which takes minutes on a CPU")
+    parser.add_argument(
+        "--desk", action="store_true", help="also simulate the desk, which takes minutes on a CPU"
+    )
     parser.add_argument("--no-atlas", action="store_true")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--size", type=int, nargs=2, default=[320, 240])
@@ -121,12 +132,18 @@ def main() -> None:
     where = options.size, options.device
     calls: list[Call] = []
     if options.desk:  # the longest
-        calls.append(("desk", amiwarp.WorldScene(*amiwarp.named_world("desk", "still")), 0, *where, {}))
+        calls.append(
+            ("desk", amiwarp.WorldScene(*amiwarp.named_world("desk", "still")), 0, *where, {})
+        )
     calls += [("panels", panels(seed), seed, *where, {}) for seed in range(options.seeds)]
     if not options.no_atlas:
-        calls += [(name, panels(0, contrast), 0, *where, changes) for name, contrast, changes in atlas()]
+        calls += [
+            (name, panels(0, contrast), 0, *where, changes) for name, contrast, changes in atlas()
+        ]
     rows = rows_of(measure, calls, options.processes)
-    options.out.write_text(json.dumps({"protocol": __doc__, "size": options.size, "rows": rows}, indent=1) + "\n")
+    options.out.write_text(
+        json.dumps({"protocol": __doc__, "size": options.size, "rows": rows}, indent=1) + "\n"
+    )
 
 
 if __name__ == "__main__":

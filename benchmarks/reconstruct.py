@@ -54,8 +54,8 @@ from amiwarp import (
 )
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
-from amiwarp.io.plain_files import read_calib
-from amiwarp.simulation.scenery import place_scene
+from amiwarp.io.camera_files import read_calib
+from amiwarp.simulation.picture_maps import place_scene
 
 CAMERA = Camera.from_fov(346, 260, math.radians(60.0))
 PRISM, PHASE = Prism(math.radians(1.0)), 1.0
@@ -73,7 +73,11 @@ DECAY_S = 0.1
 """Time constant of the high-pass filter of the method ``leaky`` [s]."""
 SHOWN = 0.25
 """Share of noise among the events of the pictures in the figure, which have a threshold of 0.25."""
-PEERS = {"panning": "panning, no prism", "integration": "integrated events", "leaky": "high-pass filter"}
+PEERS = {
+    "panning": "panning, no prism",
+    "integration": "integrated events",
+    "leaky": "high-pass filter",
+}
 """Other methods and their titles in the figure, for windows of one turn."""
 METHODS = ("amiwarp", *PEERS)
 PROBE_S = 0.06
@@ -82,10 +86,18 @@ MARGIN = 64
 """Margin of the wider view from which the view of a rotated camera is cut out [px]."""
 
 
-def simulation(picture: Path, contrast: float, seconds: float, noise: float, device: str) -> Simulation:
+def simulation(
+    picture: Path, contrast: float, seconds: float, noise: float, device: str
+) -> Simulation:
     sensor = SensorModel(contrast_on=contrast, contrast_off=contrast, shot_noise_hz=noise)
     return Simulation(
-        Scene.from_picture(picture), CAMERA, PRISM, seconds, PrismMotion(720.0, PHASE), sensor=sensor, device=device
+        Scene.from_picture(picture),
+        CAMERA,
+        PRISM,
+        seconds,
+        PrismMotion(720.0, PHASE),
+        sensor=sensor,
+        device=device,
     )
 
 
@@ -128,15 +140,21 @@ def seen_at(through: Simulation, rotation: NDArray[np.float64], fov: float) -> N
         CAMERA.width + 2 * MARGIN, CAMERA.height + 2 * MARGIN, CAMERA.fx, CAMERA.fy, CAMERA.cx + MARGIN,
         CAMERA.cy + MARGIN,
     )  # fmt: skip
-    view = replace(through, camera=wide, prism=Prism(0.0), scene=replace(through.scene, fov=fov)).log_view()
+    view = replace(
+        through, camera=wide, prism=Prism(0.0), scene=replace(through.scene, fov=fov)
+    ).log_view()
     rows, columns = np.indices((CAMERA.height, CAMERA.width), np.float32)
     rays = np.asarray(CAMERA.pixels_to_rays(np.stack([columns.ravel(), rows.ravel()], axis=1)))
-    xy = np.asarray(wide.rays_to_pixels(Rotation.from_rotvec(rotation).apply(rays).astype(np.float32)))
+    xy = np.asarray(
+        wide.rays_to_pixels(Rotation.from_rotvec(rotation).apply(rays).astype(np.float32))
+    )
     seen = ndimage.map_coordinates(view, xy[:, ::-1].T, order=1, mode="nearest")
     return np.asarray(seen, np.float32).reshape(CAMERA.height, CAMERA.width)
 
 
-def integrate(recording: Recording, model: ExactModel, length_us: int, *, decay_s: float | None) -> NDArray[np.float32]:
+def integrate(
+    recording: Recording, model: ExactModel, length_us: int, *, decay_s: float | None
+) -> NDArray[np.float32]:
     """Return the sum of polarities at the compensated positions, with bilinear votes."""
     events = recording.events.between(START_US, START_US + length_us)
     assert recording.encoder is not None
@@ -169,7 +187,9 @@ def judged(log: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, di
         quality = picture_quality(log, truth, where)
         fitted = (quality.gain * log + quality.offset).astype(np.float64)
         span = float(np.ptp(np.percentile(truth, TRUTH_PERCENTILES)))
-        _, similar = structural_similarity(truth.astype(np.float64), fitted, data_range=span, full=True)
+        _, similar = structural_similarity(
+            truth.astype(np.float64), fitted, data_range=span, full=True
+        )
         out[area] = {
             "correlation": quality.correlation, "psnr_db": quality.psnr_db, "ssim": float(similar[where].mean()),
             "gain": quality.gain,
@@ -190,7 +210,9 @@ class Seen:
     noise: float
 
     @classmethod
-    def make(cls, picture: Path, contrast: float, share: float, turns: tuple[float, ...], device: str) -> Seen:
+    def make(
+        cls, picture: Path, contrast: float, share: float, turns: tuple[float, ...], device: str
+    ) -> Seen:
         seconds = (START_US + max(turns) * TURN_US) * 1e-6 + 0.02
         noise = noise_rate(picture, contrast, share, device)
         through = simulation(picture, contrast, seconds, noise, device)
@@ -201,7 +223,9 @@ class Seen:
         """Return the measurements of one window, and the pictures."""
         length = round(turns * TURN_US)
         model = ExactModel(CAMERA, PRISM, PHASE)
-        found = Reconstruction(self.recording, model=model, device=self.through.device).window(START_US, length)
+        found = Reconstruction(self.recording, model=model, device=self.through.device).window(
+            START_US, length
+        )
         pictures = {
             "amiwarp": found.log,
             "integration": integrate(self.recording, model, length, decay_s=None),
@@ -227,7 +251,9 @@ class Seen:
         return found.log, found.pairs, judged(found.log, truth)
 
 
-def rows(picture: Path, device: str, shown: dict[str, dict[str, NDArray[np.float32]]]) -> Iterator[dict[str, Any]]:
+def rows(
+    picture: Path, device: str, shown: dict[str, dict[str, NDArray[np.float32]]]
+) -> Iterator[dict[str, Any]]:
     """Yield the results of all windows of a picture as rows.
 
     Reconstructions with noise :data:`SHOWN` are added to ``shown``.
@@ -290,7 +316,16 @@ def real(folder: Path, device: str) -> dict[str, dict[str, NDArray[np.float32]]]
                 camera_rotation=CameraRotation((x, y, z), middle_us=(first + last) // 2),
                 length_us=last - first + 1, device=device,
             )  # fmt: skip
-            print(json.dumps({"recording": name, "omega": title, "pairs": found.pairs, "residual": found.residual}))
+            print(
+                json.dumps(
+                    {
+                        "recording": name,
+                        "omega": title,
+                        "pairs": found.pairs,
+                        "residual": found.residual,
+                    }
+                )
+            )
             row[f"map, {title}"] = found.log
             if sign > 0.0:
                 row["known"] = found.known.astype(np.float32)
@@ -299,19 +334,25 @@ def real(folder: Path, device: str) -> dict[str, dict[str, NDArray[np.float32]]]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--figure", type=Path)
     parser.add_argument("--pictures", nargs="+", help="file names in FOLDER (default: all)")
-    parser.add_argument("--real", type=Path, help="folder that contains shapes_rotation and dynamic_rotation")
+    parser.add_argument(
+        "--real", type=Path, help="folder that contains shapes_rotation and dynamic_rotation"
+    )
     parser.add_argument("--real-figure", type=Path)
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
     if args.real is not None:
         grid(real(args.real, args.device), args.real_figure)
     shown: dict[str, dict[str, NDArray[np.float32]]] = {}
-    names = args.pictures or sorted(p.name for p in args.folder.iterdir() if p.suffix in (".jpg", ".png"))
+    names = args.pictures or sorted(
+        p.name for p in args.folder.iterdir() if p.suffix in (".jpg", ".png")
+    )
     for name in names:
         found = []
         for row in rows(args.folder / name, args.device, shown):
@@ -319,7 +360,9 @@ def main() -> None:
             print(json.dumps({k: v for k, v in row.items() if not isinstance(v, dict)}), flush=True)
         merge(args.out, name, found, args.device)
     every = json.loads(args.out.read_text())["rows"]
-    print("\n".join(line for contrast in (0.25, 0.1, 0.5) for line in table(every, contrast, METHODS)))
+    print(
+        "\n".join(line for contrast in (0.25, 0.1, 0.5) for line in table(every, contrast, METHODS))
+    )
     if args.figure is not None:
         grid({name: ordered(line) for name, line in shown.items()}, args.figure)
 
@@ -327,7 +370,9 @@ def main() -> None:
 def table(found: list[dict[str, Any]], contrast: float, methods: tuple[str, ...]) -> Iterator[str]:
     """Yield lines of a Markdown table: means over the pictures, and the worst correlation with its picture's name."""
     chosen = [row for row in found if row["contrast"] == contrast]
-    for turns, share in sorted({(row["turns"], row["share"]) for row in chosen}, key=lambda key: (key[1], key[0])):
+    for turns, share in sorted(
+        {(row["turns"], row["share"]) for row in chosen}, key=lambda key: (key[1], key[0])
+    ):
         group = [row for row in chosen if (row["turns"], row["share"]) == (turns, share)]
         cells = [
             f"{turns:g}",
@@ -336,10 +381,15 @@ def table(found: list[dict[str, Any]], contrast: float, methods: tuple[str, ...]
         for method in methods:
             for area in ("textured", "all") if method == "amiwarp" else ("textured",):
                 values = [row[method][area] for row in group if method in row]
-                mean = [sum(v[key] for v in values) / max(len(values), 1) for key in ("correlation", "psnr_db", "ssim")]
+                mean = [
+                    sum(v[key] for v in values) / max(len(values), 1)
+                    for key in ("correlation", "psnr_db", "ssim")
+                ]
                 cells.append(f"{mean[0]:.3f} / {mean[1]:.1f} / {mean[2]:.2f}" if values else "–")
         worst = min(group, key=lambda row: float(row["amiwarp"]["all"]["correlation"]))
-        cells.append(f"{worst['amiwarp']['all']['correlation']:.3f} ({worst['picture'].split('.')[0]})")
+        cells.append(
+            f"{worst['amiwarp']['all']['correlation']:.3f} ({worst['picture'].split('.')[0]})"
+        )
         yield f"| {contrast:g} | " + " | ".join(cells) + f" | {len(group)} |"
 
 
@@ -354,8 +404,14 @@ def merge(path: Path, picture: str, found: list[dict[str, Any]], device: str) ->
     """Write the results of a picture into the file, where they replace older results of this picture."""
     old = json.loads(path.read_text())["rows"] if path.exists() else []
     kept = [row for row in old if row["picture"] != picture] + found
-    machine = {"device": device, "machine": platform.processor(), "python": platform.python_version()}
-    text = json.dumps({"settings": machine, "rows": sorted(kept, key=lambda row: str(row["picture"]))}, indent=1)
+    machine = {
+        "device": device,
+        "machine": platform.processor(),
+        "python": platform.python_version(),
+    }
+    text = json.dumps(
+        {"settings": machine, "rows": sorted(kept, key=lambda row: str(row["picture"]))}, indent=1
+    )
     temporary = path.with_suffix(".tmp")
     temporary.write_text(text + "\n")
     os.replace(temporary, path)

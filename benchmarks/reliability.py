@@ -31,7 +31,8 @@ import numpy as np
 import psutil
 
 from amiwarp import AmiwarpError, open_recording
-from amiwarp.io.files import NewFile, remove_abandoned
+from amiwarp.io.outputs import NewFile
+from amiwarp.io.unfinished import remove_abandoned
 
 LIMIT_S = 180.0
 """Time after a signal at which a command that still runs is considered hanging [s]."""
@@ -76,7 +77,10 @@ COMMANDS = {
     "simulate": ("simulate OUT/o.h5 --picture IN/pic.png --size 160x120 --duration 0.4", ("o.h5",)),
     "translate": ("translate IN/v.npy OUT/o.h5 --fps 100", ("o.h5",)),
     "convert": ("convert IN/r.h5 OUT/o.h5 --encoder IN/enc.csv", ("o.h5",)),
-    "calibrate": ("calibrate IN/s.h5 OUT/c.json --figure OUT/c.png --events 100000", ("c.json", "c.png")),
+    "calibrate": (
+        "calibrate IN/s.h5 OUT/c.json --figure OUT/c.png --events 100000",
+        ("c.json", "c.png"),
+    ),
     "compensate": (
         "compensate IN/r.h5 OUT/o.h5 --calibration IN/cal.json --iwe OUT/i.png --iwe OUT/i.npy --iwe-window-ms 100",
         ("o.h5", "i.npy", *(f"i_{k:05d}.png" for k in range(20))),
@@ -94,14 +98,24 @@ COMMANDS = {
         "live IN/r.h5 --calibration IN/cal.json --out OUT/o.h5 --record OUT/raw.h5",
         ("o.h5", "raw.h5"),
     ),
-    "view --screenshot": ("view IN/s.h5 --calibration IN/cal.json --screenshot OUT/v.png", ("v.png",)),
+    "view --screenshot": (
+        "view IN/s.h5 --calibration IN/cal.json --screenshot OUT/v.png",
+        ("v.png",),
+    ),
     "design": (
         "design --out OUT --picture IN/pic.png --size 64x48 --apex-deg 1,2 --rpm 720",
         ("design.png", "design.svg", "design.json", "design.csv"),
     ),
     "chart": (
         "chart IN/truth.h5 --out OUT --quick",
-        ("chart.json", "chart.csv", "compensation.png", "compensation.svg", "calibration.png", "calibration.svg"),
+        (
+            "chart.json",
+            "chart.csv",
+            "compensation.png",
+            "compensation.svg",
+            "calibration.png",
+            "calibration.svg",
+        ),
     ),
     "demo": (
         "demo --out OUT --picture IN/pic.png --size 160x120 --duration 0.2",
@@ -109,7 +123,15 @@ COMMANDS = {
     ),
     "stability": (
         "stability --quick --axes apex --minutes 0.01 --out OUT",
-        ("atlas.csv", "atlas.json", "atlas.pdf", "axis_apex.png", "overview.png", "summary.md", CELLS),
+        (
+            "atlas.csv",
+            "atlas.json",
+            "atlas.pdf",
+            "axis_apex.png",
+            "overview.png",
+            "summary.md",
+            CELLS,
+        ),
     ),
     "simulate, world": (
         "simulate OUT/o.h5 --world room --size 64x48 --duration 0.1 --truth-hz 200 --preview OUT/p.png",
@@ -152,7 +174,9 @@ def prepare(folder: Path) -> Path:
         x, y, radius = rng.uniform(0, 320), rng.uniform(0, 240), rng.uniform(6, 30)
         picture[(columns - x) ** 2 + (rows - y) ** 2 < radius**2] = rng.integers(20, 250)
     Image.fromarray(picture).save(inputs / "pic.png")
-    np.save(inputs / "v.npy", np.stack([np.roll(picture, k, axis=1) for k in range(30)])[:, ::2, ::2])
+    np.save(
+        inputs / "v.npy", np.stack([np.roll(picture, k, axis=1) for k in range(30)])[:, ::2, ::2]
+    )
     for line in (
         "simulate IN/s.h5 --picture IN/pic.png --size 160x120 --duration 0.3 --nominal-apex-deg 1.1",
         "simulate IN/truth.h5 --picture IN/pic.png --size 160x120 --duration 0.5",
@@ -184,7 +208,10 @@ def many_events(inputs: Path, count: int = 3_000_000) -> None:
     )  # fmt: skip
     small = open_recording(inputs / "s.h5")
     encoder = Encoder.constant_speed(720.0, -1000, 2_001_000)
-    save_recording(inputs / "r.h5", Recording(MemoryEvents(events, 160, 120), small.camera, encoder, small.prism))
+    save_recording(
+        inputs / "r.h5",
+        Recording(MemoryEvents(events, 160, 120), small.camera, encoder, small.prism),
+    )
 
 
 def words(line: str, inputs: Path, out: Path) -> list[str]:
@@ -193,7 +220,11 @@ def words(line: str, inputs: Path, out: Path) -> list[str]:
 
 
 def digest(folder: Path) -> dict[str, str]:
-    return {str(f): hashlib.sha256(f.read_bytes()).hexdigest() for f in sorted(folder.rglob("*")) if f.is_file()}
+    return {
+        str(f): hashlib.sha256(f.read_bytes()).hexdigest()
+        for f in sorted(folder.rglob("*"))
+        if f.is_file()
+    }
 
 
 def size_of(path: Path) -> Any:
@@ -269,10 +300,16 @@ def whole_run(name: str, inputs: Path, out: Path) -> tuple[float, dict[str, Any]
     seconds = time.perf_counter() - began
     if process.returncode:
         raise SystemExit(f"{name}: {error}")
-    return seconds, {f: size_of(out / f) for f in files}, sum(f.stat().st_size for f in out.rglob("*") if f.is_file())
+    return (
+        seconds,
+        {f: size_of(out / f) for f in files},
+        sum(f.stat().st_size for f in out.rglob("*") if f.is_file()),
+    )
 
 
-def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals, code: int) -> tuple[str, list[str]]:
+def judge(
+    name: str, out: Path, expected: dict[str, Any], number: signal.Signals, code: int
+) -> tuple[str, list[str]]:
     """Return how a run ended, and the problems of the files that it left."""
     wrong = []
     there = {f.name for f in out.iterdir()}
@@ -287,7 +324,11 @@ def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals
             continue
         if file not in kept and file not in expected:
             wrong.append(f"{file} was left")
-        elif file not in kept and found != expected[file] and not (name in SHORTER and found <= expected[file]):
+        elif (
+            file not in kept
+            and found != expected[file]
+            and not (name in SHORTER and found <= expected[file])
+        ):
             wrong.append(f"{file} holds {found}, whole {expected[file]}")
     if number is not signal.SIGKILL:
         wrong += [f"{file} was left" for file in unfinished | kept]
@@ -298,7 +339,9 @@ def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals
     # exit status -number: the signal arrived while Python was starting or exiting
     if code not in ({-9, 0} if number is signal.SIGKILL else {130, 0, -number, -signal.SIGINT}):
         wrong.append(f"exit status {code}")
-    ended = "finished" if set(expected) <= there else "cut short" if there - unfinished else "nothing"
+    ended = (
+        "finished" if set(expected) <= there else "cut short" if there - unfinished else "nothing"
+    )
     return ended, wrong
 
 
@@ -309,9 +352,12 @@ def kills(name: str, inputs: Path, folder: Path, count: int, rng: random.Random)
     before = digest(inputs)
     ended: Counter[str] = Counter()
     problems, longest, unfinished = [], 0.0, 0
+    signals = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+    # Each round of the three signals has its own part of the run; the last round may be cut short
+    rounds = -(-count // len(signals))
     for k in range(count):
-        number = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)[k % 3]
-        after = seconds * (k // 3 + rng.random()) / (count // 3)
+        number = signals[k % len(signals)]
+        after = seconds * (k // len(signals) + rng.random()) / rounds
         out = emptied(folder)
         with begun(COMMANDS[name][0], inputs, out) as process:
             time.sleep(after)
@@ -325,7 +371,11 @@ def kills(name: str, inputs: Path, folder: Path, count: int, rng: random.Random)
             longest = max(longest, time.perf_counter() - signalled_s)
             alive = left_alive(process.pid)
         unfinished += any(out.rglob(".*.part"))
-        starting = after < START_S and process.returncode in (1, -signal.SIGINT)  # during Python's start
+        # During Python's start
+        starting = after < START_S and process.returncode in (
+            1,
+            -signal.SIGINT,
+        )
         how, wrong = judge(name, out, expected, number, 0 if starting else process.returncode)
         wrong += [f"{line} is still running" for line in alive]
         if "Traceback" in error and not starting:
@@ -345,7 +395,11 @@ def continued(name: str, inputs: Path, out: Path, expected: dict[str, Any]) -> l
     """Run a command again on what a killed run left; return the problems of the files."""
     with begun(COMMANDS[name][0], inputs, out) as process:
         _, error = process.communicate(timeout=600)
-    wrong = [f"the next run ended with {process.returncode}: {error[-300:]}"] if process.returncode else []
+    wrong = (
+        [f"the next run ended with {process.returncode}: {error[-300:]}"]
+        if process.returncode
+        else []
+    )
     for file, whole in expected.items():
         if not (out / file).exists() or size_of(out / file) != whole:
             wrong.append(f"{file} is not whole after the next run")
@@ -363,7 +417,9 @@ def emptied(folder: Path) -> Path:
 def small_disk(folder: Path, size: int) -> Iterator[Path]:
     place = folder / "disk"
     place.mkdir(exist_ok=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={max(size, 4096)}", "tmpfs", place], check=True)
+    subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={max(size, 4096)}", "tmpfs", place], check=True
+    )
     try:
         yield place
     finally:
@@ -393,7 +449,9 @@ def disks(name: str, inputs: Path, folder: Path) -> dict[str, Any]:
                     wrong.append(f"{file} holds {found}, whole {expected[file]}")
             if code == 0 and there != set(expected):
                 wrong.append("exit status 0 without all files")
-            if code not in (0, 1) or (code == 1 and "amiwarp: " not in error.strip().splitlines()[-1]):
+            if code not in (0, 1) or (
+                code == 1 and "amiwarp: " not in error.strip().splitlines()[-1]
+            ):
                 wrong.append(f"exit status {code}: {error[-300:]}")
             ended["whole" if code == 0 else "one clear error"] += 1
             problems += [f"{100 * share:.0f} % of {size} bytes: {text}" for text in wrong]
@@ -403,9 +461,13 @@ def disks(name: str, inputs: Path, folder: Path) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=["kills", "disks"])
-    parser.add_argument("--folder", type=Path, required=True, help="working folder; the inputs are kept in it")
+    parser.add_argument(
+        "--folder", type=Path, required=True, help="working folder; the inputs are kept in it"
+    )
     parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--only", nargs="+", choices=list(COMMANDS), default=list(COMMANDS))
     parser.add_argument("--seed", type=int, default=0)

@@ -1,9 +1,9 @@
-"""Tables of benchmarks/results/speed.md and of docs/explanation/performance.md, made from the JSON files of the runs.
+"""Tables of benchmarks/results/speed.md, made from the JSON files of the runs.
 
     python -m benchmarks.report [--check]
 
-Replaces the text between the two marker comments of each page. ``--check`` changes nothing; its exit status is 1 if the
-pages and the files differ.
+Replaces the text between the two marker comments of the page. ``--check`` changes nothing; its exit status is 1 if the
+page and the files differ.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import argparse
 import json
 import statistics
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,11 @@ from benchmarks.cases import AIMS, IMAGE, MOVED, PREPARED, Aim
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "benchmarks" / "results" / "speed.md"
-SUMMARY = ROOT / "docs" / "explanation" / "performance.md"
 FILES = {kind: ROOT / "benchmarks" / "results" / f"speed_{kind}.json" for kind in ("cpu", "cuda")}
-BEGIN, END = "<!-- speed: from here on by python -m benchmarks.report -->", "<!-- speed: to here -->"
+BEGIN, END = (
+    "<!-- speed: from here on by python -m benchmarks.report -->",
+    "<!-- speed: to here -->",
+)
 IMAGES = (IMAGE, PREPARED)
 RATES = {IMAGE: "Mev/s", PREPARED: "Mvotes/s", MOVED: "Mev/s"}
 """Unit of the rate that tables show instead of the time, by task."""
@@ -35,15 +37,6 @@ ERRORS = {
 ALSO = {"psnr_db": "PSNR [dB]", "peak_mib": "peak memory [MiB]"}
 """Titles of the columns with further results of complete tasks."""
 SCALES = {"Gev/s": 1e9, "Mev/s": 1e6, "Gvotes/s": 1e9}
-SUMMED = (
-    "amiwarp circle bilinear", "amiwarp exact bilinear", "Numba", "Numba, angle table", "NumPy", "PyTorch",
-    "CuPy, four float atomics", "Warp, four float atomics",
-)  # fmt: skip
-"""Methods whose images of warped events the summary shows."""
-SUMMED_ERRORS = {
-    "exact_px": "{} px", "model_px": "{} px", "decorrelation": "1 − correlation: {}", "places_px": "{} px at worst",
-}  # fmt: skip
-"""Errors that the summary shows, and how."""
 
 Row = dict[str, Any]
 Results = dict[str, Any]
@@ -68,7 +61,10 @@ def head(row: Row) -> list[str]:
     start = ["method", RATES.get(row["what"], "ms"), "quartiles"]
     if row["what"] in IMAGES:
         return [*start, "rms / worst pixel [events]", "misplaced", "px from exact"]
-    return [*start, *(text for name, text in (ERRORS | ALSO).items() if name in row["errors"] | row["also"])]
+    return [
+        *start,
+        *(text for name, text in (ERRORS | ALSO).items() if name in row["errors"] | row["also"]),
+    ]
 
 
 def row_cells(row: Row) -> list[str]:
@@ -101,7 +97,9 @@ def measured(rows: list[Row]) -> Iterator[str]:
     yield f"**{what[0].upper()}{what[1:]}, {rows[0]['scene']}: {count}**"
     yield ""
     titles = head(done[0]) if done else ["method", ""]
-    yield from table(titles, [[*cells, *[""] * (len(titles) - len(cells))] for cells in map(row_cells, rows)])
+    yield from table(
+        titles, [[*cells, *[""] * (len(titles) - len(cells))] for cells in map(row_cells, rows)]
+    )
 
 
 def section(results: Results) -> Iterator[str]:
@@ -118,40 +116,6 @@ def section(results: Results) -> Iterator[str]:
     for _, rows in groupby(results["rows"], lambda row: (row["what"], row["scene"])):
         yield from measured(list(rows))
     yield ""
-
-
-def summary(results: Results) -> Iterator[str]:
-    """Yield one table for a machine: speed and error of each task, for all scenes in one cell."""
-    yield f"### {results['machine']}"
-    yield ""
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in results["rows"]:
-        if "skipped" in row or (row["what"] == IMAGE and row["name"] not in SUMMED):
-            continue
-        if SUMMED_ERRORS.keys() & row["errors"].keys():
-            groups.setdefault((row["what"], row["name"]), []).append(row)
-    rows = [[what, name, summed_speed(what, same), summed_error(same)] for (what, name), same in groups.items()]
-    yield from table(["task", "method", "speed", "error"], rows)
-    yield ""
-
-
-def summed_speed(what: str, rows: list[Row]) -> str:
-    """Return the rates or times of a method on its scenes, with the peak memory if it was measured."""
-    if what in RATES:
-        rates = [row["work"] / row["median_s"] / 1e6 for row in rows]
-        giga = max(rates) >= 1e3
-        unit = RATES[what].replace("M", "G") if giga else RATES[what]
-        values = [rate / 1e3 if giga else rate for rate in rates]
-    else:
-        values, unit = [1e3 * row["median_s"] for row in rows], "ms"
-    memory = [f", {row['also']['peak_mib']:.0f} MiB" for row in rows if "peak_mib" in row["also"]]
-    return f"{' / '.join(map(speed, values))} {unit}{''.join(memory)}"
-
-
-def summed_error(rows: list[Row]) -> str:
-    """Return the error of a method on its scenes."""
-    name = next(name for name in SUMMED_ERRORS if name in rows[0]["errors"])
-    return SUMMED_ERRORS[name].format(" / ".join(f"{row['errors'][name]:.2g}" for row in rows))
 
 
 def value_of(aim: Aim, row: Row, compared_with: Row | None = None) -> float:
@@ -190,40 +154,53 @@ def aim_cells(aim: Aim, results: Results) -> list[str]:
     if skipped:
         return [*start, f"skipped: {skipped[0]}", "–"]
     values = {scene: value_of(aim, *pair) for scene, pair in sides.items()}
-    met = [value <= aim.bars[scene] if most else value >= aim.bars[scene] for scene, value in values.items()]
-    verdict = "yes" if all(met) else "no" if not any(met) else " / ".join("yes" if m else "no" for m in met)
+    met = [
+        value <= aim.bars[scene] if most else value >= aim.bars[scene]
+        for scene, value in values.items()
+    ]
+    verdict = (
+        "yes"
+        if all(met)
+        else "no"
+        if not any(met)
+        else " / ".join("yes" if m else "no" for m in met)
+    )
     notes = {f" ({row['note']})" for pair in sides.values() for row in pair if row["note"]}
     return [*start, " / ".join(map(speed, values.values())) + "".join(sorted(notes)), verdict]
 
 
-def page(text: str, results: list[Results], tables: Callable[[Results], Iterator[str]] = section) -> str:
+def page(text: str, results: list[Results]) -> str:
     """Return the page's text with new tables."""
-    start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
-    lines = "\n".join(line for r in results for line in tables(r))
+    start = text.index(BEGIN) + len(BEGIN)
+    end = text.index(END)
+    lines = "\n".join(line for each in results for line in section(each))
     return f"{text[:start]}\n\n{lines}\n{text[end:]}"
 
 
-def refreshed() -> dict[Path, str]:
-    """Return the text of each page with new tables from all files."""
+def refreshed() -> str:
+    """Return the text of the page with new tables from all files."""
     results = [json.loads(path.read_text()) for path in FILES.values() if path.exists()]
-    return {path: page(path.read_text(), results, tables) for path, tables in ((PAGE, section), (SUMMARY, summary))}
+    return page(PAGE.read_text(), results)
 
 
-def write_pages() -> None:
-    """Put new tables into the pages."""
-    for path, text in refreshed().items():
-        path.write_text(text)
+def write_page() -> None:
+    """Put new tables into the page."""
+    PAGE.write_text(refreshed())
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--check", action="store_true")
     args = parser.parse_args()
     if not args.check:
-        write_pages()
+        write_page()
         return 0
-    same = all(path.read_text() == text for path, text in refreshed().items())
-    print("pages and files agree" if same else "pages and files differ: run python -m benchmarks.report")
+    same = PAGE.read_text() == refreshed()
+    print(
+        "page and files agree" if same else "page and files differ: run python -m benchmarks.report"
+    )
     return int(not same)
 
 

@@ -96,7 +96,9 @@ class EventScene:
 
     def sample(self) -> tuple[Array, Array]:
         """Return the pixels, shape ``(m, 2)``, and the angles [rad], shape ``(m,)``, of the events in :attr:`some`."""
-        xy = np.stack([self.events.x[self.some], self.events.y[self.some]], axis=1).astype(np.float64)
+        xy = np.stack([self.events.x[self.some], self.events.y[self.some]], axis=1).astype(
+            np.float64
+        )
         return xy, self.theta[self.some]
 
 
@@ -105,7 +107,9 @@ def in_chunks(work: Callable[[int, int], Any], n: int) -> list[Any]:
     return list(threads.map(lambda start: work(start, min(start + CHUNK, n)), range(0, n, CHUNK)))
 
 
-def event_scene(name: str, n: int, *, points: int = 0, width: int = WIDTH, height: int = HEIGHT) -> EventScene:
+def event_scene(
+    name: str, n: int, *, points: int = 0, width: int = WIDTH, height: int = HEIGHT
+) -> EventScene:
     """Return events of ``points`` edge points on their orbits, rounded to pixels; with 0 points, at random pixels."""
     camera = Camera.from_fov(width, height, FOV)
     scene = EventScene(
@@ -114,7 +118,9 @@ def event_scene(name: str, n: int, *, points: int = 0, width: int = WIDTH, heigh
         np.empty(n),
     )  # fmt: skip
     border = math.ceil(scene.radius) + 1
-    edges = np.random.default_rng(points).uniform(border, [width - 1 - border, height - 1 - border], (points, 2))
+    edges = np.random.default_rng(points).uniform(
+        border, [width - 1 - border, height - 1 - border], (points, 2)
+    )
 
     def fill(start: int, stop: int) -> None:
         rng, e, m = np.random.default_rng([points, start]), scene.events, stop - start
@@ -168,11 +174,14 @@ def recording_scene(n: int, device: str, picture: Path | None) -> RecordingScene
     try:
         made = simulation(demo)
     except ImportError as error:
-        raise Missing("no picture: give --picture, or install pyvista for its map of the earth") from error
+        raise Missing(
+            "no picture: give --picture, or install pyvista for its map of the earth"
+        ) from error
     contrast = SensorModel().contrast_on
     for _ in range(PROBES):
         probe = replace(made, sensor=sensor(contrast), duration_s=2.0 * PROBE_S).run().events
-        settled = probe.between(round(PROBE_S * 1e6), round(2e6 * PROBE_S))  # the first turn has more events
+        # The first turn has more events
+        settled = probe.between(round(PROBE_S * 1e6), round(2e6 * PROBE_S))
         contrast *= (len(settled) / PROBE_S * seconds / n) ** DAMPED
     made = replace(made, sensor=sensor(contrast))
     return RecordingScene(made, made.run())

@@ -22,8 +22,8 @@ import numpy as np
 import warp as wp
 
 from amiwarp import Camera, EncoderModel, ExactModel, Prism, Scene, Simulation
-from amiwarp.simulation.scenery import step_us
-from amiwarp.simulation.simulator import Engine
+from amiwarp.simulation.engine import Engine
+from amiwarp.simulation.image_motion import step_us
 
 WIDTH, HEIGHT, FOV, INDEX = 640, 480, math.radians(60.0), 1.55
 
@@ -62,20 +62,32 @@ def error_px(simulation: Simulation) -> float:
     model = ExactModel(simulation.camera, simulation.prism)
     events, points = next(iter(simulation.blocks()))
     xy = np.stack([events.x, events.y], axis=1).astype(np.float64)
-    found = model.compensate_points(xy, encoder.angle_at(events.t - round(simulation.sensor.latency_us)))
+    found = model.compensate_points(
+        xy, encoder.angle_at(events.t - round(simulation.sensor.latency_us))
+    )
     return float(np.sqrt(np.nanmean(np.sum((found - points) ** 2, axis=1))))
 
 
 def row(scene: Scene, apex: float, duration: float, device: str, repeats: int) -> dict[str, Any]:
     prism = Prism(math.radians(apex), INDEX)
     camera = Camera.from_fov(WIDTH, HEIGHT, FOV)
-    simulation = Simulation(scene, camera, prism, duration, encoder_model=EncoderModel.ideal(), device=device)
-    result: dict[str, Any] = {"apex_deg": apex, "step_us": step_us(simulation), "duration_s": duration}
+    simulation = Simulation(
+        scene, camera, prism, duration, encoder_model=EncoderModel.ideal(), device=device
+    )
+    result: dict[str, Any] = {
+        "apex_deg": apex,
+        "step_us": step_us(simulation),
+        "duration_s": duration,
+    }
     for name, to_host in (("device", False), ("host", True)):
         runs = [time_run(simulation, to_host) for _ in range(repeats + 1)][1:]
         best = min(seconds for seconds, _, _ in runs)
         median = float(np.median([seconds for seconds, _, _ in runs]))
-        result[name] = {"ratio": median / duration, "best": best / duration, "events_per_s": runs[0][1] / median}
+        result[name] = {
+            "ratio": median / duration,
+            "best": best / duration,
+            "events_per_s": runs[0][1] / median,
+        }
         result["setup_s"] = min(setup for _, _, setup in runs)
         result["events"] = runs[0][1]
     result["error_px_rms"] = error_px(simulation)

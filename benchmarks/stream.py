@@ -46,10 +46,15 @@ from amiwarp import (
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.packets import Packet, make_packet
-from amiwarp.live.stream.session import IMAGE_US, Session, SessionStatus
-from amiwarp.studies.cluster import machine
+from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.session_status import IMAGE_US, SessionStatus
+from amiwarp.studies.machine import machine
 
-PACKET, CAMERA, PRISM = 10_000, Camera.from_fov(640, 480, math.radians(60)), Prism(math.radians(1.0))
+PACKET, CAMERA, PRISM = (
+    10_000,
+    Camera.from_fov(640, 480, math.radians(60)),
+    Prism(math.radians(1.0)),
+)
 MODELS: dict[str, Model] = {
     "exact": ExactModel.from_prism(CAMERA, PRISM, 0.3), "circle": CircleModel.from_prism(CAMERA, PRISM, 0.3),
 }  # fmt: skip
@@ -64,7 +69,10 @@ CHECKED = 50
 def random_pool(n: int) -> Events:
     """Return events at random pixels, which are the worst case for caches."""
     rng = np.random.default_rng(0)
-    x, y = rng.integers(0, CAMERA.width, n).astype(np.uint16), rng.integers(0, CAMERA.height, n).astype(np.uint16)
+    x, y = (
+        rng.integers(0, CAMERA.width, n).astype(np.uint16),
+        rng.integers(0, CAMERA.height, n).astype(np.uint16),
+    )
     return Events(x, y, np.arange(n), rng.integers(0, 2, n).astype(np.uint8))
 
 
@@ -124,7 +132,9 @@ class Check:
         for given, found in self._kept:
             if not (np.array_equal(given.t, found.t) and np.array_equal(given.p, found.p)):
                 return math.inf
-            t = np.arange(int(given.t[0]) // 1000 * 1000, int(given.t[-1]) + 2001, 1000, dtype=np.int64)
+            t = np.arange(
+                int(given.t[0]) // 1000 * 1000, int(given.t[-1]) + 2001, 1000, dtype=np.int64
+            )
             xy = compensate_events(given, model, Encoder(t, angles(t)))
             worst = max(worst, float(np.nanmax(np.hypot(found.x - xy[:, 0], found.y - xy[:, 1]))))
         return worst
@@ -136,7 +146,9 @@ def rate(device: str, pool: Events, model: Model, together: int) -> dict[str, An
     stream = Stream(pool, target)
     # packets are made before the run, because a sensor's driver would make them
     ahead = [stream.packet(k) for k in range(packets)]
-    passes = [one_pass(device, pool, model, ahead, together, target) for _ in range(REPEATS + 1)][1:]
+    passes = [one_pass(device, pool, model, ahead, together, target) for _ in range(REPEATS + 1)][
+        1:
+    ]
     mev_s = [found["mev_s"] for found in passes]
     quartiles = np.percentile(mev_s, [25, 50, 75]).tolist()
     error, voted = max(found["error_px"] for found in passes), passes[-1]["voted"]
@@ -149,7 +161,13 @@ def rate(device: str, pool: Events, model: Model, together: int) -> dict[str, An
 def one_pass(
     device: str, pool: Events, model: Model, ahead: list[Events], together: int, mev_s: float
 ) -> dict[str, float]:
-    stream, encoder, check, voted, imaged = Stream(pool, mev_s), EncoderStream(), Check(len(ahead)), 0.0, 0
+    stream, encoder, check, voted, imaged = (
+        Stream(pool, mev_s),
+        EncoderStream(),
+        Check(len(ahead)),
+        0.0,
+        0,
+    )
     compensator = Compensator(model, encoder, device=device)
     began = time.perf_counter()
     for k in range(0, len(ahead), together):
@@ -237,7 +255,9 @@ def hour(device: str, pool: Events) -> dict[str, Any]:
 
     def note(status: SessionStatus) -> None:
         with open("/proc/self/statm") as statm:
-            sizes.append((status.events, int(statm.read().split()[1]) * resource.getpagesize() / 2**20))
+            sizes.append(
+                (status.events, int(statm.read().split()[1]) * resource.getpagesize() / 2**20)
+            )
 
     seen = 0
 
@@ -245,7 +265,9 @@ def hour(device: str, pool: Events) -> dict[str, Any]:
         nonlocal seen
         seen += len(packet.events)
 
-    status = Session(source, known, sinks=(count,), device=device).run(threading.Event(), note, every_s=0.5)
+    status = Session(source, known, sinks=(count,), device=device).run(
+        threading.Event(), note, every_s=0.5
+    )
     n = source.count * PACKET
     early = [mib for events, mib in sizes if 0.05 * n < events < 0.15 * n]
     growth = sizes[-1][1] - max(early)
@@ -256,7 +278,9 @@ def hour(device: str, pool: Events) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--picture", help="scene; default: PyVista's map of the earth")
     parser.add_argument("--only", nargs="+", default=["rate", "latency", "hour"])

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 import amiwarp
 from amiwarp import DeviceEvents, Events
-from amiwarp.studies.cluster import machine, versions
+from amiwarp.studies.machine import machine, versions
 from amiwarp.tasks import cpu_threads, limited_cpu_threads
 from benchmarks.libraries import Missing, library
 
@@ -116,7 +116,9 @@ def expected_histogram(events: Events) -> NDArray[np.int64]:
     total = np.zeros(2 * BINS * size, np.int64)
     for part in pieces(events):
         k = np.minimum(BINS * (part.t - t0) // (t1 - t0), BINS - 1)
-        total += np.bincount((part.p.astype(np.int64) * BINS + k) * size + cells(part), minlength=len(total))
+        total += np.bincount(
+            (part.p.astype(np.int64) * BINS + k) * size + cells(part), minlength=len(total)
+        )
     return np.minimum(total, 255).reshape(2 * BINS, HEIGHT, WIDTH)
 
 
@@ -149,7 +151,11 @@ def ours(events: Events, device: str, threads: int | None = None) -> list[Progra
 
     def put(these: Events) -> Events | DeviceEvents:
         columns = (these.x, these.y, these.t, these.p)
-        return these if device == "cpu" else DeviceEvents(*(wp.array(values, device=device) for values in columns))
+        return (
+            these
+            if device == "cpu"
+            else DeviceEvents(*(wp.array(values, device=device) for values in columns))
+        )
 
     here = put(events)
     x = events.x.astype(np.float32) + np.float32(0.25)
@@ -212,7 +218,9 @@ def with_torch(events: Events, device: str, put: bool = False) -> Peer:
         raise Missing("this PyTorch has no CUDA")
     size = WIDTH * HEIGHT
     t = torch.from_numpy(events.t).to(device)
-    x, y, p = (torch.from_numpy(v.astype(np.int64)).to(device) for v in (events.x, events.y, events.p))
+    x, y, p = (
+        torch.from_numpy(v.astype(np.int64)).to(device) for v in (events.x, events.y, events.p)
+    )
 
     def run() -> Any:
         grid = torch.zeros((BINS + 1) * size, device=device)
@@ -296,20 +304,26 @@ def with_tonic(events: Events, device: str) -> Peer:
     transform = transforms.ToVoxelGrid(sensor_size=(WIDTH, HEIGHT, 2), n_time_bins=BINS)
     array = np.zeros(len(events), [("x", "i2"), ("y", "i2"), ("t", "i8"), ("p", "i1")])
     for name in ("x", "y", "t", "p"):
-        array[name] = getattr(events, name)  # its transform changes p to -1 and 1; a second pass leaves it so
+        # Its transform changes p to -1 and 1; a second pass leaves it so
+        array[name] = getattr(events, name)
     return lambda: transform(array)[:, 0], lambda these: expected_grid(these, BINS)
 
 
 def with_evlib(events: Events, device: str) -> Peer:
     module, pl = library("evlib.representations"), library("polars")
     t = events.t.astype("timedelta64[us]")
-    columns = {"t": t, "x": events.x.astype("i2"), "y": events.y.astype("i2"), "polarity": events.p.astype("i1")}
+    columns = {
+        "t": t,
+        "x": events.x.astype("i2"),
+        "y": events.y.astype("i2"),
+        "polarity": events.p.astype("i1"),
+    }
     table = pl.DataFrame(columns)
 
     def run() -> Any:
-        return module.densify_voxel_grid(module.create_voxel_grid(table, HEIGHT, WIDTH, BINS), BINS, HEIGHT, WIDTH)[
-            :, 0
-        ]
+        return module.densify_voxel_grid(
+            module.create_voxel_grid(table, HEIGHT, WIDTH, BINS), BINS, HEIGHT, WIDTH
+        )[:, 0]
 
     return run, lambda these: expected_grid(these, BINS)
 
@@ -321,7 +335,9 @@ def with_dv(events: Events, device: str) -> Peer:
 def dv_surface(events: Events, device: str) -> Peer:
     dv = library("dv_processing")
     store = dv.EventStore()
-    for x, y, t, p in zip(events.x.tolist(), events.y.tolist(), events.t.tolist(), events.p.tolist(), strict=True):
+    for x, y, t, p in zip(
+        events.x.tolist(), events.y.tolist(), events.t.tolist(), events.p.tolist(), strict=True
+    ):
         store.push_back(t + 1, x, y, bool(p))
     surfaces: list[Any] = []
 
@@ -380,14 +396,24 @@ def programs(events: Events, device: str) -> tuple[list[Program], list[dict[str,
             these = few if kind == "cpu" else events
             try:
                 run, expected = make(these, there)
-                out.append(Program(GRID, f"{name}, {'CUDA' if kind == 'cuda' else kind}", these, run, expected))
+                out.append(
+                    Program(
+                        GRID, f"{name}, {'CUDA' if kind == 'cuda' else kind}", these, run, expected
+                    )
+                )
             except Missing as error:
                 missing.append({"task": GRID, "program": name, "missing": str(error)})
     try:
         fewer = few[:DV_EVENTS]
-        out.append(Program("latest times", "dv-processing TimeSurface, cpu", fewer, *dv_surface(fewer, "cpu")))
+        out.append(
+            Program(
+                "latest times", "dv-processing TimeSurface, cpu", fewer, *dv_surface(fewer, "cpu")
+            )
+        )
     except Missing as error:
-        missing.append({"task": "latest times", "program": "dv-processing TimeSurface", "missing": str(error)})
+        missing.append(
+            {"task": "latest times", "program": "dv-processing TimeSurface", "missing": str(error)}
+        )
     return out, missing
 
 
@@ -429,7 +455,9 @@ def measure(events: Events, device: str, repeats: int) -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--events", type=int)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--repeats", type=int, default=9)
@@ -447,7 +475,9 @@ def main() -> int:
         "versions": versions(packages), "size": [WIDTH, HEIGHT], "bins": BINS, "scenes": results,
     }  # fmt: skip
     (args.out or RESULTS / f"tensors_{kind}.json").write_text(json.dumps(report, indent=1) + "\n")
-    wrong = [row for rows in results.values() for row in rows if row.get("ours") and row["error"] > BAR]
+    wrong = [
+        row for rows in results.values() for row in rows if row.get("ours") and row["error"] > BAR
+    ]
     return int(bool(wrong))
 
 

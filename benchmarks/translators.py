@@ -54,8 +54,8 @@ from amiwarp import (
     named_world,
     reconstruct,
 )
-from amiwarp.simulation.pictures import DARK
-from amiwarp.translation.translator import translation
+from amiwarp.simulation.picture_light import DARK
+from amiwarp.simulation.translation.translator import translation
 
 CAMERA = Camera.from_fov(160, 120, math.radians(60.0))
 PRISM, MOTION, TURN_US = Prism(math.radians(1.0)), PrismMotion(720.0), 83_333
@@ -91,7 +91,10 @@ class Source:
 
 def record(world: str, trajectory: str, folder: Path) -> Source:
     """Simulate what the cameras with and without the prism see, and write the pictures."""
-    times = {fps: np.rint(np.arange(math.ceil(DURATION_S * fps) + 1) * 1e6 / fps) for fps in FPS[trajectory]}
+    times = {
+        fps: np.rint(np.arange(math.ceil(DURATION_S * fps) + 1) * 1e6 / fps)
+        for fps in FPS[trajectory]
+    }
     seconds = max(float(t[-1]) for t in times.values()) * 1e-6
     scene = WorldScene(*named_world(world, trajectory, duration_s=seconds))
     prism = Simulation(scene, CAMERA, PRISM, DURATION_S, MOTION)
@@ -100,14 +103,18 @@ def record(world: str, trajectory: str, folder: Path) -> Source:
     recorded = plain.run(truth_times_us=np.unique([*np.concatenate(list(times.values())), middle]))
     assert recorded.truth is not None
     assert recorded.truth.frames is not None
-    frames = {int(t): recorded.truth.frames[k].intensity for k, t in enumerate(recorded.truth.frames.t)}
+    frames = {
+        int(t): recorded.truth.frames[k].intensity for k, t in enumerate(recorded.truth.frames.t)
+    }
     frames = {t: gaussian_filter(light, BLUR_PX) for t, light in frames.items()}
     for fps, instants in times.items():
         write_pictures(folder / f"{fps}", {round(t): frames[round(t)] for t in instants.tolist()})
     wide = Camera.from_fov(FINE * CAMERA.width, FINE * CAMERA.height, CAMERA.fov)
     finer = TruthRenderer(replace(plain, camera=wide))
     fine = {round(t): finer.at(round(t)).intensity for t in times[30].tolist()}
-    write_pictures(folder / "fine", {t: gaussian_filter(light, FINE * BLUR_PX) for t, light in fine.items()})
+    write_pictures(
+        folder / "fine", {t: gaussian_filter(light, FINE * BLUR_PX) for t, light in fine.items()}
+    )
     log = np.log(frames[middle] + np.float32(DARK))
     return Source(recorded, folder, prism.run(), replace(prism, seed=1).run(), log)
 
@@ -142,7 +149,15 @@ def translated(source: Source, way: str, fps: int) -> Recording:
         "events": {},
     }[way]
     work = translation(
-        given, PRISM, fov=CAMERA.fov, blur=0.0, camera=CAMERA, motion=MOTION, duration_s=DURATION_S, seed=1, **settings
+        given,
+        PRISM,
+        fov=CAMERA.fov,
+        blur=0.0,
+        camera=CAMERA,
+        motion=MOTION,
+        duration_s=DURATION_S,
+        seed=1,
+        **settings,
     )
     return work.run()
 
@@ -170,7 +185,10 @@ def matched(of: dict[str, NDArray[Any]], among: dict[str, NDArray[Any]]) -> NDAr
     span = 1 << 32
     keys = np.sort(among["place"] * span + among["t"])
     wanted = of["place"] * span + of["t"]
-    low, high = np.searchsorted(keys, wanted - NEAR_US), np.searchsorted(keys, wanted + NEAR_US, side="right")
+    low, high = (
+        np.searchsorted(keys, wanted - NEAR_US),
+        np.searchsorted(keys, wanted + NEAR_US, side="right"),
+    )
     return np.asarray(high > low)
 
 
@@ -232,13 +250,24 @@ def rows_of(world: str, trajectory: str) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         source = record(world, trajectory, Path(folder))
         given = {"truth": source.truth, "truth, other seed": source.again}
-        cases = [*((way, None) for way in given), *((way, fps) for fps in FPS[trajectory] for way in WAYS)]
+        cases = [
+            *((way, None) for way in given),
+            *((way, fps) for fps in FPS[trajectory] for way in WAYS),
+        ]
         for way, fps in [*cases, (FINER, 30), ("events", None)]:
             began = time.process_time()
             found = given.get(way) or translated(source, way, fps or 0)
             seconds = None if way in given else time.process_time() - began
-            row = {"world": world, "trajectory": trajectory, "fps": fps, "way": way, **compare(found, source)}
-            if trajectory != "fast":  # calibration refuses the truth, too: the camera moves too much
+            row = {
+                "world": world,
+                "trajectory": trajectory,
+                "fps": fps,
+                "way": way,
+                **compare(found, source),
+            }
+            if (
+                trajectory != "fast"
+            ):  # calibration refuses the truth, too: the camera moves too much
                 row["calibration_px"] = calibration_px(found)
             rows.append({**row, "seconds": seconds, "events": len(found.events)})
             print(line(rows[-1]), flush=True)
@@ -248,11 +277,16 @@ def rows_of(world: str, trajectory: str) -> list[dict[str, Any]]:
 def line(row: dict[str, Any]) -> str:
     """Return a row as text."""
     values = ("     –" if row[name] is None else f"{row[name]:6.2f}" for name in COLUMNS)
-    return f"{row['world']:5} {row['trajectory']:9} {row['fps'] or '':3} {row['way']:25} " + " ".join(values)
+    return (
+        f"{row['world']:5} {row['trajectory']:9} {row['fps'] or '':3} {row['way']:25} "
+        + " ".join(values)
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--worlds", nargs="+", default=["room", "desk"])
     parser.add_argument("--trajectories", nargs="+", default=list(FPS), choices=list(FPS))
     parser.add_argument("--out", type=Path, default=OUT)

@@ -26,7 +26,9 @@ def places(scene: EventScene, model: str, xy: Array, theta: Array) -> Array:
     if model == "plane circle":
         return xy - scene.radius * np.stack([np.cos(theta), np.sin(theta)], axis=1)
     if model == "ellipse":
-        table = scene.keep("ellipse", lambda: _ellipses(scene))[xy[:, 1].astype(int), xy[:, 0].astype(int)]
+        table = scene.keep("ellipse", lambda: _ellipses(scene))[
+            xy[:, 1].astype(int), xy[:, 0].astype(int)
+        ]
         return (
             xy
             + table[:, 0]
@@ -39,7 +41,11 @@ def places(scene: EventScene, model: str, xy: Array, theta: Array) -> Array:
 def _ellipses(scene: EventScene) -> Array:
     """Return mean and first harmonic of each pixel's exact displacement [px], shape ``(height, width, 3, 2)``."""
     width, height = scene.camera.width, scene.camera.height
-    xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
+    xy = (
+        np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+        .reshape(-1, 2)
+        .astype(np.float64)
+    )
 
     def moments(k: int) -> Array:
         phi = 2.0 * np.pi * k / HARMONIC_ANGLES
@@ -89,7 +95,9 @@ def images(scene: EventScene, model: str) -> dict[Vote, Array]:
     return scene.keep(("images", model), total)
 
 
-def iwe_errors(scene: EventScene, model: str, vote: Vote, image: Floats, found: Floats) -> dict[str, float]:
+def iwe_errors(
+    scene: EventScene, model: str, vote: Vote, image: Floats, found: Floats
+) -> dict[str, float]:
     """Return the errors of an image, and of the positions ``found`` of the scene's sample.
 
     ``rms_events``, ``max_events``: difference between a pixel and the true image [events]. ``misplaced``: share of all

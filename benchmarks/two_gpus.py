@@ -32,13 +32,20 @@ import numpy as np
 import warp as wp
 
 from amiwarp import compensate, make_dataset, open_recording
-from amiwarp.kernels.launch import start_quietly
-from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, machine, processor, run_jobs, start_workers, versions
-from amiwarp.studies.dataset import making
-from amiwarp.studies.dataset.making import Item, list_items, simulation_of, write_recording
-from amiwarp.studies.dataset.specification import content_digest, load_specification
-from amiwarp.studies.stability.cells import AXES, METHODS, Axis, Cell, Store, Stored, cells_of, run_cell
+from amiwarp.io import recorded_dataset
+from amiwarp.kernels.quiet_start import start_quietly
+from amiwarp.learning.dataset import making
+from amiwarp.learning.dataset.items import Item, list_items
+from amiwarp.learning.dataset.sources import content_digest
+from amiwarp.learning.dataset.specification import load_specification
+from amiwarp.learning.dataset.worker import simulation_of, write_recording
+from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, run_jobs, start_workers
+from amiwarp.studies.machine import machine, processor, versions
+from amiwarp.studies.stability.axes import AXES, Axis
+from amiwarp.studies.stability.cells import Store, Stored, cells_of, run_cell
 from amiwarp.studies.stability.cells import run as run_cells
+from amiwarp.studies.stability.condition import Cell
+from amiwarp.studies.stability.judging import METHODS
 from amiwarp.tasks import cpu_threads
 from benchmarks import compensate as file_benchmark
 from benchmarks import simulate
@@ -79,7 +86,9 @@ class FileTask:
 def compensate_file(task: FileTask) -> int:
     """Compensate a file by the exact model; return its number of events."""
     calibration = file_benchmark.calibrated("exact", task.phase)
-    return compensate(open_recording(task.source), calibration, task.out, device=task.device, overwrite=True).events
+    return compensate(
+        open_recording(task.source), calibration, task.out, device=task.device, overwrite=True
+    ).events
 
 
 @dataclass(frozen=True)
@@ -139,7 +148,10 @@ def run_files(place: Place, scheduler: str, tasks: int) -> Done:
     out.mkdir()
     with start_workers("benchmarks.two_gpus", "cluster", scheduler, 0, place.device) as workers:
         began = time.perf_counter()
-        done = [future.result() for _, future in run_jobs(workers, compensate_file, place.files(out, tasks))]
+        done = [
+            future.result()
+            for _, future in run_jobs(workers, compensate_file, place.files(out, tasks))
+        ]
         seconds = time.perf_counter() - began
     found = {path.name: content_digest(path) for path in sorted(out.iterdir())}
     shutil.rmtree(out)
@@ -151,7 +163,13 @@ def run_atlas(place: Place, scheduler: str, tasks: int) -> Done:
     cells.mkdir()
     with start_workers("benchmarks.two_gpus", "cluster", scheduler, 0, place.device) as workers:
         began = time.perf_counter()
-        done = run_cells(cells_of([axis()], tasks // VALUES), METHODS[:1], Store(cells), workers, device=place.device)
+        done = run_cells(
+            cells_of([axis()], tasks // VALUES),
+            METHODS[:1],
+            Store(cells),
+            workers,
+            device=place.device,
+        )
         seconds = time.perf_counter() - began
     shutil.rmtree(cells)
     return Done(seconds, sum(c.events for c in done), {c.cell.name: known(c) for c in done})
@@ -160,11 +178,13 @@ def run_atlas(place: Place, scheduler: str, tasks: int) -> Done:
 def run_dataset(place: Place, scheduler: str, tasks: int) -> Done:
     out, specification = place.folder / "dataset", place.specification(tasks)
     began = time.perf_counter()
-    done = make_dataset(specification, out, scheduler=scheduler, device="cpu" if place.device == "cpu" else ANY_GPU)
+    done = make_dataset(
+        specification, out, scheduler=scheduler, device="cpu" if place.device == "cpu" else ANY_GPU
+    )
     seconds = time.perf_counter() - began
     if done.failed:
         raise SystemExit(f"recordings failed: {done.failed}")
-    items = json.loads((out / making.MANIFEST).read_text())["items"]
+    items = json.loads((out / recorded_dataset.MANIFEST).read_text())["items"]
     shutil.rmtree(out)
     return Done(seconds, done.events, {item["file"]: item["sha256"] for item in items})
 
@@ -218,7 +238,11 @@ def warm_up(place: Place, names: list[str]) -> tuple[str, dict[str, float]]:
         began = time.perf_counter()
         JOBS[name].one(place, 1)
         times[name] = time.perf_counter() - began
-    where = wp.get_device(place.device).pci_bus_id if place.device != "cpu" else f"{cpu_threads()} cores"
+    where = (
+        wp.get_device(place.device).pci_bus_id
+        if place.device != "cpu"
+        else f"{cpu_threads()} cores"
+    )
     return where, times
 
 
@@ -241,7 +265,9 @@ def cluster(count: int, share: int, gpus: tuple[str, ...]) -> Iterator[Any]:
     cores = tuple(frozenset(mine[k * share : (k + 1) * share] or mine) for k in range(count))
     with (
         dask.config.set(LOCAL_CONFIGURATION),
-        LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0) as local,
+        LocalCluster(
+            n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0
+        ) as local,
         Client(local) as client,
     ):
         client.register_worker_callbacks(partial(prepare, gpus, cores))
@@ -255,7 +281,9 @@ def error_px(name: str, place: Place, done: Done) -> float:
     error of the positions of the first recording's events.
     """
     if name == "atlas":
-        return float(np.median([r["error_px"] for r in done.found.values() if r["error_px"] is not None]))
+        return float(
+            np.median([r["error_px"] for r in done.found.values() if r["error_px"] is not None])
+        )
     if name == "dataset":
         return simulate.error_px(simulation_of(place.items(OF_PICTURES)[0], place.device))
     with tempfile.TemporaryDirectory(dir=place.folder) as folder:
@@ -275,34 +303,57 @@ def difference(name: str, a: dict[str, Any], b: dict[str, Any]) -> float:
     common = a.keys() & b.keys()
     if name != "atlas":
         return 0.0 if common and all(a[k] == b[k] for k in common) else math.inf
-    if not common or any(a[k]["outcome"] != b[k]["outcome"] or a[k]["events"] != b[k]["events"] for k in common):
+    if not common or any(
+        a[k]["outcome"] != b[k]["outcome"] or a[k]["events"] != b[k]["events"] for k in common
+    ):
         return math.inf
     return max(abs((a[k]["error_px"] or 0.0) - (b[k]["error_px"] or 0.0)) for k in common)
 
 
-def measure(args: argparse.Namespace, place: Place, gpus: tuple[str, ...], began: float) -> Iterator[dict[str, Any]]:
+def measure(
+    args: argparse.Namespace, place: Place, gpus: tuple[str, ...], began: float
+) -> Iterator[dict[str, Any]]:
     """Run every job on one and on all workers; yield the rows."""
     first: dict[str, Done] = {}
     tasks: dict[str, int] = {}
     share = max(1, cpu_threads() // args.workers)
     alone = {name: dict(JOBS[name].one(place, k) for k in range(SAMPLE)) for name in args.jobs}
-    runs = [(1, share), (args.workers, share), *([(1, cpu_threads())] if cpu_threads() > share else [])]
+    runs = [
+        (1, share),
+        (args.workers, share),
+        *([(1, cpu_threads())] if cpu_threads() > share else []),
+    ]
     for count, cores in runs:
         if first and time.perf_counter() - began > args.limit_s:
-            print(f"left out after {args.limit_s:g} s: {count} workers with {cores} cores", flush=True)
+            print(
+                f"left out after {args.limit_s:g} s: {count} workers with {cores} cores", flush=True
+            )
             continue
         with cluster(count, cores, gpus) as client:
             addresses = sorted(client.nthreads())
-            warm = [client.submit(warm_up, place, args.jobs, workers=[a], pure=False) for a in addresses]
+            warm = [
+                client.submit(warm_up, place, args.jobs, workers=[a], pure=False) for a in addresses
+            ]
             places, times = zip(*client.gather(warm), strict=True)
-            print(f"{time.perf_counter() - began:5.1f} s  {count} workers, {cores} cores each, {places}", flush=True)
+            print(
+                f"{time.perf_counter() - began:5.1f} s  {count} workers, {cores} cores each, {places}",
+                flush=True,
+            )
             for name in args.jobs:
                 each = JOBS[name].each
-                tasks.setdefault(name, each * max(-(-4 // each), round(args.seconds / times[0][name] / each)))
+                tasks.setdefault(
+                    name, each * max(-(-4 // each), round(args.seconds / times[0][name] / each))
+                )
                 done = JOBS[name].all(place, client.scheduler.address, tasks[name])
                 base = first.setdefault(name, done)
-                of_one, of_alone = difference(name, base.found, done.found), difference(name, alone[name], done.found)
-                same = all(done.found[k] == v for k, v in alone[name].items()) and done.found == base.found
+                of_one, of_alone = (
+                    difference(name, base.found, done.found),
+                    difference(name, alone[name], done.found),
+                )
+                same = (
+                    all(done.found[k] == v for k, v in alone[name].items())
+                    and done.found == base.found
+                )
                 yield {
                     "job": name, "workers": count, "cores_per_worker": cores, "places": sorted(places),
                     "tasks": tasks[name], "seconds": done.seconds, "per_s": tasks[name] / done.seconds,
@@ -314,18 +365,28 @@ def measure(args: argparse.Namespace, place: Place, gpus: tuple[str, ...], began
 def wrong(row: dict[str, Any], gpus: tuple[str, ...]) -> bool:
     """Return whether results differ, the error is too large, or workers shared a GPU."""
     apart = not gpus or len(set(row["places"])) == min(row["workers"], len(gpus))
-    return not (apart and row["difference_px"] <= CLOSE_PX and row["error_px"] <= MOST_PX[row["job"]])
+    return not (
+        apart and row["difference_px"] <= CLOSE_PX and row["error_px"] <= MOST_PX[row["job"]]
+    )
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cuda", choices=("cpu", ANY_GPU))
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--jobs", nargs="+", choices=JOBS, default=list(JOBS))
     parser.add_argument("--seconds", type=float, default=5.0, help="time of each job on one worker")
-    parser.add_argument("--limit-s", type=float, default=45.0, help="start no further workers after this time")
+    parser.add_argument(
+        "--limit-s", type=float, default=45.0, help="start no further workers after this time"
+    )
     parser.add_argument("--events", type=int, help="events of each file")
-    parser.add_argument("--folder", type=Path, help="folder on the disk to measure; default: that of temporary files")
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        help="folder on the disk to measure; default: that of temporary files",
+    )
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     began = time.perf_counter()
@@ -351,7 +412,8 @@ def main() -> int:
             rows.append(row)
             print(json.dumps(row), flush=True)
             result = about | {"elapsed_s": time.perf_counter() - began, "rows": rows}
-            out.write_text(json.dumps(result, indent=1) + "\n")  # so that an interrupted run keeps its rows
+            # So that an interrupted run keeps its rows
+            out.write_text(json.dumps(result, indent=1) + "\n")
     bad = [row["job"] for row in rows if wrong(row, gpus)]
     print(f"wrong: {', '.join(bad)}" if bad else "all results agree")
     return 1 if bad else 0

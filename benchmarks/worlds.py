@@ -19,8 +19,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp import Camera, Events, EventTruth, Prism, Scene, Simulation, TruthRenderer, WorldScene, named_world
-from amiwarp.simulation.simulator import Engine
+from amiwarp import (
+    Camera,
+    Events,
+    EventTruth,
+    Prism,
+    Scene,
+    Simulation,
+    TruthRenderer,
+    WorldScene,
+    named_world,
+)
+from amiwarp.simulation.engine import Engine
 
 CAMERA, PRISM = Camera.from_fov(640, 480, math.radians(60.0)), Prism(math.radians(1.0))
 WIDE = math.radians(72.0)
@@ -45,10 +55,14 @@ def reprojection(scene: WorldScene, events: Events, truth: EventTruth) -> np.nda
     local = np.einsum("nij,ni->nj", rotation, places[known] - position)
     x = CAMERA.fx * local[:, 0] / local[:, 2] + CAMERA.cx
     y = CAMERA.fy * local[:, 1] / local[:, 2] + CAMERA.cy
-    return np.asarray(np.hypot(x - truth.points[::SOME][known, 0], y - truth.points[::SOME][known, 1]))
+    return np.asarray(
+        np.hypot(x - truth.points[::SOME][known, 0], y - truth.points[::SOME][known, 1])
+    )
 
 
-def timed(scene: Any, seconds: float, device: str, errors: list[np.ndarray] | None) -> tuple[float, float, int, Engine]:
+def timed(
+    scene: Any, seconds: float, device: str, errors: list[np.ndarray] | None
+) -> tuple[float, float, int, Engine]:
     """Simulate a scene; return wall time [s], processor time [s], number of events, and the engine.
 
     The times do not include the first map. If ``errors`` is a list, the times include the ground truth of all events.
@@ -64,7 +78,10 @@ def timed(scene: Any, seconds: float, device: str, errors: list[np.ndarray] | No
         count += len(block.arrays.t)
         truth = None if errors is None else block.truth()
         wp.synchronize_device(device)
-        wall, processor = wall + time.perf_counter() - began, processor + time.process_time() - began_processor
+        wall, processor = (
+            wall + time.perf_counter() - began,
+            processor + time.process_time() - began_processor,
+        )
         if truth is not None and errors is not None and isinstance(scene, WorldScene):
             errors.append(reprojection(scene, block.events(), truth))
         began, began_processor = time.perf_counter(), time.process_time()
@@ -88,22 +105,32 @@ def as_picture(name: str) -> Scene:
     """Return the first view of a built-in world as a picture at infinity with about twice the camera's resolution."""
     world, path = named_world(name, "still")
     wide = Camera.from_fov(1600, 1200, WIDE)
-    truth = TruthRenderer(Simulation(WorldScene(world, path, samples=4, blur=0.5), wide, Prism(0.0), 0.01)).at(0)
+    truth = TruthRenderer(
+        Simulation(WorldScene(world, path, samples=4, blur=0.5), wide, Prism(0.0), 0.01)
+    ).at(0)
     return Scene.from_picture(truth.intensity, fov=WIDE)
 
 
 def main() -> None:
     """Run the benchmark, print each row, and write the rows to a file."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--quick", action="store_true", help="simulate a tenth of the time")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     on_cpu = wp.get_device(args.device).is_cpu
     seconds = (0.1 if on_cpu else 1.0) * (0.1 if args.quick else 1.0)
-    rows = [measure("room, still, as a picture at infinity", as_picture("room"), seconds, args.device)]
+    rows = [
+        measure("room, still, as a picture at infinity", as_picture("room"), seconds, args.device)
+    ]
     print(json.dumps(rows[0]), flush=True)
-    cases = [("room", "still", "maps", None), ("desk", "handheld", "maps", None), ("room", "handheld", "maps", None)]
+    cases = [
+        ("room", "still", "maps", None),
+        ("desk", "handheld", "maps", None),
+        ("room", "handheld", "maps", None),
+    ]
     if not on_cpu:
         cases += [("room", "handheld", "rays", 1), ("room", "handheld", "rays", 4), ("street", "handheld", "rays", 1),
                   ("street", "handheld", "rays", 4)]  # fmt: skip
@@ -115,7 +142,8 @@ def main() -> None:
         print(json.dumps(rows[-1]), flush=True)
     if args.out is not None:
         args.out.write_text(
-            json.dumps({"machine": str(wp.get_device(args.device).name), "rows": rows}, indent=1) + "\n"
+            json.dumps({"machine": str(wp.get_device(args.device).name), "rows": rows}, indent=1)
+            + "\n"
         )
 
 

@@ -30,7 +30,13 @@ extensions = [
     "repository_pages",
     "results_table",
 ]
-exclude_patterns = ["_build", "tutorials", "gallery/backreferences", "explanation/paper-results/*", "**/*.ipynb"]
+exclude_patterns = [
+    "_build",
+    "tutorials",
+    "gallery/backreferences",
+    "reference/paper-results/*",
+    "**/*.ipynb",
+]
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
@@ -61,12 +67,15 @@ repository_pages = {
     "reference/files/auto": "benchmarks/auto.py",
     "reference/files/mutants": "benchmarks/mutants.toml",
     "reference/files/planted": "benchmarks/planted.toml",
-    "reference/files/packets": "amiwarp/live/stream/packets.py",
-    "reference/files/refraction": "amiwarp/kernels/refraction.py",
+    "reference/files/stream_format": "amiwarp/live/stream/stream_format.py",
+    "reference/files/prism_pair": "amiwarp/kernels/prism_pair.py",
 }
 repository_aliases = {
     "README.md": "index",
-    **{f"docs/tutorials/{path.name}": f"gallery/{path.stem}" for path in HERE.glob("tutorials/*.py")},
+    **{
+        f"docs/tutorials/{path.name}": f"gallery/{path.stem}"
+        for path in HERE.glob("tutorials/*.py")
+    },
 }
 
 sphinx_gallery_conf = {
@@ -93,7 +102,8 @@ html_css_files = ["site.css"]
 templates_path = ["_templates"]
 html_sidebars = {
     "**": [
-        f"sidebar/{part}.html" for part in ("brand", "search", "sections", "scroll-start", "navigation", "scroll-end")
+        f"sidebar/{part}.html"
+        for part in ("brand", "search", "sections", "scroll-start", "navigation", "scroll-end")
     ]
 }
 html_show_sourcelink = False
@@ -101,5 +111,7 @@ html_copy_source = False
 html_show_copyright = False
 html_math_renderer = "mathml"
 pygments_style = "friendly"
-copybutton_selector = "div:is(.highlight-sh, .highlight-python, .highlight-Python) pre"  # not what a program prints
+copybutton_selector = (
+    "div:is(.highlight-sh, .highlight-python, .highlight-Python) pre"  # not what a program prints
+)
 html_theme_options = {"footer_icons": [], "top_of_page_buttons": []}

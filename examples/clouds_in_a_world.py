@@ -9,7 +9,10 @@ from scipy.spatial.transform import Rotation
 import amiwarp
 
 world, way = amiwarp.named_world("room", "still", duration_s=0.1)
-camera, prism = amiwarp.Camera.from_fov(160, 120, math.radians(60)), amiwarp.Prism(math.radians(1.5))
+camera, prism = (
+    amiwarp.Camera.from_fov(160, 120, math.radians(60)),
+    amiwarp.Prism(math.radians(1.5)),
+)
 recording = amiwarp.simulate(amiwarp.WorldScene(world, way), camera, prism, duration_s=0.1)
 calibration = amiwarp.calibrate(recording)
 before, after = amiwarp.event_clouds(recording, calibration)
@@ -26,12 +29,21 @@ plotter.subplot(0, 1)
 for body in world.bodies:
     mesh = pyvista.PolyData.from_regular_faces(body.mesh.vertices, body.mesh.faces)
     if body.trajectory is not None:  # where the body is at the start
-        mesh.points = Rotation.from_quat(body.trajectory.rotation[0]).apply(mesh.points) + body.trajectory.position[0]
+        mesh.points = (
+            Rotation.from_quat(body.trajectory.rotation[0]).apply(mesh.points)
+            + body.trajectory.position[0]
+        )
     plotter.add_mesh(mesh, color="lightgrey", opacity=0.15)
 seen = after.extract_points(np.isfinite(after["place_m"]).all(axis=1), include_cells=False)
 on_the_meshes = pyvista.PolyData(seen["place_m"])
 on_the_meshes["polarity"] = seen["polarity"]
-plotter.add_mesh(on_the_meshes, scalars="polarity", point_size=3, cmap=["#0072b2", "#d55e00"], show_scalar_bar=False)
+plotter.add_mesh(
+    on_the_meshes,
+    scalars="polarity",
+    point_size=3,
+    cmap=["#0072b2", "#d55e00"],
+    show_scalar_bar=False,
+)
 plotter.view_vector((-1.0, -1.0, 0.8), viewup=(0.0, 0.0, 1.0))
 plotter.add_text("the same events in the room", font_size=9)
 plotter.screenshot("clouds_in_a_world.png")

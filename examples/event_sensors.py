@@ -12,7 +12,9 @@ import amiwarp
 
 CAMERAS, SIDE, STEPS, STEP_US, DIRECTIONS, BATCHES = 32, 32, 4, 2_000, 4, 28
 DEVICE = "cuda:0" if torch.cuda.is_available() else "cpu"
-SENSOR = amiwarp.EventSensor(CAMERAS, SIDE, SIDE, amiwarp.SensorModel.preset("davis346"), device=DEVICE)
+SENSOR = amiwarp.EventSensor(
+    CAMERAS, SIDE, SIDE, amiwarp.SensorModel.preset("davis346"), device=DEVICE
+)
 
 torch.manual_seed(0)
 y, x = torch.meshgrid(*2 * [torch.arange(SIDE, device=DEVICE, dtype=torch.float32)], indexing="ij")
@@ -31,7 +33,9 @@ def batch() -> tuple[torch.Tensor, torch.Tensor]:
         luminance = 0.5 + 0.4 * torch.sin(place * (2.0 * math.pi) / length)
         events, windows = SENSOR.step(torch.log(luminance + 0.02), k * STEP_US)
         if k:  # the first images only set the references
-            grids.append(torch.from_dlpack(amiwarp.voxel_grid(events, SIDE, SIDE, bins=2, windows=windows)))
+            grids.append(
+                torch.from_dlpack(amiwarp.voxel_grid(events, SIDE, SIDE, bins=2, windows=windows))
+            )
     return torch.cat(grids, dim=1), labels
 
 
@@ -49,5 +53,7 @@ for _ in range(BATCHES):
 
 grids, labels = batch()  # gratings that the network has not seen
 correct = (network(grids).argmax(1) == labels).float().mean().item()
-print(f"{correct:.0%} of {CAMERAS} new gratings right on {DEVICE}; guessing gives {1 / DIRECTIONS:.0%}")
+print(
+    f"{correct:.0%} of {CAMERAS} new gratings right on {DEVICE}; guessing gives {1 / DIRECTIONS:.0%}"
+)
 assert correct > 2 / DIRECTIONS, "the network has learnt nothing"

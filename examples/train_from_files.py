@@ -26,22 +26,40 @@ import amiwarp
 
 BINS, WINDOW_US = 5, 25_000
 DIRECTIONS, DURATION_US, STEP_US, AT_ONCE = 4, 204_000, 2_000, 16  # of the recordings that are made
-COLUMNS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}  # in the order of a batch: largest first
+COLUMNS = {
+    "t": np.int64,
+    "x": np.uint16,
+    "y": np.uint16,
+    "p": np.uint8,
+}  # in the order of a batch: largest first
 EVENT_BYTES, PAGE = sum(np.dtype(kind).itemsize for kind in COLUMNS.values()), 4096
 
 
 def make_data(folder: Path, recordings: int, device: str) -> None:
     """Write recordings of plain cameras, each of which sees a grating that moves in one of several directions."""
     items, side = [], 128 if device.startswith("cuda") else 64
-    y, x = torch.meshgrid(*2 * [torch.arange(side, device=device, dtype=torch.float32)], indexing="ij")
+    y, x = torch.meshgrid(
+        *2 * [torch.arange(side, device=device, dtype=torch.float32)], indexing="ij"
+    )
     for first in range(0, recordings, AT_ONCE):
         n = min(AT_ONCE, recordings - first)
         random = torch.rand((4, n, 1, 1), generator=torch.Generator().manual_seed(first)).to(device)
         labels = [k % DIRECTIONS for k in range(first, first + n)]
-        angle = (torch.tensor(labels, device=device)[:, None, None] + 0.4 * random[0] - 0.2) * (math.tau / DIRECTIONS)
-        length, contrast, speed = 8 + 24 * random[1], 0.2 + 0.25 * random[2], 0.03 + 0.06 * random[3]  # px, 1, px/ms
+        angle = (torch.tensor(labels, device=device)[:, None, None] + 0.4 * random[0] - 0.2) * (
+            math.tau / DIRECTIONS
+        )
+        length, contrast, speed = (
+            8 + 24 * random[1],
+            0.2 + 0.25 * random[2],
+            0.03 + 0.06 * random[3],
+        )  # px, 1, px/ms
         sensor = amiwarp.EventSensor(
-            n, side, side, amiwarp.SensorModel.preset("davis346"), seed=list(range(first, first + n)), device=device
+            n,
+            side,
+            side,
+            amiwarp.SensorModel.preset("davis346"),
+            seed=list(range(first, first + n)),
+            device=device,
         )
         parts: list[list[amiwarp.Events]] = [[] for _ in range(n)]
         for t_us in range(0, DURATION_US + 1, STEP_US):
@@ -49,24 +67,40 @@ def make_data(folder: Path, recordings: int, device: str) -> None:
             luminance = 0.5 + contrast * torch.sin(place * (math.tau / length))
             events, cameras = sensor.step(torch.log(luminance + 0.02), t_us)
             host = events.to_host()
-            for part, start, stop in zip(parts, cameras.start.tolist(), cameras.stop.tolist(), strict=True):
+            for part, start, stop in zip(
+                parts, cameras.start.tolist(), cameras.stop.tolist(), strict=True
+            ):
                 part.append(host[start:stop])
         for k, (part, label) in enumerate(zip(parts, labels, strict=True), first):
             found = amiwarp.Events.concatenate(part)
-            amiwarp.save_recording(folder / f"{k}.h5", amiwarp.Recording(amiwarp.MemoryEvents(found, side, side)))
-            items.append({"file": f"{k}.h5", "split": "train", "labels": {"class": label}, "events": len(found)})
+            amiwarp.save_recording(
+                folder / f"{k}.h5", amiwarp.Recording(amiwarp.MemoryEvents(found, side, side))
+            )
+            items.append(
+                {
+                    "file": f"{k}.h5",
+                    "split": "train",
+                    "labels": {"class": label},
+                    "events": len(found),
+                }
+            )
     manifest = {"format": "amiwarp-dataset", "version": 1, "items": items}
     (folder / "manifest.json").write_text(json.dumps(manifest))
 
 
-def cut(recording: amiwarp.Recording, labels: dict[str, Any]) -> tuple[list[amiwarp.Events], Any, tuple[int, int]]:
+def cut(
+    recording: amiwarp.Recording, labels: dict[str, Any]
+) -> tuple[list[amiwarp.Events], Any, tuple[int, int]]:
     """Return the events of all windows of a recording, its class, and the size of its sensor.
 
     Opening a file takes longer than reading a window, so every window of an opened file is used.
     """
     events = recording.events[:]
     windows = amiwarp.windows(events, duration_us=WINDOW_US)
-    blocks = [events[start:stop] for start, stop in zip(windows.start.tolist(), windows.stop.tolist(), strict=True)]
+    blocks = [
+        events[start:stop]
+        for start, stop in zip(windows.start.tolist(), windows.stop.tolist(), strict=True)
+    ]
     return blocks, labels["class"], recording.events.size
 
 
@@ -82,7 +116,9 @@ class Join:
         self.slots = torch.empty((slots, size), dtype=torch.uint8).share_memory_()
         if device.startswith("cuda"):  # page-locked, from which a GPU copies at full speed
             runtime = torch.cuda.cudart()
-            torch.cuda.check_error(runtime.cudaHostRegister(self.slots.data_ptr(), self.slots.numel(), 0))
+            torch.cuda.check_error(
+                runtime.cudaHostRegister(self.slots.data_ptr(), self.slots.numel(), 0)
+            )
         self._free = multiprocessing.get_context("spawn").SimpleQueue()
         for slot in range(slots):
             self.release(slot)
@@ -97,13 +133,19 @@ class Join:
             size = sum(map(len, columns))
             np.concatenate(columns, out=place[:size])
             place = place[size:]
-        return slot, [len(block) for block in blocks], [label for blocks, label, _ in items for _ in blocks]
+        return (
+            slot,
+            [len(block) for block in blocks],
+            [label for blocks, label, _ in items for _ in blocks],
+        )
 
     def events(self, slot: int, n: int) -> amiwarp.Events:
         """Return the ``n`` events in a slot, without a copy."""
         ends = n * np.cumsum([np.dtype(kind).itemsize for kind in COLUMNS.values()])
         parts = np.split(self.slots[slot].numpy()[: n * EVENT_BYTES], ends[:-1])
-        columns = {name: part.view(kind) for (name, kind), part in zip(COLUMNS.items(), parts, strict=True)}
+        columns = {
+            name: part.view(kind) for (name, kind), part in zip(COLUMNS.items(), parts, strict=True)
+        }
         return amiwarp.Events(**columns)
 
     def release(self, slot: int) -> None:
@@ -137,16 +179,23 @@ def make_network(classes: int, n: int) -> nn.Module:
     )  # fmt: skip
 
 
-def on_device(loader: Any, join: Join, names: list[Any], size: tuple[int, int], device: str) -> Iterator[Any]:
+def on_device(
+    loader: Any, join: Join, names: list[Any], size: tuple[int, int], device: str
+) -> Iterator[Any]:
     """Yield the voxel grids and classes of each batch, on the device."""
     for slot, counts, classes in loader:
         ends = np.cumsum([0, *counts])
         found = join.events(slot, int(ends[-1]))
         windows = amiwarp.windows(found, ranges=np.stack([ends[:-1], ends[1:]], axis=1))
         events, _ = amiwarp.collate([found], device=device)
-        grids = amiwarp.voxel_grid(events, *size, BINS, windows=windows, normalize=True, device=device)
+        grids = amiwarp.voxel_grid(
+            events, *size, BINS, windows=windows, normalize=True, device=device
+        )
         join.release(slot)
-        yield torch.from_dlpack(grids), torch.tensor([names.index(c) for c in classes], device=device)
+        yield (
+            torch.from_dlpack(grids),
+            torch.tensor([names.index(c) for c in classes], device=device),
+        )
 
 
 def main() -> None:
@@ -155,14 +204,22 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder of a data set; by default one is made")
     parser.add_argument("--recordings", type=int, default=2, help="number of recordings to make")
     parser.add_argument("--batch", type=int, default=1, help="recordings in a batch")
-    parser.add_argument("--epochs", type=int, default=2, help="epochs; the first one is not measured")
-    parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 1) - 2), help="reading processes")
+    parser.add_argument(
+        "--epochs", type=int, default=2, help="epochs; the first one is not measured"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=max(1, (os.cpu_count() or 1) - 2), help="reading processes"
+    )
     parser.add_argument("--device", default="cuda:0" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--width", type=int, help="channels of the network's first layers; default 64, on a CPU 16")
+    parser.add_argument(
+        "--width", type=int, help="channels of the network's first layers; default 64, on a CPU 16"
+    )
     given = parser.parse_args()
     given.width = given.width or (64 if given.device.startswith("cuda") else 16)
     if given.epochs < 2:
-        parser.error(f"--epochs is {given.epochs}; give at least 2, because the first one is not measured")
+        parser.error(
+            f"--epochs is {given.epochs}; give at least 2, because the first one is not measured"
+        )
     with tempfile.TemporaryDirectory() as made:
         if given.data is None:
             make_data(Path(made), given.recordings, given.device)
@@ -199,7 +256,9 @@ def train(folder: Path, given: argparse.Namespace) -> None:
 
     losses, windows, begun = [], 0, 0.0
     # On a stream of its own, the network does not wait for copies and voxel grids.
-    with torch.cuda.stream(torch.cuda.Stream(given.device) if given.device.startswith("cuda") else None):
+    with torch.cuda.stream(
+        torch.cuda.Stream(given.device) if given.device.startswith("cuda") else None
+    ):
         batches = on_device(loader, join, names, size, given.device)
         following = next(batches)
         for k in range(steps):
@@ -215,7 +274,9 @@ def train(folder: Path, given: argparse.Namespace) -> None:
         for _ in range(steps - epoch):
             step(*batch).item()
         kept = time.perf_counter() - begun
-    print(f"{sum(p.numel() for p in network.parameters()) / 1e6:.2f} million parameters, {size[0]}x{size[1]} px")
+    print(
+        f"{sum(p.numel() for p in network.parameters()) / 1e6:.2f} million parameters, {size[0]}x{size[1]} px"
+    )
     first, last = (sum(part) / len(part) for part in (losses[:epoch], losses[-epoch:]))
     print(f"mean loss {first:.2f} in the first epoch, {last:.2f} in the last one")
     print(f"{windows} windows in {total:.2f} s on {given.device}, {windows / total:.3g} per second")

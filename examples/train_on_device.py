@@ -13,7 +13,10 @@ import amiwarp
 
 SIDE, ORIENTATIONS, BATCH, BATCHES, PASSES = 32, 4, 16, 10, 6
 DEVICE = "cuda:0" if torch.cuda.is_available() else "cpu"
-CAMERA, PRISM = amiwarp.Camera.from_fov(SIDE, SIDE, math.radians(20)), amiwarp.Prism(math.radians(1.5))
+CAMERA, PRISM = (
+    amiwarp.Camera.from_fov(SIDE, SIDE, math.radians(20)),
+    amiwarp.Prism(math.radians(1.5)),
+)
 MODEL = amiwarp.ExactModel(CAMERA, PRISM)
 
 
@@ -22,13 +25,25 @@ def sample(label: int, seed: int) -> torch.Tensor:
     rng = np.random.default_rng(seed)
     angle = (label + rng.uniform(-0.2, 0.2)) * math.pi / ORIENTATIONS
     y, x = np.mgrid[:64, :64]
-    wave = np.sin((x * math.cos(angle) + y * math.sin(angle)) * rng.uniform(0.3, 0.5) + rng.uniform(0, 2 * math.pi))
+    wave = np.sin(
+        (x * math.cos(angle) + y * math.sin(angle)) * rng.uniform(0.3, 0.5)
+        + rng.uniform(0, 2 * math.pi)
+    )
     picture = (0.5 + rng.uniform(0.2, 0.45) * wave).astype(np.float32)
     recording = amiwarp.simulate(
-        picture, CAMERA, PRISM, duration_s=0.02, motion=3000.0, seed=seed, device=DEVICE, on_device=True
+        picture,
+        CAMERA,
+        PRISM,
+        duration_s=0.02,
+        motion=3000.0,
+        seed=seed,
+        device=DEVICE,
+        on_device=True,
     )
     events = recording.events.slice_on_device(0, len(recording.events))
-    image = amiwarp.iwe(events, SIDE, SIDE, model=MODEL, encoder=recording.encoder, per_polarity=True)
+    image = amiwarp.iwe(
+        events, SIDE, SIDE, model=MODEL, encoder=recording.encoder, per_polarity=True
+    )
     return torch.from_dlpack(image)
 
 

@@ -15,8 +15,12 @@ assert encoder is not None
 
 images = []
 for block in recording.events.blocks(duration_us=50_000):
-    image = amiwarp.iwe(block, 320, 240, model=calibration.model, encoder=encoder, per_polarity=True)
+    image = amiwarp.iwe(
+        block, 320, 240, model=calibration.model, encoder=encoder, per_polarity=True
+    )
     raw = amiwarp.sharpness(amiwarp.iwe(block, 320, 240))
-    print(f"{len(block)} events: sharpness {raw:.2f} raw, {amiwarp.sharpness(image.sum(axis=0)):.2f} compensated")
+    print(
+        f"{len(block)} events: sharpness {raw:.2f} raw, {amiwarp.sharpness(image.sum(axis=0)):.2f} compensated"
+    )
     images.append(image)
 np.save("windows.npy", np.stack(images))

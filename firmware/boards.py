@@ -83,8 +83,13 @@ class NativeBoard:
         clock_start: float = 0.0, seed: int = 1, library: Path = BUILD / "libboard.so",
     ) -> None:  # fmt: skip
         self._load(library)
-        counts, numbers = counts_per_turn or COUNTS[magnetic], map(ctypes.c_double, (drift_ppm, clock_start))
-        self._board = ctypes.c_void_p(self.library.board_new(counts, int(magnetic), pulses, *numbers, seed))
+        counts, numbers = (
+            counts_per_turn or COUNTS[magnetic],
+            map(ctypes.c_double, (drift_ppm, clock_start)),
+        )
+        self._board = ctypes.c_void_p(
+            self.library.board_new(counts, int(magnetic), pulses, *numbers, seed)
+        )
 
     def _load(self, library: Path) -> None:
         self.library = ctypes.CDLL(str(library))
@@ -95,7 +100,9 @@ class NativeBoard:
 
     def advance(self, now_us: int) -> bytes:
         """Run until a simulated time and return the bytes sent; the simulated line of the core is infinitely fast."""
-        size = self.library.board_advance(self._board, ctypes.c_uint64(max(now_us, 0)), self._out, len(self._out))
+        size = self.library.board_advance(
+            self._board, ctypes.c_uint64(max(now_us, 0)), self._out, len(self._out)
+        )
         return self._out.raw[:size] if size else b""
 
     def feed(self, data: bytes, now_us: int) -> None:
@@ -125,7 +132,15 @@ class NativeBoard:
 
     def counters(self) -> dict[str, int]:
         """Return the firmware's statistics of received frames."""
-        names = ("frames", "damaged", "unknown", "lost", "overruns", "encoder_errors", "index_bounces")
+        names = (
+            "frames",
+            "damaged",
+            "unknown",
+            "lost",
+            "overruns",
+            "encoder_errors",
+            "index_bounces",
+        )
         return {name: self.library.board_counter(self._board, k) for k, name in enumerate(names)}
 
 
@@ -140,7 +155,12 @@ class SimulatedBoard:
     plugged = True
 
     def __init__(
-        self, image: Path, *, magnetic: bool = False, counts_per_turn: int | None = None, usb: bool = False
+        self,
+        image: Path,
+        *,
+        magnetic: bool = False,
+        counts_per_turn: int | None = None,
+        usb: bool = False,
     ) -> None:
         bus = "usb" if usb else "no-usb"
         kind, counts = "MAGNETIC" if magnetic else "QUADRATURE", counts_per_turn or COUNTS[magnetic]
@@ -193,7 +213,11 @@ class SimulatedBoard:
         """Return the longest run and the sum of the runs [cycles], by interrupt."""
         worst, busy = self.get("worst"), self.get("busy")
         names = {"16": "tick", "29": "edges", "36": "UART"}
-        return {name: {"worst": worst[key], "busy": busy[key]} for key, name in names.items() if key in worst}
+        return {
+            name: {"worst": worst[key], "busy": busy[key]}
+            for key, name in names.items()
+            if key in worst
+        }
 
     def reset(self) -> None:
         """Reset the chip."""
@@ -211,7 +235,9 @@ class SimulatedBoard:
 class UsbBoard(SimulatedBoard):
     """The image for the RP2040 on rp2040js, with the link over USB instead of the UART."""
 
-    def __init__(self, image: Path, *, magnetic: bool = False, counts_per_turn: int | None = None) -> None:
+    def __init__(
+        self, image: Path, *, magnetic: bool = False, counts_per_turn: int | None = None
+    ) -> None:
         super().__init__(image, magnetic=magnetic, counts_per_turn=counts_per_turn, usb=True)
         self._received = b""
 
@@ -238,10 +264,18 @@ class AvrBoard(NativeBoard):
     }  # fmt: skip
     """Numbers of the vectors."""
 
-    def __init__(self, image: Path, *, counts_per_turn: int | None = None, library: Path = BUILD / "libavr.so") -> None:
+    def __init__(
+        self,
+        image: Path,
+        *,
+        counts_per_turn: int | None = None,
+        library: Path = BUILD / "libavr.so",
+    ) -> None:
         self._load(library)
         with flash_of(image) as flash:
-            self._board = ctypes.c_void_p(self.library.board_new(str(flash).encode(), counts_per_turn or COUNTS[0]))
+            self._board = ctypes.c_void_p(
+                self.library.board_new(str(flash).encode(), counts_per_turn or COUNTS[0])
+            )
         if not self._board:
             raise FileNotFoundError(f"{image} cannot be read: run make -C firmware avr")
 
@@ -249,7 +283,9 @@ class AvrBoard(NativeBoard):
         """Return a value, or a list of times."""
         if name in self.LISTS:
             times = ctypes.POINTER(ctypes.c_double)()
-            size = self.library.board_times(self._board, self.LISTS.index(name), ctypes.byref(times))
+            size = self.library.board_times(
+                self._board, self.LISTS.index(name), ctypes.byref(times)
+            )
             return times[:size]
         return super().get(name)
 
@@ -304,7 +340,7 @@ def make(name: str, counts_per_turn: int | None = None, *, usb: bool = False) ->
 
 def serve(board: Any, link: Path, seconds: float) -> None:
     """Offer a board as a serial port. A simulator slower than real time slows the board's clock, and loses nothing."""
-    from amiwarp.live.link.emulator import PseudoTerminal
+    from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 
     state = [time.monotonic(), float(board.now)]
 
@@ -324,10 +360,16 @@ def main() -> int:
     from amiwarp.live.link.conformance import check_controller
 
     options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("board", help="native, native-magnetic, or an image (.bin, .uf2: RP2040; .elf, .hex: AVR)")
+    options.add_argument(
+        "board", help="native, native-magnetic, or an image (.bin, .uf2: RP2040; .elf, .hex: AVR)"
+    )
     options.add_argument("--link", type=Path, help="symbolic link for the serial port")
-    options.add_argument("--counts-per-turn", type=int, help="of the prism, for which the image was built")
-    options.add_argument("--usb", action="store_true", help="link over the RP2040's USB instead of its UART")
+    options.add_argument(
+        "--counts-per-turn", type=int, help="of the prism, for which the image was built"
+    )
+    options.add_argument(
+        "--usb", action="store_true", help="link over the RP2040's USB instead of its UART"
+    )
     options.add_argument("--seconds", type=float, default=3600.0)
     options.add_argument("--rpm", type=float, default=240.0)
     chosen = options.parse_args()
@@ -336,7 +378,9 @@ def main() -> int:
         serve(board, chosen.link, chosen.seconds)
         return 0
     checks = check_controller(
-        SimulatedWire(board), chosen.rpm, lambda c: print(f"{c.passed!s:6} {c.name}: {c.measured}", flush=True)
+        SimulatedWire(board),
+        chosen.rpm,
+        lambda c: print(f"{c.passed!s:6} {c.name}: {c.measured}", flush=True),
     )
     return int(any(check.passed is False for check in checks))
 

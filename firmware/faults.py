@@ -22,8 +22,22 @@ FASTEST_COMMAND = 1440.0
 SETTINGS: tuple[dict[str, Any], ...] = (
     {}, {"counts_per_turn": 1000}, {"magnetic": True}, {"magnetic": True, "counts_per_turn": 32768},
 )  # fmt: skip
-LASTING = ("dead_encoder", "dead_a", "bad_spi", "no_magnet", "no_index", "jammed", "no_supply", "sensed_supply")
-PARTS = {"lost_counts": (0.05, 0.95), "load": (200.0, 8000.0), "heavy": (-0.5, 3.0), "bad_spi_at_random": (0.01, 0.5)}
+LASTING = (
+    "dead_encoder",
+    "dead_a",
+    "bad_spi",
+    "no_magnet",
+    "no_index",
+    "jammed",
+    "no_supply",
+    "sensed_supply",
+)
+PARTS = {
+    "lost_counts": (0.05, 0.95),
+    "load": (200.0, 8000.0),
+    "heavy": (-0.5, 3.0),
+    "bad_spi_at_random": (0.01, 0.5),
+}
 KINDS = (
     *LASTING,
     *PARTS,
@@ -104,7 +118,10 @@ def run(case: Case, seed: int, library: Path = BUILD / "libboard.so") -> Outcome
             (active.add if size else active.discard)(name)
             switch(board, name, size)
             if name == "other_speed" and size:
-                board.feed(encode(SetSpeed(rng.uniform(-FASTEST_COMMAND, FASTEST_COMMAND), 2000.0), 0), board.now)
+                board.feed(
+                    encode(SetSpeed(rng.uniform(-FASTEST_COMMAND, FASTEST_COMMAND), 2000.0), 0),
+                    board.now,
+                )
         if not commanded and now >= 0.1:
             board.feed(encode(SetSpeed(case.rpm, case.ramp), step), board.now)
             commanded = True
@@ -112,7 +129,9 @@ def run(case: Case, seed: int, library: Path = BUILD / "libboard.so") -> Outcome
             board.feed(encode(Stop(), step), board.now)
         data = encode(Ping(step), step)
         if "noisy_link" in active:
-            data = bytes(b ^ 1 << rng.randrange(8) if rng.random() < 0.05 else b for b in data) + rng.randbytes(40)
+            data = bytes(
+                b ^ 1 << rng.randrange(8) if rng.random() < 0.05 else b for b in data
+            ) + rng.randbytes(40)
         if "silent_host" not in active:
             board.feed(data, board.now)
         board.advance(board.now + 20_000)
@@ -151,7 +170,10 @@ def main() -> int:
         fastest, longest = max(fastest, outcome.fastest_rpm), max(longest, outcome.unfed_us)
         if not outcome.safe:
             bad += 1
-            print(f"seed {seed}: {outcome.fastest_rpm:.0f} rpm, {outcome.unfed_us / 1000:.0f} ms: {case}", flush=True)
+            print(
+                f"seed {seed}: {outcome.fastest_rpm:.0f} rpm, {outcome.unfed_us / 1000:.0f} ms: {case}",
+                flush=True,
+            )
         if (seed - first) % 1000 == 999:
             print(f"{seed - first + 1} of {number}", file=sys.stderr, flush=True)
     for name, count in sorted(kinds.items()):

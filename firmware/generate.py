@@ -40,7 +40,11 @@ def described() -> str:
     ]
     for message in protocol.PLAIN:
         prefix = name(message.__name__)
-        lines += ["", f"#define {prefix}_TYPE 0x{message.KIND:02X}", f"#define {prefix}_BYTES {message.LAYOUT.size}"]
+        lines += [
+            "",
+            f"#define {prefix}_TYPE 0x{message.KIND:02X}",
+            f"#define {prefix}_BYTES {message.LAYOUT.size}",
+        ]
         layout = re.findall(r"\d*[A-Za-z]", message.LAYOUT.format)
         for k, field in enumerate(fields(message)):
             offset = struct.calcsize("<" + "".join(layout[:k]))
@@ -52,15 +56,27 @@ def described() -> str:
     ):  # fmt: skip
         lines += ["", *(f"#define {prefix}_{name(text)} {k}" for k, text in enumerate(names))]
     lines += ["", "/* Smallest and largest value of each setting, and whether 0 is allowed too. */"]
-    ranges = (f"    {{{setting.least}, {setting.most}, {int(setting.off)}}}," for setting in protocol.SETTINGS)
-    lines += [" \\\n".join(["#define SETTING_RANGES", *ranges]), f"#define SETTINGS {len(settings)}"]
-    lines += ["", f"#define UNKNOWN_MV {protocol.UNKNOWN_MV}u", f"#define BOARD_BYTES {protocol.BOARD_BYTES}"]
+    ranges = (
+        f"    {{{setting.least}, {setting.most}, {int(setting.off)}}},"
+        for setting in protocol.SETTINGS
+    )
+    lines += [
+        " \\\n".join(["#define SETTING_RANGES", *ranges]),
+        f"#define SETTINGS {len(settings)}",
+    ]
+    lines += [
+        "",
+        f"#define UNKNOWN_MV {protocol.UNKNOWN_MV}u",
+        f"#define BOARD_BYTES {protocol.BOARD_BYTES}",
+    ]
     return "\n".join([*lines, "", "#endif", ""])
 
 
 if __name__ == "__main__":
     if "--check" in sys.argv:
         if HEADER.read_text() != described():
-            sys.exit(f"{HEADER}: differs from amiwarp/live/link/protocol.py; run: python {__file__}")
+            sys.exit(
+                f"{HEADER}: differs from amiwarp/live/link/protocol.py; run: python {__file__}"
+            )
     else:
         HEADER.write_text(described())

@@ -41,10 +41,22 @@ class Held:
 
 
 def hold(
-    drive: object, rpm: float, *, seconds: float = 4.0, seed: int = 1, library: Path = BUILD / "libboard.so"
+    drive: object,
+    rpm: float,
+    *,
+    seconds: float = 4.0,
+    seed: int = 1,
+    library: Path = BUILD / "libboard.so",
 ) -> Held:
     """Simulate a start from rest and some seconds at a speed; ``drive`` is a :class:`rig.drive.Drive`."""
-    from amiwarp.live.link.protocol import ControllerStatus, FrameDecoder, Ping, Samples, SetSpeed, encode
+    from amiwarp.live.link.protocol import (
+        ControllerStatus,
+        FrameDecoder,
+        Ping,
+        Samples,
+        SetSpeed,
+        encode,
+    )
     from rig.drive import COUNTS, RATIO
 
     per_turn = COUNTS * RATIO
@@ -76,7 +88,9 @@ def hold(
     mean = sum(late) / len(late)
     ripple = math.sqrt(sum((v - mean) ** 2 for v in late) / len(late)) / mean if mean else math.inf
     after = start + round(1e6 * settle)
-    errors = [math.tau * counted[t] / per_turn - turned[t] for t in counted if t in turned and t > after]
+    errors = [
+        math.tau * counted[t] / per_turn - turned[t] for t in counted if t in turned and t > after
+    ]
     off = math.degrees(max(errors) - min(errors)) / 2.0 if errors else math.inf
     return Held(rpm, mean, ripple, off, max(speeds) / rpm - 1.0, faults)
 
@@ -101,7 +115,14 @@ def main() -> int:
 
     drive = drive_of(GIMBAL)
     print("\n".join(text(drive)))
-    head = ("commanded [rpm]", "mean [rpm]", "ripple, rms [%]", "angle off by [deg]", "overshoot [%]", "held")
+    head = (
+        "commanded [rpm]",
+        "mean [rpm]",
+        "ripple, rms [%]",
+        "angle off by [deg]",
+        "overshoot [%]",
+        "held",
+    )
     print(f"| {' | '.join(head)} |\n{'|---' * len(head)}|")
     wrong = False
     for rpm in SPEEDS:

@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 from boards import make
 
-from amiwarp.live.link.protocol import ControllerStatus, FrameDecoder, Index, Ping, Samples, SetSpeed, encode
+from amiwarp.live.link.protocol import (
+    ControllerStatus,
+    FrameDecoder,
+    Index,
+    Ping,
+    Samples,
+    SetSpeed,
+    encode,
+)
 
 
 def main(image: Path, seconds: float, rpm: float, counts_per_turn: int) -> bool:
@@ -40,14 +48,22 @@ def main(image: Path, seconds: float, rpm: float, counts_per_turn: int) -> bool:
             if number % 60 == 0:
                 print(f"{board.now / 1e6:.0f} s: {decoder.received}", flush=True)
     received, true = decoder.received, np.array(board.get("index_us"))
-    late = np.array(pulses) - true[: len(pulses)] if pulses and "MAGNETIC" not in image.name else np.zeros(1)
+    late = (
+        np.array(pulses) - true[: len(pulses)]
+        if pulses and "MAGNETIC" not in image.name
+        else np.zeros(1)
+    )
     cycles, interrupts = board.get("cycles"), board.interrupts()
     board.close()
     print(
         f"{board.now / 1e6:.0f} s at {np.mean(speeds):.1f} rpm (status, deviation {np.std(speeds):.1f} rpm): {received}"
     )
-    print(f"{samples:,} samples, {gaps} gaps, {sent / board.now * 1e6:.0f} bytes/s, faults {faults:#x}")
-    print(f"{len(pulses)} index pulses, latched {late.min():.2f} to {late.max():.2f} us after the edge")
+    print(
+        f"{samples:,} samples, {gaps} gaps, {sent / board.now * 1e6:.0f} bytes/s, faults {faults:#x}"
+    )
+    print(
+        f"{len(pulses)} index pulses, latched {late.min():.2f} to {late.max():.2f} us after the edge"
+    )
     for name, measured in interrupts.items():
         print(f"interrupt {name} [cycles]: {measured}")
     total = board.now * board.MHZ

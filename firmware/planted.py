@@ -20,14 +20,26 @@ import boards
 HERE = Path(__file__).parent
 FAULTS: list[dict[str, Any]] = tomllib.loads((HERE / "planted.toml").read_text())["fault"]
 VERDICTS = {True: "caught", False: "MISSED", None: "left out"}
-COMPILE = ("gcc", "-std=gnu11", "-O1", "-shared", "-fPIC", "-Icore", "-o", "libboard.so", "native/board.c")
+COMPILE = (
+    "gcc",
+    "-std=gnu11",
+    "-O1",
+    "-shared",
+    "-fPIC",
+    "-Icore",
+    "-o",
+    "libboard.so",
+    "native/board.c",
+)
 
 
 def planted(text: str, fault: dict[str, Any]) -> str:
     """Return the text of a file with a fault; raise ValueError unless each replaced text is there exactly once."""
     for before, after in ((fault["before"], fault["after"]), *fault.get("also", ())):
         if text.count(before) != 1:
-            raise ValueError(f"{fault['file']}: {before!r} is there {text.count(before)} times; correct planted.toml")
+            raise ValueError(
+                f"{fault['file']}: {before!r} is there {text.count(before)} times; correct planted.toml"
+            )
         text = text.replace(before, after)
     return text
 
@@ -57,15 +69,29 @@ def fails(fault: dict[str, Any], folder: Path) -> bool | None:
     Raises RuntimeError if there is no such test.
     """
     copy = folder / "firmware"
-    shutil.copytree(HERE, copy, ignore=shutil.ignore_patterns("build", "node_modules", "__pycache__"))
+    shutil.copytree(
+        HERE, copy, ignore=shutil.ignore_patterns("build", "node_modules", "__pycache__")
+    )
     modules = HERE / "simulator" / "node_modules"
     if modules.is_dir():
         (copy / "simulator" / "node_modules").symlink_to(modules)
     file = copy / fault["file"]
     file.write_text(planted(file.read_text(), fault))
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider", f"tests/{fault['test']}"]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-n0",
+        "-p",
+        "no:cacheprovider",
+        f"tests/firmware/{fault['test']}",
+    ]
     environment = os.environ | {"AMIWARP_FIRMWARE": str(copy)}
-    done = subprocess.run(command, cwd=HERE.parent, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=HERE.parent, env=environment, capture_output=True, text=True, check=False
+    )
     if done.returncode not in (0, 1):
         raise RuntimeError(f"{fault['test']}: {done.stdout[-500:]}{done.stderr[-500:]}")
     return None if done.returncode == 0 and "skipped" in done.stdout else done.returncode == 1
@@ -91,7 +117,9 @@ def main() -> int:
         results.append(found)
         print(f"{VERDICTS[found]}: {fault['wrong']}: {what}", flush=True)
     tried = len(results) - results.count(None)
-    left_out = f"; {results.count(None)} left out, as their tools are missing" if None in results else ""
+    left_out = (
+        f"; {results.count(None)} left out, as their tools are missing" if None in results else ""
+    )
     print(f"{results.count(True)} of {tried} planted faults were caught{left_out}")
     return int(False in results)
 

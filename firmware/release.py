@@ -43,11 +43,15 @@ def read_uf2(data: bytes) -> bytes:
         if (first, second, last) != UF2_MAGIC:
             raise ValueError(f"block {number}: no UF2 block")
         if (flags, family) != (UF2_FAMILY_PRESENT, UF2_RP2040):
-            raise ValueError(f"block {number}: flags {flags:#x} and family {family:#x} are not those of an RP2040")
+            raise ValueError(
+                f"block {number}: flags {flags:#x} and family {family:#x} are not those of an RP2040"
+            )
         if (block, blocks) != (number, len(data) // UF2_BLOCK.size):
             raise ValueError(f"block {number}: says that it is {block} of {blocks}")
         if size != BOOT_BYTES or address % BOOT_BYTES:
-            raise ValueError(f"block {number}: the ROM writes pages of 256 bytes, not {size} at {address:#x}")
+            raise ValueError(
+                f"block {number}: the ROM writes pages of 256 bytes, not {size} at {address:#x}"
+            )
         parts[address] = payload[:size]
     if min(parts) != FLASH:
         raise ValueError(f"begins at {min(parts):#x}, not at the flash's {FLASH:#x}")
@@ -92,7 +96,9 @@ def read_hex(text: str) -> bytes:
         elif kind != 0x03:  # 3: where to start, which an AVR does not use
             raise ValueError(f"line {number}: unknown record of type {kind}")
     if number != len(lines) or kind != HEX_END:
-        raise ValueError("the last line is not the end of the file: it was cut, or goes on after it")
+        raise ValueError(
+            "the last line is not the end of the file: it was cut, or goes on after it"
+        )
     if min(parts) != 0:
         raise ValueError(f"begins at {min(parts):#x}, not at the reset's 0")
     return joined(parts, "HEX")
@@ -101,7 +107,11 @@ def read_hex(text: str) -> bytes:
 def read(path: Path) -> bytes:
     """Return the content of the flash in a ``.uf2`` or ``.hex``; raise ValueError, with its name, for a wrong one."""
     try:
-        return read_uf2(path.read_bytes()) if path.suffix == ".uf2" else read_hex(path.read_text("ascii"))
+        return (
+            read_uf2(path.read_bytes())
+            if path.suffix == ".uf2"
+            else read_hex(path.read_text("ascii"))
+        )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -111,10 +121,15 @@ def main(folder: Path) -> None:
     images = sorted([*folder.glob("*.uf2"), *folder.glob("*.hex")])
     sizes = "".join(f"{path.name}: {len(read(path)):,} bytes of flash\n" for path in images)
     listed = folder / "sizes.txt"
-    listed.write_text(sizes + "".join(f"\n{path.read_text()}" for path in sorted(folder.glob("*.size"))))
+    listed.write_text(
+        sizes + "".join(f"\n{path.read_text()}" for path in sorted(folder.glob("*.size")))
+    )
     for path in folder.glob("*.size"):
         path.unlink()
-    sums = "".join(f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n" for path in [*images, listed])
+    sums = "".join(
+        f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n"
+        for path in [*images, listed]
+    )
     (folder / "SHA256SUMS").write_text(sums)
     print(f"{folder}:\n{sizes}{sums}", end="")
 

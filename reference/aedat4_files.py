@@ -57,7 +57,9 @@ def lists(kind: str, rows: list[dict[int, bytes]]) -> bytes:
 
 
 def events_packet(events: Events, **wrong: Any) -> bytes:
-    rows = np.zeros(len(events), [("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("rest", "V3")])
+    rows = np.zeros(
+        len(events), [("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("rest", "V3")]
+    )
     for name in "xytp":
         rows[name] = wrong.get(name, getattr(events, name))
     rows["rest"] = b"\xff\xff\xff"  # bytes without a meaning
@@ -67,12 +69,19 @@ def events_packet(events: Events, **wrong: Any) -> bytes:
 def frame_packet(t: int, pixels: np.ndarray, kind: int) -> bytes:
     sides = {6: struct.pack("<h", pixels.shape[1]), 7: struct.pack("<h", pixels.shape[0])}
     data = pixels.tobytes()
-    return flat("FRME", {0: DOUBLE.pack(t), 5: bytes([kind]), **sides}, {10: struct.pack("<I", len(data)) + data})
+    return flat(
+        "FRME",
+        {0: DOUBLE.pack(t), 5: bytes([kind]), **sides},
+        {10: struct.pack("<I", len(data)) + data},
+    )
 
 
 def imu_row(t: int, *values: float) -> dict[int, bytes]:
     """A sample with acceleration x, y, z and angular velocity x, y, z; fields of the value 0 are left out."""
-    return {0: DOUBLE.pack(t), **{2 + k: struct.pack("<f", value) for k, value in enumerate(values) if value}}
+    return {
+        0: DOUBLE.pack(t),
+        **{2 + k: struct.pack("<f", value) for k, value in enumerate(values) if value},
+    }
 
 
 COMPRESSIONS: dict[str, tuple[int, Callable[[bytes], bytes]]] = {
@@ -85,7 +94,10 @@ COMPRESSIONS: dict[str, tuple[int, Callable[[bytes], bytes]]] = {
 
 
 def file_of(
-    packets: list[tuple[int, bytes]], *, kinds: str = "EVTS FRME IMUS TRIG", compression: str = "lz4"
+    packets: list[tuple[int, bytes]],
+    *,
+    kinds: str = "EVTS FRME IMUS TRIG",
+    compression: str = "lz4",
 ) -> tuple[bytes, list[int]]:
     """A file without a table, and the positions of its packets. Stream k is of the kind k."""
     sizes = f'<attr key="sizeX" type="int">{SIZE[0]}</attr><attr key="sizeY" type="int">{SIZE[1]}</attr>'
@@ -97,7 +109,8 @@ def file_of(
     text = f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'.encode()
     number, compress = COMPRESSIONS[compression]
     data, start = table(
-        {0: struct.pack("<i", number), 1: DOUBLE.pack(-1)}, {2: struct.pack("<I", len(text)) + text + b"\0"}
+        {0: struct.pack("<i", number), 1: DOUBLE.pack(-1)},
+        {2: struct.pack("<I", len(text)) + text + b"\0"},
     )
     header = struct.pack("<I", 8 + start) + b"IOHE" + data
     out = b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header)) + header
@@ -111,7 +124,9 @@ def file_of(
 
 def whole_file(events: Events, compression: str) -> bytes:
     """A file with packets of all types; the frames have 8 bits."""
-    rows = [imu_row(int(events.t[k]), 0.1, 0.2, 0.3, 1.0, 2.0, 3.0) for k in range(0, len(events), 50)]
+    rows = [
+        imu_row(int(events.t[k]), 0.1, 0.2, 0.3, 1.0, 2.0, 3.0) for k in range(0, len(events), 50)
+    ]
     edges = [{0: DOUBLE.pack(int(t)), 1: bytes([1 + k % 3])} for k, t in enumerate(events.t[::60])]
     image = np.arange(35, dtype=np.uint8).reshape(5, 7)
     packets = [(0, events_packet(events[at : at + 100])) for at in range(0, len(events), 100)]

@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.io.aedat2_header import Chip
-from amiwarp.io.aedat4_packets import EVENT
-from amiwarp.io.aedat4_tables import DAMAGE, root_of, vector_of
-from amiwarp.io.file_scan import Columns, unwrapped
+from amiwarp.io.aedat.aedat2_header import Chip
+from amiwarp.io.aedat.aedat4_packets import EVENT
+from amiwarp.io.aedat.aedat4_tables import DAMAGE, root_of, vector_of
+from amiwarp.io.event_packets import Columns
+from amiwarp.io.file_pieces import unwrapped
 
 
 class Aedat2Records:
@@ -27,16 +28,28 @@ class Aedat2Records:
         return _davis(words, t, self._chip) if self._chip.davis else _dvs128(words, t)
 
 
-def _davis(words: NDArray[np.int64], t: NDArray[np.int64], chip: Chip) -> tuple[Columns, dict[str, Any]]:
+def _davis(
+    words: NDArray[np.int64], t: NDArray[np.int64], chip: Chip
+) -> tuple[Columns, dict[str, Any]]:
     other, external = words >> 31 == 1, words >> 10 & 1 == 1
     kind = words[other] >> 10 & 3
     # A frame has two samples of each pixel: the type is 0 for the reset level, 1 for the signal. One pixel is counted.
     frames = np.count_nonzero((kind == 1) & (words[other] >> 12 & 0x7FFFF == 0))
     imu = other & (words >> 10 & 3 == 3)
-    others = {"edge_t": t[external & ~other], "imu_t": t[imu], "imu_words": words[imu], "frames": frames}
+    others = {
+        "edge_t": t[external & ~other],
+        "imu_t": t[imu],
+        "imu_words": words[imu],
+        "frames": frames,
+    }
     at = ~other & ~external
     kept = words[at]
-    columns = chip.width - 1 - (kept >> 12 & 0x3FF), chip.height - 1 - (kept >> 22 & 0x1FF), t[at], kept >> 11 & 1
+    columns = (
+        chip.width - 1 - (kept >> 12 & 0x3FF),
+        chip.height - 1 - (kept >> 22 & 0x1FF),
+        t[at],
+        kept >> 11 & 1,
+    )
     return columns, others
 
 
@@ -46,7 +59,12 @@ def _dvs128(words: NDArray[np.int64], t: NDArray[np.int64]) -> tuple[Columns, di
     others = {"edge_t": t[external], "imu_t": nothing, "imu_words": nothing, "frames": 0}
     kept = words[~external]
     # In jAER, bit 0 is 0 for an ON event.
-    return (127 - (kept >> 1 & 0x7F), 127 - (kept >> 8 & 0x7F), t[~external], 1 - (kept & 1)), others
+    return (
+        127 - (kept >> 1 & 0x7F),
+        127 - (kept >> 8 & 0x7F),
+        t[~external],
+        1 - (kept & 1),
+    ), others
 
 
 def polarity_events(parts: list[bytes], bases: list[int]) -> Columns:

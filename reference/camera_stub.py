@@ -68,7 +68,13 @@ class StubDevice:
             package = sys.modules[PACKAGE]
             name = package.Name(camera.name)
             present = len(camera.opened) < camera.most_openings
-            if present and serial == camera.serial and device_type == name.name.lower() and not raw and address is None:
+            if (
+                present
+                and serial == camera.serial
+                and device_type == name.name.lower()
+                and not raw
+                and address is None
+            ):
                 self = super().__new__(cls)
                 camera.opened.append({
                     "configuration": package.deserialize_configuration(name, configuration),
@@ -151,11 +157,14 @@ def configuration_codes(words: Any) -> list[int]:
 def connected(*cameras: StubCamera) -> Iterator[None]:
     """Let neuromorphic-drivers find these cameras in a ``with`` block."""
     importlib.import_module(PACKAGE)
-    kept = {name: module for name, module in sys.modules.items() if name.partition(".")[0] == PACKAGE}
+    kept = {
+        name: module for name, module in sys.modules.items() if name.partition(".")[0] == PACKAGE
+    }
     extension: Any = ModuleType(f"{PACKAGE}.{PACKAGE}")
     extension.Device = type("Device", (StubDevice,), {"cameras": list(cameras)})
     extension.list_devices = lambda: [
-        (each.name, "USB 3.0 SuperSpeed (5.0 Gb/s)", "1:2", each.serial, each.error) for each in cameras
+        (each.name, "USB 3.0 SuperSpeed (5.0 Gb/s)", "1:2", each.serial, each.error)
+        for each in cameras
     ]
     for name in kept:
         del sys.modules[name]

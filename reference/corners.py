@@ -11,7 +11,10 @@ from amiwarp import CornerMethod, Events
 
 QUARTERS = {3: [(0, 3), (1, 3), (2, 2), (3, 1)], 4: [(0, 4), (1, 4), (2, 3), (3, 2), (4, 1)]}
 TURNS = [np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), k) for k in range(4)]
-CIRCLES = {radius: np.concatenate([np.array(quarter) @ turn for turn in TURNS]) for radius, quarter in QUARTERS.items()}
+CIRCLES = {
+    radius: np.concatenate([np.array(quarter) @ turn for turn in TURNS])
+    for radius, quarter in QUARTERS.items()
+}
 """Pixels of the digital circles by radius, in the order of their angles, shape (n, 2)."""
 
 
@@ -34,7 +37,9 @@ def corners(events: Events, width: int, height: int, method: CornerMethod) -> ND
     surface = np.full((2, height, width), -np.inf)
     last: dict[tuple[int, int], tuple[int, int]] = {}
     seen: dict[int, list[NDArray[np.float64]]] = {}
-    for i, (x, y, t, p) in enumerate(zip(*(c.tolist() for c in (events.x, events.y, events.t, events.p)), strict=True)):
+    for i, (x, y, t, p) in enumerate(
+        zip(*(c.tolist() for c in (events.x, events.y, events.t, events.p)), strict=True)
+    ):
         if method is CornerMethod.ARC:
             t_before, p_before = last.get((x, y), (0, None))
             last[x, y] = (t, p)
@@ -47,7 +52,9 @@ def corners(events: Events, width: int, height: int, method: CornerMethod) -> ND
     for k, (least, most) in enumerate(((3, 6), (4, 8))):
         times = np.array([circles[k] for circles in seen.values()]).reshape(len(seen), -1)
         n, size = times.shape[1], shortest_arc(times, least)
-        corner &= (size <= most) | ((method is CornerMethod.ARC) & (n - most <= size) & (size <= n - least))
+        corner &= (size <= most) | (
+            (method is CornerMethod.ARC) & (n - most <= size) & (size <= n - least)
+        )
     found = np.zeros(len(events), bool)
     found[np.array(list(seen), int)[corner]] = True
     return found
@@ -62,7 +69,9 @@ DV_RADII = {
     5: [(0, 5), (1, 5), (2, 5), (3, 4), (4, 3), (5, 2), (5, 1)],
     6: [(0, 6), (1, 6), (2, 6), (3, 5), (4, 4), (5, 3), (6, 2), (6, 1)],
 }
-DV_CIRCLES = [np.concatenate([np.array(quarter) @ turn for turn in TURNS]) for quarter in DV_RADII.values()]
+DV_CIRCLES = [
+    np.concatenate([np.array(quarter) @ turn for turn in TURNS]) for quarter in DV_RADII.values()
+]
 
 
 def dv_accepts(times: NDArray[np.int64], range_us: int) -> bool | None:
@@ -72,7 +81,11 @@ def dv_accepts(times: NDArray[np.int64], range_us: int) -> bool | None:
         return None
     ends, oldest = [first, first], times[first]
     open_ends = [True, True]
-    while any(open_ends) and (ends[1] - ends[0] + 1) < n and (ends[0] == ends[1] or (ends[1] - ends[0]) % n):
+    while (
+        any(open_ends)
+        and (ends[1] - ends[0] + 1) < n
+        and (ends[0] == ends[1] or (ends[1] - ends[0]) % n)
+    ):
         for side, step in enumerate((-1, 1)):
             following = times[(ends[side] + step) % n]
             open_ends[side] = open_ends[side] and abs(following - oldest) < range_us
@@ -85,7 +98,9 @@ def dv_accepts(times: NDArray[np.int64], range_us: int) -> bool | None:
     return (least <= size <= most or least <= n - size <= most) and all(t < oldest for t in rest)
 
 
-def corners_of_dv_processing(events: Events, width: int, height: int, range_us: int) -> NDArray[np.bool_]:
+def corners_of_dv_processing(
+    events: Events, width: int, height: int, range_us: int
+) -> NDArray[np.bool_]:
     """Return which events are corners by the rule of dv-processing 2.0."""
     surface, found = np.zeros((2, height, width), np.int64), np.zeros(len(events), bool)
     for i, (x, y, t, p) in enumerate(table(events).tolist()):

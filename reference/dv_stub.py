@@ -99,7 +99,9 @@ class CameraInputBase:
         self._next = None
         if isinstance(part, Exception):
             raise part
-        self._edges = [] if part is None else [edge for edge in part.edges if self._detects(edge[1])]
+        self._edges = (
+            [] if part is None else [edge for edge in part.edges if self._detects(edge[1])]
+        )
         if part is None or part.events is None:
             return None
         left, top, width, height = self._crop
@@ -113,7 +115,9 @@ class CameraInputBase:
 
     def getNextTriggerBatch(self) -> Any:
         kinds = TriggerType.EXTERNAL_SIGNAL_FALLING_EDGE, TriggerType.EXTERNAL_SIGNAL_RISING_EDGE
-        return [SimpleNamespace(timestamp=t, type=kinds[rising]) for t, rising in self._edges] or None
+        return [
+            SimpleNamespace(timestamp=t, type=kinds[rising]) for t, rising in self._edges
+        ] or None
 
     def _detects(self, rising: bool) -> bool:
         return False
@@ -214,7 +218,9 @@ def dv_connected(*cameras: StubDv) -> Iterator[None]:
         "TriggerType": TriggerType,
         "io": SimpleNamespace(
             camera=SimpleNamespace(
-                discover=lambda: [SimpleNamespace(serialNumber=camera.serial) for camera in present()],
+                discover=lambda: [
+                    SimpleNamespace(serialNumber=camera.serial) for camera in present()
+                ],
                 open=open_camera,
             )
         ),

@@ -63,10 +63,14 @@ def decode_chunk(data: bytes) -> EventColumns:
 
 
 def _damaged(what: str) -> AmiwarpError:
-    return AmiwarpError(f"a chunk of the ECF codec holds other {what} than events; the file is damaged")
+    return AmiwarpError(
+        f"a chunk of the ECF codec holds other {what} than events; the file is damaged"
+    )
 
 
-def _without_lengths(words: NDArray[np.int64], long: NDArray[np.bool_], width: int) -> NDArray[np.int64]:
+def _without_lengths(
+    words: NDArray[np.int64], long: NDArray[np.bool_], width: int
+) -> NDArray[np.int64]:
     """Return the indices of the words that begin a run.
 
     Behind a ``long`` one, ``width`` words hold the length of the run. These can have any value, so one is followed at a
@@ -82,7 +86,11 @@ def _without_lengths(words: NDArray[np.int64], long: NDArray[np.bool_], width: i
 
 
 def _lengths(
-    words: NDArray[np.int64], places: NDArray[np.int64], short: NDArray[np.int64], longest: int, width: int
+    words: NDArray[np.int64],
+    places: NDArray[np.int64],
+    short: NDArray[np.int64],
+    longest: int,
+    width: int,
 ) -> NDArray[np.int64]:
     """Return the lengths of the runs: ``short``, or what the next ``width`` words hold if it is ``longest``."""
     padded = np.concatenate([words, np.zeros(2, np.int64)])
@@ -98,7 +106,9 @@ def _until(lengths: NDArray[np.int64], count: int, what: str) -> int:
     return used
 
 
-def _times(data: NDArray[np.uint8], origin: int, count: int) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+def _times(
+    data: NDArray[np.uint8], origin: int, count: int
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     """Return the times of ``count`` events [us], and the bytes behind them.
 
     A byte holds a step of the time and the number of events at this time, four bits each. A step of 15 marks a byte
@@ -151,7 +161,10 @@ def _masked(data: NDArray[np.uint8], count: int) -> tuple[NDArray[np.int64], NDA
     A word holds a column, and a bit for each of the five next ones, the highest for the nearest.
     """
     words = np.frombuffer(data, "<u2", data.size // 2).astype(np.int64)
-    has = np.concatenate([np.ones((words.size, 1), np.int64), words[:, None] >> np.array([4, 3, 2, 1, 0]) & 1], axis=1)
+    has = np.concatenate(
+        [np.ones((words.size, 1), np.int64), words[:, None] >> np.array([4, 3, 2, 1, 0]) & 1],
+        axis=1,
+    )
     stops = np.cumsum(has.sum(axis=1))
     used = int(np.searchsorted(stops, count)) + 1 if count else 0
     if used > words.size:
@@ -161,7 +174,9 @@ def _masked(data: NDArray[np.uint8], count: int) -> tuple[NDArray[np.int64], NDA
     return columns[has[:used] == 1][:count], data[2 * used :]
 
 
-def _packed(data: NDArray[np.uint8], count: int, bits: int) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+def _packed(
+    data: NDArray[np.uint8], count: int, bits: int
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     """Return the numbers of ``bits`` bits, 12 or 24, of ``count`` events, and the bytes behind them.
 
     Four numbers stand in three words of 16 or 32 bits, the upper bits first, except that the second and the third are

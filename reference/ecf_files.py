@@ -28,7 +28,8 @@ def ecf_packed(values: list[int], bits: int) -> bytes:
     part = bits // 3
     out = b""
     for at in range(0, len(values), 4):
-        v0, v1, v2, v3 = [*values[at : at + 4], 1, 2, 3][:4]  # the codec does not clear the last ones
+        # The codec does not clear the last ones
+        v0, v1, v2, v3 = [*values[at : at + 4], 1, 2, 3][:4]
         first = v0 << part | v1 % 2**part
         second = v1 >> part << 2 * part | v2 % 2 ** (2 * part)
         third = v2 >> 2 * part << 3 * part | v3
@@ -55,7 +56,9 @@ def ecf_chunk(events: Events, mode: str) -> bytes:
         else:
             out += bytes([step << 4 | count])
     if mode == "packed":
-        return out + ecf_packed([row << 12 | column << 1 | on for column, row, on in zip(x, y, p, strict=True)], 24)
+        return out + ecf_packed(
+            [row << 12 | column << 1 | on for column, row, on in zip(x, y, p, strict=True)], 24
+        )
     out += ecf_runs(y, 5, "H")
     if mode == "rows":
         return out + ecf_packed([column << 1 | on for column, on in zip(x, p, strict=True)], 12)
@@ -72,7 +75,9 @@ def ecf_chunk(events: Events, mode: str) -> bytes:
     return out + ecf_runs(p, 7, "B")
 
 
-def write_ecf(path: Path, chunks: list[bytes], count: int, length: int, *filters: int, mask: int = 0) -> None:
+def write_ecf(
+    path: Path, chunks: list[bytes], count: int, length: int, *filters: int, mask: int = 0
+) -> None:
     """A file as Metavision writes it: chunks of ``length`` events in the ECF codec."""
     rows = np.dtype({"names": ["x", "y", "p", "t"], "formats": ["<u2", "<u2", "<i2", "<i8"],
                      "offsets": [0, 2, 4, 8], "itemsize": 16})  # fmt: skip

@@ -24,5 +24,7 @@ def es_bytes(events: Events, kind: str, *, exposure: np.ndarray | None = None) -
         on = int(events.p[k])
         bits = on if kind == "dvs" else on << 1 | int(exposure is not None and exposure[k])
         out += bytes([left << shift | bits])
-        out += struct.pack("<HH", events.x[k], ES_SIZE[1] - 1 - int(events.y[k])) + bytes([longest << shift])
+        out += struct.pack("<HH", events.x[k], ES_SIZE[1] - 1 - int(events.y[k])) + bytes(
+            [longest << shift]
+        )
     return out

@@ -9,13 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.io.file_scan import Columns, unwrapped
+from amiwarp.io.event_packets import Columns
+from amiwarp.io.file_pieces import unwrapped
 
 TIME_HIGH, TRIGGER = 0x8, 0xA
 """Types of words that all versions share."""
 
 
-UNKNOWN_TYPES = {2: (1, 9, 0xB, 0xC, 0xD), **dict.fromkeys((4, 8), (2, 3, 4, 5, 6, 7, 9, 0xB, 0xC, 0xD))}
+UNKNOWN_TYPES = {
+    2: (1, 9, 0xB, 0xC, 0xD),
+    **dict.fromkeys((4, 8), (2, 3, 4, 5, 6, 7, 9, 0xB, 0xC, 0xD)),
+}
 """Types of words that are not in Prophesee's documentation, by the size of a word [bytes]."""
 
 
@@ -97,7 +101,9 @@ class Evt3Decoder:
         x[of_vector], p[of_vector] = base[vectors][row] + bit, polarity[vectors][row]
         return (x, y[which], t[which], p), edges
 
-    def _times(self, kind: NDArray[Any], load: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _times(
+        self, kind: NDArray[Any], load: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return the time of each word [us], and whether it is known."""
         is_high = kind == TIME_HIGH
         highs = unwrapped(load[is_high], 12, self.high)
@@ -112,7 +118,9 @@ class Evt3Decoder:
             self.high = int(highs[-1])
         return (all_highs[np.cumsum(is_high)] << 12) | low, known
 
-    def _filled(self, name: str, mask: NDArray[np.bool_], values: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _filled(
+        self, name: str, mask: NDArray[np.bool_], values: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
         """Return the last masked value up to each word, starting from the state, and update the state."""
         filled = np.concatenate([values, [self.state[name]]])[_latest(mask)]
         if filled.size:

@@ -32,7 +32,9 @@ def to_faery(events: Events) -> np.ndarray:
     return packet
 
 
-def write_evt(version: str, *, dimensions: tuple[int, int] = SIZE) -> Callable[[Path, Events], None]:
+def write_evt(
+    version: str, *, dimensions: tuple[int, int] = SIZE
+) -> Callable[[Path, Events], None]:
     def write(path: Path, events: Events) -> None:
         with evt.Encoder(path, version, False, dimensions, True) as encoder:
             encoder.write({"events": to_faery(events)})
@@ -64,7 +66,9 @@ def write_aedat4(path: Path, events: Events) -> None:
     }
     info = node("info", "/mainloop/Recorder/outInfo/0/info/", size, [])
     output = node("0", "/mainloop/Recorder/outInfo/0/", stream, [info])
-    with aedat.Encoder(path, [node("outInfo", "/mainloop/Recorder/outInfo/", {}, [output])], ("lz4", 1)) as encoder:
+    with aedat.Encoder(
+        path, [node("outInfo", "/mainloop/Recorder/outInfo/", {}, [output])], ("lz4", 1)
+    ) as encoder:
         for start in range(0, len(events), 200):
             encoder.write(0, to_faery(events[start : start + 200]))
 
@@ -77,7 +81,9 @@ def write_es(path: Path, events: Events) -> None:
 
 
 def write_text(path: Path, events: Events) -> None:
-    rows = zip(events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True)
+    rows = zip(
+        events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True
+    )
     path.write_text("".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for t, x, y, p in rows))
     path.with_name("calib.txt").write_text(CALIB)
 
@@ -91,7 +97,12 @@ def write_native(path: Path, events: Events) -> None:
     encoder = Encoder.constant_speed(3000.0, 999_000, int(events.t[-1]))
     points = np.zeros((len(events), 2), np.float32)
     with RecordingWriter(
-        path, width=SIZE[0], height=SIZE[1], camera=camera, encoder=encoder, truth_parameters={"apex": 0.03}
+        path,
+        width=SIZE[0],
+        height=SIZE[1],
+        camera=camera,
+        encoder=encoder,
+        truth_parameters={"apex": 0.03},
     ) as writer:
         writer.append(events, truth_points=points)
 
@@ -100,7 +111,12 @@ def write_dsec(path: Path, events: Events) -> None:
     with h5py.File(path, "w") as file:
         file.attrs["width"], file.attrs["height"] = SIZE
         relative = events.t - 1_000_000
-        for name, values in (("x", events.x), ("y", events.y), ("t", relative.astype("u4")), ("p", events.p)):
+        for name, values in (
+            ("x", events.x),
+            ("y", events.y),
+            ("t", relative.astype("u4")),
+            ("p", events.p),
+        ):
             blosc = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE)
             file.create_dataset(f"events/{name}", data=values, chunks=(200,), compression=blosc)
         file["t_offset"] = np.int64(1_000_000)

@@ -43,7 +43,9 @@ def evt2_words(events: Events, *, vectors: bool = False) -> np.ndarray:
     """EVT 2.0 words, or those of EVT 2.1 with one pixel each."""
     words = []
     high = None
-    for x, y, t, p in zip(*(column.tolist() for column in (events.x, events.y, events.t, events.p)), strict=True):
+    for x, y, t, p in zip(
+        *(column.tolist() for column in (events.x, events.y, events.t, events.p)), strict=True
+    ):
         if t >> 6 != high:
             high = t >> 6
             words.append((0x8 << 28 | high & 0xFFFFFFF) << (32 if vectors else 0))
@@ -53,10 +55,15 @@ def evt2_words(events: Events, *, vectors: bool = False) -> np.ndarray:
     return np.array(words, "<u8" if vectors else "<u4")
 
 
-def write_evt21(path: Path, events: Events, *, legacy: bool = True, header: str | None = None) -> None:
+def write_evt21(
+    path: Path, events: Events, *, legacy: bool = True, header: str | None = None
+) -> None:
     words = evt2_words(events, vectors=True)
     words = words >> np.uint64(32) | words << np.uint64(32) if legacy else words
-    text = header or f"% evt 2.1\n% format EVT21;height={SIZE[1]};width={SIZE[0]}{';endianness=legacy' * legacy}\n"
+    text = (
+        header
+        or f"% evt 2.1\n% format EVT21;height={SIZE[1]};width={SIZE[0]}{';endianness=legacy' * legacy}\n"
+    )
     path.write_bytes(f"{text}% end\n".encode() + words.astype("<u8").tobytes())
 
 
@@ -69,7 +76,9 @@ def write_raw_of_a_sensor(path: Path, line: str) -> None:
 # AEDAT, by iniVation's specification and jAER's addresses.
 
 
-def write_aedat2(path: Path, events: Events, *, chip: str = "Davis346blue", between: bytes = b"") -> None:
+def write_aedat2(
+    path: Path, events: Events, *, chip: str = "Davis346blue", between: bytes = b""
+) -> None:
     """Write events of a DAVIS of 346 x 260 pixels, or of a DVS128, which holds only columns and rows below 128."""
     x, y, t, p = (column.astype(np.int64) for column in (events.x, events.y, events.t, events.p))
     addresses = {"DVS128": (127 - y) << 8 | (127 - x) << 1 | (1 - p)}
@@ -81,17 +90,25 @@ def write_aedat2(path: Path, events: Events, *, chip: str = "Davis346blue", betw
 
 def aedat3_packet(kind: int, rows: np.ndarray, *, overflow: int = 0, source: int = 1) -> bytes:
     size = rows.shape[1] * 4
-    return struct.pack("<hhiiiiii", kind, source, size, 4, overflow, len(rows), len(rows), len(rows)) + rows.tobytes()
+    return (
+        struct.pack("<hhiiiiii", kind, source, size, 4, overflow, len(rows), len(rows), len(rows))
+        + rows.tobytes()
+    )
 
 
 def write_aedat3(path: Path, events: Events, *, between: bytes = b"") -> None:
     """Write packets of 100 events, with a packet of an inertial unit and one of special events between them."""
     x, y, t, p = (column.astype(np.int64) for column in (events.x, events.y, events.t, events.p))
     rows = np.stack([x << 17 | y << 2 | p << 1 | 1, t & 0x7FFFFFFF], axis=1).astype("<u4")
-    parts = [aedat3_packet(1, rows[at : at + 100], overflow=int(t[at] >> 31)) for at in range(0, len(t), 100)]
+    parts = [
+        aedat3_packet(1, rows[at : at + 100], overflow=int(t[at] >> 31))
+        for at in range(0, len(t), 100)
+    ]
     imu = aedat3_packet(3, np.zeros((5, 9), "<u4"))
     header = "#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: DAVIS346\r\n#Start-Time: 2020-01-01 00:00:00 (TZ+0000)\r\n"
-    path.write_bytes(f"{header}#!END-HEADER\r\n".encode() + parts[0] + imu + between + b"".join(parts[1:]))
+    path.write_bytes(
+        f"{header}#!END-HEADER\r\n".encode() + parts[0] + imu + between + b"".join(parts[1:])
+    )
 
 
 def write_bin(path: Path, events: Events) -> None:
@@ -112,7 +129,9 @@ def write_n_imagenet(path: Path, events: Events) -> None:
 
 
 def write_evimo(path: Path, events: Events) -> None:
-    np.savez(path, events=np.stack([events.t * 1e-6, events.x, events.y, events.p], axis=1), K=np.eye(3))
+    np.savez(
+        path, events=np.stack([events.t * 1e-6, events.x, events.y, events.p], axis=1), K=np.eye(3)
+    )
 
 
 def write_evimo2(path: Path, events: Events) -> None:
@@ -125,7 +144,9 @@ def write_evimo2(path: Path, events: Events) -> None:
 def write_tumvie(path: Path, events: Events) -> None:
     with h5py.File(path, "w") as file:
         for name in "xytp":
-            file.create_dataset(f"events/{name}", data=getattr(events, name), chunks=(200,), compression="gzip")
+            file.create_dataset(
+                f"events/{name}", data=getattr(events, name), chunks=(200,), compression="gzip"
+            )
         file["ms_to_idx"] = np.searchsorted(events.t, 1000 * np.arange(events.t[-1] // 1000 + 1))
 
 
@@ -134,8 +155,12 @@ def write_m3ed(path: Path, events: Events, *, sides: tuple[str, ...] = ("left",)
         for side in sides:
             group = file.create_group(f"prophesee/{side}")
             for name in "xytp":
-                group.create_dataset(name, data=getattr(events, name), chunks=(200,), compression="lzf")
-            group["ms_map_idx"] = np.searchsorted(events.t, 1000 * np.arange(events.t[-1] // 1000 + 1))
+                group.create_dataset(
+                    name, data=getattr(events, name), chunks=(200,), compression="lzf"
+                )
+            group["ms_map_idx"] = np.searchsorted(
+                events.t, 1000 * np.arange(events.t[-1] // 1000 + 1)
+            )
             group["calib/resolution"] = np.array(SIZE)
             group["calib/intrinsics"] = np.array([200.0, 201.0, 150.0, 110.0])
             group["calib/distortion_coeffs"] = np.array([-0.3, 0.1, 1e-4, -2e-4])
@@ -145,8 +170,12 @@ def write_mvsec(path: Path, events: Events, *, sides: tuple[str, ...] = ("left",
     with h5py.File(path, "w") as file:
         for side in sides:
             rows = np.stack([events.x, events.y, events.t * 1e-6, events.p * 2.0 - 1.0], axis=1)
-            file.create_dataset(f"davis/{side}/events", data=rows, chunks=(100, 2), compression="gzip")
-            file[f"davis/{side}/image_raw"] = np.arange(3 * 26 * 34, dtype=np.uint16).reshape(3, 26, 34)
+            file.create_dataset(
+                f"davis/{side}/events", data=rows, chunks=(100, 2), compression="gzip"
+            )
+            file[f"davis/{side}/image_raw"] = np.arange(3 * 26 * 34, dtype=np.uint16).reshape(
+                3, 26, 34
+            )
             file[f"davis/{side}/image_raw_ts"] = 1.0 + np.arange(3) * 0.04
             file[f"davis/{side}/imu"] = np.arange(42.0).reshape(7, 6)
             file[f"davis/{side}/imu_ts"] = 1.0 + np.arange(7) * 0.001
@@ -172,7 +201,9 @@ def typestore(ros1: bool) -> Any:
     time = "time" if ros1 else "builtin_interfaces/Time"
     for package in ("dvs_msgs", "prophesee_event_msgs", "dv_ros_msgs" if ros1 else "dv_ros2_msgs"):
         store.register(get_types_from_msg(EVENT.replace("time", time), f"{package}/msg/Event"))
-        store.register(get_types_from_msg(ARRAY.replace("dvs_msgs", package), f"{package}/msg/EventArray"))
+        store.register(
+            get_types_from_msg(ARRAY.replace("dvs_msgs", package), f"{package}/msg/EventArray")
+        )
     store.register(get_types_from_msg(PACKET, "event_camera_msgs/msg/EventPacket"))
     return store
 
@@ -187,7 +218,8 @@ def array_message(store: Any, events: Events, *, ros1: bool, package: str = "dvs
     time, event = store.types["builtin_interfaces/msg/Time"], store.types[f"{package}/msg/Event"]
     columns = (column.tolist() for column in (events.x, events.y, events.t, events.p))
     found = [
-        event(x, y, time(t // 1_000_000, t % 1_000_000 * 1000), bool(p)) for x, y, t, p in zip(*columns, strict=True)
+        event(x, y, time(t // 1_000_000, t % 1_000_000 * 1000), bool(p))
+        for x, y, t, p in zip(*columns, strict=True)
     ]
     message = store.types[f"{package}/msg/EventArray"]
     return message(header(store, ros1), SIZE[1], SIZE[0], found)
@@ -195,7 +227,9 @@ def array_message(store: Any, events: Events, *, ros1: bool, package: str = "dvs
 
 def packet_message(store: Any, encoding: str, data: np.ndarray, base: int, *, ros1: bool) -> Any:
     message = store.types["event_camera_msgs/msg/EventPacket"]
-    return message(header(store, ros1), SIZE[1], SIZE[0], 0, base, encoding, False, data.view(np.uint8))
+    return message(
+        header(store, ros1), SIZE[1], SIZE[0], 0, base, encoding, False, data.view(np.uint8)
+    )
 
 
 def write_ros1(path: Path, topics: dict[str, list[Any]]) -> None:
@@ -261,19 +295,31 @@ def _libcaer(events: Events) -> tuple[int, np.ndarray]:
 
 def _libcaer_cmp(events: Events) -> tuple[int, np.ndarray]:
     base, words = int(events.t[0]), []
-    for x, y, t, p in zip(*(column.tolist() for column in (events.x, events.y, events.t, events.p)), strict=True):
+    for x, y, t, p in zip(
+        *(column.tolist() for column in (events.x, events.y, events.t, events.p)), strict=True
+    ):
         words += [(t - base) >> 12, 1 << 12 | (t - base) & 0xFFF, 2 << 12 | x]
         # Odd rows as the second of two vectors, even rows alone.
-        words += [4 << 12 | p << 11 | y - 9, 5 << 12, 5 << 12 | 2] if y % 2 and y > 8 else [3 << 12 | p << 11 | y]
+        words += (
+            [4 << 12 | p << 11 | y - 9, 5 << 12, 5 << 12 | 2]
+            if y % 2 and y > 8
+            else [3 << 12 | p << 11 | y]
+        )
     return base * 1000, np.array(words, "<u2")
 
 
 def evt3_words(events: Events) -> np.ndarray:
     words = []
-    for x, y, t, p in zip(*(column.tolist() for column in (events.x, events.y, events.t, events.p)), strict=True):
+    for x, y, t, p in zip(
+        *(column.tolist() for column in (events.x, events.y, events.t, events.p)), strict=True
+    ):
         words += [0x8000 | t >> 12 & 0xFFF, 0x6000 | t & 0xFFF, y]
         # Odd columns as the second of two vectors, even columns alone.
-        words += [0x3000 | p << 11 | x - 13, 0x4000, 0x5002] if x % 2 and x > 12 else [0x2000 | p << 11 | x]
+        words += (
+            [0x3000 | p << 11 | x - 13, 0x4000, 0x5002]
+            if x % 2 and x > 12
+            else [0x2000 | p << 11 | x]
+        )
     return np.array(words, "<u2")
 
 
@@ -291,7 +337,9 @@ def write_bag1(path: Path, events: Events) -> None:
 
 
 def write_bag2(storage: str, path: Path, events: Events) -> None:
-    made = write_ros2(path.with_name("bag_of_sample"), {"/events": packets("evt3", events)}, storage=storage)
+    made = write_ros2(
+        path.with_name("bag_of_sample"), {"/events": packets("evt3", events)}, storage=storage
+    )
     path.write_bytes(made.read_bytes())
 
 
@@ -336,7 +384,12 @@ def by_dsec(path: Path) -> Columns:
         t, index = file["events/t"][:], file["ms_to_idx"][:]
         ms = np.arange(t[-1] // 1000 + 1 if t.size else 0)
         np.testing.assert_array_equal(index, np.searchsorted(t, 1000 * ms))
-        return file["events/x"][:], file["events/y"][:], t + file["t_offset"][()], file["events/p"][:]
+        return (
+            file["events/x"][:],
+            file["events/y"][:],
+            t + file["t_offset"][()],
+            file["events/p"][:],
+        )
 
 
 def by_faery(path: Path) -> Columns:
@@ -361,7 +414,12 @@ def by_words(path: Path) -> Columns:
             high = word >> 32 & 0xFFFFFFF
             continue
         base, y = word >> 43 & 0x7FF, word >> 32 & 0x7FF
-        assert (kind in (0, 1), base % 32, high >= 0, word & 0xFFFFFFFF > 0) == (True, 0, True, True)
+        assert (kind in (0, 1), base % 32, high >= 0, word & 0xFFFFFFFF > 0) == (
+            True,
+            0,
+            True,
+            True,
+        )
         t = origin + (high << 6 | word >> 54 & 63)
         rows += [(base + bit, y, t, kind) for bit in range(32) if word >> bit & 1]
     return tuple(np.array(rows, np.int64).reshape(-1, 4).T)
@@ -375,7 +433,11 @@ def by_faery_dat(path: Path) -> Columns:
 
 
 def _columns_of_faery(packets: list[np.ndarray], polarity: str) -> Columns:
-    events = np.concatenate(packets) if packets else np.zeros(0, [(name, "<u8") for name in ("t", "x", "y", polarity)])
+    events = (
+        np.concatenate(packets)
+        if packets
+        else np.zeros(0, [(name, "<u8") for name in ("t", "x", "y", polarity)])
+    )
     return events["x"], events["y"], events["t"], events[polarity]
 
 
@@ -407,7 +469,9 @@ def by_decimals(path: Path) -> Columns:
     """Read text without rounding: the point is taken out of the seconds."""
     rows = [line.split() for line in path.read_text().splitlines()]
     assert all(len(row) == 4 and len(row[0].partition(".")[2]) == 6 for row in rows)
-    table = np.array([[int(word.replace(".", "")) for word in row] for row in rows], np.int64).reshape(-1, 4)
+    table = np.array(
+        [[int(word.replace(".", "")) for word in row] for row in rows], np.int64
+    ).reshape(-1, 4)
     return table[:, 1], table[:, 2], table[:, 0], table[:, 3]
 
 
@@ -425,8 +489,12 @@ def by_rosbags_ros1(path: Path) -> Columns:
     rows, at = [], 0
     with AnyReader([path]) as reader:
         for connection in reader.connections:
-            assert (connection.topic, connection.msgtype) == ("/dvs/events", "dvs_msgs/msg/EventArray")
-            assert connection.digest == "5e8beee5a6c107e504c2e78903c224b8"  # as rosbag prints it of rpg_dvs_ros
+            assert (connection.topic, connection.msgtype) == (
+                "/dvs/events",
+                "dvs_msgs/msg/EventArray",
+            )
+            # As rosbag prints it of rpg_dvs_ros
+            assert connection.digest == "5e8beee5a6c107e504c2e78903c224b8"
         for connection, recorded, data in reader.messages():
             array = reader.deserialize(data, connection.msgtype)
             assert (array.width, array.height, array.header.seq) == (*SIZE, at)
@@ -450,7 +518,11 @@ def by_rosbags(path: Path) -> Columns:
                 "event_camera_msgs/msg/EventPacket",
             )
             packet = reader.deserialize(data, connection.msgtype)
-            assert (packet.width, packet.height, packet.encoding, packet.is_bigendian) == (*SIZE, "evt3", False)
+            assert (packet.width, packet.height, packet.encoding, packet.is_bigendian) == (
+                *SIZE,
+                "evt3",
+                False,
+            )
             assert packet.seq == len(words)
             stamps.append(packet.header.stamp.sec * 1_000_000 + packet.header.stamp.nanosec // 1000)
             assert recorded == stamps[-1] * 1000
@@ -458,7 +530,10 @@ def by_rosbags(path: Path) -> Columns:
             counts.append(int(np.count_nonzero(packet.events.view("<u2") >> 12 == 2)))
     origin = 0 if not stamps or stamps[0] < HOURS_28 else stamps[0]
     raw = path.with_suffix(".packets")
-    raw.write_bytes(f"% evt 3.0\n% geometry {SIZE[0]}x{SIZE[1]}\n% t0 {origin}\n% end\n".encode() + b"".join(words))
+    raw.write_bytes(
+        f"% evt 3.0\n% geometry {SIZE[0]}x{SIZE[1]}\n% t0 {origin}\n% end\n".encode()
+        + b"".join(words)
+    )
     columns = by_faery(raw)
     np.testing.assert_array_equal(columns[2][np.cumsum([0, *counts])[:-1]], stamps)
     return columns

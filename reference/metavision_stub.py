@@ -64,7 +64,8 @@ class LLBiases:
 
     def get_bias_info(self, bias_name: str) -> Any:
         return SimpleNamespace(
-            get_bias_allowed_range=lambda: (-85, 140), is_modifiable=lambda: bias_name != "bias_diff"
+            get_bias_allowed_range=lambda: (-85, 140),
+            is_modifiable=lambda: bias_name != "bias_diff",
         )
 
 
@@ -235,7 +236,9 @@ class Device:
     def __init__(self, camera: StubMetavision) -> None:
         self._camera = camera
         self.parts = iter(camera.parts.pop(0) if camera.parts else ())
-        self.facilities = {name: None if name in camera.lacks else kind() for name, kind in FACILITIES.items()}
+        self.facilities = {
+            name: None if name in camera.lacks else kind() for name, kind in FACILITIES.items()
+        }
         for name, facility in self.facilities.items():
             setattr(self, name, lambda facility=facility: facility)
 
@@ -245,7 +248,8 @@ class Device:
 
     def get_i_hw_identification(self) -> Any:
         return SimpleNamespace(
-            get_serial=lambda: self._camera.serial, get_sensor_info=lambda: SimpleNamespace(name="IMX636")
+            get_serial=lambda: self._camera.serial,
+            get_sensor_info=lambda: SimpleNamespace(name="IMX636"),
         )
 
     def sends(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
@@ -297,8 +301,12 @@ class EventsIterator:
                 raise part
             if isinstance(trigger, TriggerIn) and trigger.is_enabled(TriggerIn.Channel.MAIN):
                 edges = [(int(rising), t, 0) for t, rising in part.edges]
-                self.reader.edges = np.concatenate([self.reader.edges, np.array(edges, EVENT_EXT_TRIGGER)])
-            kept = part.events[self._device.sends(part.events["x"].astype(int), part.events["y"].astype(int))]
+                self.reader.edges = np.concatenate(
+                    [self.reader.edges, np.array(edges, EVENT_EXT_TRIGGER)]
+                )
+            kept = part.events[
+                self._device.sends(part.events["x"].astype(int), part.events["y"].astype(int))
+            ]
             rows = np.zeros(len(kept), EVENT_CD)
             for name, source in (("t", "t"), ("x", "x"), ("y", "y"), ("p", "on")):
                 rows[name] = kept[source]
@@ -320,7 +328,11 @@ def metavision_connected(*cameras: StubMetavision) -> Iterator[None]:
         "metavision_core": {},
         "metavision_core.event_io": {"EventsIterator": EventsIterator},
         "metavision_core.event_io.raw_reader": {"initiate_device": initiate_device},
-        "metavision_hal": {"I_TriggerIn": TriggerIn, "I_ROI": Roi, "I_AntiFlickerModule": AntiFlicker},
+        "metavision_hal": {
+            "I_TriggerIn": TriggerIn,
+            "I_ROI": Roi,
+            "I_AntiFlickerModule": AntiFlicker,
+        },
     }
     kept = {name: sys.modules.get(name) for name in modules}
     for name, content in modules.items():

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Writer1
 
 from amiwarp import Events, MemoryEvents, Recording, convert, save_recording
-from amiwarp.io.aedat2_header import read_aedat2_header
-from amiwarp.io.file_scan import smallest_sensor
+from amiwarp.io.aedat.aedat2_header import read_aedat2_header
+from amiwarp.io.assumptions import smallest_sensor
 from reference.aedat4_files import whole_file
 from reference.ecf_files import ecf_chunk, write_ecf
 from reference.es_files import ES_SIZE, es_bytes
@@ -87,7 +87,9 @@ def said_by_evt(recording: Recording, data: bytes) -> list[Said]:
     version = str(recording.metadata["format"]).removeprefix("evt")
     fields, offset = evt_header(data)
     dtype = np.dtype(
-        {"2.0": "<u4", "2.1": "<u8", "3.0": "<u2"}[{"2": "2.0", "21": "2.1", "3": "3.0"}.get(version, version)]
+        {"2.0": "<u4", "2.1": "<u8", "3.0": "<u2"}[
+            {"2": "2.0", "21": "2.1", "3": "3.0"}.get(version, version)
+        ]
     )
     words = np.frombuffer(data[offset:], dtype, (len(data) - offset) // dtype.itemsize)
     rest = (len(data) - offset) % dtype.itemsize
@@ -95,19 +97,35 @@ def said_by_evt(recording: Recording, data: bytes) -> list[Said]:
     if dtype.itemsize == 8:
         layout = fields.get("format", "")
         legacy = swap_halves(words)
-        orders = [legacy] if "endianness=legacy" in layout else [words] if "endianness=" in layout else [words, legacy]
-    return [_evt_words(each, int(fields.get("t0", "0")), {"truncated_bytes": rest}) for each in orders]
+        orders = (
+            [legacy]
+            if "endianness=legacy" in layout
+            else [words]
+            if "endianness=" in layout
+            else [words, legacy]
+        )
+    return [
+        _evt_words(each, int(fields.get("t0", "0")), {"truncated_bytes": rest}) for each in orders
+    ]
 
 
 def _evt_words(words: NDArray[Any], origin: int, counts: dict[str, int]) -> Said:
     def decoder(high: int | None) -> Any:
-        return Evt3Decoder(high) if words.dtype.itemsize == 2 else Evt2Decoder(words.dtype.itemsize == 8, high)
+        return (
+            Evt3Decoder(high)
+            if words.dtype.itemsize == 2
+            else Evt2Decoder(words.dtype.itemsize == 8, high)
+        )
 
     (x, y, t, p), edges = decoder(None).decode(words)
     all_events, all_edges = decoder(0).decode(words)
     untimed = all_events[0].size - x.size + all_edges[0].size - edges[0].size
     rows = np.stack([np.minimum(x, 65535), y, t + origin, p], axis=1).astype(np.int64)
-    counts |= {"dropped_untimed_events": untimed, "triggers": edges[0].size, "unknown_words": unknown_words(words)}
+    counts |= {
+        "dropped_untimed_events": untimed,
+        "triggers": edges[0].size,
+        "unknown_words": unknown_words(words),
+    }
     return Said(rows, counts)
 
 
@@ -151,12 +169,25 @@ def said_by_aedat2(recording: Recording, data: bytes) -> list[Said]:
         elif word < 1 << 31 and word >> 10 & 1:
             triggers += 1
         elif word < 1 << 31:
-            rows.append((chip.width - 1 - (word >> 12 & 1023), chip.height - 1 - (word >> 22 & 511), t, word >> 11 & 1))
+            rows.append(
+                (
+                    chip.width - 1 - (word >> 12 & 1023),
+                    chip.height - 1 - (word >> 22 & 511),
+                    t,
+                    word >> 11 & 1,
+                )
+            )
     counts = {"truncated_bytes": len(body) % 8, "triggers": triggers}
     return [Said(np.array(rows, np.int64).reshape(-1, 4), counts)]
 
 
-AEDAT3_COUNTS = ("truncated_bytes", "triggers", "events_of_other_sources", "invalid_events", "packets_of_other_types")
+AEDAT3_COUNTS = (
+    "truncated_bytes",
+    "triggers",
+    "events_of_other_sources",
+    "invalid_events",
+    "packets_of_other_types",
+)
 """Counts of an AEDAT 3.1 file."""
 
 
@@ -182,13 +213,18 @@ def said_by_aedat3(recording: Recording, data: bytes) -> list[Said]:
                 counts["triggers"] += sum(word >> 1 & 127 in (2, 3, 4) for word, _ in valid)
             elif first in (None, source):
                 first = source
-                rows += [(w >> 17 & 0x7FFF, w >> 2 & 0x7FFF, t + (overflow << 31), w >> 1 & 1) for w, t in valid]
+                rows += [
+                    (w >> 17 & 0x7FFF, w >> 2 & 0x7FFF, t + (overflow << 31), w >> 1 & 1)
+                    for w, t in valid
+                ]
             else:
                 counts["events_of_other_sources"] += len(valid)
         elif kind not in (2, 3, 4):
             counts["packets_of_other_types"] += 1
         at = end
-    return [Said(np.array(rows, np.int64).reshape(-1, 4), {**dict.fromkeys(AEDAT3_COUNTS, 0), **counts})]
+    return [
+        Said(np.array(rows, np.int64).reshape(-1, 4), {**dict.fromkeys(AEDAT3_COUNTS, 0), **counts})
+    ]
 
 
 def said_by_es(recording: Recording, data: bytes) -> list[Said]:
@@ -237,7 +273,12 @@ def assert_said(recording: Recording, rows: Rows, found: list[Said]) -> None:
         expected, counts = repaired(said, stated)
         wrong = [
             f"{name}: {recording.metadata.get(name, 0)} stated, {counts.get(name, 0)} found"
-            for name in {*said.counts, "dropped_outside_events", "repaired_time_events", "largest_time_repair_us"}
+            for name in {
+                *said.counts,
+                "dropped_outside_events",
+                "repaired_time_events",
+                "largest_time_repair_us",
+            }
             if recording.metadata.get(name, 0) != counts.get(name, 0)
         ]
         right, bottom = expected[:, :2].max(axis=0, initial=0).tolist()
@@ -270,7 +311,9 @@ def by_amiwarp(format: str, path: Path) -> None:
 
 
 def write_evt3_vectors(path: Path) -> None:
-    path.write_bytes(b"% evt 3.0\n% format EVT3;height=240;width=320\n% end\n" + evt3_words(EVENTS).tobytes())
+    path.write_bytes(
+        b"% evt 3.0\n% format EVT3;height=240;width=320\n% end\n" + evt3_words(EVENTS).tobytes()
+    )
 
 
 def write_dat1(path: Path) -> None:
@@ -282,7 +325,12 @@ def write_dat1(path: Path) -> None:
 def write_davis(path: Path) -> None:
     """Write events of a DAVIS with frames, IMU samples and an edge between them."""
     now = int(EVENTS.t[99])
-    frame = [(1 << 31 | y << 22 | x << 12 | kind << 10 | 99, now) for kind in (0, 1) for y in (0, 1) for x in (0, 1)]
+    frame = [
+        (1 << 31 | y << 22 | x << 12 | kind << 10 | 99, now)
+        for kind in (0, 1)
+        for y in (0, 1)
+        for x in (0, 1)
+    ]
     imu = [(1 << 31 | kind << 28 | 500 << 12 | 3 << 10, now) for kind in range(7)]
     write_aedat2(path, EVENTS, between=np.array([*frame, *imu, (1 << 10, now)], ">u4").tobytes())
 
@@ -305,7 +353,11 @@ def numbered(encoding: str, *, ros1: bool) -> list[Any]:
     if encoding == "arrays":
         messages = arrays(EVENTS, ros1=ros1)
     else:
-        messages = [each for at in range(0, 300, 50) for each in packets(encoding, EVENTS[at : at + 50], ros1=ros1)]
+        messages = [
+            each
+            for at in range(0, 300, 50)
+            for each in packets(encoding, EVENTS[at : at + 50], ros1=ros1)
+        ]
     for number, message in enumerate(messages):
         stamp = message.header.stamp
         stamp.sec, stamp.nanosec = 1, 1_000_000 * number
@@ -334,13 +386,17 @@ def write_bag1_compressed(kind: str, path: Path) -> None:
 
 
 def write_bag2(encoding: str, storage: str, path: Path) -> None:
-    made = write_ros2(path.with_name("bag"), {"/events": numbered(encoding, ros1=False)}, storage=storage)
+    made = write_ros2(
+        path.with_name("bag"), {"/events": numbered(encoding, ros1=False)}, storage=storage
+    )
     data = made.read_bytes()
     path.write_bytes(zstandard.compress(data) if path.suffix == ".zstd" else data)
 
 
 def write_csv(path: Path) -> None:
-    rows = zip(*(column.tolist() for column in (EVENTS.t, EVENTS.x, EVENTS.y, EVENTS.p)), strict=True)
+    rows = zip(
+        *(column.tolist() for column in (EVENTS.t, EVENTS.x, EVENTS.y, EVENTS.p)), strict=True
+    )
     path.write_text("t_us,x,y,p\n" + "".join(f"{t},{x},{y},{p}\n" for t, x, y, p in rows))
 
 
@@ -410,7 +466,11 @@ OUTCOMES = (
 )
 """What can become of the events of a mutant."""
 
-VARIANTS = {f"{decoder}/{name}": variant for decoder, found in DECODERS.items() for name, variant in found.items()}
+VARIANTS = {
+    f"{decoder}/{name}": variant
+    for decoder, found in DECODERS.items()
+    for name, variant in found.items()
+}
 
 
 @cache
@@ -449,7 +509,10 @@ def check(path: Path, name: str) -> str:
     if second is not None:
         assert_said(recording, rows, second(recording, path.read_bytes()))
     known, about, size = sound(name)
-    if any(recording.metadata.get(key) != about.get(key) for key in {*recording.metadata, *about} - {"format"}):
+    if any(
+        recording.metadata.get(key) != about.get(key)
+        for key in {*recording.metadata, *about} - {"format"}
+    ):
         return "noted"
     if recording.metadata["format"] != about["format"]:
         return "silent: version"
@@ -460,11 +523,17 @@ def check(path: Path, name: str) -> str:
     if np.array_equal(rows, known):
         return "same" if recording.events.size == size else "silent: size"
     step = rows[:, 2] - known[:, 2]
-    shifted = step[0] != 0 and (step == step[0]).all() and np.array_equal(rows[:, [0, 1, 3]], known[:, [0, 1, 3]])
+    shifted = (
+        step[0] != 0
+        and (step == step[0]).all()
+        and np.array_equal(rows[:, [0, 1, 3]], known[:, [0, 1, 3]])
+    )
     return "silent: all times" if shifted else "silent: values"
 
 
-def count_outcomes(checker: Checker, decoder: str, numbers: range, folder: Path, keep: Path) -> Counter[str]:
+def count_outcomes(
+    checker: Checker, decoder: str, numbers: range, folder: Path, keep: Path
+) -> Counter[str]:
     """Check mutants of a decoder's samples with a checker of this module; return what became of their events.
 
     Files with findings are saved in ``keep``.

@@ -51,23 +51,30 @@ from amiwarp import (
     load_world,
     open_recording,
 )
-from amiwarp.cli.recordings import describe
-from amiwarp.cli.simulation import _read_speed
 from amiwarp.events.recording import check_events
 from amiwarp.events.truth import MAPS
 from amiwarp.io import read_encoder_csv, reading_process
-from amiwarp.io.camera_files import load_camera, save_camera
-from amiwarp.io.json_files import append_line, sealed
-from amiwarp.io.plain_files import read_calib
-from amiwarp.simulation.pictures import _read_times, open_pictures, read_picture
-from amiwarp.simulation.worlds.world_files import load_mesh
-from amiwarp.studies.dataset.making import JOURNAL, Journal, Made, list_items
-from amiwarp.studies.dataset.specification import load_specification
-from amiwarp.studies.evaluate.edges import THRESHOLDS
-from amiwarp.studies.evaluate.evaluation import Store, section
-from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, encode_picture
+from amiwarp.io.camera_files import load_camera, read_calib, save_camera
+from amiwarp.io.description import describe
+from amiwarp.io.finished_work import append_line, sealed
+from amiwarp.learning.dataset.files import JOURNAL, Journal
+from amiwarp.learning.dataset.items import list_items
+from amiwarp.learning.dataset.specification import load_specification
+from amiwarp.learning.dataset.worker import Made
+from amiwarp.simulation.commands.rig_options import _read_speed
+from amiwarp.simulation.picture_light import read_picture
+from amiwarp.simulation.picture_opening import _read_times, open_pictures
+from amiwarp.simulation.worlds.mesh_reader import load_mesh
+from amiwarp.studies.evaluate.conditions import QUICK, Condition
+from amiwarp.studies.evaluate.edge_agreement import THRESHOLDS
+from amiwarp.studies.evaluate.jobs import Store
+from amiwarp.studies.evaluate.report import section
+from amiwarp.studies.evaluate.results import CellResult
+from amiwarp.studies.evaluate.stored_pictures import encode_picture
+from amiwarp.studies.evaluate.streams import Stream
+from amiwarp.studies.stability import axes, condition, judging
 from amiwarp.studies.stability import cells as stability
-from amiwarp.studies.stability.report import aggregate
+from amiwarp.studies.stability.atlas import aggregate
 from reference.aedat4_files import whole_file
 from reference.calibration_sample import exact_calibration
 from reference.io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
@@ -92,17 +99,26 @@ def write_hdf5(filters: dict[str, Any], libver: str, path: Path) -> None:
             file.create_dataset(f"events/{name}", data=values, **filters)
         file["t_offset"] = np.int64(1_000_000)
         file["ms_to_idx"] = np.searchsorted(relative, 1000 * np.arange(relative[-1] // 1000 + 1))
-        file["encoder/t"], file["encoder/angle"] = np.arange(0, 50_000, 500), np.linspace(0.0, 9.0, 100)
+        file["encoder/t"], file["encoder/angle"] = (
+            np.arange(0, 50_000, 500),
+            np.linspace(0.0, 9.0, 100),
+        )
         camera = {"width": 320, "height": 240, "fx": 200.0, "fy": 200.0, "cx": 160.0, "cy": 120.0}
-        file.create_group("camera").attrs.update(camera, distortion_model="fisheye", distortion=[0.1, 0.0, 0.0, 0.0])
-        file.create_group("metadata").attrs.update(place="roof", fixed=np.bytes_("abc"), number=3, flag=True)
+        file.create_group("camera").attrs.update(
+            camera, distortion_model="fisheye", distortion=[0.1, 0.0, 0.0, 0.0]
+        )
+        file.create_group("metadata").attrs.update(
+            place="roof", fixed=np.bytes_("abc"), number=3, flag=True
+        )
         file.create_group("truth").attrs.update(apex=0.03, phase=-1.0)
 
 
 def write_truth(path: Path) -> None:
     """Write a native file with the ground truth of events, instants and poses."""
     rng, count, (width, height) = np.random.default_rng(0), len(EVENTS), (8, 6)
-    maps = {name: rng.random((height, width, *tail)).astype(kind) for name, (kind, tail) in MAPS.items()}
+    maps = {
+        name: rng.random((height, width, *tail)).astype(kind) for name, (kind, tail) in MAPS.items()
+    }
     poses = np.tile([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0], (3, 1))
     truth = EventTruth(
         rng.random((count, 2)).astype(np.float32), rng.integers(0, 4, count).astype(np.uint8),
@@ -115,7 +131,9 @@ def write_truth(path: Path) -> None:
         writer.append(events, truth=truth)
         for t in (0, 1000):
             writer.append_frame(
-                FrameTruth(t, **maps, rotation=np.eye(3), position=np.ones(3), joints={"a": np.ones(3)})
+                FrameTruth(
+                    t, **maps, rotation=np.eye(3), position=np.ones(3), joints={"a": np.ones(3)}
+                )
             )
             writer.append_known(t, rng.random((height, width)) < 0.5)
         writer.append_poses(Poses(np.arange(3) * 1000, poses, {"ball": poses}, {"a": poses[:, :3]}))
@@ -137,7 +155,11 @@ def write_plain(write: Callable[[Path], None], path: Path) -> None:
     with h5py.File(path) as file:
         found: dict[str, Any] = {}
         about = dict(file.attrs)
-        file.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
+        file.visititems(
+            lambda name, item: found.update(
+                {name: item[()]} if isinstance(item, h5py.Dataset) else {}
+            )
+        )
     with h5py.File(path, "w", libver="earliest") as file:
         file.attrs.update(about)
         for name, values in found.items():
@@ -165,7 +187,11 @@ LENS = Camera(320, 240, 200.0, 201.0, 160.0, 120.0, RadialTangential(-0.1, 0.02)
 
 
 def write_camera(path: Path) -> None:
-    path.write_text(json.dumps({"width": 320, "height": 240, "fx": 200.0, "fy": 200.0, "cx": 160.0, "cy": 120.0}))
+    path.write_text(
+        json.dumps(
+            {"width": 320, "height": 240, "fx": 200.0, "fy": 200.0, "cx": 160.0, "cy": 120.0}
+        )
+    )
 
 
 def write_picture(kind: str, path: Path) -> None:
@@ -185,7 +211,9 @@ def write_video(path: Path) -> None:
         stream: Any = container.add_stream("mpeg4", rate=25)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         for _ in range(10):
-            frame = av.VideoFrame.from_ndarray(rng.integers(0, 256, (48, 64, 3)).astype(np.uint8), format="rgb24")
+            frame = av.VideoFrame.from_ndarray(
+                rng.integers(0, 256, (48, 64, 3)).astype(np.uint8), format="rgb24"
+            )
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
@@ -196,9 +224,18 @@ def stored_edges() -> CellResult:
     counts = [1] * len(THRESHOLDS)
     names = (Stream.PLAIN.value, Stream.CALIBRATED.value)
     values: dict[str, Any] = {
-        "images": [{"stream": name, "found": counts, "entropy": [0.5] * len(counts)} for name in names],
+        "images": [
+            {"stream": name, "found": counts, "entropy": [0.5] * len(counts)} for name in names
+        ],
         "rows": [
-            {"stream": n, "truth": "Canny", "tolerance": 1.5, "matched": counts, "chance": counts, "true": 9}
+            {
+                "stream": n,
+                "truth": "Canny",
+                "tolerance": 1.5,
+                "matched": counts,
+                "chance": counts,
+                "true": 9,
+            }
             for n in names
         ],
         "sectors": [{"stream": names[0], "angle": 7.5, "recall": 0.5}],
@@ -209,28 +246,45 @@ def stored_edges() -> CellResult:
 
 def stored_fading() -> CellResult:
     """Return a cell of the fading with one part of a turn, two tiles and a film of two frames."""
-    tiles = {"part_ms": 1.0, "columns": 2, "rate": [[1.0, 2.0]], "speed": [[1.0, 2.0]], "camera_speed": [[0.0, 1.0]]}
+    tiles = {
+        "part_ms": 1.0,
+        "columns": 2,
+        "rate": [[1.0, 2.0]],
+        "speed": [[1.0, 2.0]],
+        "camera_speed": [[0.0, 1.0]],
+    }
     film = [encode_picture(np.zeros((3, 4, 3), np.uint8))] * 2
     rows = [{"speed": speed, "rate": 1.0, "tiles": 5} for speed in (0.25, 1.0)]
-    return CellResult("fading", Condition(), {"rows": rows, "whole": [], "film": film, "tiles": tiles}, "", 1.0)
+    return CellResult(
+        "fading", Condition(), {"rows": rows, "whole": [], "film": film, "tiles": tiles}, "", 1.0
+    )
 
 
 def stored_texture() -> CellResult:
     """Return a cell of the texture with two streams."""
-    rows = [{"stream": s.value, "h": 1.0, "window": 0.5, "variance": 0.2} for s in (Stream.PLAIN, Stream.CALIBRATED)]
-    return CellResult("texture", Condition(), {"rows": rows, "rates": [{"stream": "S-EV", "rate": 1.5}]}, "", 1.0)
+    rows = [
+        {"stream": s.value, "h": 1.0, "window": 0.5, "variance": 0.2}
+        for s in (Stream.PLAIN, Stream.CALIBRATED)
+    ]
+    return CellResult(
+        "texture", Condition(), {"rows": rows, "rates": [{"stream": "S-EV", "rate": 1.5}]}, "", 1.0
+    )
 
 
 def stored_atlas() -> stability.Stored:
     """Return a cell of the stability study with a success and a refusal."""
-    names = [stability.identity(method) for method in stability.METHODS[:2]]
-    good = stability.Result(stability.Outcome.SUCCESS, 0.02, 0.1, 1.5, deviations={"apex": 0.5})
-    refused = stability.Result(stability.Outcome.REFUSAL, None, 0.1, 1.5, "too little light", "two cores")
-    cell = stability.Cell(stability.AXES[0].conditions()[0], 0)
+    names = [stability.identity(method) for method in judging.METHODS[:2]]
+    good = judging.Result(judging.Outcome.SUCCESS, 0.02, 0.1, 1.5, deviations={"apex": 0.5})
+    refused = judging.Result(
+        judging.Outcome.REFUSAL, None, 0.1, 1.5, "too little light", "two cores"
+    )
+    cell = condition.Cell(axes.AXES[0].conditions()[0], 0)
     return stability.Stored(cell, 1000, dict(zip(names, (good, refused), strict=True)))
 
 
-def store_of(cell: CellResult | stability.Stored, folder: Path) -> tuple[Store | stability.Store, Path]:
+def store_of(
+    cell: CellResult | stability.Stored, folder: Path
+) -> tuple[Store | stability.Store, Path]:
     """Return a store in a folder that holds one cell, and the cell's file."""
     store: Store | stability.Store
     if isinstance(cell, CellResult):
@@ -253,14 +307,20 @@ def write_journal(path: Path) -> None:
     for k in range(3):
         key = f"{k:016x}"
         file = f"train/disc-{key}.h5"
-        append_line(path, asdict(Made(key, file, 9, "0" * 64, 5, 0.1, 64, 48, 1.0, 0.9, "cpu", "0.1.0")))
+        append_line(
+            path, asdict(Made(key, file, 9, "0" * 64, 5, 0.1, 64, 48, 1.0, 0.9, "cpu", "0.1.0"))
+        )
 
 
 def write_unsealed(write: Callable[[Path], None], path: Path) -> None:
     """Write a file without its checksums. Its reader adds them, so that damage reaches the values."""
     write(path)
     lines = [json.loads(line) for line in path.read_text().splitlines()]
-    path.write_text("".join(json.dumps({k: v for k, v in data.items() if k != "checksum"}) + "\n" for data in lines))
+    path.write_text(
+        "".join(
+            json.dumps({k: v for k, v in data.items() if k != "checksum"}) + "\n" for data in lines
+        )
+    )
 
 
 def resealed(line: bytes) -> bytes:
@@ -282,12 +342,17 @@ def read_cell(make: Callable[[], CellResult | stability.Stored], path: Path) -> 
             result = store.load(cell.evaluation, cell.condition, QUICK)
             if result is not None:
                 for table in section(cell.evaluation, [result]).tables:
-                    assert all(math.isfinite(v) for row in table.rows for v in row if isinstance(v, int | float))
+                    assert all(
+                        math.isfinite(v)
+                        for row in table.rows
+                        for v in row
+                        if isinstance(v, int | float)
+                    )
         elif isinstance(store, stability.Store):
             for known in store.load_all():
-                methods = [m for m in stability.METHODS if stability.identity(m) in known.results]
+                methods = [m for m in judging.METHODS if stability.identity(m) in known.results]
                 if methods and known.cell == cell.cell:
-                    atlas = aggregate([known], stability.AXES[:1], methods, {})
+                    atlas = aggregate([known], axes.AXES[:1], methods, {})
                     json.dumps(atlas.aims.to_json(), allow_nan=False)
     if store.damaged:
         raise AmiwarpError(store.damaged[0].replace(str(file), str(path)))
@@ -296,7 +361,9 @@ def read_cell(make: Callable[[], CellResult | stability.Stored], path: Path) -> 
 def read_made(path: Path) -> None:
     """Read the journal of a data set."""
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / JOURNAL).write_bytes(b"\n".join(map(resealed, path.read_bytes().split(b"\n"))))
+        (Path(folder) / JOURNAL).write_bytes(
+            b"\n".join(map(resealed, path.read_bytes().split(b"\n")))
+        )
         journal = Journal(Path(folder))
         json.dumps([asdict(made) for made in journal.made.values()], allow_nan=False)
         assert all(".." not in made.file for made in journal.made.values())
@@ -378,9 +445,15 @@ def write_mesh(colours: bool, path: Path) -> None:
     if colours:
         box.visual.vertex_colors = [90, 120, 200, 255]
     else:
-        picture = Image.fromarray(np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8))
-        material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, baseColorFactor=[200, 100, 50, 255])
-        box.visual = trimesh.visual.TextureVisuals(np.random.default_rng(1).random((8, 2)), material)
+        picture = Image.fromarray(
+            np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
+        )
+        material = trimesh.visual.material.PBRMaterial(
+            baseColorTexture=picture, baseColorFactor=[200, 100, 50, 255]
+        )
+        box.visual = trimesh.visual.TextureVisuals(
+            np.random.default_rng(1).random((8, 2)), material
+        )
     scene = trimesh.Scene()
     for x in (-2.0, 2.0):
         scene.add_geometry(box, transform=trimesh.transformations.translation_matrix((x, 0, 0)))
@@ -397,14 +470,23 @@ def write_ascii(kind: str, path: Path) -> None:
     import trimesh
 
     box = trimesh.creation.box((1.0, 2.0, 3.0))
-    made = box.export(file_type="stl_ascii") if kind == "stl" else box.export(file_type="ply", encoding="ascii")
+    made = (
+        box.export(file_type="stl_ascii")
+        if kind == "stl"
+        else box.export(file_type="ply", encoding="ascii")
+    )
     path.write_bytes(made if isinstance(made, bytes) else made.encode())
 
 
 def write_poses(separator: str, path: Path) -> None:
     """Write a trajectory of 30 poses."""
-    rows = [separator.join(f"{v:.6f}" for v in (k / 100, k / 500, 0, 1, 0, 0, 0, 1)) for k in range(30)]
-    path.write_text("\n".join(["# t x y z qx qy qz qw" if separator == " " else "t,x,y,z,qx,qy,qz,qw", *rows]) + "\n")
+    rows = [
+        separator.join(f"{v:.6f}" for v in (k / 100, k / 500, 0, 1, 0, 0, 0, 1)) for k in range(30)
+    ]
+    path.write_text(
+        "\n".join(["# t x y z qx qy qz qw" if separator == " " else "t,x,y,z,qx,qy,qz,qw", *rows])
+        + "\n"
+    )
 
 
 def read_mesh(path: Path) -> None:
@@ -429,7 +511,9 @@ def read_world(path: Path) -> None:
             assert np.isfinite(values).all()
     for body in world.bodies:
         assert np.isfinite(np.asarray(body.mesh.vertices)).all()
-    assert np.isfinite([world.ambient, world.sky.luminance, *(lamp.intensity for lamp in world.lamps)]).all()
+    assert np.isfinite(
+        [world.ambient, world.sky.luminance, *(lamp.intensity for lamp in world.lamps)]
+    ).all()
 
 
 def read_times(path: Path) -> None:
@@ -483,12 +567,20 @@ def check_finite(recording: Recording) -> None:
         return
     assert np.isfinite(list(truth.parameters.values())).all()
     known = truth.of_events(0, len(recording.events))
-    assert not any(np.isinf(values).any() for values in (known.points, known.place) if values is not None)
+    assert not any(
+        np.isinf(values).any() for values in (known.points, known.place) if values is not None
+    )
     assert known.depth is None or (np.isfinite(known.depth) | (known.depth == np.inf)).all()
     for index in range(0 if truth.frames is None else len(truth.frames.t)):
         assert truth.frames is not None
         frame = truth.frames[index]
-        for values in (frame.normal, frame.intensity, frame.intensity_with_prism, frame.rotation, frame.position):
+        for values in (
+            frame.normal,
+            frame.intensity,
+            frame.intensity_with_prism,
+            frame.rotation,
+            frame.position,
+        ):
             assert np.isfinite(values).all()
         assert not np.isinf(frame.flow).any()
         assert not np.isinf(frame.flow_with_prism).any()
@@ -497,7 +589,9 @@ def check_finite(recording: Recording) -> None:
     if truth.poses is not None:
         poses = truth.poses[:]
         assert np.isfinite(poses.camera).all()
-        assert all(np.isfinite(rows).all() for rows in (*poses.bodies.values(), *poses.joints.values()))
+        assert all(
+            np.isfinite(rows).all() for rows in (*poses.bodies.values(), *poses.joints.values())
+        )
 
 
 def read_log(path: Path) -> None:
@@ -519,7 +613,10 @@ PLUGINS: dict[str, dict[str, Any]] = {
     "gzip": {"chunks": (70,), "compression": "gzip", "shuffle": True, "fletcher32": True},
     "lzf": {"chunks": (70,), "compression": "lzf"},
     "scaleoffset": {"chunks": (70,), "scaleoffset": 0},
-    "blosc": {"chunks": (70,), **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE)},
+    "blosc": {
+        "chunks": (70,),
+        **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE),
+    },
     "blosc2": {"chunks": (70,), **hdf5plugin.Blosc2(cname="lz4", clevel=3)},
     "bitshuffle": {"chunks": (70,), **hdf5plugin.Bitshuffle(cname="lz4")},
     "bitshuffle_zstd": {"chunks": (70,), **hdf5plugin.Bitshuffle(cname="zstd")},
@@ -649,14 +746,18 @@ def _flip(data: bytearray, at: int, length: int, rng: random.Random) -> bytearra
 
 
 def _set(data: bytearray, at: int, length: int, rng: random.Random) -> bytearray:
-    data[at : at + length] = bytes([rng.choice([0, 255, rng.randrange(256)])]) * len(data[at : at + length])
+    data[at : at + length] = bytes([rng.choice([0, 255, rng.randrange(256)])]) * len(
+        data[at : at + length]
+    )
     return data
 
 
 def _number(data: bytearray, at: int, length: int, rng: random.Random) -> bytearray:
     """Overwrite bytes with a number: small, huge, negative or near a power of two."""
     size = rng.choice([1, 2, 4, 8])
-    value = rng.choice([0, 1, -1, 1 << rng.randrange(64), (1 << rng.randrange(64)) - 1, rng.randrange(1 << 16)])
+    value = rng.choice(
+        [0, 1, -1, 1 << rng.randrange(64), (1 << rng.randrange(64)) - 1, rng.randrange(1 << 16)]
+    )
     patch = (value % (1 << 8 * size)).to_bytes(size, rng.choice(["little", "big"]))
     data[at : at + size] = patch[: len(data[at : at + size])]
     return data
@@ -666,7 +767,9 @@ def _digits(data: bytearray, at: int, length: int, rng: random.Random) -> bytear
     """Insert characters that have a meaning in text files."""
     return (
         data[:at]
-        + rng.choice([b"9" * length, b"-", b"nan", b"1e999", b"\n", b",", b"\0", b"\xff", b"[", b"{"])
+        + rng.choice(
+            [b"9" * length, b"-", b"nan", b"1e999", b"\n", b",", b"\0", b"\xff", b"[", b"{"]
+        )
         + data[at:]
     )
 
@@ -688,7 +791,10 @@ def _swap(data: bytearray, at: int, length: int, rng: random.Random) -> bytearra
     other = rng.randrange(len(data))
     low, high = min(at, other), max(at, other)
     length = min(length, high - low, len(data) - high)
-    data[low : low + length], data[high : high + length] = data[high : high + length], data[low : low + length]
+    data[low : low + length], data[high : high + length] = (
+        data[high : high + length],
+        data[low : low + length],
+    )
     return data
 
 
@@ -713,8 +819,12 @@ def _value(data: bytearray, at: int, length: int, rng: random.Random) -> bytearr
         b'""',
         b"[]",
     ]
-    found = re.compile(rb'(?<=[:,\[=])[ \n]*(?:-?[0-9][0-9.eE+-]*|"[^"]*")(?=[,\]}\n])').search(data, at)
-    return data if found is None else data[: found.start()] + rng.choice(values) + data[found.end() :]
+    found = re.compile(rb'(?<=[:,\[=])[ \n]*(?:-?[0-9][0-9.eE+-]*|"[^"]*")(?=[,\]}\n])').search(
+        data, at
+    )
+    return (
+        data if found is None else data[: found.start()] + rng.choice(values) + data[found.end() :]
+    )
 
 
 WORDS = (b"-", b"nan", b"1e999", b"\n", b",", b"\0", b"\xff", b"\x1b[2J", b"[", b"{", b'"', b"null")
@@ -732,12 +842,15 @@ def checked(path: Path, read: Callable[[Path], object]) -> str | None:
 
     Any other exception is a defect. So is a refusal of several lines or without the file's name.
     """
-    Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here: other tests ran in this process before
+    # The peak counts from here: other tests ran in this process before
+    Path("/proc/self/clear_refs").write_text("5")
     before = memory_kib("VmRSS")
     said = refusal(read, path)
     if said is not None:
         assert str(path) in said, said
-        assert all(character.isprintable() or unicodedata.category(character) == "Zs" for character in said), repr(said)
+        assert all(
+            character.isprintable() or unicodedata.category(character) == "Zs" for character in said
+        ), repr(said)
         assert len(said) < 1000 + len(str(path)), said
     used = memory_kib("VmHWM") - before
     assert used < MEMORY_KIB, f"{used} KiB of memory"
@@ -758,7 +871,9 @@ class Checker:
     """
 
     def __init__(
-        self, cpu_seconds: float = reading_process.CPU_SECONDS, module: str = "reference.mutation_files"
+        self,
+        cpu_seconds: float = reading_process.CPU_SECONDS,
+        module: str = "reference.mutation_files",
     ) -> None:
         self._cpu_seconds = cpu_seconds
         self._module = module
@@ -766,8 +881,11 @@ class Checker:
 
     def _start(self) -> None:
         command = [sys.executable, "-P", "-m", self._module, "--serve", str(self._cpu_seconds)]
-        modules = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}  # the amiwarp of this process
-        self._process = subprocess.Popen(command, env=modules, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        # The amiwarp of this process
+        modules = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+        self._process = subprocess.Popen(
+            command, env=modules, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
 
     def check(self, path: Path, name: str) -> str | None:
         """Run :func:`check`. Raise :class:`AssertionError` for a crash, a hang or a wrong exception as well."""

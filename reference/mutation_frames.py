@@ -17,7 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from amiwarp.events.encoder import LARGEST_ANGLE
-from amiwarp.live.link.link import Follower
+from amiwarp.live.link.follower import Follower
 from amiwarp.live.link.protocol import (
     LONGEST,
     Answer,
@@ -32,13 +32,45 @@ from amiwarp.live.link.protocol import (
     Sync,
     encode,
 )
-from amiwarp.live.stream.packets import COLUMNS, END, EVENTS, HEADER, HELLO, MAGIC, SECOND_ENCODER, PacketDecoder
-from amiwarp.live.stream.sources import StreamSource
+from amiwarp.live.stream.stream_format import (
+    COLUMNS,
+    END,
+    EVENTS,
+    HEADER,
+    HELLO,
+    MAGIC,
+    SECOND_ENCODER,
+    PacketDecoder,
+)
+from amiwarp.live.stream.stream_source import StreamSource
 
 WIDTH, HEIGHT = 64, 48
 WHOLE = [0, 1, 2, 255, 256, 65535, 65536, (1 << 31) - 1, 1 << 31, (1 << 32) - 1]
-TIMES = [0, -1, 1, 1 << 31, 1 << 40, 1 << 60, (1 << 60) + 1, 1 << 62, (1 << 63) - 1, -(1 << 63), -(1 << 60)]
-ANGLES = [0.0, -1e3, LARGEST_ANGLE, 1.1 * LARGEST_ANGLE, 1e308, -1e308, math.inf, -math.inf, math.nan, 5e-324]
+TIMES = [
+    0,
+    -1,
+    1,
+    1 << 31,
+    1 << 40,
+    1 << 60,
+    (1 << 60) + 1,
+    1 << 62,
+    (1 << 63) - 1,
+    -(1 << 63),
+    -(1 << 60),
+]
+ANGLES = [
+    0.0,
+    -1e3,
+    LARGEST_ANGLE,
+    1.1 * LARGEST_ANGLE,
+    1e308,
+    -1e308,
+    math.inf,
+    -math.inf,
+    math.nan,
+    5e-324,
+]
 NUMBERS = [
     "1e999",
     "-1e999",
@@ -60,32 +92,76 @@ CAMERA = {"width": WIDTH, "height": HEIGHT, "fx": 60.0, "fy": 60.0, "cx": 31.5, 
 
 def packed(kind: int, count: int, payload: bytes, **wrong: int) -> bytes:
     """Return one packet. Its header is right, except for the fields in ``wrong``."""
-    fields = {"version": 1, "zero": 0, "length": len(payload), "check": zlib.crc32(payload), **wrong}
+    fields = {
+        "version": 1,
+        "zero": 0,
+        "length": len(payload),
+        "check": zlib.crc32(payload),
+        **wrong,
+    }
     return (
-        HEADER.pack(MAGIC, fields["version"], kind, fields["zero"], count, fields["length"], fields["check"]) + payload
+        HEADER.pack(
+            MAGIC, fields["version"], kind, fields["zero"], count, fields["length"], fields["check"]
+        )
+        + payload
     )
 
 
 def hello(rng: random.Random, encoders: int) -> bytes:
     """Return a hello packet, invalid in a quarter of the cases."""
     camera = {**CAMERA, "distortion_model": "none"}
-    fields = {"width": WIDTH, "height": HEIGHT, "camera": camera, "prism": {"apex": 0.03, "index": 1.5}}
+    fields = {
+        "width": WIDTH,
+        "height": HEIGHT,
+        "camera": camera,
+        "prism": {"apex": 0.03, "index": 1.5},
+    }
     if encoders == 2 or rng.random() < 0.5:
         fields["encoders"] = encoders
     text = json.dumps(fields)
     what = rng.randrange(20)
     if what == 0:
-        name = rng.choice(["width", "height", "fx", "cy", "apex", "index", *["encoders"] * ("encoders" in fields)])
+        name = rng.choice(
+            ["width", "height", "fx", "cy", "apex", "index", *["encoders"] * ("encoders" in fields)]
+        )
         start = text.index(f'"{name}": ') + len(name) + 4
         stop = start + next(k for k, c in enumerate(text[start:]) if c in ",}")
         text = text[:start] + rng.choice(NUMBERS) + text[stop:]
     elif what == 1:
         depth = rng.choice([10, 500, 3000, 30_000])
-        text = rng.choice(['{"a":' * (depth // 3), "[" * depth, "[" * depth + "]" * depth, '{"width":' + "[" * depth])
+        text = rng.choice(
+            [
+                '{"a":' * (depth // 3),
+                "[" * depth,
+                "[" * depth + "]" * depth,
+                '{"width":' + "[" * depth,
+            ]
+        )
     elif what == 2:
-        part = rng.choice(["camera", "prism", "encoders", "distortion", "distortion_model", "flat_side"])
-        value = rng.choice([5, [], [1, "a"], [math.inf] * 9, "x" * 5000, "a\nb", True, {"width": {}}, [[]] * 4, None])
-        place = fields if part in (*fields, "encoders") else camera if part.startswith("dist") else fields["prism"]
+        part = rng.choice(
+            ["camera", "prism", "encoders", "distortion", "distortion_model", "flat_side"]
+        )
+        value = rng.choice(
+            [
+                5,
+                [],
+                [1, "a"],
+                [math.inf] * 9,
+                "x" * 5000,
+                "a\nb",
+                True,
+                {"width": {}},
+                [[]] * 4,
+                None,
+            ]
+        )
+        place = (
+            fields
+            if part in (*fields, "encoders")
+            else camera
+            if part.startswith("dist")
+            else fields["prism"]
+        )
         place[part] = value  # type: ignore[index]
         text = json.dumps(fields)
     elif what == 3:
@@ -112,11 +188,15 @@ def rows(kind: int, rng: random.Random, at: int) -> bytes:
     columns = []
     for k, dtype in enumerate(COLUMNS[kind]):
         if k == 0:
-            column = (at + np.sort(np.array([rng.randrange(3000) for _ in range(n)], np.int64))).astype(dtype)
+            column = (
+                at + np.sort(np.array([rng.randrange(3000) for _ in range(n)], np.int64))
+            ).astype(dtype)
         elif dtype in ("<f8", "<f4"):
             column = np.array([at * 7e-6 + 0.1 * i for i in range(n)]).astype(dtype)
         else:
-            column = np.array([rng.randrange(2 if dtype == "u1" else HEIGHT) for _ in range(n)]).astype(dtype)
+            column = np.array(
+                [rng.randrange(2 if dtype == "u1" else HEIGHT) for _ in range(n)]
+            ).astype(dtype)
         if n and rng.random() < 0.01:
             wild = {"<i8": TIMES, "<f8": ANGLES, "<f4": ANGLES[:4]}.get(dtype, [255])
             column[rng.randrange(n)] = rng.choice(wild)
@@ -141,11 +221,19 @@ def mutated_stream(seed: int) -> bytes:
         if rng.random() < 0.01:
             parts.append(wild_header(rng))
         second = SECOND_ENCODER if encoders == 2 or rng.random() < 0.02 else 5
-        parts.append(rows(rng.choice([EVENTS, EVENTS, 4, 5, second, 3 if rng.random() < 0.05 else 5]), rng, at))
+        parts.append(
+            rows(
+                rng.choice([EVENTS, EVENTS, 4, 5, second, 3 if rng.random() < 0.05 else 5]), rng, at
+            )
+        )
         at += rng.choice([3000, 3000, 3000, -20_000, 10_000_000])
     if rng.random() < 0.7:
         parts.append(packed(END, 0, b""))
-    for change in (rng.shuffle, lambda p: p.append(p[0]), lambda p: p.insert(rng.randrange(len(p)), rng.choice(p))):
+    for change in (
+        rng.shuffle,
+        lambda p: p.append(p[0]),
+        lambda p: p.insert(rng.randrange(len(p)), rng.choice(p)),
+    ):
         if rng.random() < 0.1:
             change(parts)
     stream = b"".join(parts)
@@ -191,7 +279,9 @@ def lines(rng: random.Random) -> list[bytes]:
             b"\0",
         ]
         out.append(
-            rng.choice([*wild, b"%d,%d\n" % (rng.choice(WHOLE), 1)]) if rng.random() < 0.1 else b"%d,%d\n" % (t, 9 * k)
+            rng.choice([*wild, b"%d,%d\n" % (rng.choice(WHOLE), 1)])
+            if rng.random() < 0.1
+            else b"%d,%d\n" % (t, 9 * k)
         )
     return out
 
@@ -203,7 +293,8 @@ def mutated_serial(seed: int) -> bytes:
     parts = made(rng)
     if rng.random() < 0.2:
         parts.insert(
-            rng.randrange(len(parts)), rng.choice([rng.randbytes(3000), b"\1" * 5000, b"\0" * 3000, b"\n" * 2000])
+            rng.randrange(len(parts)),
+            rng.choice([rng.randbytes(3000), b"\1" * 5000, b"\0" * 3000, b"\n" * 2000]),
         )
     if rng.random() < 0.1:
         rng.shuffle(parts)

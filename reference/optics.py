@@ -34,7 +34,10 @@ def monotonic_limit(*k: float, below: tuple[float, ...] = (), largest: float) ->
     """
 
     def terms(r: Array, *k: float, slope: int = 0) -> Array:
-        return np.sum([(slope * 2 * i + 1) * value * r ** (2 * i) for i, value in enumerate((1.0, *k))], axis=0)
+        return np.sum(
+            [(slope * 2 * i + 1) * value * r ** (2 * i) for i, value in enumerate((1.0, *k))],
+            axis=0,
+        )
 
     def slope(r: Array) -> Array:
         n, d = terms(r, *k), terms(r, *below)
@@ -52,7 +55,9 @@ def monotonic_limit(*k: float, below: tuple[float, ...] = (), largest: float) ->
     return float(low)
 
 
-def invert_polynomial(value: Array, *k: float, limit: float, below: tuple[float, ...] = ()) -> Array:
+def invert_polynomial(
+    value: Array, *k: float, limit: float, below: tuple[float, ...] = ()
+) -> Array:
     """Return the radius in [0, limit] at which the polynomial equals ``value``, by bisection; NaN if there is none."""
 
     def ratio(r: Array) -> Array:
@@ -72,14 +77,18 @@ def lens_limit(camera: Camera) -> float:
     d = camera.distortion
     if isinstance(d, Fisheye):
         return monotonic_limit(d.k1, d.k2, d.k3, d.k4, largest=0.999 * np.pi / 2)
-    return monotonic_limit(d.k1, d.k2, d.k3, below=(d.k4, d.k5, d.k6), largest=100.0) if d else np.inf
+    return (
+        monotonic_limit(d.k1, d.k2, d.k3, below=(d.k4, d.k5, d.k6), largest=100.0) if d else np.inf
+    )
 
 
 def distort_radial_tangential(d: RadialTangential, p: Array) -> Array:
     """Return x'' and y'' from x' and y' (tangents), shape (n, 2). OpenCV, Camera Calibration and 3D Reconstruction."""
     x, y = p.T
     r2 = x**2 + y**2
-    radial = (1.0 + d.k1 * r2 + d.k2 * r2**2 + d.k3 * r2**3) / (1.0 + d.k4 * r2 + d.k5 * r2**2 + d.k6 * r2**3)
+    radial = (1.0 + d.k1 * r2 + d.k2 * r2**2 + d.k3 * r2**3) / (
+        1.0 + d.k4 * r2 + d.k5 * r2**2 + d.k6 * r2**3
+    )
     return np.stack(
         [
             x * radial + 2.0 * d.p1 * x * y + d.p2 * (r2 + 2.0 * x**2),
@@ -99,17 +108,24 @@ def undistort_radial_tangential(d: RadialTangential, distorted: Array, limit: fl
     for _ in range(20):
         error = distort_radial_tangential(d, p) - distorted
         jx, jy = (
-            (distort_radial_tangential(d, p + h) - distort_radial_tangential(d, p - h)) / 2e-7 for h in 1e-7 * np.eye(2)
+            (distort_radial_tangential(d, p + h) - distort_radial_tangential(d, p - h)) / 2e-7
+            for h in 1e-7 * np.eye(2)
         )
         det = jx[:, 0] * jy[:, 1] - jy[:, 0] * jx[:, 1]
         det = np.where(np.abs(det) < 1e-12, 1e-12, det)
         step = np.stack(
-            [jy[:, 1] * error[:, 0] - jy[:, 0] * error[:, 1], jx[:, 0] * error[:, 1] - jx[:, 1] * error[:, 0]], axis=1
+            [
+                jy[:, 1] * error[:, 0] - jy[:, 0] * error[:, 1],
+                jx[:, 0] * error[:, 1] - jx[:, 1] * error[:, 0],
+            ],
+            axis=1,
         )
         step /= det[:, None]
         scale = np.ones(len(p))
         for _ in range(8):
-            after = np.linalg.norm(distort_radial_tangential(d, p - scale[:, None] * step) - distorted, axis=1)
+            after = np.linalg.norm(
+                distort_radial_tangential(d, p - scale[:, None] * step) - distorted, axis=1
+            )
             scale = np.where(after <= np.linalg.norm(error, axis=1), scale, 0.5 * scale)
         p = p - scale[:, None] * step
     residual = np.linalg.norm(distort_radial_tangential(d, p) - distorted, axis=1)
@@ -123,7 +139,9 @@ def pixels_to_rays(camera: Camera, xy: Array) -> Array:
     lens = camera.distortion
     if isinstance(lens, Fisheye):
         radius = np.linalg.norm(d, axis=1)
-        angle = invert_polynomial(radius, lens.k1, lens.k2, lens.k3, lens.k4, limit=lens_limit(camera))
+        angle = invert_polynomial(
+            radius, lens.k1, lens.k2, lens.k3, lens.k4, limit=lens_limit(camera)
+        )
         direction = d / np.maximum(radius, 1e-300)[:, None]
         return np.concatenate([np.sin(angle)[:, None] * direction, np.cos(angle)[:, None]], axis=1)
     if lens is not None:
@@ -143,7 +161,9 @@ def rays_to_pixels(camera: Camera, rays: Array) -> Array:
         if isinstance(lens, Fisheye):
             angle = np.arctan(radius)
             ahead &= angle <= lens_limit(camera)
-            scale = polynomial(angle, lens.k1, lens.k2, lens.k3, lens.k4) / np.where(radius > 0, radius, 1.0)
+            scale = polynomial(angle, lens.k1, lens.k2, lens.k3, lens.k4) / np.where(
+                radius > 0, radius, 1.0
+            )
             p = np.where((radius > 0)[:, None], tangent * scale[:, None], tangent)
         elif lens is not None:
             ahead &= radius <= lens_limit(camera)
@@ -191,7 +211,13 @@ def tipped(towards: tuple[float, float]) -> Array:
 
 
 def through_uneven_prism(
-    prism: Prism, rays: Array, phi: Array, *, to_scene: bool, cylinder: tuple[float, float], wobble: tuple[float, float]
+    prism: Prism,
+    rays: Array,
+    phi: Array,
+    *,
+    to_scene: bool,
+    cylinder: tuple[float, float],
+    wobble: tuple[float, float],
 ) -> Array:
     """Trace bearings (n, 3) as :func:`through_prism` does, in the frame of each angle.
 
@@ -199,13 +225,17 @@ def through_uneven_prism(
     the apex and the cylinder matrix times the ray's tangents.
     """
     c, s, zero = np.cos(phi), np.sin(phi), np.zeros_like(phi)
-    turned = np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]]).transpose(2, 0, 1) @ tipped(wobble)
+    turned = np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]]).transpose(
+        2, 0, 1
+    ) @ tipped(wobble)
     local = np.einsum("nji,nj->ni", turned, rays)
     power = np.array([[cylinder[0], cylinder[1]], [cylinder[1], -cylinder[0]]])
     out = local
     for _ in range(1 if to_scene else 60):
         tangent = (local if to_scene else out)[:, :2] / (local if to_scene else out)[:, 2:]
-        normal = np.column_stack([np.array([np.tan(prism.apex), 0.0]) + tangent @ power, np.ones(len(rays))])
+        normal = np.column_stack(
+            [np.array([np.tan(prism.apex), 0.0]) + tangent @ power, np.ones(len(rays))]
+        )
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         out = through_faces(prism, local, normal, to_scene=to_scene)
     return np.einsum("nij,nj->ni", turned, out)
@@ -214,7 +244,9 @@ def through_uneven_prism(
 def rotation(tilt: tuple[float, float]) -> Array:
     """Return the matrix (3, 3) of a rotation about x by ``tilt[0]``, then about y by ``tilt[1]`` [rad]."""
     cx, sx, cy, sy = np.cos(tilt[0]), np.sin(tilt[0]), np.cos(tilt[1]), np.sin(tilt[1])
-    return np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    return np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array(
+        [[1, 0, 0], [0, cx, -sx], [0, sx, cx]]
+    )
 
 
 def through_plate(
@@ -230,7 +262,12 @@ def through_plate(
     steeper = plate.tilt + np.arctan(wedge[0])
     s, c, aside = np.sin(steeper), np.cos(steeper), wedge[1] * np.cos(np.arctan(wedge[0]))
     far = np.stack(
-        [s * np.cos(phi) - aside * np.sin(phi), s * np.sin(phi) + aside * np.cos(phi), np.full_like(phi, c)], axis=1
+        [
+            s * np.cos(phi) - aside * np.sin(phi),
+            s * np.sin(phi) + aside * np.cos(phi),
+            np.full_like(phi, c),
+        ],
+        axis=1,
     ) / np.hypot(1.0, aside)
     place, bearing = np.zeros_like(rays), rays
     faces = ((near, 1e-4, 1.0 / plate.index), (far, 1e-4 + plate.thickness, plate.index))
@@ -242,7 +279,13 @@ def through_plate(
 
 
 def through_pair(
-    camera: Camera, prism: Prism, phases: tuple[float, float], xy: Array, theta: Array, *, to_scene: bool
+    camera: Camera,
+    prism: Prism,
+    phases: tuple[float, float],
+    xy: Array,
+    theta: Array,
+    *,
+    to_scene: bool,
 ) -> Array:
     """Return pixels (n, 2) compensated (``to_scene``) or deflected by a prism and its second one at angles (n, 2)."""
     assert prism.second is not None
@@ -293,6 +336,27 @@ def in_mirror(camera: Camera, values: Mapping[str, float], xy: Array, theta: Arr
     return rays_to_pixels(camera, reflected(reflected(pixels_to_rays(camera, xy), tilted), rest))
 
 
+def steered(
+    camera: Camera, values: Mapping[str, float], xy: Array, theta: Array, *, to_scene: bool
+) -> Array:
+    """Return pixels without a beam steerer, for pixels ``xy`` seen at angles (n, 2) of its commands, or the reverse.
+
+    A deflector along x adds to the cosine of the ray's angle with the x axis.
+    """
+    rays = pixels_to_rays(camera, xy)
+    cosines = rays[:, :2]
+    sense = -1.0 if to_scene else 1.0
+    for k, prefix in enumerate(("", "second_")):
+        command = np.cos(theta[:, k] + values[f"{prefix}phase"])
+        size = sense * np.sin(values[f"{prefix}amplitude"]) * command
+        along = values[f"{prefix}direction"]
+        cosines = cosines + size[:, None] * np.array([np.cos(along), np.sin(along)])
+    transverse = np.hypot(*cosines.T)
+    with np.errstate(invalid="ignore"):
+        axial = np.cos(np.arcsin(transverse))
+    return rays_to_pixels(camera, np.column_stack([cosines, axial]))
+
+
 def vibration(values: Mapping[str, float], theta: Array) -> Rotation:
     """Return a vibrating camera's rotation from rest at angles (n,) of the vibration.
 
@@ -300,7 +364,9 @@ def vibration(values: Mapping[str, float], theta: Array) -> Rotation:
     """
 
     def part(name: str, k: int) -> Array:
-        return complex(values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0)) * np.exp(1j * k * theta)
+        return complex(values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0)) * np.exp(
+            1j * k * theta
+        )
 
     circle = values["amplitude"] * np.exp(1j * (theta + values["phase"]))
     circle = circle + part("backward", -1) + part("second", 2) + part("second_backward", -2)
@@ -330,7 +396,9 @@ def move(
     axis = rotation(tilt)
     rays, phi = pixels_to_rays(camera, xy) @ axis, np.asarray(theta, dtype=np.float64) + phase
     if any((*cylinder, *wobble)):
-        out = through_uneven_prism(prism, rays, phi, to_scene=to_scene, cylinder=cylinder, wobble=wobble)
+        out = through_uneven_prism(
+            prism, rays, phi, to_scene=to_scene, cylinder=cylinder, wobble=wobble
+        )
     else:
         out = through_prism(prism, rays, phi, to_scene=to_scene)
     return rays_to_pixels(camera, out @ axis.T)
@@ -361,7 +429,9 @@ def turn(rays: Array, phi: Array, angle: Array | float) -> Array:
     return turned
 
 
-def place(name: str, camera: Camera, prism: Prism, xy: Array, theta: Array, *, phase: float) -> Array:
+def place(
+    name: str, camera: Camera, prism: Prism, xy: Array, theta: Array, *, phase: float
+) -> Array:
     """Return pixels compensated by the model ``exact``, ``radial`` or ``circle``; the flat face points to the scene."""
     if name == "exact":
         return move(camera, prism, xy, theta, to_scene=True, phase=phase)
@@ -369,5 +439,9 @@ def place(name: str, camera: Camera, prism: Prism, xy: Array, theta: Array, *, p
     angle: Array | float = prism.deflection
     if name == "radial":
         cosine2 = rays[:, 2] ** 2
-        angle = angle * (np.sqrt((prism.index**2 - 1.0 + cosine2) / cosine2) - 1.0) / (prism.index - 1.0)
+        angle = (
+            angle
+            * (np.sqrt((prism.index**2 - 1.0 + cosine2) / cosine2) - 1.0)
+            / (prism.index - 1.0)
+        )
     return rays_to_pixels(camera, turn(rays, theta + phase, angle))

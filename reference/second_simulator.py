@@ -71,7 +71,9 @@ class Pixels:
     """Step of the time stamps [us]."""
 
 
-def dead_leaves(width: int, height: int, rng: np.random.Generator, *, contrast: float = 1.0) -> Array:
+def dead_leaves(
+    width: int, height: int, rng: np.random.Generator, *, contrast: float = 1.0
+) -> Array:
     """Return the spline of a scene of discs with soft shading, relative to white, with :data:`FINER` samples per pixel.
 
     ``contrast`` 1 has light from 0.05 to 1; smaller values bring everything nearer to the middle.
@@ -87,7 +89,9 @@ def dead_leaves(width: int, height: int, rng: np.random.Generator, *, contrast: 
         v, u = np.mgrid[top:bottom, left:right].astype(np.float64)
         inside = (u - x) ** 2 + (v - y) ** 2 < radius**2
         slope = rng.uniform(-0.3, 0.3, 2) / radius
-        shade = np.exp(rng.uniform(np.log(0.05), 0.0)) * (1.0 + slope[0] * (u - x) + slope[1] * (v - y))
+        shade = np.exp(rng.uniform(np.log(0.05), 0.0)) * (
+            1.0 + slope[0] * (u - x) + slope[1] * (v - y)
+        )
         part = light[top:bottom, left:right]
         part[inside] = shade[inside]
     blurred = gaussian_filter(np.clip(light, 0.03, 1.0), 0.6 * FINER)
@@ -98,7 +102,9 @@ def dead_leaves(width: int, height: int, rng: np.random.Generator, *, contrast: 
 def light_at(scene: Array, places: Array) -> Array:
     """Return the light at places (n, 2) [px] of the image without an optic."""
     at = (places + MARGIN_PX) * FINER
-    return np.asarray(map_coordinates(scene, [at[:, 1], at[:, 0]], order=3, prefilter=False, mode="nearest"))
+    return np.asarray(
+        map_coordinates(scene, [at[:, 1], at[:, 0]], order=3, prefilter=False, mode="nearest")
+    )
 
 
 class SmoothField:
@@ -107,12 +113,18 @@ class SmoothField:
     def __init__(self, width: int, height: int) -> None:
         nodes = [np.cos(np.pi * (np.arange(n) + 0.5) / n) for n in NODES]
         middle = (width - 1) / 2.0, (height - 1) / 2.0
-        self.xy = np.stack(np.meshgrid(*(m * (1.0 + n) for m, n in zip(middle, nodes, strict=True)), indexing="ij"), -1)
+        self.xy = np.stack(
+            np.meshgrid(
+                *(m * (1.0 + n) for m, n in zip(middle, nodes, strict=True)), indexing="ij"
+            ),
+            -1,
+        )
         """Nodes [px], shape (nodes along x, nodes along y, 2)."""
         self._fits = [np.linalg.inv(chebyshev.chebvander(n, len(n) - 1)) for n in nodes]
         pixels = np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height)
         self._x, self._y = (
-            chebyshev.chebvander(p, len(n) - 1) @ fit for p, n, fit in zip(pixels, nodes, self._fits, strict=True)
+            chebyshev.chebvander(p, len(n) - 1) @ fit
+            for p, n, fit in zip(pixels, nodes, self._fits, strict=True)
         )
 
     def __call__(self, place: Place, t: float) -> Array:
@@ -125,7 +137,10 @@ def largest_speed(place: Place, camera: Camera, duration_s: float) -> float:
     """Return the largest speed of the image's middle [px/s], by differences over 20 us."""
     middle = np.array([[(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]])
     times = np.linspace(0.0, duration_s, 2000)
-    return max(float(np.linalg.norm(place(middle, t + 1e-5) - place(middle, t - 1e-5))) for t in times) / 2e-5
+    return (
+        max(float(np.linalg.norm(place(middle, t + 1e-5) - place(middle, t - 1e-5))) for t in times)
+        / 2e-5
+    )
 
 
 def events_of(
@@ -179,7 +194,9 @@ def events_of(
         start_s, end_s = k * step_s, (k + 1) * step_s
         light = lamp(end_s) * light_at(scene, field(place, end_s)) + LEAST_LIGHT
         new_log = np.log(light)
-        new_first = _low_pass(first, log_light, new_log, step_s, 1.0 / (2 * np.pi * sensor.bandwidth_hz * light))
+        new_first = _low_pass(
+            first, log_light, new_log, step_s, 1.0 / (2 * np.pi * sensor.bandwidth_hz * light)
+        )
         voltage = _low_pass(voltage, first, new_first, step_s, 1.0 / (2 * np.pi * sensor.buffer_hz))
         log_light, first = new_log, new_first
         keep = np.exp(-step_s / (1e-6 * sensor.noise_us))
@@ -187,7 +204,9 @@ def events_of(
         wandering = keep * wandering + kick * rng.standard_normal(count)
         after = voltage + wandering
         reference -= sensor.leak_hz * step_s * on
-        found += _crossings(before, after, reference, ready_s, on, off, start_s, end_s, 1e-6 * sensor.refractory_us)
+        found += _crossings(
+            before, after, reference, ready_s, on, off, start_s, end_s, 1e-6 * sensor.refractory_us
+        )
         before = after
     return _stamped(found, camera, duration_s, rng, sensor)
 
@@ -198,7 +217,9 @@ def _started(light: Array) -> tuple[Array, Array, Array]:
     return log_light, log_light.copy(), log_light.copy()
 
 
-def _low_pass(state: Array, start: Array, end: Array, step_s: float, constant_s: Array | float) -> Array:
+def _low_pass(
+    state: Array, start: Array, end: Array, step_s: float, constant_s: Array | float
+) -> Array:
     """Return a first-order low-pass filter's output after a step over which its input grows linearly."""
     lag = (end - start) / step_s * constant_s
     return np.asarray(end - lag + (state - start + lag) * np.exp(-step_s / constant_s))
@@ -242,7 +263,11 @@ def _crossings(
 
 
 def _stamped(
-    found: list[tuple[Array, Array, Array]], camera: Camera, duration_s: float, rng: np.random.Generator, sensor: Pixels
+    found: list[tuple[Array, Array, Array]],
+    camera: Camera,
+    duration_s: float,
+    rng: np.random.Generator,
+    sensor: Pixels,
 ) -> Events:
     """Return events with their delays and time stamps, and the random ones among them."""
     count = camera.width * camera.height
@@ -257,5 +282,8 @@ def _stamped(
     stamp = np.rint((1e6 * t + delay_us) / sensor.stamp_us).astype(np.int64) * sensor.stamp_us
     order = np.argsort(stamp, kind="stable")
     return Events.from_arrays(
-        pixel[order] % camera.width, pixel[order] // camera.width, stamp[order], polarity[order].astype(np.uint8)
+        pixel[order] % camera.width,
+        pixel[order] // camera.width,
+        stamp[order],
+        polarity[order].astype(np.uint8),
     )

@@ -22,18 +22,27 @@ APEXES = (0.5, 1.0, 2.0)
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Return a table in Markdown."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join([*lines, *("| " + " | ".join(str(cell) for cell in row) + " |" for row in rows)]) + "\n"
+    return (
+        "\n".join([*lines, *("| " + " | ".join(str(cell) for cell in row) + " |" for row in rows)])
+        + "\n"
+    )
 
 
 def list_of_parts(made: Sequence[Part]) -> str:
     """Return the masses of the parts."""
     rows = [
-        ("" if part.kind == "screws" else k, part.name, part.kind, f"{part.mass:.1f}") for k, part in enumerate(made, 1)
+        ("" if part.kind == "screws" else k, part.name, part.kind, f"{part.mass:.1f}")
+        for k, part in enumerate(made, 1)
     ]
-    return table(("number", "part", "kind", "mass [g]"), [*rows, ("", "all", "", f"{sum(p.mass for p in made):.0f}")])
+    return table(
+        ("number", "part", "kind", "mass [g]"),
+        [*rows, ("", "all", "", f"{sum(p.mass for p in made):.0f}")],
+    )
 
 
-def balance_rows(rigs: Sequence[Rig] = parts.RIGS, apexes: Sequence[float] = APEXES) -> list[tuple[str, ...]]:
+def balance_rows(
+    rigs: Sequence[Rig] = parts.RIGS, apexes: Sequence[float] = APEXES
+) -> list[tuple[str, ...]]:
     """Return unbalance, grade, forces and vibration of both rigs, for each apex, without and with set screws."""
     rows = []
     for rig in rigs:
@@ -43,7 +52,10 @@ def balance_rows(rigs: Sequence[Rig] = parts.RIGS, apexes: Sequence[float] = APE
             screws, balanced = numbers.balance(own, body)
             slack = own.seat * numbers.glass_mass(own)
             held = balanced + numbers.point(1e-9, slack / 1e-9, 0.0, own.seat_z + own.thickness / 2)
-            for name, each in (("no screws", body), (words(screws) + f", wedge off by {own.seat} mm", held)):
+            for name, each in (
+                ("no screws", body),
+                (words(screws) + f", wedge off by {own.seat} mm", held),
+            ):
                 path, lean = numbers.vibration(own, each)
                 forces = [numbers.bearing_forces(own, each, rpm) for rpm in SPEEDS]
                 rows.append(
@@ -70,7 +82,10 @@ def speed_rows() -> list[tuple[str, ...]]:
     """Return friction at both speeds, and stresses at over-speed."""
     rows = []
     for rig in parts.RIGS:
-        greased, oiled = ([numbers.friction(rig, rpm, *oil) for rpm in SPEEDS] for oil in ((100.0, 1.8), (15.0, 0.8)))
+        greased, oiled = (
+            [numbers.friction(rig, rpm, *oil) for rpm in SPEEDS]
+            for oil in ((100.0, 1.8), (15.0, 0.8))
+        )
         stress = numbers.stress(rig, OVERSPEED)
         rows.append(
             (
@@ -78,7 +93,10 @@ def speed_rows() -> list[tuple[str, ...]]:
                 rig.bearing.name,
                 " / ".join(f"{v:.0f}" for v in greased),
                 " / ".join(f"{v:.1f}" for v in oiled),
-                *(f"{stress[name]:.2f}" for name in ("glass", "rotor", "wedge's pull", "shock", "rim", "energy")),
+                *(
+                    f"{stress[name]:.2f}"
+                    for name in ("glass", "rotor", "wedge's pull", "shock", "rim", "energy")
+                ),
             )
         )
     return rows
@@ -90,9 +108,17 @@ def lens_rows(rigs: Sequence[Rig] = parts.RIGS) -> list[tuple[str, ...]]:
     for rig in rigs:
         for lens, own in numbers.lenses(rig).items():
             for name, sensor in numbers.SENSORS.items():
-                found = [numbers.shortest_focal(own, sensor, *at) for at in ((2.0,), (4.0,), (4.0, OFF))]
-                wide = [math.degrees(2 * math.atan(sensor[0] * sensor[2] / 2 / focal)) for focal in found[:2]]
-                cells = [f"{f:.1f} ({w:.0f}°)" if w else "none" for f, w in zip(found[:2], wide, strict=True)]
+                found = [
+                    numbers.shortest_focal(own, sensor, *at) for at in ((2.0,), (4.0,), (4.0, OFF))
+                ]
+                wide = [
+                    math.degrees(2 * math.atan(sensor[0] * sensor[2] / 2 / focal))
+                    for focal in found[:2]
+                ]
+                cells = [
+                    f"{f:.1f} ({w:.0f}°)" if w else "none"
+                    for f, w in zip(found[:2], wide, strict=True)
+                ]
                 off = f"{found[2]:.1f}" if math.isfinite(found[2]) else "none"
                 rows.append((rig.name, lens, f"{own.seat_z - own.lens_z:.1f}", name, *cells, off))
     return rows
@@ -109,7 +135,11 @@ def tolerances(rig: Rig) -> list[Tolerance]:
     pulley = rig.pitch(rig.teeth[0])
     loose = math.degrees(play)
     wobbles = {"print": (0.15 / rig.wedge, runout), "turned": (0.02 / rig.wedge, runout)}
-    out = [Tolerance("bearings with play, not preloaded", f"axis off by {loose:.2f}°", tilt_deg=(loose, 0.0))]
+    out = [
+        Tolerance(
+            "bearings with play, not preloaded", f"axis off by {loose:.2f}°", tilt_deg=(loose, 0.0)
+        )
+    ]
     for name, (seat, race) in wobbles.items():
         total = math.degrees(math.hypot(seat, race))
         half = total / math.sqrt(2)
@@ -118,16 +148,41 @@ def tolerances(rig: Rig) -> list[Tolerance]:
     wide, long = rig.grip
     seated = math.degrees(math.hypot(0.1 / wide, 0.1 / (rig.bearing.outer + 8.0)))
     askew = math.degrees(0.2 / long)
-    for name, tilt in (("holder: printed faces off by 0.1 mm", seated), ("holder: ring askew in its clamp", askew)):
-        out.append(Tolerance(name, f"camera tilted by {tilt:.2f}°", tilt_deg=(tilt / math.sqrt(2),) * 2))
+    for name, tilt in (
+        ("holder: printed faces off by 0.1 mm", seated),
+        ("holder: ring askew in its clamp", askew),
+    ):
+        out.append(
+            Tolerance(name, f"camera tilted by {tilt:.2f}°", tilt_deg=(tilt / math.sqrt(2),) * 2)
+        )
     off = math.degrees(0.05 / pulley)
-    out.append(Tolerance("printed pulley off by 0.05 mm", f"{off:.2f}° once a turn", harmonics_deg=(off, 0, 0, 0)))
+    out.append(
+        Tolerance(
+            "printed pulley off by 0.05 mm", f"{off:.2f}° once a turn", harmonics_deg=(off, 0, 0, 0)
+        )
+    )
     small = math.degrees(0.05 / pulley)
-    out.append(Tolerance("motor's pulley off by 0.05 mm", f"{small:.2f}° twice a turn", harmonics_deg=(0, 0, small, 0)))
-    out.append(Tolerance("encoder's magnet: 1° of the motor", "0.5° twice a turn", harmonics_deg=(0, 0, 0, 0.5)))
+    out.append(
+        Tolerance(
+            "motor's pulley off by 0.05 mm",
+            f"{small:.2f}° twice a turn",
+            harmonics_deg=(0, 0, small, 0),
+        )
+    )
+    out.append(
+        Tolerance(
+            "encoder's magnet: 1° of the motor", "0.5° twice a turn", harmonics_deg=(0, 0, 0, 0.5)
+        )
+    )
     body = numbers.rotating(rig)
     lean = numbers.vibration(rig, body)[1]
-    out.append(Tolerance("unbalanced, on soft feet", f"camera shaken by {math.degrees(lean):.3f}°", shake=(lean, 0.0)))
+    out.append(
+        Tolerance(
+            "unbalanced, on soft feet",
+            f"camera shaken by {math.degrees(lean):.3f}°",
+            shake=(lean, 0.0),
+        )
+    )
     return out
 
 
@@ -163,7 +218,9 @@ def simulated_rows() -> list[tuple[str, ...]]:
         tilts, wobbles = ((math.radians(size) / math.sqrt(2),) * 2 for size in (tilt, wobble))
         motion = amiwarp.PrismMotion(720.0, 0.3, tilt=tilts, wobble=wobbles)
         encoder = amiwarp.EncoderModel(harmonics=(0.0, 0.0, 0.0, math.radians(wave)))
-        recording = amiwarp.simulate(light, camera, prism, duration_s=0.35, motion=motion, encoder=encoder, seed=1)
+        recording = amiwarp.simulate(
+            light, camera, prism, duration_s=0.35, motion=motion, encoder=encoder, seed=1
+        )
         true = amiwarp.ExactModel(camera, prism, 0.3, tilt=tilts, wobble=wobbles)
         found = amiwarp.calibrate(recording).model
         rows.append((name, f"{amiwarp.predicted_error(found, true, remove_lag=True).rms:.3f}"))
@@ -176,7 +233,9 @@ def checked(rig: Rig, view: View | None = None, rpm: float = max(SPEEDS)) -> Seq
         sys.exit("\n".join(f"{rig.name}: {line}" for line in refused))
     made = numbers.assembly(rig)
     wrong = parts.problems(rig, made)
-    wrong += [f"{part.name} is not watertight" for part in made if not numbers.in_file(part).is_watertight]
+    wrong += [
+        f"{part.name} is not watertight" for part in made if not numbers.in_file(part).is_watertight
+    ]
     if wrong:
         sys.exit(f"{rig.name}: " + "; ".join(wrong))
     return made
@@ -189,7 +248,10 @@ def report() -> str:
         "nothing was measured on metal.\n"
     ]
     for rig in parts.RIGS:
-        text += [f"## Parts: {rig.name}\n\nPrinted parts are taken as solid PETG.\n", list_of_parts(checked(rig))]
+        text += [
+            f"## Parts: {rig.name}\n\nPrinted parts are taken as solid PETG.\n",
+            list_of_parts(checked(rig)),
+        ]
     text += [
         "## Balance\n\nAngles of set screws count from the thick edge. Below each: with screws, and the wedge "
         "off the axis by the gap of its seat.\n",
@@ -225,7 +287,15 @@ def report() -> str:
         "## Shortest focal length without vignetting\n\nWith the widest field of view, for lenses in the holder. "
         f"Last column: the lens is {OFF} mm off the axis.\n",
         table(
-            ("rig", "lens", "lens to wedge [mm]", "sensor", "f/2 [mm]", "f/4 [mm]", f"f/4, off by {OFF} mm [mm]"),
+            (
+                "rig",
+                "lens",
+                "lens to wedge [mm]",
+                "sensor",
+                "f/2 [mm]",
+                "f/4 [mm]",
+                f"f/4, off by {OFF} mm [mm]",
+            ),
             lens_rows(),
         ),
         "## Error that tolerances cost, apex 1°, 640×480, 60°\n\n"
@@ -233,7 +303,10 @@ def report() -> str:
         f"{OFF} mm move a point at the border by "
         f"{numbers.offset_error(replace(parts.ONE_INCH, apex_deg=1.0), OFF, 1000.0):.4f} px if it is 1 m away. "
         "Freed besides apex and phase:\n",
-        table(("rig", "what is off", "by", *(", ".join(free) or "nothing" for free in FREED)), error_rows()),
+        table(
+            ("rig", "what is off", "by", *(", ".join(free) or "nothing" for free in FREED)),
+            error_rows(),
+        ),
         "## The same by simulation and calibration, apex 1°, 320×240, 60°\n\n"
         "Rms error of what `amiwarp calibrate` finds with its defaults [px].\n",
         table(("what is off", "error"), simulated_rows()),
@@ -267,49 +340,124 @@ def arguments_of(given: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--rig", choices=[rig.name for rig in gimbal.KINDS], help="only this rig")
     parser.add_argument("--pictures", action="store_true", help="write drawing and pictures, too")
     parser.add_argument(
-        "--format", nargs="+", choices=("stl", "3mf", "step"), default=["stl"], help="formats of the parts; default stl"
+        "--format",
+        nargs="+",
+        choices=("stl", "3mf", "step"),
+        default=["stl"],
+        help="formats of the parts; default stl",
     )
-    parser.add_argument("--boards", action="store_true", help="write the wiring and the perfboard plans, too")
+    parser.add_argument(
+        "--boards", action="store_true", help="write the wiring and the perfboard plans, too"
+    )
     parser.add_argument("--numbers", type=Path, help="page of numbers to write; takes some minutes")
 
     def sizes(group: argparse._ArgumentGroup, name: str, text: str, *values: str) -> None:
-        count = {"nargs": len(values), "metavar": values} if len(values) > 1 else {"metavar": values[0]}
+        count = (
+            {"nargs": len(values), "metavar": values} if len(values) > 1 else {"metavar": values[0]}
+        )
         group.add_argument(name, type=float, help=text, **count)
 
     wedge = parser.add_argument_group("wedge")
-    sizes(wedge, "--wedge-mm", "diameter [mm]; default: 25.4 for one-inch, 50.8 for the others", "DIAMETER")
+    sizes(
+        wedge,
+        "--wedge-mm",
+        "diameter [mm]; default: 25.4 for one-inch, 50.8 for the others",
+        "DIAMETER",
+    )
     sizes(wedge, "--thickness-mm", "thickness on the axis [mm]", "THICKNESS")
-    sizes(wedge, "--apex-deg", "apex angle [deg]; default: 0.5 for one-inch, 1 for the others", "ANGLE")
-    sizes(wedge, "--edges-mm", "thin and thick edge [mm], instead of thickness and apex", "THIN", "THICK")
-    sizes(wedge, "--rpm", "fastest speed of the prism, at which it must be balanced; default 1440", "RPM")
+    sizes(
+        wedge,
+        "--apex-deg",
+        "apex angle [deg]; default: 0.5 for one-inch, 1 for the others",
+        "ANGLE",
+    )
+    sizes(
+        wedge,
+        "--edges-mm",
+        "thin and thick edge [mm], instead of thickness and apex",
+        "THIN",
+        "THICK",
+    )
+    sizes(
+        wedge,
+        "--rpm",
+        "fastest speed of the prism, at which it must be balanced; default 1440",
+        "RPM",
+    )
     lens = parser.add_argument_group("lens and camera")
-    sizes(lens, "--lens-mm", "lens: diameter, and length before its ring [mm]", "DIAMETER", "LENGTH")
+    sizes(
+        lens, "--lens-mm", "lens: diameter, and length before its ring [mm]", "DIAMETER", "LENGTH"
+    )
     sizes(lens, "--pupil-mm", "entrance pupil of the lens: distance behind its front [mm]", "DEPTH")
-    sizes(lens, "--grip-mm", "ring that the holder grips: diameter and width [mm]", "DIAMETER", "WIDTH")
+    sizes(
+        lens,
+        "--grip-mm",
+        "ring that the holder grips: diameter and width [mm]",
+        "DIAMETER",
+        "WIDTH",
+    )
     sizes(lens, "--camera-mm", "camera's body [mm]", "WIDTH", "HEIGHT", "LENGTH")
     threads = ("c", "cs", "m12")
     lens.add_argument("--camera-thread", choices=threads, help="thread of the camera; default cs")
     lens.add_argument("--lens-thread", choices=threads, help="thread of the lens")
-    sizes(lens, "--flange-mm", "distance from flange to sensor; default 12.526 (cs), 17.526 (c)", "DISTANCE")
+    sizes(
+        lens,
+        "--flange-mm",
+        "distance from flange to sensor; default 12.526 (cs), 17.526 (c)",
+        "DISTANCE",
+    )
     view = parser.add_argument_group("view, to check that the wedge is wide enough")
-    sizes(view, "--fov-deg", "horizontal field of view [deg]; without it no view is checked", "ANGLE")
-    view.add_argument("--size", default="640x480", help="columns x rows of the sensor; default 640x480")
+    sizes(
+        view, "--fov-deg", "horizontal field of view [deg]; without it no view is checked", "ANGLE"
+    )
+    view.add_argument(
+        "--size", default="640x480", help="columns x rows of the sensor; default 640x480"
+    )
     view.add_argument("--pitch-um", type=float, default=9.0, help="pixel pitch [µm]; default 9")
     view.add_argument("--f-number", type=float, default=2.0, help="f-number of the lens; default 2")
     motor = parser.add_argument_group("motor and belt")
-    sizes(motor, "--motor-mm", "motor: diameter, length, and diameter of the shaft [mm]", "DIAMETER", "LENGTH", "SHAFT")
-    sizes(motor, "--motor-screws-mm", "distance of its two M3 threads, and its boss [mm]", "DISTANCE", "BOSS")
-    motor.add_argument("--teeth", type=int, nargs=2, metavar=("ROTOR", "MOTOR"), help="teeth of both pulleys")
+    sizes(
+        motor,
+        "--motor-mm",
+        "motor: diameter, length, and diameter of the shaft [mm]",
+        "DIAMETER",
+        "LENGTH",
+        "SHAFT",
+    )
+    sizes(
+        motor,
+        "--motor-screws-mm",
+        "distance of its two M3 threads, and its boss [mm]",
+        "DISTANCE",
+        "BOSS",
+    )
+    motor.add_argument(
+        "--teeth", type=int, nargs=2, metavar=("ROTOR", "MOTOR"), help="teeth of both pulleys"
+    )
     sizes(motor, "--belt-mm", "length of the belt [mm]", "LENGTH")
     hollow = parser.add_argument_group("hollow-shaft motor, with --rig gimbal")
     sizes(hollow, "--hollow-mm", "outer diameter, height and bore [mm]", "OUTER", "HEIGHT", "BORE")
-    sizes(hollow, "--hollow-screws-mm", "circles of its 4 × M3 threads, rear and front [mm]", "STATOR", "ROTOR")
+    sizes(
+        hollow,
+        "--hollow-screws-mm",
+        "circles of its 4 × M3 threads, rear and front [mm]",
+        "STATOR",
+        "ROTOR",
+    )
     sizes(hollow, "--kv", "speed without load for each volt [turns/min/V]", "KV")
     sizes(hollow, "--resistance-ohm", "between two wires [Ω]", "OHM")
     sizes(hollow, "--current-a", "current limit of its driver [A]", "AMPERE")
     sizes(hollow, "--cogging-mnm", "amplitude of its cogging [mN m]", "TORQUE")
-    sizes(hollow, "--friction-mnm", "friction of its bearings and the encoder's belt [mN m]", "TORQUE")
-    hollow.add_argument("--slots-poles", type=int, nargs=2, metavar=("SLOTS", "POLES"), help="of its stator and bell")
+    sizes(
+        hollow, "--friction-mnm", "friction of its bearings and the encoder's belt [mN m]", "TORQUE"
+    )
+    hollow.add_argument(
+        "--slots-poles",
+        type=int,
+        nargs=2,
+        metavar=("SLOTS", "POLES"),
+        help="of its stator and bell",
+    )
     return parser.parse_args(given)
 
 
@@ -320,17 +468,23 @@ def wedge_of(rig: Rig, given: argparse.Namespace) -> Rig:
     diameter = rig.wedge if given.wedge_mm is None else given.wedge_mm
     if given.edges_mm is not None:
         if given.thickness_mm is not None or given.apex_deg is not None:
-            sys.exit("--edges-mm: thickness and apex follow from the edges; leave out --thickness-mm and --apex-deg")
+            sys.exit(
+                "--edges-mm: thickness and apex follow from the edges; leave out --thickness-mm and --apex-deg"
+            )
         thin, thick = given.edges_mm
         if not thick > thin:
-            sys.exit(f"--edges-mm {thin:g} {thick:g}: the thick edge comes second, and is the thicker one")
+            sys.exit(
+                f"--edges-mm {thin:g} {thick:g}: the thick edge comes second, and is the thicker one"
+            )
         thickness = (thin + thick) / 2.0
         apex = math.degrees(math.atan2(thick - thin, diameter))
     teeth = None if given.teeth is None else tuple(given.teeth)
     own = replace(rig, thickness=thickness, apex_deg=apex)
     if not (math.isfinite(diameter) and diameter > 0.0):
         sys.exit(f"--wedge-mm {diameter:g}: give a number above 0")
-    if not isinstance(rig, GimbalRig) and (refused := list(limits.bearings(replace(own, wedge=diameter)))):
+    if not isinstance(rig, GimbalRig) and (
+        refused := list(limits.bearings(replace(own, wedge=diameter)))
+    ):
         sys.exit(f"{rig.name}: " + refused[0])
     return parts.for_wedge(own, diameter, teeth=teeth, belt=given.belt_mm)
 
@@ -420,7 +574,9 @@ def said(rig: Rig, given: argparse.Namespace) -> list[str]:
     lines = []
     if rig.belt != given.belt_mm or given.teeth is None:
         large, small = rig.teeth
-        lines.append(f"belt {rig.belt:g} mm (--belt-mm), pulleys of {large} and {small} teeth (--teeth)")
+        lines.append(
+            f"belt {rig.belt:g} mm (--belt-mm), pulleys of {large} and {small} teeth (--teeth)"
+        )
     of_camera, of_lens = (name.upper() for name in rig.threads)
     lines.append(
         f"lens: its front is {rig.seat_z - rig.lens_z:.1f} mm from the wedge; {of_lens} on a camera with {of_camera} "
@@ -457,7 +613,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for part in printed:
             write_part(part, folder, given.format)
         files.written(folder / "bill.csv", bill.of_rig(own).encode())
-        print(f"{folder}: {len(printed)} parts to print, all watertight, none overlaps; {', '.join(given.format)}")
+        print(
+            f"{folder}: {len(printed)} parts to print, all watertight, none overlaps; {', '.join(given.format)}"
+        )
         lines = [*said(own, given), view_text(own, view), balance_text(own)]
         if isinstance(own, GimbalRig):
             lines += drive.text(drive.drive_of(own))

@@ -51,7 +51,10 @@ MOTOR_SCREWS = {"belt": (2, "M3×6", "countersunk"), "gimbal": (4, "M3×8", "cou
 
 def screws_of(rig: Rig) -> dict[str, tuple[int, str, str]]:
     """Return number, size and kind of the screws in a rig's assembly, by their names."""
-    own = {**SCREWS, "screws of the motor": MOTOR_SCREWS["gimbal" if isinstance(rig, GimbalRig) else "belt"]}
+    own = {
+        **SCREWS,
+        "screws of the motor": MOTOR_SCREWS["gimbal" if isinstance(rig, GimbalRig) else "belt"],
+    }
     return {part.name: own[part.name] for part in numbers.assembly(rig) if part.kind == "screws"}
 
 
@@ -84,9 +87,24 @@ def mechanics(rig: Rig) -> list[Item]:
     pulley = "encoder pulley" if isinstance(rig, GimbalRig) else "motor pulley"
     out += [
         Item("", "set screw M3×5", "1", f"ISO 4026, in the {pulley}"),
-        Item("", f"set screw M{rig.screw[1]:g}, 3 to 8 mm", "up to 12", "ISO 4026; which ones, the command prints"),
-        Item("", "foot", "4", "soft rubber, higher than 8 mm, with an M4 stud of 10 mm or more and a nut"),
-        Item("", "board of the fork barrier", "1", "perfboard 20 × 16 mm, 1.6 mm thick: see “Two small boards”"),
+        Item(
+            "",
+            f"set screw M{rig.screw[1]:g}, 3 to 8 mm",
+            "up to 12",
+            "ISO 4026; which ones, the command prints",
+        ),
+        Item(
+            "",
+            "foot",
+            "4",
+            "soft rubber, higher than 8 mm, with an M4 stud of 10 mm or more and a nut",
+        ),
+        Item(
+            "",
+            "board of the fork barrier",
+            "1",
+            "perfboard 20 × 16 mm, 1.6 mm thick: see “Two small boards”",
+        ),
         Item("", "tape", "", "black, over the slits of the holder"),
         Item("", "glue, thread locker", "", consumables(rig)),
     ]
@@ -97,7 +115,9 @@ def consumables(rig: Rig) -> str:
     """Return what glue and oil are for."""
     if isinstance(rig, GimbalRig):
         return "retaining compound for both 625 bearings and the shaft in them; glue for cup and magnet; thread locker"
-    return "glue for cup and magnet; thread locker; white spirit and instrument oil for the bearings"
+    return (
+        "glue for cup and magnet; thread locker; white spirit and instrument oil for the bearings"
+    )
 
 
 FOCALS = (6.0, 8.0, 12.0, 16.0, 25.0, 35.0, 50.0)
@@ -122,14 +142,20 @@ def lens_item(rig: Rig) -> Item:
             f"**focal length at least {shortest:g} mm** for {sensor_name} at f/{number:g} (sees {widest:g}°); for "
             "another sensor see the numbers"
         )
-    held = "fixed aperture, and a lock nut or locking screw for the focus" if m12 else "locking screws for both rings"
+    held = (
+        "fixed aperture, and a lock nut or locking screw for the focus"
+        if m12
+        else "locking screws for both rings"
+    )
     usual = next((focal for focal in FOCALS if focal >= shortest), None)
     kind = "M12 lens" if m12 else "fixed lens for machine vision"
     example = ""
     if usual is not None:
         sees = View(sensor, 1.0, number).degrees(usual)
         example = f"{kind}, {usual:g} mm (sees {sees:.1f}°) or longer"
-    spec = f"{name}, at most {rig.lens:g} mm wide, {rig.reach:g} mm before its ring; {limit}; {held}"
+    spec = (
+        f"{name}, at most {rig.lens:g} mm wide, {rig.reach:g} mm before its ring; {limit}; {held}"
+    )
     return Item("", "lens", "1", spec, example)
 
 
@@ -276,7 +302,11 @@ def electrics(kind: str, drive: str) -> list[Item]:
     """Return the electrical parts for a controller and a drive."""
     pico = kind == "rp2040"
     what = "RP2040 board with its LED at GPIO25" if pico else "ATmega2560 at 16 MHz, 5 V"
-    which = "Raspberry Pi Pico; not Pico W (LED elsewhere), not Pico 2 (another chip)" if pico else "Arduino Mega 2560"
+    which = (
+        "Raspberry Pi Pico; not Pico W (LED elsewhere), not Pico 2 (another chip)"
+        if pico
+        else "Arduino Mega 2560"
+    )
     out = [Item("U1", "controller", "1", what, which)]
     if drive == "belt":
         what = "12 V, 2 A, PWM of 25 kHz, direction, enable, open-drain fault output, current limit"
@@ -303,17 +333,35 @@ def electrics(kind: str, drive: str) -> list[Item]:
             only = f"{film}; only for a driver's board without a pull-up at VREF: **not with Pololu 4035**"
             out.append(Item("R14", value, "1", only))
     connectors = sorted(
-        (part for part in wires.components(kind, drive) if part.ref[0] == "J"), key=lambda part: part.ref
+        (part for part in wires.components(kind, drive) if part.ref[0] == "J"),
+        key=lambda part: part.ref,
     )
     widths = ", ".join(f"{part.ref} {len(part.pins)}" for part in connectors)
-    strips = "two of 20 pins for the Pico" if pico else f"one of {len(wires.MEGA)} pins for the wires to the Mega"
-    headers = [Item("", "headers", "2", "2.54 mm, 20 pins each, to solder on the Pico, pins downwards")] if pico else []
+    strips = (
+        "two of 20 pins for the Pico"
+        if pico
+        else f"one of {len(wires.MEGA)} pins for the wires to the Mega"
+    )
+    headers = (
+        [Item("", "headers", "2", "2.54 mm, 20 pins each, to solder on the Pico, pins downwards")]
+        if pico
+        else []
+    )
     plugs = ", ".join(f"{len(part.pins)}" for part in connectors)
     pins = sum(len(part.pins) for part in connectors)
-    across = [Item("", "capacitor", "1", "100 nF, 50 V, across the motor's wires")] if drive == "belt" else []
+    across = (
+        [Item("", "capacitor", "1", "100 nF, 50 V, across the motor's wires")]
+        if drive == "belt"
+        else []
+    )
     return [
         *out,
-        Item(", ".join(part.ref for part in connectors), "pin strips", "1 set", f"2.54 mm; pins: {widths}"),
+        Item(
+            ", ".join(part.ref for part in connectors),
+            "pin strips",
+            "1 set",
+            f"2.54 mm; pins: {widths}",
+        ),
         Item("", "sockets", "1 set", f"2.54 mm, {strips}"),
         *headers,
         Item(
@@ -324,7 +372,12 @@ def electrics(kind: str, drive: str) -> list[Item]:
             "solder its wires)",
         ),
         Item("", "perfboard", "1", "9 × 7 cm, 31 × 26 holes of 1 mm, 2.54 mm apart, single pads"),
-        Item("", "perfboard for a level shifter", "0 or 1", "3 × 3 cm or so, only if the table of levels asks for one"),
+        Item(
+            "",
+            "perfboard for a level shifter",
+            "0 or 1",
+            "3 × 3 cm or so, only if the table of levels asks for one",
+        ),
         Item(
             "",
             "standoffs",

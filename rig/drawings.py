@@ -53,7 +53,9 @@ SCREWS = "#3f3f3f"
 
 def section(solid: Manifold) -> CrossSection:
     """Return the cut through a solid at y = 0, with z to the right and x up."""
-    return solid.rotate((90, 0, 0)).slice(0.0).transform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]))
+    return (
+        solid.rotate((90, 0, 0)).slice(0.0).transform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]))
+    )
 
 
 def fill(axes: Any, shape: CrossSection, colour: str, alpha: float = 0.55) -> None:
@@ -70,7 +72,9 @@ def fill(axes: Any, shape: CrossSection, colour: str, alpha: float = 0.55) -> No
     axes.add_patch(PathPatch(line, facecolor="none", edgecolor="#202020", linewidth=0.5))
 
 
-def dimension(axes: Any, a: tuple[float, float], b: tuple[float, float], text: str, side: float = 0.0) -> None:
+def dimension(
+    axes: Any, a: tuple[float, float], b: tuple[float, float], text: str, side: float = 0.0
+) -> None:
     """Draw a dimension between two points, along x if they have the same y, else along y, ``side`` mm beside them."""
     flat = abs(a[1] - b[1]) < 1e-6
     move = (0.0, side) if flat else (side, 0.0)
@@ -78,7 +82,16 @@ def dimension(axes: Any, a: tuple[float, float], b: tuple[float, float], text: s
     for u, v in ((a, p), (b, q)):
         axes.plot([u[0], v[0]], [u[1], v[1]], color="#666666", linewidth=0.4)
     axes.annotate(
-        "", p, q, arrowprops={"arrowstyle": "<->", "linewidth": 0.6, "color": "#222222", "shrinkA": 0, "shrinkB": 0}
+        "",
+        p,
+        q,
+        arrowprops={
+            "arrowstyle": "<->",
+            "linewidth": 0.6,
+            "color": "#222222",
+            "shrinkA": 0,
+            "shrinkB": 0,
+        },
     )
     box = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}
     axes.text(
@@ -133,9 +146,17 @@ def whole(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     """Draw the cut through the rig at the height of the axis."""
     for name, solid in solids.items():
         fill(axes, section(solid), COLOURS.get(name, SCREWS), 0.75)
-    axes.set_title(f"{rig.name}: cut at the height of the axis, seen from above; camera left, scene right")
+    axes.set_title(
+        f"{rig.name}: cut at the height of the axis, seen from above; camera left, scene right"
+    )
     low, edge = parts.camera_z(rig)[0], rig.distance + rig.motor[0] / 2
-    dimension(axes, (0, 0), (0, rig.distance), number(rig.distance), min(low, rig.face_z - 9 - rig.motor[1]) - 8)
+    dimension(
+        axes,
+        (0, 0),
+        (0, rig.distance),
+        number(rig.distance),
+        min(low, rig.face_z - 9 - rig.motor[1]) - 8,
+    )
     dimension(axes, (0, -rig.outline), (rig.front_z, -rig.outline), number(rig.front_z), -6)
     gap = f"lens to wedge {number(rig.seat_z - rig.lens_z)}"
     dimension(axes, (rig.lens_z, edge), (rig.seat_z, edge), gap, 8)
@@ -147,11 +168,17 @@ def housing(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     """Draw the housing from the scene."""
     solid, bearing, end = solids["housing"], rig.bearing, parts.motor_end(rig)
     fill(axes, solid.slice(rig.face_z - 0.5), COLOURS["housing"])
-    lip = CrossSection.circle(bearing.outer / 2 + 0.025, 180) - CrossSection.circle(bearing.outside, 180)
+    lip = CrossSection.circle(bearing.outer / 2 + 0.025, 180) - CrossSection.circle(
+        bearing.outside, 180
+    )
     fill(axes, lip, "white", 0.9)
     depth = number(rig.face_z)
-    axes.set_title(f"6 housing, from the scene; depth of the barrel {depth}, plate {number(parts.PLATE)}")
-    dimension(axes, (0, 0), (rig.distance, 0), number(rig.distance) + " (slot ± 3)", rig.outline + 6)
+    axes.set_title(
+        f"6 housing, from the scene; depth of the barrel {depth}, plate {number(parts.PLATE)}"
+    )
+    dimension(
+        axes, (0, 0), (rig.distance, 0), number(rig.distance) + " (slot ± 3)", rig.outline + 6
+    )
     dimension(axes, (0, -rig.height), (0, 0), number(rig.height), -rig.outline - 8)
     bores = f"⌀ {number(bearing.outer)} + 0.05, lip ⌀ {number(2 * bearing.outside)}"
     dimension(axes, (-bearing.outer / 2, 0), (bearing.outer / 2, 0), bores)
@@ -170,16 +197,22 @@ def holder(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     shift = max(rig.barrel, parts.holder_screws(rig)[0][0]) + 24.0 - rig.grip_z
     fill(axes, section(solid).translate((shift, 0.0)), COLOURS["holder"])
     at = parts.clamp_radius(rig)
-    axes.set_title(f"4 holder, from the camera, and cut at the height of the axis; plate {number(parts.HOLDER)}")
+    axes.set_title(
+        f"4 holder, from the camera, and cut at the height of the axis; plate {number(parts.HOLDER)}"
+    )
     x, _ = parts.holder_screws(rig)[0]
     low = -max(rig.barrel + 4.0, x + 4.0)
     dimension(axes, (-x, low), (x, low), f"{number(2 * x)} square, 4 × ⌀ 2.9", -6)
-    dimension(axes, (-rig.grip[0] / 2, 0), (rig.grip[0] / 2, 0), f"clamp ⌀ {number(rig.grip[0] + 0.2)}")
+    dimension(
+        axes, (-rig.grip[0] / 2, 0), (rig.grip[0] / 2, 0), f"clamp ⌀ {number(rig.grip[0] + 0.2)}"
+    )
     rear = rig.grip_z - rig.grip[1] + 0.1
     dimension(axes, (rear + shift, low), (shift, low), number(-rear), -6)
     dimension(axes, (shift, low), (shift + 1.5, low), "1.5", -13)
     spigot = rig.centring - 0.05
-    dimension(axes, (shift + 1.5, -spigot), (shift + 1.5, spigot), f"spigot ⌀ {number(2 * spigot)}", 7)
+    dimension(
+        axes, (shift + 1.5, -spigot), (shift + 1.5, spigot), f"spigot ⌀ {number(2 * spigot)}", 7
+    )
     dimension(axes, (rear + shift, -at), (rear + shift, at), f"⌀ {number(2 * at)}", -6)
 
 
@@ -189,16 +222,28 @@ def gimbal_housing(axes: Any, rig: GimbalRig, solids: dict[str, Manifold]) -> No
     fill(axes, solid.slice(rig.face_z - 0.5).mirror((1, 0)), COLOURS["housing"], 0.25)
     fill(axes, solid.slice(2.5).mirror((1, 0)), COLOURS["housing"])
     motor, bore = rig.hollow, 2 * (rig.barrel)
-    axes.set_title(f"housing, from the camera; wall {number(parts.PLATE)}, bore for the bell ⌀ {number(bore)}")
+    axes.set_title(
+        f"housing, from the camera; wall {number(parts.PLATE)}, bore for the bell ⌀ {number(bore)}"
+    )
     dimension(axes, (-rig.centring, 0), (rig.centring, 0), f"⌀ {number(2 * rig.centring)}")
     half = motor.stator_circle / 2
-    dimension(axes, (-half, 0), (half, 0), f"4 × M3 countersunk on ⌀ {number(2 * half)}, at 45°", half + 6)
-    dimension(axes, (-rig.distance, 0), (0, 0), number(rig.distance) + " (slot ± 3)", rig.outline + 6)
+    dimension(
+        axes, (-half, 0), (half, 0), f"4 × M3 countersunk on ⌀ {number(2 * half)}, at 45°", half + 6
+    )
+    dimension(
+        axes, (-rig.distance, 0), (0, 0), number(rig.distance) + " (slot ± 3)", rig.outline + 6
+    )
     dimension(axes, (0, -rig.height), (0, 0), number(rig.height), rig.outline + 8)
     low, high = parts.plate_screws(rig)
     at = -low[0]
     side = rig.distance + 26 - low[0]
-    dimension(axes, (at, low[1]), (at, high[1]), f"{number(high[1] - low[1])}, 2 × M3 for the encoder block", -side)
+    dimension(
+        axes,
+        (at, low[1]),
+        (at, high[1]),
+        f"{number(high[1] - low[1])}, 2 × M3 for the encoder block",
+        -side,
+    )
 
 
 def cell(axes: Any, rig: GimbalRig, solids: dict[str, Manifold]) -> None:
@@ -208,7 +253,9 @@ def cell(axes: Any, rig: GimbalRig, solids: dict[str, Manifold]) -> None:
     block = section(solids["encoder block"]).translate((0.0, 12.0))
     fill(axes, block, COLOURS["encoder block"])
     motor, front = rig.hollow, rig.front_z
-    axes.set_title(f"cell on the motor, wedge ({number(rig.apex_deg)}°), wedge ring; encoder block (above)")
+    axes.set_title(
+        f"cell on the motor, wedge ({number(rig.apex_deg)}°), wedge ring; encoder block (above)"
+    )
     items = [
         (rig.clear, rig.shoulder_z + 1, number(2 * rig.clear)),
         (motor.rotor_circle / 2, rig.shoulder_z + 1, f"{number(motor.rotor_circle)}, 4 × M3"),
@@ -225,7 +272,9 @@ def cell(axes: Any, rig: GimbalRig, solids: dict[str, Manifold]) -> None:
     dimension(axes, (rear, top), (high, top), number(high - rear), 5)
     wide = gimbal.SMALL[1] + 0.05
     middle = rig.distance + 12.0
-    dimension(axes, (rear, middle - wide / 2), (rear, middle + wide / 2), f"2 × ⌀ {number(wide)}", -6)
+    dimension(
+        axes, (rear, middle - wide / 2), (rear, middle + wide / 2), f"2 × ⌀ {number(wide)}", -6
+    )
 
 
 def rotor(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
@@ -250,13 +299,23 @@ def rotor(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     half = bearing.bore / 2
     for y in (-half, half):
         axes.plot([rig.bearing_z[0] - 9, rig.bearing_z[0]], [y, y], color="#666666", linewidth=0.4)
-    dimension(axes, (rig.bearing_z[0], -half), (rig.bearing_z[0], half), f"⌀ {number(bearing.bore)} − 0.02", -9)
+    dimension(
+        axes,
+        (rig.bearing_z[0], -half),
+        (rig.bearing_z[0], half),
+        f"⌀ {number(bearing.bore)} − 0.02",
+        -9,
+    )
     y = -rig.flag
     start = rig.bearing_z[0] + 0.2
     dimension(axes, (start, y), (rig.shoulder_z, y), number(rig.shoulder_z - start), -5)
     dimension(axes, (rig.pulley_z, y), (rig.front_z, y), number(rig.front_z - rig.pulley_z), -5)
     dimension(
-        axes, (rig.seat_z, -rig.pulley_flange), (rig.front_z, -rig.pulley_flange), number(rig.front_z - rig.seat_z), 5
+        axes,
+        (rig.seat_z, -rig.pulley_flange),
+        (rig.front_z, -rig.pulley_flange),
+        number(rig.front_z - rig.seat_z),
+        5,
     )
     dimension(axes, (rig.bearing_z[0], 0), (rig.bearing_z[0], y), f"flag {number(rig.flag)}", -18)
 
@@ -265,9 +324,13 @@ def cover(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     """Draw the cover from the scene."""
     solid, inside = solids["cover"], rig.cover_z + 1.0
     fill(axes, solid.slice(inside) + solid.slice(rig.face_z + 1.0), COLOURS["cover"])
-    axes.set_title(f"19 cover, from the scene; depth {number(rig.cover_z + 2 - rig.face_z)}, walls 2")
+    axes.set_title(
+        f"19 cover, from the scene; depth {number(rig.cover_z + 2 - rig.face_z)}, walls 2"
+    )
     dimension(axes, (-rig.opening, 0), (rig.opening, 0), f"⌀ {number(2 * rig.opening)} inside")
-    dimension(axes, (-rig.outline, 0), (rig.outline, 0), f"⌀ {number(2 * rig.outline)}", -rig.outline - 7)
+    dimension(
+        axes, (-rig.outline, 0), (rig.outline, 0), f"⌀ {number(2 * rig.outline)}", -rig.outline - 7
+    )
     low, high = parts.lugs(rig)[3], parts.lugs(rig)[2]
     dimension(axes, low, high, f"{number(high[1] - low[1])}, 4 × ⌀ 3.4", 14)
 
@@ -284,7 +347,9 @@ def base(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     dimension(axes, (-x, far), (x, far), number(2 * x))
     dimension(axes, (x, near), (x, far), number(far - near))
     dimension(axes, (low_x + 6, high_z - 6), (high_x - 6, high_z - 6), number(high_x - low_x - 12))
-    dimension(axes, (high_x - 6, low_z + 6), (high_x - 6, high_z - 6), number(high_z - low_z - 12), 14)
+    dimension(
+        axes, (high_x - 6, low_z + 6), (high_x - 6, high_z - 6), number(high_z - low_z - 12), 14
+    )
 
 
 def rings(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
@@ -313,8 +378,12 @@ def rings(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
 
 def plate(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     """Draw the motor plate from the scene."""
-    fill(axes, solids["motor plate"].project().translate((-rig.distance, 0)), COLOURS["motor plate"])
-    axes.set_title(f"22 motor plate, from the scene; {number(parts.MOTOR_PLATE)} thick, slots for M3 ± 3")
+    fill(
+        axes, solids["motor plate"].project().translate((-rig.distance, 0)), COLOURS["motor plate"]
+    )
+    axes.set_title(
+        f"22 motor plate, from the scene; {number(parts.MOTOR_PLATE)} thick, slots for M3 ± 3"
+    )
     half, low = rig.motor_screws[0] / 2, rig.motor[0] / 2 + 3.0
     boss = rig.motor_screws[1] / 2 + 0.1
     dimension(axes, (-boss, 0), (boss, 0), f"⌀ {number(2 * boss)}")
@@ -327,8 +396,19 @@ def bearing_cap(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
     fill(axes, solids["bearing cap"].project(), COLOURS["bearing cap"])
     axes.set_title("11 bearing cap, from the scene; 1.9 thick, 3 × ⌀ 3.4")
     out = math.hypot(*parts.cap_screws(rig)[0])
-    dimension(axes, (-rig.bearing.outside, 0), (rig.bearing.outside, 0), f"⌀ {number(2 * rig.bearing.outside)}")
-    dimension(axes, (-out - 3, 0), (out + 3, 0), f"⌀ {number(2 * out + 6)}, screws on ⌀ {number(2 * out)}", -out - 9)
+    dimension(
+        axes,
+        (-rig.bearing.outside, 0),
+        (rig.bearing.outside, 0),
+        f"⌀ {number(2 * rig.bearing.outside)}",
+    )
+    dimension(
+        axes,
+        (-out - 3, 0),
+        (out + 3, 0),
+        f"⌀ {number(2 * out + 6)}, screws on ⌀ {number(2 * out)}",
+        -out - 9,
+    )
 
 
 def mesh_of(part: Part) -> Any:
@@ -340,14 +420,21 @@ def mesh_of(part: Part) -> Any:
     return pyvista.PolyData(np.asarray(mesh.vertices), faces.ravel())
 
 
-def exploded(made: Sequence[Part], out: Path, *, apart: float = 1.5, size: tuple[int, int] = (1600, 900)) -> None:
+def exploded(
+    made: Sequence[Part], out: Path, *, apart: float = 1.5, size: tuple[int, int] = (1600, 900)
+) -> None:
     """Write a picture of the parts, moved apart, with their numbers in the list of :func:`rig.parts.assembly`."""
     import pyvista
     from PIL import Image
 
-    meshes = [mesh_of(part).translate([apart * v for v in part.apart], inplace=False) for part in made]
+    meshes = [
+        mesh_of(part).translate([apart * v for v in part.apart], inplace=False) for part in made
+    ]
     shots = []
-    for flat in (False, True):  # a second picture has one colour for each part, and so shows where it can be seen
+    for flat in (
+        False,
+        True,
+    ):  # a second picture has one colour for each part, and so shows where it can be seen
         plotter = pyvista.Plotter(off_screen=True, window_size=size)
         plotter.set_background("white")
         for k, (part, mesh) in enumerate(zip(made, meshes, strict=True), 1):

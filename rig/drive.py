@@ -57,7 +57,9 @@ class Drive:
         friction = self.motor.friction * 1e-3
         if friction >= self.torque:
             return 0.0
-        return max(0.0, self.no_load * (1.0 - friction * self.motor.resistance / (self.constant * SUPPLY)))
+        return max(
+            0.0, self.no_load * (1.0 - friction * self.motor.resistance / (self.constant * SUPPLY))
+        )
 
     @property
     def cogs(self) -> int:
@@ -117,7 +119,9 @@ def text(drive: Drive) -> list[str]:
     """Return the numbers that the command prints."""
     ripples = [f"{100.0 * drive.ripple(rpm):.2g} %" for rpm in numbers.SPEEDS]
     speeds = " / ".join(f"{rpm:g}" for rpm in numbers.SPEEDS)
-    settings = {name.replace("_", "-"): value for name, value in drive.gains.items() if name != "duty_slew"}
+    settings = {
+        name.replace("_", "-"): value for name, value in drive.gains.items() if name != "duty_slew"
+    }
     changes = " ".join(f"--change {name}={value}" for name, value in settings.items())
     return [
         f"motor: at most {drive.fastest:.0f} rpm at {SUPPLY:g} V (--kv {drive.motor.kv:g}, --resistance-ohm "

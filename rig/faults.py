@@ -26,7 +26,13 @@ def recordings() -> dict[str, amiwarp.Recording]:
     def made(camera_motion: amiwarp.CameraMotion | None = None) -> amiwarp.Recording:
         motion = amiwarp.PrismMotion(720.0, PHASE)
         return amiwarp.simulate(
-            picture, camera, prism, duration_s=0.26, motion=motion, camera_motion=camera_motion, seed=2
+            picture,
+            camera,
+            prism,
+            duration_s=0.26,
+            motion=motion,
+            camera_motion=camera_motion,
+            seed=2,
         )
 
     good = made()
@@ -40,8 +46,12 @@ def recordings() -> dict[str, amiwarp.Recording]:
     )
     return {
         "all is well": good,
-        "encoder reversed (A and B exchanged)": replace(good, encoder=replace(encoder, angle=-encoder.angle)),
-        "counts lost in the middle, index missed": replace(good, encoder=replace(encoder, angle=slipped)),
+        "encoder reversed (A and B exchanged)": replace(
+            good, encoder=replace(encoder, angle=-encoder.angle)
+        ),
+        "counts lost in the middle, index missed": replace(
+            good, encoder=replace(encoder, angle=slipped)
+        ),
         "wedge of 1.5° taken for one of 0.75°": good,
         "camera shaken twice a turn by 0.2°": made(shaken),
         "no sync: clocks 8 ms apart": replace(good, encoder=replace(encoder, t=encoder.t + 8000)),
@@ -73,7 +83,9 @@ def main(out: Path) -> None:
                 "--size",
                 "1000x440",
             ]
-            subprocess.run([sys.executable, "-m", "amiwarp", *command], check=True, capture_output=True)
+            subprocess.run(
+                [sys.executable, "-m", "amiwarp", *command], check=True, capture_output=True
+            )
             tile = Image.open(picture).convert("RGB")
             framed = Image.new("RGB", (tile.width, tile.height + 34), "white")
             framed.paste(tile, (0, 34))

@@ -88,11 +88,15 @@ def write_3mf(solids: Sequence[tuple[str, Manifold]], out: Path) -> None:
             ("3D/3dmodel.model", "\n".join(lines)),
         ):
             # a fixed time: equal parts have equal files
-            package.writestr(zipfile.ZipInfo(path, (1980, 1, 1, 0, 0, 0)), text, zipfile.ZIP_DEFLATED)
+            package.writestr(
+                zipfile.ZipInfo(path, (1980, 1, 1, 0, 0, 0)), text, zipfile.ZIP_DEFLATED
+            )
     beside.replace(out)
 
 
-def flat_faces(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+def flat_faces(
+    points: NDArray[np.float64], triangles: NDArray[np.int64]
+) -> Iterator[NDArray[np.int64]]:
     """Yield groups of triangles that are connected and lie in one plane, as indices of triangles.
 
     Each group grows from its largest triangle, whose plane is known best.
@@ -189,7 +193,9 @@ def add_solid(step: StepFile, name: str, solid: Manifold) -> int:
             length = float(np.linalg.norm(span))
             vector = step.add(f"VECTOR('',#{step.direction(span / length)},{length:.12E})")
             line = step.add(f"LINE('',#{step.point(points[low])},#{vector})")
-            edges[low, high] = step.add(f"EDGE_CURVE('',#{corners[low]},#{corners[high]},#{line},.T.)")
+            edges[low, high] = step.add(
+                f"EDGE_CURVE('',#{corners[low]},#{corners[high]},#{line},.T.)"
+            )
         return f"ORIENTED_EDGE('',*,*,#{edges[low, high]},{'.T.' if a == low else '.F.'})"
 
     def face(group: NDArray[np.int64], borders: list[list[int]]) -> int:
@@ -217,7 +223,10 @@ def add_solid(step: StepFile, name: str, solid: Manifold) -> int:
         borders = loops(triangles[group])
         if borders is None:
             # where a face touches itself in a corner, its triangles are faces
-            faces += [face(group[k : k + 1], loops(triangles[group[k : k + 1]]) or []) for k in range(len(group))]
+            faces += [
+                face(group[k : k + 1], loops(triangles[group[k : k + 1]]) or [])
+                for k in range(len(group))
+            ]
         else:
             faces.append(face(group, borders))
     shell = step.add(f"CLOSED_SHELL('',({refs(faces)}))")
@@ -227,8 +236,12 @@ def add_solid(step: StepFile, name: str, solid: Manifold) -> int:
 def write_step(name: str, solids: Sequence[tuple[str, Manifold]], out: Path) -> None:
     """Write a STEP file (AP214) of named solids in their places, as one product."""
     step = StepFile()
-    context = step.add("APPLICATION_CONTEXT('core data for automotive mechanical design processes')")
-    step.add(f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,#{context})")
+    context = step.add(
+        "APPLICATION_CONTEXT('core data for automotive mechanical design processes')"
+    )
+    step.add(
+        f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,#{context})"
+    )
     field = step.add(f"PRODUCT_CONTEXT('',#{context},'mechanical')")
     product = step.add(f"PRODUCT('{name}','{name}','',(#{field}))")
     version = step.add(f"PRODUCT_DEFINITION_FORMATION('','',#{product})")
@@ -238,7 +251,9 @@ def write_step(name: str, solids: Sequence[tuple[str, Manifold]], out: Path) -> 
     length = step.add("(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT(.MILLI.,.METRE.))")
     angle = step.add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))")
     solid_angle = step.add("(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT())")
-    exact = step.add(f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-06),#{length},'distance_accuracy_value','')")
+    exact = step.add(
+        f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-06),#{length},'distance_accuracy_value','')"
+    )
     space = step.add(
         f"(GEOMETRIC_REPRESENTATION_CONTEXT(3)GLOBAL_UNCERTAINTY_ASSIGNED_CONTEXT((#{exact}))"
         f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({refs((length, angle, solid_angle))}))REPRESENTATION_CONTEXT('',''))"
@@ -247,7 +262,9 @@ def write_step(name: str, solids: Sequence[tuple[str, Manifold]], out: Path) -> 
         f"AXIS2_PLACEMENT_3D('',#{step.point((0, 0, 0))},#{step.direction((0, 0, 1))},#{step.direction((1, 0, 0))})"
     )
     made = [add_solid(step, each, solid) for each, solid in solids]
-    brep = step.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('{name}',({refs((axes, *made))}),#{space})")
+    brep = step.add(
+        f"ADVANCED_BREP_SHAPE_REPRESENTATION('{name}',({refs((axes, *made))}),#{space})"
+    )
     step.add(f"SHAPE_DEFINITION_REPRESENTATION(#{shape},#{brep})")
     head = (
         "ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION(('faceted parts of a rig, in millimetres'),'2;1');\n"

@@ -157,7 +157,9 @@ def housing(rig: GimbalRig) -> Manifold:
     """Return the housing: wall that carries the motor, barrel around its bell, plate of the encoder block, foot."""
     out = parts.housing_body(rig) - rod(rig.barrel, PLATE, rig.face_z + 1, sides=SEGMENTS)
     out -= rod(rig.centring, -1, PLATE + 1, sides=SEGMENTS)
-    out -= holes(stator_points(rig), 3.4, -1, PLATE + 1) + sinks(stator_points(rig), 3.0, 0.0, rear=True)
+    out -= holes(stator_points(rig), 3.4, -1, PLATE + 1) + sinks(
+        stator_points(rig), 3.0, 0.0, rear=True
+    )
     # the motor's wires leave upwards
     return out - parts.box((-5, 5), (0, rig.barrel + 5), (PLATE, PLATE + 4))
 
@@ -197,9 +199,18 @@ def block(rig: GimbalRig) -> Manifold:
     rear, high = block_z(rig)
     low = high - MOTOR_PLATE
     points = parts.plate_screws(rig)
-    eyes = [CrossSection.circle(4.5, 48).translate((x + dx, y)) for x, y in points for dx in (-SLIDE, SLIDE)]
+    eyes = [
+        CrossSection.circle(4.5, 48).translate((x + dx, y))
+        for x, y in points
+        for dx in (-SLIDE, SLIDE)
+    ]
     tube = CrossSection.circle(TUBE, 96).translate((rig.distance, 0))
-    out = CrossSection.batch_boolean([tube, *eyes], ADD).hull().extrude(MOTOR_PLATE).translate((0, 0, low))
+    out = (
+        CrossSection.batch_boolean([tube, *eyes], ADD)
+        .hull()
+        .extrude(MOTOR_PLATE)
+        .translate((0, 0, low))
+    )
     out += rod(TUBE - 0.05, rear, high, rig.distance, sides=96)
     seat = SMALL[1] / 2 + 0.025
     out -= rod(6.0, rear - 1, high + 1, rig.distance, sides=96)
@@ -212,7 +223,10 @@ def small_bearings(rig: GimbalRig) -> list[Manifold]:
     """Return the bearings of the encoder shaft: the front one is 0.7 mm behind the housing's plate."""
     rear, high = block_z(rig)
     at = (rear, high - SMALL[2] - 0.7)
-    return [ring(SMALL[0] / 2, SMALL[1] / 2, z, z + SMALL[2]).translate((rig.distance, 0, 0)) for z in at]
+    return [
+        ring(SMALL[0] / 2, SMALL[1] / 2, z, z + SMALL[2]).translate((rig.distance, 0, 0))
+        for z in at
+    ]
 
 
 def shaft(rig: GimbalRig) -> Manifold:
@@ -226,21 +240,42 @@ def screw_solids(rig: GimbalRig) -> list[tuple[str, str, Manifold, tuple[float, 
     fork, clamp = parts.fork_and_clamp(rig)
     foot = [(x, -rig.height - 6.0, z) for x, z in parts.foot_holes(rig)]
     plate_at = at_z(parts.plate_screws(rig), rig.face_z - PLATE - MOTOR_PLATE)
-    cover_at, ring_at = at_z(parts.lugs(rig), rig.face_z + 4.0), at_z(parts.ring_screws(rig)[1], rig.front_z + 2.0)
+    cover_at, ring_at = (
+        at_z(parts.lugs(rig), rig.face_z + 4.0),
+        at_z(parts.ring_screws(rig)[1], rig.front_z + 2.0),
+    )
     cell_at, stator_at = at_z(rotor_points(rig), rig.seat_z - HEAD), at_z(stator_points(rig), 0.0)
     grip = rig.seat_z - HEAD - rig.shoulder_z
-    holder_at, board_at = at_z(parts.holder_screws(rig), -HOLDER), at_z(parts.board_screws(rig), rig.cover_z + 3.6)
+    holder_at, board_at = (
+        at_z(parts.holder_screws(rig), -HOLDER),
+        at_z(parts.board_screws(rig), rig.cover_z + 3.6),
+    )
     return [
-        ("screws of the motor", "", screws(3.0, 8.0, PLATE, stator_at, behind, sunk=True), (0, 0, -12)),
+        (
+            "screws of the motor",
+            "",
+            screws(3.0, 8.0, PLATE, stator_at, behind, sunk=True),
+            (0, 0, -12),
+        ),
         ("screws of the cell", "prism", screws(3.0, 5.0, grip, cell_at), (0, 0, 82)),
         ("screws of the cover", "", screws(3.0, 8.0, 4.0, cover_at), (0, 0, 162)),
         ("screws of the wedge ring", "prism", screws(2.0, 8.0, 2.0, ring_at), (0, 0, 118)),
         ("screws of the holder", "", screws(2.5, 8.0, HOLDER, holder_at, behind), (0, 0, -40)),
         ("screw of the clamp", "", clamp, (0, 12, -24)),
-        ("screws of the encoder block", "", screws(3.0, 8.0, MOTOR_PLATE, plate_at, behind), (0, 46, -34)),
+        (
+            "screws of the encoder block",
+            "",
+            screws(3.0, 8.0, MOTOR_PLATE, plate_at, behind),
+            (0, 46, -34),
+        ),
         ("screws of the base", "", screws(4.0, 12.0, 6.0, foot, up), (0, -42, 0)),
         ("screws of the fork barrier", "", fork, (0, 38, 150)),
-        ("screws of the encoder board", "", screws(2.5, 8.0, 8.0, board_at) + parts.board_nuts(rig), (0, 0, 176)),
+        (
+            "screws of the encoder board",
+            "",
+            screws(2.5, 8.0, 8.0, board_at) + parts.board_nuts(rig),
+            (0, 0, 176),
+        ),
     ]
 
 
@@ -275,5 +310,8 @@ def assembly(rig: GimbalRig) -> tuple[Part, ...]:
         Part("encoder board", parts.encoder(rig), "bought", "", 4.0, (0, 0, 168)),
         Part("O-ring", rubber, "bought", "prism", rubber.volume() * RUBBER, (0, 0, 104)),
         Part("lens", lens, "bought", "", 50.0, (0, 0, -46)),
-        *(Part(n, each, "screws", moves, each.volume() * STEEL, apart) for n, moves, each, apart in screw_solids(rig)),
+        *(
+            Part(n, each, "screws", moves, each.volume() * STEEL, apart)
+            for n, moves, each, apart in screw_solids(rig)
+        ),
     )

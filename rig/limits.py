@@ -110,7 +110,9 @@ def bearings(rig: Rig) -> Iterator[str]:
 
 def largest_wedge(rig: Rig) -> float:
     """Return the diameter of the largest wedge for which there is a bearing."""
-    return max(each.bore for each in BEARINGS if each.name.startswith(rig.series)) - 2.0 * (rig.seat + rig.wall)
+    return max(each.bore for each in BEARINGS if each.name.startswith(rig.series)) - 2.0 * (
+        rig.seat + rig.wall
+    )
 
 
 def rotor(rig: Rig) -> Iterator[str]:
@@ -218,7 +220,9 @@ def hollow(rig: GimbalRig, rpm: float) -> Iterator[str]:
         )
     if beside_motor(rig) < 0.0:
         widest = largest(lambda size: replace(rig, hollow=replace(own, outer=size)), own.outer)
-        camera_width = largest(lambda width: replace(rig, camera=(width, *rig.camera[1:])), rig.camera[0])
+        camera_width = largest(
+            lambda width: replace(rig, camera=(width, *rig.camera[1:])), rig.camera[0]
+        )
         ways = [
             f"a motor of at most {widest:.1f}" if widest else "",
             f"a camera of at most {camera_width:.1f}" if camera_width else "",
@@ -236,7 +240,11 @@ def hollow(rig: GimbalRig, rpm: float) -> Iterator[str]:
             f"holder's spigot; give at most {slim:.1f}, or a wider bore"
         )
     torques = own.friction, own.cogging
-    if not all(math.isfinite(value) and value >= 0.0 for value in torques) or own.slots < 1 or own.poles < 2:
+    if (
+        not all(math.isfinite(value) and value >= 0.0 for value in torques)
+        or own.slots < 1
+        or own.poles < 2
+    ):
         yield "--friction-mnm, --cogging-mnm, --slots-poles: give numbers that are not negative"
         return
     engine = Drive(own, 1.0)  # its speed does not depend on the inertia
@@ -336,7 +344,9 @@ def camera(rig: Rig) -> Iterator[str]:
 def lens(rig: Rig) -> Iterator[str]:
     """Refuse lenses and rings that leave the holder no wall beside its screws."""
     corner = math.hypot(*parts.holder_screws(rig)[0])
-    widest = 2.0 * (corner - 2.6 - LEAST_WALL - 1.0)  # holes of 5.2 mm for the heads, and 1 mm of air around the lens
+    widest = 2.0 * (
+        corner - 2.6 - LEAST_WALL - 1.0
+    )  # holes of 5.2 mm for the heads, and 1 mm of air around the lens
     for option, value in (("--lens-mm, diameter", rig.lens), ("--grip-mm, diameter", rig.grip[0])):
         if value > widest + 1e-9:
             yield (
@@ -398,7 +408,12 @@ def largest_apex(rig: Rig, rpm: float) -> float:
     body = numbers.rotating(rig)
     _, screwed = numbers.balance(rig, body)
     left = numbers.grade(screwed, rpm) - BALANCED
-    per_tan = numbers.wedge_unbalance(rig) / math.tan(math.radians(rig.apex_deg)) / screwed.mass * numbers.omega(rpm)
+    per_tan = (
+        numbers.wedge_unbalance(rig)
+        / math.tan(math.radians(rig.apex_deg))
+        / screwed.mass
+        * numbers.omega(rpm)
+    )
     apex = math.degrees(math.atan(math.tan(math.radians(rig.apex_deg)) - left / per_tan))
     tenth = math.floor(10.0 * apex)
     while tenth > 1 and balanced_grade(replace(rig, apex_deg=tenth / 10.0)) * rpm > BALANCED:

@@ -53,13 +53,17 @@ def field(
     out = np.zeros(np.shape(x))
     for radius, sign in ((magnet.outer, 1.0), (magnet.inner, -1.0)):
         charge = sign * radius * math.tau / 720 * np.cos(turn - theta)
-        flat = (x[..., None] - radius * np.cos(turn)) ** 2 + (y[..., None] - radius * np.sin(turn)) ** 2
+        flat = (x[..., None] - radius * np.cos(turn)) ** 2 + (
+            y[..., None] - radius * np.sin(turn)
+        ) ** 2
         near, far = (1.0 / np.sqrt(flat + depth**2) for depth in (gap, gap + magnet.height))
         out += (near - far) @ charge
     return out
 
 
-def reading(magnet: Magnet, off: float, gap: float, thetas: NDArray[np.float64]) -> NDArray[np.float64]:
+def reading(
+    magnet: Magnet, off: float, gap: float, thetas: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the angles that a chip reads [rad] whose middle is ``off`` [mm] beside the magnet's axis, along x."""
     x = off + HALL * np.array([1.0, -1.0, 0.0, 0.0])
     y = HALL * np.array([0.0, 0.0, 1.0, -1.0])

@@ -49,7 +49,9 @@ class Body:
         mesh.density = part.mass / mesh.volume
         centre, mass = np.asarray(mesh.center_mass), float(mesh.mass)
         about = np.asarray(mesh.moment_inertia)
-        return cls(mass, centre, about + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre)))
+        return cls(
+            mass, centre, about + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+        )
 
     def __add__(self, other: Self) -> Self:
         mass = self.mass + other.mass
@@ -68,7 +70,9 @@ def to_mesh(part: Part):
     import trimesh
 
     mesh = part.solid.to_mesh64()
-    return trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts), process=False)
+    return trimesh.Trimesh(
+        np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts), process=False
+    )
 
 
 def in_file(part: Part):
@@ -95,10 +99,15 @@ def rotating(rig: Rig) -> Body:
 
     With a hollow-shaft motor it is its bell instead of bearings.
     """
-    turning = [body for part, body in zip(assembly(rig), bodies(rig), strict=True) if part.moves == "prism"]
+    turning = [
+        body for part, body in zip(assembly(rig), bodies(rig), strict=True) if part.moves == "prism"
+    ]
     rings = []
     if not isinstance(rig, gimbal.GimbalRig):
-        rings = [point(rig.bearing.mass * 0.45, 0.0, 0.0, z + rig.bearing.width / 2) for z in rig.bearing_z]
+        rings = [
+            point(rig.bearing.mass * 0.45, 0.0, 0.0, z + rig.bearing.width / 2)
+            for z in rig.bearing_z
+        ]
     total = turning[0]
     for body in (*turning[1:], *rings):
         total = total + body
@@ -138,7 +147,12 @@ def balance(rig: Rig, body: Body) -> tuple[list[tuple[float, float]], Body]:
     tried = np.array(list(itertools.product(LENGTHS, repeat=len(groups))))
     left = np.abs(u[0] + screw_mass(rig, 1.0) * tried @ pull)
     best = tried[np.argmin(left + 0.05 * (tried > 0) @ [len(group) for group in groups])]
-    screws = [(a, float(length)) for group, length in zip(groups, best, strict=True) if length for a in group]
+    screws = [
+        (a, float(length))
+        for group, length in zip(groups, best, strict=True)
+        if length
+        for a in group
+    ]
     for angle, length in screws:
         (x, y), z = parts.around(radius, [angle])[0], rig.front_z - 0.2 - length / 2
         body = body + point(screw_mass(rig, length), x, y, z)
@@ -180,7 +194,9 @@ def vibration(rig: Rig, body: Body) -> tuple[float, float]:
     force, moment = unbalance(body), -body.inertia[:2, 2]
     arm = moment - centre[2] * force
     lean = max(
-        abs(arm[0]) / about[1, 1], abs(arm[1]) / about[0, 0], float(np.hypot(*arm)) / min(about[0, 0], about[1, 1])
+        abs(arm[0]) / about[1, 1],
+        abs(arm[1]) / about[0, 0],
+        float(np.hypot(*arm)) / min(about[0, 0], about[1, 1]),
     )
     return float(np.hypot(*force) / total.mass), float(lean)
 
@@ -276,10 +292,17 @@ def lenses(rig: Rig) -> dict[str, Rig]:
     camera, and 5 mm before the adapter.
     """
     slim = replace(rig, lens=17.0, reach=5.0, pupil=4.0, threads=("cs", "m12"))
-    short, long = (replace(rig, lens=34.0, reach=reach, pupil=10.0, threads=("cs", "c")) for reach in (30.0, 40.0))
+    short, long = (
+        replace(rig, lens=34.0, reach=reach, pupil=10.0, threads=("cs", "c"))
+        for reach in (30.0, 40.0)
+    )
     found = {"M12, 17 mm wide, 5 mm before its CS adapter": slim}
     if short.enters:
-        return {**found, "C-mount, 34 mm wide, 30 mm long": short, "C-mount, 34 mm wide, 40 mm long": long}
+        return {
+            **found,
+            "C-mount, 34 mm wide, 30 mm long": short,
+            "C-mount, 34 mm wide, 40 mm long": long,
+        }
     return {**found, "C-mount, 34 mm wide, any length, behind the rotor": short}
 
 
@@ -321,7 +344,9 @@ def clear_of_stops(
     return min(left)
 
 
-def shortest_focal(rig: Rig, sensor: tuple[int, int, float], number: float = 2.0, off: float = 0.0) -> float:
+def shortest_focal(
+    rig: Rig, sensor: tuple[int, int, float], number: float = 2.0, off: float = 0.0
+) -> float:
     """Return the shortest focal length without vignetting [mm], in steps of 0.1 mm, or infinity if there is none."""
     for tenth in range(20, 1000):
         if clear_of_stops(rig, sensor, tenth / 10, number, off) >= 0:
@@ -346,7 +371,9 @@ class Tolerance:
     """Rotation of the camera once a turn [rad]: in phase with the prism, and a quarter turn later."""
 
 
-def offset_error(rig: Rig, off: float, distance: float, width: int = 640, fov_deg: float = 60.0) -> float:
+def offset_error(
+    rig: Rig, off: float, distance: float, width: int = 640, fov_deg: float = 60.0
+) -> float:
     """Return how far a point at the border of the image moves if the lens is off the rotor's axis [px].
 
     Off the axis by d, the light passes glass that is thicker or thinner by d tan α. At the angle i from the axis, this
@@ -366,7 +393,12 @@ def offset_error(rig: Rig, off: float, distance: float, width: int = 640, fov_de
 
 
 def error(
-    tolerance: Tolerance, free: Sequence[str], *, apex_deg: float, width: int = 640, fov_deg: float = 60.0
+    tolerance: Tolerance,
+    free: Sequence[str],
+    *,
+    apex_deg: float,
+    width: int = 640,
+    fov_deg: float = 60.0,
 ) -> float:
     """Return the rms error [px] that is left if calibration frees these parameters besides apex and phase.
 
@@ -395,7 +427,9 @@ def error(
     if any(tolerance.shake):
         rays = camera.pixels_to_rays(seen)
         along, across = tolerance.shake
-        lean = along * np.array([np.cos(angle), np.sin(angle)]) + across * np.array([-np.sin(angle), np.cos(angle)])
+        lean = along * np.array([np.cos(angle), np.sin(angle)]) + across * np.array(
+            [-np.sin(angle), np.cos(angle)]
+        )
         turned = np.column_stack(
             [
                 rays[:, 0] + lean[0] * rays[:, 2],
@@ -407,7 +441,12 @@ def error(
 
     def waves(values: Sequence[float]) -> NDArray[np.float64]:
         c1, s1, c2, s2 = values
-        return c1 * np.cos(angle) + s1 * np.sin(angle) + c2 * np.cos(2 * angle) + s2 * np.sin(2 * angle)
+        return (
+            c1 * np.cos(angle)
+            + s1 * np.sin(angle)
+            + c2 * np.cos(2 * angle)
+            + s2 * np.sin(2 * angle)
+        )
 
     told = angle + waves(harmonics)
     sizes = {"tilt": 2, "wobble": 2, "harmonics": 4}

@@ -15,19 +15,29 @@ IMAGES = PAGE.parent.parent / "images"
 
 def rows(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     """Return a table in Markdown."""
-    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines)) + "\n"
+    return (
+        "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines)) + "\n"
+    )
 
 
 def tables() -> dict[str, str]:
     """Return all tables of the page that are made by code, by their names."""
     return {
         **bill.pages(),
-        "pins": rows(("net", "pin of the Pico", "pin of the Mega", "what", "on the board"), wires.controller_rows()),
-        "connectors": rows(
-            ("connector", "pin", "net", "goes to, belt", "goes to, hollow-shaft motor"), wires.connector_rows()
+        "pins": rows(
+            ("net", "pin of the Pico", "pin of the Mega", "what", "on the board"),
+            wires.controller_rows(),
         ),
-        "wires": rows(("wire", "net", "from", "hole", "to", "hole"), perfboard.wire_rows("rp2040", "belt")),
-        "left out": rows(("left out", "when", "and these wires"), perfboard.left_out_rows("rp2040", "belt")),
+        "connectors": rows(
+            ("connector", "pin", "net", "goes to, belt", "goes to, hollow-shaft motor"),
+            wires.connector_rows(),
+        ),
+        "wires": rows(
+            ("wire", "net", "from", "hole", "to", "hole"), perfboard.wire_rows("rp2040", "belt")
+        ),
+        "left out": rows(
+            ("left out", "when", "and these wires"), perfboard.left_out_rows("rp2040", "belt")
+        ),
         "power": rows(("from", "to, belt", "to, hollow-shaft motor"), wires.POWER),
     }
 

@@ -283,7 +283,9 @@ class Rig:
         for _ in range(60):
             middle = (low + high) / 2
             lean = math.asin((large - small) / middle)
-            length = 2 * middle * math.cos(lean) + math.pi * (large + small) + 2 * lean * (large - small)
+            length = (
+                2 * middle * math.cos(lean) + math.pi * (large + small) + 2 * lean * (large - small)
+            )
             low, high = (middle, high) if length < self.belt else (low, middle)
         return low
 
@@ -365,7 +367,10 @@ def for_wedge(rig: Rig, wedge: float, *, teeth: tuple[int, int] | None, belt: fl
         return rig
     for length in BELTS:
         own = replace(own, belt=length)
-        if length > 2 * BELT_PITCH * max(teeth) / 1.5 and own.distance > own.barrel + 8.0 + SLIDE + own.motor[0] / 2:
+        if (
+            length > 2 * BELT_PITCH * max(teeth) / 1.5
+            and own.distance > own.barrel + 8.0 + SLIDE + own.motor[0] / 2
+        ):
             break
     return own
 
@@ -394,7 +399,9 @@ def ring(inner: float, outer: float, low: float, high: float) -> Manifold:
     return flat.extrude(high - low).translate((0, 0, low))
 
 
-def rod(radius: float, low: float, high: float, x: float = 0.0, y: float = 0.0, sides: int = 48) -> Manifold:
+def rod(
+    radius: float, low: float, high: float, x: float = 0.0, y: float = 0.0, sides: int = 48
+) -> Manifold:
     """Return a cylinder along z."""
     return Manifold.cylinder(high - low, radius, radius, sides).translate((x, y, low))
 
@@ -407,22 +414,30 @@ def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) 
 
 def around(radius: float, angles_deg: Iterable[float]) -> list[tuple[float, float]]:
     """Return points on a circle about the axis."""
-    return [(radius * math.cos(math.radians(a)), radius * math.sin(math.radians(a))) for a in angles_deg]
+    return [
+        (radius * math.cos(math.radians(a)), radius * math.sin(math.radians(a))) for a in angles_deg
+    ]
 
 
-def holes(points: Iterable[tuple[float, float]], diameter: float, low: float, high: float) -> Manifold:
+def holes(
+    points: Iterable[tuple[float, float]], diameter: float, low: float, high: float
+) -> Manifold:
     """Return round holes along z, to subtract."""
     return Manifold.batch_boolean([rod(diameter / 2, low, high, x, y, 32) for x, y in points], ADD)
 
 
-def slots(points: Iterable[tuple[float, float]], diameter: float, reach: float, low: float, high: float) -> Manifold:
+def slots(
+    points: Iterable[tuple[float, float]], diameter: float, reach: float, low: float, high: float
+) -> Manifold:
     """Return slots along x, to subtract: ``reach`` to either side."""
     flats = [
         CrossSection.circle(diameter / 2, 32).translate((x - reach, y))
         + CrossSection.circle(diameter / 2, 32).translate((x + reach, y))
         for x, y in points
     ]
-    return Manifold.batch_boolean([flat.hull().extrude(high - low).translate((0, 0, low)) for flat in flats], ADD)
+    return Manifold.batch_boolean(
+        [flat.hull().extrude(high - low).translate((0, 0, low)) for flat in flats], ADD
+    )
 
 
 def screws(
@@ -463,10 +478,14 @@ def screws(
     return Manifold.batch_boolean([one.translate(point) for point in points], ADD)
 
 
-def sinks(points: Iterable[tuple[float, float]], size: float, z: float, *, rear: bool = False) -> Manifold:
+def sinks(
+    points: Iterable[tuple[float, float]], size: float, z: float, *, rear: bool = False
+) -> Manifold:
     """Return countersinks of 90° in a face at z that looks to the front or to the rear, to subtract."""
     top = HEADS[size][0] / 2 + 0.15
-    one = Manifold.cylinder(top + 0.5, 0.0, top + 0.5, 32).translate((0, 0, -top))  # beyond the face, there is nothing
+    one = Manifold.cylinder(top + 0.5, 0.0, top + 0.5, 32).translate(
+        (0, 0, -top)
+    )  # beyond the face, there is nothing
     if rear:
         one = one.rotate((180, 0, 0))
     return Manifold.batch_boolean([one.translate((x, y, z)) for x, y in points], ADD)
@@ -481,7 +500,9 @@ def pulley(teeth: int) -> CrossSection:
     """Return the outline of a GT2 pulley."""
     tip = teeth * BELT_PITCH / (2 * math.pi) - PITCH_LINE
     groove = CrossSection.circle(0.56, 24).translate((tip - TOOTH_DEPTH + 0.56, 0.0))
-    groove += CrossSection([[(tip - 0.3, -0.54), (tip + 0.2, -0.72), (tip + 0.2, 0.72), (tip - 0.3, 0.54)]])
+    groove += CrossSection(
+        [[(tip - 0.3, -0.54), (tip + 0.2, -0.72), (tip + 0.2, 0.72), (tip - 0.3, 0.54)]]
+    )
     grooves = [groove.rotate(360 * k / teeth) for k in range(teeth)]
     return CrossSection.circle(tip, 4 * teeth) - CrossSection.batch_boolean(grooves, ADD)
 
@@ -518,7 +539,9 @@ def least_teeth(wedge: float, seat: float, hole: float) -> int:
 
 def balance_holes(rig: Rig) -> tuple[float, list[float]]:
     """Return the radius and the angles [deg] of the twelve threads for set screws that balance the rotor."""
-    angles = [k * BALANCE_STEP for k in range(24) if (k * BALANCE_STEP) % 90 not in (30.0, 45.0, 60.0)]
+    angles = [
+        k * BALANCE_STEP for k in range(24) if (k * BALANCE_STEP) % 90 not in (30.0, 45.0, 60.0)
+    ]
     return ring_screws(rig)[0], angles
 
 
@@ -561,14 +584,20 @@ def motor_end(rig: Rig) -> float:
 def outline(rig: Rig) -> CrossSection:
     """Return the outline of the plate and the cover, without feet and lugs."""
     end = motor_end(rig)
-    ends = [CrossSection.circle(end, 96).translate((rig.distance + dx, 0)) for dx in (-SLIDE, SLIDE)]
-    return CrossSection.batch_boolean([CrossSection.circle(rig.outline, SEGMENTS), *ends], ADD).hull()
+    ends = [
+        CrossSection.circle(end, 96).translate((rig.distance + dx, 0)) for dx in (-SLIDE, SLIDE)
+    ]
+    return CrossSection.batch_boolean(
+        [CrossSection.circle(rig.outline, SEGMENTS), *ends], ADD
+    ).hull()
 
 
 def lugs(rig: Rig) -> list[tuple[float, float]]:
     """Return the points of the M3 screws that hold the cover."""
     end, middle = motor_end(rig), rig.distance + SLIDE
-    straight = math.degrees(math.acos((rig.outline - end) / middle))  # where the outline becomes round at the motor
+    straight = math.degrees(
+        math.acos((rig.outline - end) / middle)
+    )  # where the outline becomes round at the motor
     at_motor = [(middle + x, y) for x, y in around(end + 3.5, (straight, -straight))]
     return [*around(rig.outline + 3.5, (135, 225)), *at_motor]
 
@@ -592,9 +621,18 @@ def plate_screws(rig: Rig) -> list[tuple[float, float]]:
 def motor_plate(rig: Rig) -> Manifold:
     """Return the plate of the motor, behind the housing. Its slots allow to tighten the belt from behind."""
     low, high = rig.face_z - PLATE - MOTOR_PLATE, rig.face_z - PLATE
-    eyes = [CrossSection.circle(4.5, 48).translate((x + dx, y)) for x, y in plate_screws(rig) for dx in (-SLIDE, SLIDE)]
+    eyes = [
+        CrossSection.circle(4.5, 48).translate((x + dx, y))
+        for x, y in plate_screws(rig)
+        for dx in (-SLIDE, SLIDE)
+    ]
     middle = CrossSection.circle(rig.motor_screws[0] / 2 + 4.5, 96).translate((rig.distance, 0))
-    out = CrossSection.batch_boolean([middle, *eyes], ADD).hull().extrude(high - low).translate((0, 0, low))
+    out = (
+        CrossSection.batch_boolean([middle, *eyes], ADD)
+        .hull()
+        .extrude(high - low)
+        .translate((0, 0, low))
+    )
     out -= holes([(rig.distance, 0)], rig.motor_screws[1] + 0.2, low - 1, high + 1)
     out -= holes(motor_points(rig), 3.4, low - 1, high + 1) + sinks(motor_points(rig), 3.0, high)
     return out - slots(plate_screws(rig), 3.4, SLIDE, low - 1, high + 1)
@@ -618,10 +656,15 @@ def housing_body(rig: Rig) -> Manifold:
     face = rig.face_z
     barrel = rig.barrel + 4.0
     circle = CrossSection.circle(barrel, SEGMENTS)
-    eyes = [(circle + CrossSection.circle(3.2, 48).translate(point)).hull() for point in holder_screws(rig)]
+    eyes = [
+        (circle + CrossSection.circle(3.2, 48).translate(point)).hull()
+        for point in holder_screws(rig)
+    ]
     out = with_lugs(rig).extrude(PLATE).translate((0, 0, face - PLATE))
     out += CrossSection.batch_boolean(eyes, ADD).extrude(face)
-    out += box((-barrel, barrel), (-rig.height, -0.5), (face - PLATE, face))  # at 0, corners would lie 1e-9 apart
+    out += box(
+        (-barrel, barrel), (-rig.height, -0.5), (face - PLATE, face)
+    )  # at 0, corners would lie 1e-9 apart
     out += box((-barrel, barrel), (-rig.height, -rig.height + PLATE), (0, face + 20))
     for x in (-barrel, barrel - 4):
         out += box((x, x + 4), (-rig.height, -barrel * 0.5), (0, face))
@@ -640,7 +683,9 @@ def foot_holes(rig: Rig) -> list[tuple[float, float]]:
 def upright_holes(rig: Rig, points: Iterable[tuple[float, float]], diameter: float) -> Manifold:
     """Return holes along y through foot and base, to subtract."""
     made = [
-        Manifold.cylinder(30, diameter / 2, diameter / 2, 32).rotate((-90, 0, 0)).translate((x, -rig.height - 15, z))
+        Manifold.cylinder(30, diameter / 2, diameter / 2, 32)
+        .rotate((-90, 0, 0))
+        .translate((x, -rig.height - 15, z))
         for x, z in points
     ]
     return Manifold.batch_boolean(made, ADD)
@@ -649,7 +694,9 @@ def upright_holes(rig: Rig, points: Iterable[tuple[float, float]], diameter: flo
 def cap(rig: Rig) -> Manifold:
     """Return the cap that clamps the front bearing's outer ring."""
     outer = math.hypot(*cap_screws(rig)[0]) + 3.0
-    return ring(rig.bearing.outside, outer, rig.shoulder_z, cap_z(rig)) - holes(cap_screws(rig), 3.4, 0, rig.pulley_z)
+    return ring(rig.bearing.outside, outer, rig.shoulder_z, cap_z(rig)) - holes(
+        cap_screws(rig), 3.4, 0, rig.pulley_z
+    )
 
 
 def cap_z(rig: Rig) -> float:
@@ -659,13 +706,20 @@ def cap_z(rig: Rig) -> float:
 
 def spacer(rig: Rig) -> Manifold:
     """Return the spacer between the bearings' inner rings."""
-    return ring(rig.bearing.bore / 2 + 0.05, rig.bearing.inner, rig.bearing_z[0] + rig.bearing.width, rig.bearing_z[1])
+    return ring(
+        rig.bearing.bore / 2 + 0.05,
+        rig.bearing.inner,
+        rig.bearing_z[0] + rig.bearing.width,
+        rig.bearing_z[1],
+    )
 
 
 def rear_ring(rig: Rig) -> Manifold:
     """Return the ring that clamps the bearings' inner rings on the rotor."""
     low, high = rig.bearing_z[0] - 2.5, rig.bearing_z[0]
-    out = ring(rig.clear, rig.bearing.inner, low, high) - holes(rear_screws(rig), 2.4, low - 1, high + 1)
+    out = ring(rig.clear, rig.bearing.inner, low, high) - holes(
+        rear_screws(rig), 2.4, low - 1, high + 1
+    )
     return out - sinks(rear_screws(rig), 2.0, low, rear=True)
 
 
@@ -676,8 +730,14 @@ def wedge_ring(rig: Rig) -> Manifold:
     """
     low, high = rig.front_z, rig.front_z + 2.0
     outer = rig.pitch(rig.teeth[0]) + 1.0
-    lip = beyond(rig, ring(rig.front_clear, rig.wedge / 2 + rig.seat - 0.15, rig.seat_z, low + 0.1), SQUEEZED)
-    out = ring(rig.front_clear, outer, low, high) + lip - holes(ring_screws(rig)[1], 2.4, low - 3, high + 1)
+    lip = beyond(
+        rig, ring(rig.front_clear, rig.wedge / 2 + rig.seat - 0.15, rig.seat_z, low + 0.1), SQUEEZED
+    )
+    out = (
+        ring(rig.front_clear, outer, low, high)
+        + lip
+        - holes(ring_screws(rig)[1], 2.4, low - 3, high + 1)
+    )
     return out - rod(0.8, low - 1, high + 1, outer)
 
 
@@ -714,7 +774,9 @@ def cover(rig: Rig) -> Manifold:
     out += shape.extrude(high - low - 2.0).translate((0, 0, low + 2.0))
     out += box((-12, 12), (0, rig.outline + 1), (high - 18.0, high))
     out -= shape.offset(-2.0).extrude(inside - low + 1).translate((0, 0, low - 1))
-    out -= Manifold.cylinder(2.02, rig.opening, rig.opening + 2.02, SEGMENTS).translate((0, 0, inside - 0.01))
+    out -= Manifold.cylinder(2.02, rig.opening, rig.opening + 2.02, SEGMENTS).translate(
+        (0, 0, inside - 0.01)
+    )
     out -= holes(lugs(rig), 3.4, low - 1, low + 5)
     z = rig.front_z - FLANGE / 2
     side, half = FORK_LENGTH / 2 + 0.4, FORK_WIDTH / 2 + 0.4
@@ -729,7 +791,9 @@ def fork_screws(rig: Rig) -> list[tuple[float, float, float]]:
     return [(x, rig.outline + 1, rig.front_z - FLANGE / 2) for x in (-7.0, 7.0)]
 
 
-def screw_holes(points: Iterable[tuple[float, float, float]], diameter: float, depth: float) -> Manifold:
+def screw_holes(
+    points: Iterable[tuple[float, float, float]], diameter: float, depth: float
+) -> Manifold:
     """Return round holes downwards from points, which begin 3 mm above them, to subtract."""
     one = rod(diameter / 2, -depth, 3.0, sides=32).rotate((-90, 0, 0))
     return Manifold.batch_boolean([one.translate(point) for point in points], ADD)
@@ -767,7 +831,9 @@ def holder(rig: Rig) -> Manifold:
     (wide, _), front = rig.grip, rig.grip_z
     rear, outer = front - rig.grip[1] + 0.1, clamp_radius(rig)
     eyes = [CrossSection.circle(4.0, 48).translate(point) for point in holder_screws(rig)]
-    plate = CrossSection.batch_boolean([CrossSection.circle(rig.barrel + 4.0, SEGMENTS), *eyes], ADD).hull()
+    plate = CrossSection.batch_boolean(
+        [CrossSection.circle(rig.barrel + 4.0, SEGMENTS), *eyes], ADD
+    ).hull()
     out = plate.extrude(HOLDER).translate((0, 0, -HOLDER)) + ring(0, outer, rear, -HOLDER)
     out += ring(0, rig.centring - 0.05, -0.1, 1.5)
     y = clamp_y(rig)
@@ -776,7 +842,9 @@ def holder(rig: Rig) -> Manifold:
     out -= box((-1, 1), (0, 100), (rear - 1, front + LIP + SLIT))
     spigot = rig.spigot
     out -= rod(rig.lens / 2 + 1.0, front - 0.1, 2.0 if rig.enters else -1.0, sides=SEGMENTS)
-    out -= rod(spigot, 0.0, 2.0, sides=SEGMENTS) + rod(min(spigot, rig.lens / 2 + 1.0), -1.1, 2.0, sides=SEGMENTS)
+    out -= rod(spigot, 0.0, 2.0, sides=SEGMENTS) + rod(
+        min(spigot, rig.lens / 2 + 1.0), -1.1, 2.0, sides=SEGMENTS
+    )
     out -= rod(wide / 2 + 0.1, rear - 1, front, sides=SEGMENTS)
     out -= rod(1.35, -20, 20).rotate((0, 90, 0)).translate((0, y, clamp_z(rig)))
     points = holder_screws(rig)
@@ -823,7 +891,9 @@ def belt(rig: Rig) -> Manifold:
     inner, outer = (
         CrossSection.batch_boolean(
             [
-                CrossSection.circle(rig.pitch(teeth) - PITCH_LINE + more, SEGMENTS).translate((x, 0))
+                CrossSection.circle(rig.pitch(teeth) - PITCH_LINE + more, SEGMENTS).translate(
+                    (x, 0)
+                )
                 for teeth, x in zip(rig.teeth, (0.0, rig.distance), strict=True)
             ],
             ADD,
@@ -839,8 +909,12 @@ def motor(rig: Rig) -> Manifold:
     body, length, shaft = rig.motor
     rear = rig.face_z - PLATE - MOTOR_PLATE
     out = rod(body / 2, rear - length, rear, sides=96)
-    out += rod(rig.motor_screws[1] / 2, rear - 1, rear + 3) + rod(shaft / 2, rear, rig.front_z + 3.0)
-    return out.translate((rig.distance, 0, 0)) - holes(motor_points(rig), 2.5, rear - MOTOR_THREAD, rear + 1)
+    out += rod(rig.motor_screws[1] / 2, rear - 1, rear + 3) + rod(
+        shaft / 2, rear, rig.front_z + 3.0
+    )
+    return out.translate((rig.distance, 0, 0)) - holes(
+        motor_points(rig), 2.5, rear - MOTOR_THREAD, rear + 1
+    )
 
 
 def motor_pulley(rig: Rig) -> Manifold:
@@ -849,7 +923,9 @@ def motor_pulley(rig: Rig) -> Manifold:
     out = pulley(rig.teeth[1]).extrude(high - low).translate((0, 0, low))
     out += rod(flange, low, low + FLANGE, sides=96) + rod(flange, high - FLANGE, high, sides=96)
     out -= rod(rig.motor[2] / 2 + 0.02, low - 1, high + 1)
-    thread = Manifold.cylinder(30, 1.25, 1.25, 24).rotate((0, 90, 0)).translate((0, 0, (low + high) / 2))
+    thread = (
+        Manifold.cylinder(30, 1.25, 1.25, 24).rotate((0, 90, 0)).translate((0, 0, (low + high) / 2))
+    )
     return (out - thread).translate((rig.distance, 0, 0))
 
 
@@ -859,7 +935,9 @@ def fork(rig: Rig) -> Manifold:
     half, side = FORK_WIDTH / 2, FORK_LENGTH / 2
     out = box((-side, side), (top - FORK_DEPTH, top), (z - half, z + half))
     slot = FORK_SLOT / 2
-    out -= box((-5, 5), (top - FORK_DEPTH - 1, top - FORK_DEPTH + FORK_SLOT_DEPTH), (z - slot, z + slot))
+    out -= box(
+        (-5, 5), (top - FORK_DEPTH - 1, top - FORK_DEPTH + FORK_SLOT_DEPTH), (z - slot, z + slot)
+    )
     board = box((-10, 10), (top, top + 1.6), (rig.cover_z - 15.0, rig.cover_z + 1.0))
     return out + board - screw_holes(fork_screws(rig), 2.2, 1.0)
 
@@ -867,7 +945,9 @@ def fork(rig: Rig) -> Manifold:
 def encoder(rig: Rig) -> Manifold:
     """Return the magnetic encoder's chip and board."""
     low = rig.cover_z + 2.0
-    out = box((-2.5, 2.5), (-2.5, 2.5), (low - 1.1, low)) + box((-11, 11), (-14, 14), (low, low + 1.6))
+    out = box((-2.5, 2.5), (-2.5, 2.5), (low - 1.1, low)) + box(
+        (-11, 11), (-14, 14), (low, low + 1.6)
+    )
     return out.translate((rig.distance, 0, 0)) - holes(board_screws(rig), 2.7, low - 1, low + 3)
 
 
@@ -893,7 +973,11 @@ def fork_and_clamp(rig: Rig) -> tuple[Manifold, Manifold]:
     fork = [(x, y + 1.6, z) for x, y, z in fork_screws(rig)]
     y, z = clamp_y(rig), clamp_z(rig)
     clamp = screws(2.5, 16.0, 16.0, [(-CLAMP, y, z)], (0.0, -90.0, 0.0))
-    clamp += (rod(2.75, CLAMP, CLAMP + 2.0, sides=6) - rod(1.25, 0, 20)).rotate((0, 90, 0)).translate((0, y, z))
+    clamp += (
+        (rod(2.75, CLAMP, CLAMP + 2.0, sides=6) - rod(1.25, 0, 20))
+        .rotate((0, 90, 0))
+        .translate((0, y, z))
+    )
     return screws(2.0, 5.0, 1.6, fork, (-90.0, 0.0, 0.0)), clamp
 
 
@@ -913,21 +997,39 @@ def screw_solids(rig: Rig) -> list[tuple[str, str, Manifold, tuple[float, float,
     fork, clamp = fork_and_clamp(rig)
     foot = [(x, -rig.height - 6.0, z) for x, z in foot_holes(rig)]
     cap_at, cover_at = at_z(cap_screws(rig), cap_z(rig)), at_z(lugs(rig), rig.face_z + 4.0)
-    ring_at, rear_at = at_z(ring_screws(rig)[1], rig.front_z + 2.0), at_z(rear_screws(rig), rig.bearing_z[0] - 2.5)
+    ring_at, rear_at = (
+        at_z(ring_screws(rig)[1], rig.front_z + 2.0),
+        at_z(rear_screws(rig), rig.bearing_z[0] - 2.5),
+    )
     holder_at, motor_at = at_z(holder_screws(rig), -HOLDER), at_z(motor_points(rig), low)
     plate_at, board_at = at_z(plate_screws(rig), low - MOTOR_PLATE), at_z(board_screws(rig), board)
     return [
         ("screws of the cap", "", screws(3.0, 6.0, 1.9, cap_at), (0, 0, 64)),
         ("screws of the cover", "", screws(3.0, 8.0, 4.0, cover_at), (0, 0, 162)),
         ("screws of the wedge ring", "prism", screws(2.0, 8.0, 2.0, ring_at), (0, 0, 106)),
-        ("screws of the rear ring", "prism", screws(2.0, 8.0, 2.5, rear_at, behind, sunk=True), (0, 0, 12)),
+        (
+            "screws of the rear ring",
+            "prism",
+            screws(2.0, 8.0, 2.5, rear_at, behind, sunk=True),
+            (0, 0, 12),
+        ),
         ("screws of the holder", "", screws(2.5, 8.0, HOLDER, holder_at, behind), (0, 0, -40)),
         ("screw of the clamp", "", clamp, (0, 12, -24)),
         ("screws of the motor", "", screws(3.0, 6.0, MOTOR_PLATE, motor_at, sunk=True), (0, 0, -8)),
-        ("screws of the motor plate", "", screws(3.0, 8.0, MOTOR_PLATE, plate_at, behind), (0, 0, -20)),
+        (
+            "screws of the motor plate",
+            "",
+            screws(3.0, 8.0, MOTOR_PLATE, plate_at, behind),
+            (0, 0, -20),
+        ),
         ("screws of the base", "", screws(4.0, 12.0, 6.0, foot, up), (0, -42, 0)),
         ("screws of the fork barrier", "", fork, (0, 38, 150)),
-        ("screws of the encoder board", "", screws(2.5, 8.0, 8.0, board_at) + board_nuts(rig), (0, 0, 176)),
+        (
+            "screws of the encoder board",
+            "",
+            screws(2.5, 8.0, 8.0, board_at) + board_nuts(rig),
+            (0, 0, 176),
+        ),
     ]
 
 
@@ -977,9 +1079,16 @@ def assembly(rig: Rig) -> tuple[Part, ...]:
         Part("encoder board", encoder(rig), "bought", "", 4.0, (0, 0, 168)),
         printed("motor plate", motor_plate(rig), "", (0, 0, -14)),
         Part("O-ring", rubber, "bought", "prism", rubber.volume() * RUBBER, (0, 0, 94)),
-        Part("lens", ring(0, rig.lens / 2, rig.grip_z, rig.lens_z), "bought", "", 50.0, (0, 0, -46)),
-        Part("wave spring", spring, "bought", "", spring.volume() / SPRING * BAND * STEEL, (0, 0, 25)),
-        *(Part(n, each, "screws", moves, each.volume() * STEEL, apart) for n, moves, each, apart in screw_solids(rig)),
+        Part(
+            "lens", ring(0, rig.lens / 2, rig.grip_z, rig.lens_z), "bought", "", 50.0, (0, 0, -46)
+        ),
+        Part(
+            "wave spring", spring, "bought", "", spring.volume() / SPRING * BAND * STEEL, (0, 0, 25)
+        ),
+        *(
+            Part(n, each, "screws", moves, each.volume() * STEEL, apart)
+            for n, moves, each, apart in screw_solids(rig)
+        ),
     )
 
 
@@ -991,7 +1100,9 @@ def swept(solid: Manifold, x: float = 0.0) -> Manifold:
     """Return the space that a solid passes when it turns about the axis along z at x: its half cuts, turned."""
     half = CrossSection.square((1e3, 2e3)).translate((0.0, -1e3))
     upright = solid.translate((-x, 0, 0))
-    cuts = [upright.rotate((0, 0, 7.5 * k)).rotate((-90, 0, 0)).slice(0.0) ^ half for k in range(48)]
+    cuts = [
+        upright.rotate((0, 0, 7.5 * k)).rotate((-90, 0, 0)).slice(0.0) ^ half for k in range(48)
+    ]
     profile = CrossSection.batch_boolean(cuts, ADD)
     return profile.revolve(SEGMENTS).translate((x, 0, 0))
 
@@ -1003,7 +1114,9 @@ def problems(rig: Rig, made: Sequence[Part]) -> list[str]:
         if len(part.solid.decompose()) != 1 and part.kind == "printed":
             out.append(f"{part.name} is in several pieces")
     axes = {"prism": 0.0, "motor": rig.distance}
-    passed = [swept(part.solid, axes[part.moves]) if part.moves in axes else part.solid for part in made]
+    passed = [
+        swept(part.solid, axes[part.moves]) if part.moves in axes else part.solid for part in made
+    ]
     for (one, first), (other, second) in itertools.combinations(zip(made, passed, strict=True), 2):
         names = {one.name, other.name}
         fits = one.moves == other.moves or bool(FITS & names) or names in RUNS
@@ -1014,7 +1127,9 @@ def problems(rig: Rig, made: Sequence[Part]) -> list[str]:
             continue
         gap = first.min_gap(second, rig.clearance)
         if gap < rig.clearance - 1e-4:
-            out.append(f"{one.name} and {other.name} are {gap:.2f} mm apart, less than {rig.clearance} mm")
+            out.append(
+                f"{one.name} and {other.name} are {gap:.2f} mm apart, less than {rig.clearance} mm"
+            )
     return out
 
 

@@ -96,7 +96,9 @@ def leads(kind: str, drive: str) -> list[Lead]:
 
 def rail(net: str) -> list[Lead]:
     """Return the places on a rail for wires: all but its ends, where the bare wire itself is soldered."""
-    return [Lead(f"rail {net}", str(column), net, (column, RAILS[net])) for column in range(2, COLUMNS)]
+    return [
+        Lead(f"rail {net}", str(column), net, (column, RAILS[net])) for column in range(2, COLUMNS)
+    ]
 
 
 def far(one: Hole, other: Hole) -> float:
@@ -138,17 +140,26 @@ def name(hole: Hole) -> str:
 
 def wire_rows(kind: str, drive: str) -> list[tuple[str, ...]]:
     """Return number, net, and both ends of each wire, with their holes."""
-    out = [("bare", net, "rail", name((1, row)), "rail", name((COLUMNS, row))) for net, row in RAILS.items()]
+    out = [
+        ("bare", net, "rail", name((1, row)), "rail", name((COLUMNS, row)))
+        for net, row in RAILS.items()
+    ]
     for number, (old, new) in enumerate(links(kind, drive), 1):
         start = "rail" if old.ref.startswith("rail") else f"{old.ref}.{old.pin}"
-        out.append((str(number), new.net, f"{new.ref}.{new.pin}", name(new.hole), start, name(old.hole)))
+        out.append(
+            (str(number), new.net, f"{new.ref}.{new.pin}", name(new.hole), start, name(old.hole))
+        )
     return out
 
 
 def touching(kind: str, drive: str, refs: Iterable[str]) -> list[int]:
     """Return the numbers of the wires that end at one of some parts: they go if the parts are left out."""
     parts = set(refs)
-    return [number for number, ends in enumerate(links(kind, drive), 1) if parts & {lead.ref for lead in ends}]
+    return [
+        number
+        for number, ends in enumerate(links(kind, drive), 1)
+        if parts & {lead.ref for lead in ends}
+    ]
 
 
 LEFT_OUT = (
@@ -218,8 +229,18 @@ class Text:
         wide = LETTER * self.size * len(self.words)
         start = {"start": 0.0, "middle": -wide / 2, "end": -wide}[self.anchor]
         if self.upright:
-            return self.x - 0.8 * self.size, self.y - start - wide, self.x + 0.2 * self.size, self.y - start
-        return self.x + start, self.y - 0.8 * self.size, self.x + start + wide, self.y + 0.2 * self.size
+            return (
+                self.x - 0.8 * self.size,
+                self.y - start - wide,
+                self.x + 0.2 * self.size,
+                self.y - start,
+            )
+        return (
+            self.x + start,
+            self.y - 0.8 * self.size,
+            self.x + start + wide,
+            self.y + 0.2 * self.size,
+        )
 
     def svg(self) -> str:
         """Return it as an element."""
@@ -253,7 +274,11 @@ def drawing(kind: str, drive: str, mirrored: bool = False) -> str:
     whats = {part.ref: part.what for part in wires.components(kind, drive)}
     by_net = colours(kind, drive)
     title = f"{whats['U1']}, {'DC motor with belt' if drive == 'belt' else 'hollow-shaft motor'}"
-    seen = "solder side, left and right exchanged" if mirrored else "seen from the parts; wires lie on the other side"
+    seen = (
+        "solder side, left and right exchanged"
+        if mirrored
+        else "seen from the parts; wires lie on the other side"
+    )
     out = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" font-family="sans-serif" font-size="11">',
         f"<title>Perfboard plan: {escape(title)}</title>",
@@ -267,23 +292,32 @@ def drawing(kind: str, drive: str, mirrored: bool = False) -> str:
         x, y = at((column, 1), mirrored)
         label = name((column, 1))[:-1]
         out.append(f'<text x="{x}" y="{y - 24}" text-anchor="middle" fill="#666">{label}</text>')
-        out.append(f'<text x="{x}" y="{high - EDGE + 32}" text-anchor="middle" fill="#666">{label}</text>')
+        out.append(
+            f'<text x="{x}" y="{high - EDGE + 32}" text-anchor="middle" fill="#666">{label}</text>'
+        )
     for row in range(1, ROWS + 1):
         x, y = at((1, row))
         out.append(f'<text x="{x - 24}" y="{y + 4}" text-anchor="end" fill="#666">{row}</text>')
         out.append(f'<text x="{wide - EDGE + 24}" y="{y + 4}" fill="#666">{row}</text>')
-        out += [f'<circle cx="{x + k * PITCH}" cy="{y}" r="2.6" fill="#fff" stroke="#c9ba8c"/>' for k in range(COLUMNS)]
+        out += [
+            f'<circle cx="{x + k * PITCH}" cy="{y}" r="2.6" fill="#fff" stroke="#c9ba8c"/>'
+            for k in range(COLUMNS)
+        ]
     out += bodies(kind, drive, mirrored)
     for net, row in RAILS.items():
         (x, y), (end, _) = at((1, row)), at((COLUMNS, row))
-        out.append(f'<path d="M{x} {y}H{end}" stroke="{COLOURS[net]}" stroke-width="5" opacity="0.45"/>')
+        out.append(
+            f'<path d="M{x} {y}H{end}" stroke="{COLOURS[net]}" stroke-width="5" opacity="0.45"/>'
+        )
     texts = names(kind, drive, mirrored) + labels(kind, drive, mirrored)
     lines, numbers = wire_lines(kind, drive, mirrored, by_net, texts)
     out += lines
     for lead in leads(kind, drive):
         x, y = at(lead.hole, mirrored)
         fill = by_net[lead.net] if lead.net else "#ffffff"
-        out.append(f'<circle cx="{x}" cy="{y}" r="5" fill="{fill}" stroke="#333" data-net="{lead.net}"/>')
+        out.append(
+            f'<circle cx="{x}" cy="{y}" r="5" fill="{fill}" stroke="#333" data-net="{lead.net}"/>'
+        )
     out += [text.svg() for text in (*texts, *numbers)]
     return "\n".join([*out, "</svg>", ""])
 
@@ -297,13 +331,23 @@ def wire_lines(
     taken = [at(lead.hole, mirrored) for lead in leads(kind, drive)]
     boxes = [text.box for text in texts]
     for number, (old, new) in enumerate(links(kind, drive), 1):
-        foreign = [at(lead.hole, mirrored) for lead in leads(kind, drive) if lead.hole not in (old.hole, new.hole)]
+        foreign = [
+            at(lead.hole, mirrored)
+            for lead in leads(kind, drive)
+            if lead.hole not in (old.hole, new.hole)
+        ]
         bends = (0.0, 0.5, -0.5, 0.9, -0.9, 1.4, -1.4, 2.0, -2.0, 2.8, -2.8)
-        paths = [curve(at(old.hole, mirrored), at(new.hole, mirrored), bend * PITCH) for bend in bends]
-        points = max(paths, key=lambda path: (min(gap(path, foreign), 0.42 * PITCH), -paths.index(path)))
+        paths = [
+            curve(at(old.hole, mirrored), at(new.hole, mirrored), bend * PITCH) for bend in bends
+        ]
+        points = max(
+            paths, key=lambda path: (min(gap(path, foreign), 0.42 * PITCH), -paths.index(path))
+        )
         colour = by_net[new.net]
         line = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
-        lines.append(f'<path d="M{line}" stroke="{colour}" stroke-width="2.2" opacity="0.8" fill="none"/>')
+        lines.append(
+            f'<path d="M{line}" stroke="{colour}" stroke-width="2.2" opacity="0.8" fill="none"/>'
+        )
         look = f'fill="{colour}" stroke="#fff" stroke-width="2.5" paint-order="stroke"'
         places = [Text(x, y + 3.0, str(number), size=9.0, look=look) for x, y in points[2:-2]]
         best = max(places, key=lambda place: free(place, taken, boxes))
@@ -313,7 +357,9 @@ def wire_lines(
 
 
 def free(
-    place: Text, points: Iterable[tuple[float, float]], boxes: Iterable[tuple[float, float, float, float]]
+    place: Text,
+    points: Iterable[tuple[float, float]],
+    boxes: Iterable[tuple[float, float, float, float]],
 ) -> float:
     """Return how far words are from leads and from other words [px], at most 8; negative if they overlap."""
     left, top, right, bottom = place.box
@@ -419,7 +465,9 @@ def write(folder: Path) -> list[str]:
         for drive in wires.DRIVES:
             stem = f"board_{kind}_{drive}"
             (folder / f"{stem}.svg").write_text(drawing(kind, drive), encoding="utf-8")
-            (folder / f"{stem}_solder.svg").write_text(drawing(kind, drive, mirrored=True), encoding="utf-8")
+            (folder / f"{stem}_solder.svg").write_text(
+                drawing(kind, drive, mirrored=True), encoding="utf-8"
+            )
             (folder / f"{stem}.csv").write_text(as_csv(kind, drive), encoding="utf-8")
             out += [f"{stem}.svg", f"{stem}_solder.svg", f"{stem}.csv"]
     (folder / "wires.csv").write_text(wires.as_csv(), encoding="utf-8")

@@ -38,7 +38,14 @@ SIGNALS = (
     Signal("A", "PIN_A", 2, "PE4", "2", "encoder A"),
     Signal("B", "PIN_B", 3, "PE5", "3", "encoder B"),
     Signal("INDEX", "PIN_INDEX", 4, "PL0", "49", "index of the prism"),
-    Signal("SYNC_IN", "PIN_CAMERA_SYNC", 5, "PL1", "48", "pulses of the camera, only with PULSES_CAMERA"),
+    Signal(
+        "SYNC_IN",
+        "PIN_CAMERA_SYNC",
+        5,
+        "PL1",
+        "48",
+        "pulses of the camera, only with PULSES_CAMERA",
+    ),
     Signal("TRIGGER", "PIN_TRIGGER", 6, "PA3", "25", "pulses to the camera"),
     Signal("PWM", "PIN_PWM", 8, "PE3", "5", "voltage of the motor, 25 kHz (Mega: 27 kHz)"),
     Signal("DIRECTION", "PIN_DIRECTION", 9, "PA0", "22", "high: forwards"),
@@ -89,7 +96,21 @@ PICO = {
 """Pins of a Raspberry Pi Pico by their names; those in between are ground."""
 PICO_GROUND = (18, 23)
 """Pins of its ground that are wired; the other six are joined to them on the Pico."""
-MEGA = ("A", "B", "INDEX", "SYNC_IN", "TRIGGER", "PWM", "DIRECTION", "ENABLE", "FAULT", "SUPPLY", "VOLTS", VIO, GND)
+MEGA = (
+    "A",
+    "B",
+    "INDEX",
+    "SYNC_IN",
+    "TRIGGER",
+    "PWM",
+    "DIRECTION",
+    "ENABLE",
+    "FAULT",
+    "SUPPLY",
+    "VOLTS",
+    VIO,
+    GND,
+)
 """Nets of the strip that stands for the Mega on the board, whose pins are wired to it."""
 
 
@@ -167,16 +188,33 @@ def components(kind: str, drive: str) -> list[Component]:
         out.append(strip("J1", "encoder A, B", ("V+", VIO), ("A", "A"), ("B", "B"), ("GND", GND)))
         out += [two("R1", "4.7 kΩ", "A", VIO), two("R2", "4.7 kΩ", "B", VIO)]
     if pico:
-        spi = (("MISO", "MISO"), ("CSn", "CSN"), ("CLK", "SCK"), ("MOSI", "MOSI"), ("3V3", VIO), ("GND", GND))
+        spi = (
+            ("MISO", "MISO"),
+            ("CSn", "CSN"),
+            ("CLK", "SCK"),
+            ("MOSI", "MOSI"),
+            ("3V3", VIO),
+            ("GND", GND),
+        )
         out.append(strip("J2", "AS5047P board", *spi))
     if drive == "belt":
-        out += [two("R13", "5.1 kΩ" if pico else "2.7 kΩ", "VREF", GND), two("R14", "10 kΩ", "VREF", VIO)]
+        out += [
+            two("R13", "5.1 kΩ" if pico else "2.7 kΩ", "VREF", GND),
+            two("R14", "10 kΩ", "VREF", VIO),
+        ]
     return out
 
 
 def driver_pins(drive: str) -> list[tuple[str, str]]:
     """Return names and nets of the driver's connector."""
-    pins = [("PWM", "PWM"), ("DIR", "DIRECTION"), ("EN", "ENABLE"), ("FLT", "FAULT"), ("GND", GND), ("VIO", VIO)]
+    pins = [
+        ("PWM", "PWM"),
+        ("DIR", "DIRECTION"),
+        ("EN", "ENABLE"),
+        ("FLT", "FAULT"),
+        ("GND", GND),
+        ("VIO", VIO),
+    ]
     return [*pins, ("VREF", "VREF")] if drive == "belt" else pins
 
 
@@ -192,8 +230,14 @@ def nets(kind: str, drive: str) -> dict[str, list[tuple[str, str]]]:
 
 FAR = {
     ("J1", "V+"): ("motor encoder: supply, if it takes this level", "AS5047P board: 5V (Mega)"),
-    ("J1", "A"): ("motor encoder: A; 5 V push-pull only through a 74LVC125A", "AS5047P board: A (Mega)"),
-    ("J1", "B"): ("motor encoder: B; 5 V push-pull only through a 74LVC125A", "AS5047P board: B (Mega)"),
+    ("J1", "A"): (
+        "motor encoder: A; 5 V push-pull only through a 74LVC125A",
+        "AS5047P board: A (Mega)",
+    ),
+    ("J1", "B"): (
+        "motor encoder: B; 5 V push-pull only through a 74LVC125A",
+        "AS5047P board: B (Mega)",
+    ),
     ("J1", "GND"): ("motor encoder: GND", "AS5047P board: GND (Mega)"),
     ("J2", "MISO"): ("AS5047P board, without A and B: MISO (DO)", "AS5047P board: MISO (DO)"),
     ("J2", "CSn"): ("AS5047P board: CSn", "AS5047P board: CSn"),
@@ -216,7 +260,10 @@ FAR = {
     ("J5", "DIR"): ("DRV8874: PH / IN2", "brushless driver: direction"),
     ("J5", "EN"): ("DRV8874: nSLEEP (SLP)", "brushless driver: enable, high is on"),
     ("J5", "FLT"): ("DRV8874: nFAULT", "brushless driver: fault, open drain, low is a fault"),
-    ("J5", "GND"): ("DRV8874: GND; its PMODE and IMODE go to its GND, too", "brushless driver: GND of its logic"),
+    ("J5", "GND"): (
+        "DRV8874: GND; its PMODE and IMODE go to its GND, too",
+        "brushless driver: GND of its logic",
+    ),
     ("J5", "VIO"): ("open", "brushless driver: level of its logic, if it asks for one"),
     ("J5", "VREF"): ("DRV8874: VREF; no R14 with Pololu 4035, which has its own", ""),
     ("J6", "TRIG"): ("camera: trigger input", "camera: trigger input"),
@@ -237,7 +284,11 @@ POWER = (
     ("fuse", "emergency stop", "emergency stop"),
     ("emergency stop", "DRV8874: VM (VIN on Pololu's board)", "brushless driver: supply"),
     ("12 V supply −", "DRV8874: GND, the star point", "brushless driver: GND, the star point"),
-    ("470 µF 25 V", "+ at VM, − at GND of the driver, at the driver", "+ at its supply, − at its GND, at the driver"),
+    (
+        "470 µF 25 V",
+        "+ at VM, − at GND of the driver, at the driver",
+        "+ at its supply, − at its GND, at the driver",
+    ),
     (
         "driver, outputs",
         "OUT1, OUT2: the motor's two wires, 100 nF across",
@@ -261,10 +312,18 @@ def controller_rows() -> Iterator[tuple[str, str, str, str, str]]:
     """Yield net, pin of the Pico, pin of the Mega, what it is for, and what it meets on the board."""
     pico, mega = nets("rp2040", "belt"), nets("avr", "belt")
     for signal in SIGNALS:
-        met = [f"{ref}.{pin}" if ref[0] == "J" else ref for ref, pin in pico[signal.net] if ref != "U1"]
+        met = [
+            f"{ref}.{pin}" if ref[0] == "J" else ref for ref, pin in pico[signal.net] if ref != "U1"
+        ]
         there = pin_of(signal, "avr") if signal.net in mega or signal.mega == "USB" else "none"
         yield signal.net, pin_of(signal, "rp2040"), there, signal.what, ", ".join(met)
-    yield VIO, "36 (3V3)", "5V", "level of the logic", "J1.V+, J2.3V3, J4.VCCIO, J5.VIO, pull-ups, R6, C1"
+    yield (
+        VIO,
+        "36 (3V3)",
+        "5V",
+        "level of the logic",
+        "J1.V+, J2.3V3, J4.VCCIO, J5.VIO, pull-ups, R6, C1",
+    )
     yield V5, "40 (VBUS)", "5V", "5 V of USB", "J8.5V"
     yield GND, " and ".join(map(str, PICO_GROUND)), "GND", "ground", "all"
 

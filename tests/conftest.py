@@ -8,6 +8,7 @@ import os
 import pkgutil
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -29,9 +30,9 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.__main__ import MOST_NEW
-from amiwarp.kernels.launch import load_all
+from amiwarp.kernels.loading import load_all
 from amiwarp.tasks import cores, limited_cpu_threads
-from tests import SHARE
+from tests import ROOT, SHARE, durations
 
 with contextlib.suppress(ImportError):
     # PyTorch's CUDA build imports Triton, which ends a process in which VTK has drawn with Mesa before.
@@ -48,20 +49,8 @@ gc.set_threshold(MOST_NEW)  # as the command line does
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-LONGEST_FIRST = (
-    "test_photometric", "test_moving", "test_consistency", "test_view_browser", "test_lens", "test_stream_cli",
-    "test_stability", "test_cli", "test_dataset", "test_examples", "test_rig", "test_demo", "test_design",
-    "test_named_worlds", "test_io_mutation", "test_refusals", "test_calibrate", "test_evaluate", "test_session",
-    "test_public_values", "test_chart", "test_optics_comparison", "test_evaluate_motion", "test_mirror",
-    "test_vibration", "test_firmware", "test_window", "test_live_writer", "test_world_truth", "test_sensor_timing",
-    "test_output", "test_benchmarks_gpu", "test_sparse", "test_benchmarks", "test_reconstruct", "test_io_hdf5",
-    "test_prism_path", "test_plate", "test_pixels", "test_serve_attacks", "test_io_writers", "test_link",
-    "test_chunk_file", "test_stream_cameras", "test_structure", "test_risley", "test_compensate", "test_small_orbits",
-    "test_worlds", "test_optics_properties", "test_auto", "test_arrays", "test_evaluate_paper", "test_view_cli",
-    "test_docstrings", "test_stream_returning", "test_io_formats", "test_cli_printable", "test_optics",
-    "test_conformance", "test_translate",
-)  # fmt: skip
-"""Files whose tests take longest, in this order. They are run first, so that no process works alone at the end."""
+SLOW_LEFT_OUT = pytest.StashKey[int]()
+"""Number of slow tests that ``-m`` left out."""
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -70,14 +59,25 @@ def pytest_xdist_auto_num_workers() -> int:
     return cores() + 1
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that records how long the tests take."""
+    parser.addoption(
+        "--record-durations", action="store_true", help="update tests/durations.json by this run"
+    )
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Let xdist keep the order of the files. By itself it begins with the files that have most tests.
 
     Kernels are compiled before its processes start, or each of them would compile them.
     """
+    if config.getoption("record_durations"):
+        config.pluginmanager.register(durations.Recorder())
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
-    if (getattr(config.option, "numprocesses", None) or 0) > 1 and not hasattr(config, "workerinput"):
+    if (getattr(config.option, "numprocesses", None) or 0) > 1 and not hasattr(
+        config, "workerinput"
+    ):
         for module in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}."):
             importlib.import_module(module.name)
         for device in wp.get_devices():
@@ -89,15 +89,59 @@ def pytest_collection(session: pytest.Session) -> None:
     worker = getattr(session.config, "workerinput", None)
     if worker is not None and session.config.args == session.config.getini("testpaths"):
         number = int(worker["workerid"].removeprefix("gw"))
-        for path in sorted(Path(__file__).parent.glob("test_*.py"))[number :: worker["workercount"]]:
-            with contextlib.suppress(Exception, pytest.skip.Exception):  # collection imports it again, and reports that
-                importlib.import_module(f"tests.{path.stem}")
+        files = sorted((ROOT / "tests").rglob("test_*.py"))
+        for path in files[number :: worker["workercount"]]:
+            module = path.relative_to(ROOT).with_suffix("")
+            with contextlib.suppress(
+                Exception, pytest.skip.Exception
+            ):  # collection imports it again, and reports that
+                importlib.import_module(".".join(module.parts))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the longest files. The order within a file stays."""
-    rank = {name: k for k, name in enumerate(LONGEST_FIRST)}
-    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+@pytest.hookimpl(wrapper=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> Iterator[None]:
+    """Mark the slow tests by their recorded durations. Begin with the files that take longest, so that no process works
+    alone at the end; the order within a file stays."""
+    seconds = durations.recorded()
+    for item in items:
+        if seconds.get(durations.name_of(item.nodeid), 0.0) >= durations.SLOW_S:
+            item.add_marker("slow")
+    yield
+    of_file: Counter[Path] = Counter()
+    for item in items:
+        of_file[item.path] += seconds.get(durations.name_of(item.nodeid), 0.0)
+    items.sort(key=lambda item: -of_file[item.path])
+
+
+def pytest_deselected(items: list[pytest.Item]) -> None:
+    """Count the slow tests that are left out."""
+    stash = items[0].config.stash
+    slow = sum(item.get_closest_marker("slow") is not None for item in items)
+    stash[SLOW_LEFT_OUT] = stash.get(SLOW_LEFT_OUT, 0) + slow
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Tell xdist's main process how many slow tests are left out."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["slow_left_out"] = session.config.stash.get(SLOW_LEFT_OUT, 0)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Take the number from one of xdist's processes: each of them collects all tests."""
+    number = getattr(node, "workeroutput", {}).get("slow_left_out", 0)  # none from one that crashed
+    node.config.stash[SLOW_LEFT_OUT] = max(number, node.config.stash.get(SLOW_LEFT_OUT, 0))
+
+
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
+    """Say how many slow tests were left out."""
+    number = config.stash.get(SLOW_LEFT_OUT, 0)
+    if number and config.option.markexpr:
+        terminalreporter.write_line(
+            f"{number:,} slow tests were left out ({durations.SLOW_S:g} s or more each); pytest -m slow runs them"
+        )
 
 
 def pytest_collection_finish() -> None:
@@ -132,7 +176,9 @@ def device(request: pytest.FixtureRequest) -> str:
 def browser() -> Iterator[Any]:
     """A headless Chromium. Without Chromium, its tests are reported as skipped."""
     sync_api = pytest.importorskip("playwright.sync_api")
-    chromium = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
+    chromium = next(
+        filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None
+    )
     if chromium is None:
         pytest.skip("no Chromium on PATH")
     arguments = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
@@ -145,7 +191,7 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Folder of the real recordings and pictures: AMIWARP_TEST_DATA, or ../shared/data next to the checkout."""
-    default = Path(__file__).parents[2] / "shared" / "data"
+    default = ROOT.parent / "shared" / "data"
     folder = Path(os.environ.get("AMIWARP_TEST_DATA", default))
     if not (folder / "README.md").is_file():
         pytest.skip(f"no real recordings at {folder}; set AMIWARP_TEST_DATA")

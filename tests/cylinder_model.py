@@ -10,9 +10,12 @@ import warp as wp
 
 from amiwarp import Camera, ExactModel, Model, Parameter, Prism
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
-from amiwarp.kernels.refraction import ExactParams, compensate_direction, deflect, deflect_direction
-from amiwarp.optics.models import MODELS, PHASE, phase_values, struct_of
-from amiwarp.validation import guarded
+from amiwarp.kernels.exact import ExactParams, deflect_direction
+from amiwarp.kernels.refraction import compensate_direction, deflect
+from amiwarp.optics import MODELS
+from amiwarp.optics.models.parameter import PHASE
+from amiwarp.optics.models.structs import phase_values, struct_of
+from amiwarp.schema.calls import guarded
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -53,7 +56,9 @@ class CylinderModel(Model):
     PARAMETERS = (
         Parameter("apex", "rad"),
         PHASE,
-        Parameter("power", "1", 0.1, limits=(-0.5, 0.5), label="cylinder power", slider=(-0.1, 0.1, 0.001)),
+        Parameter(
+            "power", "1", 0.1, limits=(-0.5, 0.5), label="cylinder power", slider=(-0.1, 0.1, 0.001)
+        ),
     )
 
     camera: Camera

@@ -1,6 +1,7 @@
 """All public functions, classes and methods, by the stub ``amiwarp/__init__.pyi``, each with valid arguments."""
 
 import enum
+import functools
 import inspect
 import itertools
 import re
@@ -16,10 +17,30 @@ import amiwarp as aw
 from tests.networks import write_network
 
 NAMES = re.findall(r"import (\w+) as \1", Path(aw.__file__).with_suffix(".pyi").read_text())
-NOT_CALLED = {"AmiwarpError", "CalibrationOptions", "CameraPackets", "InspectorHandle", "Model", "Packet", "Triggers"}
+NOT_CALLED = {
+    "AmiwarpError",
+    "CalibrationOptions",
+    "CameraPackets",
+    "InspectorHandle",
+    "LivePicture",
+    "Model",
+    "Packet",
+    "PhaseImage",
+    "PhaseSums",
+    "PhaseUpdate",
+    "RingPart",
+    "Triggers",
+}
 """Public classes that users catch, receive, derive from or annotate with, and do not make."""
 
 _count = itertools.count()
+
+
+def _ring() -> aw.PhaseRing:
+    """Return a ring that holds a turn."""
+    ring = aw.PhaseRing(4, 3)
+    ring.add(EVENTS, TURNED)
+    return ring
 
 
 def _new(suffix: str) -> Callable[[], str]:
@@ -37,6 +58,7 @@ TABLE = np.zeros((3, 4, 2), np.float32)
 PIXELS = aw.PixelMap(*np.ones((8, 3, 4)))
 DEPTHS = aw.DepthMap(np.ones((3, 4)), np.ones((3, 4)), np.ones((3, 4, 3)))
 PLATE = aw.Plate(0.01, 0.7)
+ROTATION_PATH = aw.RotationPath(0, np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
 EVENTS = aw.Events.from_arrays([1, 2, 1], [0, 1, 2], [0, 400, 900], [1, 0, 1])
 ON_DEVICE = aw.DeviceEvents.from_arrays(EVENTS.x, EVENTS.y, EVENTS.t, EVENTS.p)
 SOURCE = aw.MemoryEvents(EVENTS, 4, 3)
@@ -66,7 +88,9 @@ STAGE = aw.SearchStage(
     points=np.zeros((1, 1)),
     scores=np.zeros(1),
 )
-SUMMARY = aw.StageSummary(name="n", algorithm="a", evaluations=1, seconds=1.0, sharpness=1.0, ended="e")
+SUMMARY = aw.StageSummary(
+    name="n", algorithm="a", evaluations=1, seconds=1.0, sharpness=1.0, ended="e"
+)
 CALIBRATION = aw.Calibration(
     model_name="exact",
     camera=CAMERA,
@@ -94,9 +118,16 @@ SPACE = aw.ParameterSpace(
     duration_us=1000.0,
     undrifted={},
 )
+SUMS = aw.phase_sums(EVENTS, np.zeros(3), 4, 3)
+PHASE_IMAGE = aw.phase_image(SUMS, MODEL)
+TURNED = np.array([0.0, 3.0, 8.0])
 BOARD = aw.Board(3, 4, 0.03)
-CORNERS = aw.Corners(np.arange(12), np.mgrid[20:50:10, 20:60:10].reshape(2, -1).T.astype(np.float64))
-BOARD_POSE = aw.BoardPose("a", CORNERS, np.zeros((12, 2)), np.zeros(3), np.ones(3), np.zeros((60, 80), np.uint8))
+CORNERS = aw.Corners(
+    np.arange(12), np.mgrid[20:50:10, 20:60:10].reshape(2, -1).T.astype(np.float64)
+)
+BOARD_POSE = aw.BoardPose(
+    "a", CORNERS, np.zeros((12, 2)), np.zeros(3), np.ones(3), np.zeros((60, 80), np.uint8)
+)
 LENS = aw.LensCalibration(CAMERA, {}, CALIBRATION, (BOARD_POSE,), {}, (), (), 1.0)
 STACK = aw.PictureStack(np.zeros((2, 3, 4), np.uint8), 100.0, "s")
 FOLDER = aw.PictureFolder((Path("a.png"), Path("b.png")), np.array([0, 10]), (4, 3))
@@ -223,6 +254,7 @@ OWN: dict[str, dict[str, Any]] = {
     "StageSummary": _all(SUMMARY),
     "StageSummary.of": {"name": "n", "stage": STAGE, "names": ("apex",), "values": [{"apex": 0.1}]},
     "compensate_live": {"source": "in.h5"},
+    "pictures_live": {"source": "in.h5"},
     "open_camera": {"name": "camera:"},
     "CameraSettings": {"biases": {"diff_on": 20}, "region": (1, 2, 3, 4), "masked": ((1, 2),), "flicker_hz": (90, 130)},
     "CompensationSummary": {"events": 1, "outside": 1, "seconds": 1.0},
@@ -329,12 +361,25 @@ OWN: dict[str, dict[str, Any]] = {
     "PixelMap.load": {"path": "none.npz"},
     "PixelMap.save": {"path": _new(".npz")},
     "pixel_thresholds": {"model": MODEL},
+    "phase_sums": {"angles": np.zeros(3)},
+    "PhaseSums.from_integers": {"integers": np.zeros((3, 4, 5), np.int32), "turns": 1.0, "off_ratio": 1.0},
+    "weighted_sums": {"parts": [SUMS, SUMS], "weights": [1.0, 2.0]},
+    "phase_picture": {"sums": SUMS, "model": MODEL},
+    "PhaseCamera": {"model": MODEL, "encoder": aw.EncoderStream()},
+    "PhaseRing.add_part": {"part": _ring().split(EVENTS, TURNED)[0]},
+    "PhaseRing.add": {"angles": TURNED + 1.0},
+    "PhaseRing.split": {"angles": TURNED + 1.0},
+    "PhaseRing.span_us": {"bins": 16},
+    "PhaseRing.update": {"prior": _ring().sums(), "turns": 0.25},
+    "phase_image": {"sums": SUMS, "model": MODEL},
+    "PhaseImage.save": {"path": _new(".npz")},
+    "PhaseReconstruction": {"recording": RECORDING, "calibration": CALIBRATION},
     "open_recording": {"path": "in.h5"},
     "RecordingWriter.append_frame": {"frame": FRAME},
     "RecordingWriter.append_image": {"t_us": 0, "image": np.zeros((3, 4), np.uint8)},
     "RecordingWriter.append_imu": {"samples": IMU},
     "RecordingWriter.append_known": {"t_us": 0, "mask": np.zeros((3, 4), np.bool_)},
-    "RecordingWriter.fill": {"pieces": [], "count": 0, "done": lambda *_: None},
+    "RecordingWriter.fill": {"pieces": [], "count": 0},
     "RecordedDataset": {"folder": "."},
     "save_flow_dsec": {"folder": _new(""), "frames": FRAMES},
     "save_flow_mvsec": {"path": _new(".npz"), "frames": FRAMES},
@@ -344,13 +389,19 @@ OWN: dict[str, dict[str, Any]] = {
     "Camera.from_opencv": {"K": CAMERA.to_opencv()[0], "dist": np.zeros(5), "size": (4, 3)},
     "Camera.rays_to_pixels": {"rays": np.ones((2, 3))},
     "CameraRotation.about": {"middle_us": 5},
+    "CameraRotation.params": {"device": "cpu"},
     "CameraRotation.reach": {"half_s": 0.1},
+    "RotationPath": _all(ROTATION_PATH),
+    "RotationPath.from_rates": {"t": np.array([0, 1000]), "rates": np.zeros((2, 3)), "span": (0, 1000)},
+    "RotationPath.orientations": {"t": np.zeros(2)},
+    "RotationPath.vectors": {"middle_us": 0},
+    "RotationPath.at": {"tau": np.zeros(2), "middle_us": 0},
     "CameraRotation.rotation": {"tau": np.zeros(2)},
     **{
         f"{name}.{method}": given
         for name in (
             "CircleModel", "EllipseModel", "ExactModel", "MirrorModel", "PlateModel", "RadialCircleModel",
-            "RisleyModel", "VibrationModel",
+            "RisleyModel", "SteererModel", "VibrationModel",
         )
         for method, given in (("apex_from_size", {"size": 0.02}), ("size_from_apex", {"apex": 0.02}))
     },
@@ -359,7 +410,7 @@ OWN: dict[str, dict[str, Any]] = {
         for name, size in (
             ("CircleModel", "deflection"), ("EllipseModel", "apex"), ("ExactModel", "apex"),
             ("PlateModel", "inverse_depth"), ("RadialCircleModel", "deflection"), ("RisleyModel", "apex"),
-            ("MirrorModel", "amplitude"), ("VibrationModel", "amplitude"),
+            ("MirrorModel", "amplitude"), ("SteererModel", "amplitude"), ("VibrationModel", "amplitude"),
         )
         for method, given in (
             ("freed", {"ratio": 1.0}),
@@ -375,6 +426,10 @@ OWN: dict[str, dict[str, Any]] = {
     "MirrorModel.from_values": {"values": {"amplitude": 0.01, "phase": 0.0}},
     "MirrorModel.rotations": {"theta": np.zeros((20, 2))},
     "Mirror": {"hz": (60.0, 77.0), "amplitude": (0.01, 0.01)},
+    "SteererModel": {"amplitude": 0.01},
+    "SteererModel.from_values": {"values": {"amplitude": 0.01, "phase": 0.0}},
+    "SteererModel.added": {"theta": np.zeros((20, 2))},
+    "Steerer": {"hz": (5000.0, 6100.0), "amplitude": (0.01, 0.01)},
     "VibrationModel.from_values": {"values": {"amplitude": 0.01, "phase": 0.0}},
     "VibrationModel.rotations": {"theta": np.linspace(0, 6, 20)},
     "Vibration": {"hz": 100.0, "amplitude": 0.01},
@@ -477,6 +532,7 @@ OBJECTS: dict[str, Any] = {
     "Poses": POSES,
     "Camera": CAMERA,
     "CameraRotation": aw.CameraRotation((0.0, 0.1, 0.0)),
+    "RotationPath": ROTATION_PATH,
     "CircleModel": aw.CircleModel(CAMERA, 0.01),
     "RadialCircleModel": aw.RadialCircleModel(CAMERA, 0.01),
     "EllipseModel": aw.EllipseModel(CAMERA, *[TABLE] * 3),
@@ -486,9 +542,13 @@ OBJECTS: dict[str, Any] = {
     "Vibration": aw.Vibration(100.0, 0.01),
     "MirrorModel": aw.MirrorModel(CAMERA, 0.01),
     "Mirror": aw.Mirror((60.0, 77.0), (0.01, 0.01)),
+    "SteererModel": aw.SteererModel(CAMERA, 0.01),
+    "Steerer": aw.Steerer((5000.0, 6100.0), (0.01, 0.01)),
     "UnsizedPrism": aw.UnsizedPrism(),
     "Picture": PICTURE,
     "PixelMap": PIXELS,
+    "PhaseImage": PHASE_IMAGE,
+    "PhaseReconstruction": aw.PhaseReconstruction(RECORDING, CALIBRATION),
     "DepthMap": DEPTHS,
     "PlateModel": aw.PlateModel(CAMERA, PLATE),
     "CameraMotion": aw.CameraMotion(),
@@ -511,6 +571,8 @@ OBJECTS: dict[str, Any] = {
 
 MADE: dict[str, Callable[[], Any]] = {
     "Compensator": lambda: aw.Compensator(MODEL, _stream()),
+    "PhaseCamera": lambda: aw.PhaseCamera(MODEL, _stream()),
+    "PhaseRing": _ring,
     "EncoderStream": _stream,
     "EventSensor": lambda: aw.EventSensor(2, 3, 4),
     "CornerDetector": lambda: aw.CornerDetector((4, 3)),
@@ -525,6 +587,9 @@ REFUSED = {
     "RecordedDataset": "no manifest",
     "Reconstruction.window": "no pixel fires twice",
     "Reconstruction.windows": "no pixel fires twice",
+    "PhaseReconstruction.sums": "need a whole turn",
+    "PhaseReconstruction.window": "need a whole turn",
+    "PhaseReconstruction.windows": "need a whole turn",
     "reconstruct": "outside the encoder's",
     "PictureFolder.read": "no such file",
     "VideoFile.read": "v.mp4",
@@ -579,17 +644,30 @@ class PublicCall:
         thing = MADE[kind]() if kind in MADE else OBJECTS[kind]
         return thing, getattr(thing, name)
 
+    @functools.cached_property
+    def _signature(self) -> inspect.Signature:
+        """What is called, by its parameters. Finding this takes as long as many of the calls."""
+        return inspect.signature(self.target()[1])
+
     def parameters(self) -> dict[str, str]:
         """Return the annotation of each parameter by name."""
-        found = inspect.signature(self.target()[1]).parameters.values()
-        named = {one.name: str(one.annotation) for one in found if one.kind is not one.VAR_KEYWORD}
+        named = {
+            one.name: str(one.annotation)
+            for one in self._signature.parameters.values()
+            if one.kind is not one.VAR_KEYWORD
+        }
         return {**named, **dict.fromkeys(SETTINGS.get(self.label, ()), "")}
 
-    def arguments(self, function: Callable[..., Any]) -> dict[str, Any]:
+    def arguments(self) -> dict[str, Any]:
         """Return valid arguments."""
-        needed = [n for n, one in inspect.signature(function).parameters.items() if one.default is one.empty]
+        needed = [
+            name for name, one in self._signature.parameters.items() if one.default is one.empty
+        ]
         given = {**{n: BY_NAME[n] for n in needed if n in BY_NAME}, **OWN.get(self.label, {})}
-        return {n: v() if getattr(v, "__qualname__", "").startswith("_new.") else v for n, v in given.items()}
+        return {
+            n: v() if getattr(v, "__qualname__", "").startswith("_new.") else v
+            for n, v in given.items()
+        }
 
 
 def public_calls() -> Iterator[PublicCall]:

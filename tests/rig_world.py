@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from amiwarp.live.link.emulator import PseudoTerminal
-from amiwarp.live.link.link import Link
-from amiwarp.live.link.protocol import Answer
-from amiwarp.live.stream.packets import Packet, Source
-from amiwarp.live.stream.session import Session
-from amiwarp.live.stream.sources import EmulatedCamera
+from amiwarp import Packet
+from amiwarp.live.link import Answer, Link, PseudoTerminal
+from amiwarp.live.stream import EmulatedCamera, Session
+from amiwarp.live.stream.packets import Source
 
 LONG_S = 120.0
 """Limit of every wait [s]. Only a hang takes so long."""
@@ -85,7 +83,9 @@ class Counted:
         self._source.close()
 
 
-def has_taken_in(session: Session, source: Counted, camera: EmulatedCamera, link: Link) -> Callable[[], bool]:
+def has_taken_in(
+    session: Session, source: Counted, camera: EmulatedCamera, link: Link
+) -> Callable[[], bool]:
     """Return a check that the session has the link's samples, the camera's pulses, and all but its last few events."""
     first, last = camera._events.t_first, camera._events.t_last
 

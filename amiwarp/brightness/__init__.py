@@ -1,1 +1,5 @@
 """The scene's log brightness from pairs of events: equations, solver, residuals."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

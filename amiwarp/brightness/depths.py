@@ -14,7 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.brightness.pixel_costs import PixelCosts
-from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, PlateModel
+from amiwarp.optics.models.plate import LARGEST_INVERSE_DEPTH, PlateModel
+
+Vector = NDArray[np.float64]
+Floats = NDArray[np.float32]
 
 WINDOW_PX = 2.5
 """Standard deviation of the Gaussian window whose pixels are assumed to see one depth [px]."""
@@ -22,9 +25,11 @@ SMALLEST_PX = 0.4
 """Smallest radius of an orbit that is tried [px]. On smaller ones, the map has enough nodes to fit each pixel alone."""
 PLANE_PX = 0.3
 """Largest distance of the orbits' radii at successive inverse depths [px]."""
-STEP_PX, SLOPE_PX = 0.03, 0.02
-"""Distances of the orbits' radii for the second and for the first derivative of the cost [px]. With 0.08 px for the
-second, depths of a desk came out 1 % too large."""
+STEP_PX = 0.03
+"""Distance of the orbits' radii for the second derivative of the cost [px]. With 0.08 px, depths of a desk came out 1 %
+too large."""
+SLOPE_PX = 0.02
+"""Distance of the orbits' radii for the first derivative of the cost [px]."""
 LONGEST_STEP_PX = 0.15
 """Longest step by which the best inverse depth of the series is improved: the change of the orbit's radius [px]."""
 CORRELATED = 12.0
@@ -55,31 +60,50 @@ class Depths:
 
 
 def find_depths(
-    costs: PixelCosts, model: PlateModel, largest: float, report: Callable[[float], None] = lambda share: None
+    costs: PixelCosts,
+    model: PlateModel,
+    largest: float,
+    report: Callable[[float], None] = lambda share: None,
 ) -> Depths:
     """Return the depths of all pixels. ``largest``: largest inverse depth to try [1/m]; ``report`` gets the share."""
     from scipy.ndimage import gaussian_filter
 
     radius = orbit_px(model)
     least = min(SMALLEST_PX / radius, largest / 2.0)
-    tried = np.linspace(least, largest, max(5, 1 + math.ceil((largest - least) * radius / PLANE_PX)))
+    planes = 1 + math.ceil((largest - least) * radius / PLANE_PX)
+    tried = np.linspace(least, largest, max(5, planes))
+
+    # The cost of each pixel, and of the window about it, at each depth.
     pixels = []
-    for k, each in enumerate(tried):
-        cost = costs.of(replace(model, inverse_depth=float(each), depths=None))
-        pixels.append(cost.astype(np.float32))
+    windows = []
+    for k, inverse_depth in enumerate(tried.tolist()):
+        plane = replace(model, inverse_depth=inverse_depth, depths=None)
+        cost = costs.of(plane).astype(np.float32)
+        pixels.append(cost)
+        windows.append(gaussian_filter(cost, WINDOW_PX))
         report((k + 1) / (len(tried) + 4))
-    windows: NDArray[np.float32] = np.stack([gaussian_filter(one, WINDOW_PX) for one in pixels])
-    best = lowest(tried, windows)
+    of_windows: Floats = np.stack(windows)
+
+    best = lowest(tried, of_windows)
     step = newton_step(costs, model, best)
     report(1.0)
     best = np.clip(best + step, 0.0, LARGEST_INVERSE_DEPTH).astype(np.float32)
+
     count = gaussian_filter(costs.count.astype(np.float64), WINDOW_PX)
-    std = deviation(tried, windows, count, best, FLOOR_PX / radius)
-    lowest_at = windows.argmin(axis=0)
-    std[(lowest_at == 0) | (lowest_at == len(tried) - 1)] = np.inf  # the lowest cost may lie beyond what was tried
+    std = deviation(tried, of_windows, count, best, FLOOR_PX / radius)
+    lowest_at = of_windows.argmin(axis=0)
+    # The lowest cost may lie beyond what was tried
+    std[(lowest_at == 0) | (lowest_at == len(tried) - 1)] = np.inf
     std = np.sqrt(std**2 + contrast(best, std) ** 2)
-    total = np.take_along_axis(np.stack(pixels), lowest_at[None], axis=0).sum()
-    return Depths(best, std.astype(np.float32), costs.count, float(total / max(costs.count.sum(), 1)))
+
+    lowest_costs = np.take_along_axis(np.stack(pixels), lowest_at[None], axis=0)
+    pairs = max(costs.count.sum(), 1)
+    return Depths(
+        inverse_depth=best,
+        std=std.astype(np.float32),
+        count=costs.count,
+        cost=float(lowest_costs.sum() / pairs),
+    )
 
 
 def orbit_px(model: PlateModel) -> float:
@@ -87,36 +111,57 @@ def orbit_px(model: PlateModel) -> float:
     return max(model.camera.fx, model.camera.fy) * model.plate.shift
 
 
-def lowest(tried: NDArray[np.float64], windows: NDArray[np.float32]) -> NDArray[np.float32]:
+def lowest(tried: Vector, windows: Floats) -> Floats:
     """Return the inverse depth of the lowest cost, between those that were tried by a parabola; (height, width)."""
     middle = np.clip(windows.argmin(axis=0), 1, len(tried) - 2)
-    a, b, c = (np.take_along_axis(windows, (middle + k)[None], axis=0)[0] for k in (-1, 0, 1))
-    bend = a - 2.0 * b + c
-    away = np.clip(0.5 * (a - c) / np.where(bend > 0.0, bend, np.inf), -1.0, 1.0)
-    return np.asarray(tried[middle] + away * (tried[1] - tried[0]), np.float32)
+
+    def cost_at(plane: NDArray[np.int64]) -> Floats:
+        chosen = np.take_along_axis(windows, plane[None], axis=0)
+        return np.asarray(chosen[0])
+
+    before = cost_at(middle - 1)
+    after = cost_at(middle + 1)
+    bend = before - 2.0 * cost_at(middle) + after
+    positive_bend = np.where(bend > 0.0, bend, np.inf)
+    planes = np.clip(0.5 * (before - after) / positive_bend, -1.0, 1.0)
+    distance = tried[1] - tried[0]
+    return np.asarray(tried[middle] + planes * distance, np.float32)
 
 
-def newton_step(costs: PixelCosts, model: PlateModel, at: NDArray[np.float32]) -> NDArray[np.float64]:
+def newton_step(
+    costs: PixelCosts,
+    model: PlateModel,
+    at: Floats,
+) -> Vector:
     """Return the change of the inverse depths that minimises the cost to second order, shape (height, width).
 
-    The second derivative is a difference of first ones: that of Gauss and Newton is several times too large, because
-    the map follows the noise.
+    The second derivative is a difference of first ones. The usual one of Gauss and Newton is several times too large,
+    because the map follows the noise.
     """
     from scipy.ndimage import gaussian_filter
 
     radius = orbit_px(model)
-    far, near = STEP_PX / radius, SLOPE_PX / radius
+    far = STEP_PX / radius
+    near = SLOPE_PX / radius
 
     def moved(by: float) -> PlateModel:
-        return model.with_depths(np.clip(at + by, 0.0, LARGEST_INVERSE_DEPTH).astype(np.float32))
+        depths = np.clip(at + by, 0.0, LARGEST_INVERSE_DEPTH)
+        return model.with_depths(depths.astype(np.float32))
 
-    low, high = (costs.gradient(moved(by), moved(by + near), moved(by - near), 2.0 * near) for by in (-far, far))
-    slope, bend = (gaussian_filter(one, WINDOW_PX) for one in ((low + high) / 2.0, (high - low) / (2.0 * far)))
+    def slope_at(by: float) -> Vector:
+        return costs.gradient(moved(by), moved(by + near), moved(by - near), 2.0 * near)
+
+    low = slope_at(-far)
+    high = slope_at(far)
+    slope = gaussian_filter((low + high) / 2.0, WINDOW_PX)
+    bend = gaussian_filter((high - low) / (2.0 * far), WINDOW_PX)
+    positive_bend = np.where(bend > 0.0, bend, np.inf)
     longest = LONGEST_STEP_PX / radius
-    return np.asarray(np.clip(-slope / np.where(bend > 0.0, bend, np.inf), -longest, longest))
+    step = np.clip(-slope / positive_bend, -longest, longest)
+    return np.asarray(step)
 
 
-def contrast(inverse_depth: NDArray[np.float32], std: NDArray[np.float64]) -> NDArray[np.float64]:
+def contrast(inverse_depth: Floats, std: Vector) -> Vector:
     """Return by how much the inverse depths of two pixels nearby differ, beyond their noise [rms], (height, width).
 
     A window across the edge of a body holds two depths, of which its pixel has one.
@@ -127,20 +172,28 @@ def contrast(inverse_depth: NDArray[np.float32], std: NDArray[np.float64]) -> ND
     weight = np.divide(1.0, std**2, out=np.zeros(std.shape), where=known)
     value = np.where(known, inverse_depth, 0.0).astype(np.float64)
     total = gaussian_filter(weight, NEARBY_PX)
-    sums = weight * value, weight * value**2, known.astype(np.float64)
-    mean, square, noise = (
-        np.divide(gaussian_filter(each, NEARBY_PX), total, out=np.zeros(std.shape), where=total > 0.0) for each in sums
-    )
-    return np.asarray(np.sqrt(2.0 * np.maximum(square - mean**2 - noise, 0.0)))
+
+    def weighted_mean(weighted: Vector) -> Vector:
+        nothing = np.zeros(std.shape)
+        nearby = gaussian_filter(weighted, NEARBY_PX)
+        mean = np.divide(nearby, total, out=nothing, where=total > 0.0)
+        return np.asarray(mean)
+
+    mean = weighted_mean(weight * value)
+    square = weighted_mean(weight * value**2)
+    # The variance of each value, times its weight, is 1.
+    noise = weighted_mean(known.astype(np.float64))
+    variance = np.maximum(square - mean**2 - noise, 0.0)
+    return np.asarray(np.sqrt(2.0 * variance))
 
 
 def deviation(
-    tried: NDArray[np.float64],
-    windows: NDArray[np.float32],
-    count: NDArray[np.float64],
-    at: NDArray[np.float32],
+    tried: Vector,
+    windows: Floats,
+    count: Vector,
+    at: Floats,
     floor: float,
-) -> NDArray[np.float64]:
+) -> Vector:
     """Return the standard deviation of the inverse depths ``at``, shape (height, width).
 
     The cost of a window is taken as a likelihood, whose variance is the lowest cost of a pair. So a window in which
@@ -149,16 +202,23 @@ def deviation(
     from scipy.interpolate import CubicSpline
 
     seen = count > LEAST_COUNT
-    fine = np.linspace(tried[0], tried[-1], FINER * (len(tried) - 1) + 1)
-    out = np.full(count.shape, np.inf)
-    for row in range(len(count)):  # of a whole image, the interpolated costs would take gigabytes
+    samples = FINER * (len(tried) - 1) + 1
+    fine = np.linspace(tried[0], tried[-1], samples)
+    area = 4.0 * math.pi * WINDOW_PX**2
+    std = np.full(count.shape, np.inf)
+    # Row by row: of a whole image, the interpolated costs would take gigabytes.
+    for row in range(len(count)):
         some = seen[row]
         if not some.any():
             continue
-        costs = CubicSpline(tried, windows[:, row, some])(fine)
-        least = np.maximum(costs.min(axis=0), 1e-6 * count[row, some])  # a spline may swing below 0
-        area = 4.0 * math.pi * WINDOW_PX**2
-        weight = np.exp(-np.maximum(costs / least - 1.0, 0.0) * (count[row, some] * area / (2.0 * CORRELATED)))
-        away = (fine[:, None] - at[row, some]) ** 2
-        out[row, some] = np.sqrt((weight * away).sum(axis=0) / weight.sum(axis=0) + floor**2)
-    return out
+        pairs = count[row, some]
+        spline = CubicSpline(tried, windows[:, row, some])
+        costs = spline(fine)
+        least = np.maximum(costs.min(axis=0), 1e-6 * pairs)  # a spline may swing below 0
+        excess = np.maximum(costs / least - 1.0, 0.0)
+        independent_pairs = pairs * area / (2.0 * CORRELATED)
+        likelihood = np.exp(-excess * independent_pairs)
+        square = (fine[:, None] - at[row, some]) ** 2
+        variance = (likelihood * square).sum(axis=0) / likelihood.sum(axis=0)
+        std[row, some] = np.sqrt(variance + floor**2)
+    return std

@@ -1,1 +1,5 @@
 """Calibration: find the prism's parameters in the recording itself."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

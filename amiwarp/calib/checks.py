@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.calib.bad_pixels import BadPixelSummary
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.iwe import Image
+from amiwarp.imaging.canvas import Image
 from amiwarp.imaging.sharpness import edge_coherence
-from amiwarp.io.file_scan import ASSUMED_SIZE
-from amiwarp.optics.models import MODELS, Model
+from amiwarp.io.assumptions import ASSUMED_SIZE
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.models.registry import MODELS
 from amiwarp.optics.prism import Prism
 
 FEWEST_EVENTS = 2000
@@ -26,7 +27,7 @@ deviations]."""
 LARGEST_FROM_NOMINAL = 0.18
 """Largest relative difference between the calibrated and the nominal size of the prism's orbit."""
 LARGEST_FLICKER = 0.7
-"""Largest share of the pixels that may be masked as bad."""
+"""Largest share of the pixels that may be hot or flicker."""
 LARGEST_DRIFT = 0.02
 """Largest drift of the index pulses relative to the encoder counts over a recording [turns]."""
 FEWEST_PULSES = 3
@@ -42,11 +43,16 @@ frequent, 1 if all edges are parallel."""
 class NoSharpOptimumError(AmiwarpError):
     """Raised if no motion of a prism makes the image of events sharp. A rotating camera can be the cause."""
 
+    _KIND = ErrorCode.CALIBRATION_REFUSED
+
 
 def check_events(count: int, name: str) -> None:
     """Raise :class:`AmiwarpError` if a recording has too few events for a calibration."""
     if count < FEWEST_EVENTS:
-        raise AmiwarpError(f"{name}: {count} events are too few to calibrate; record at least {FEWEST_EVENTS}")
+        raise AmiwarpError(
+            f"{name}: {count} events are too few to calibrate; record at least {FEWEST_EVENTS}",
+            ErrorCode.CALIBRATION_REFUSED,
+        )
 
 
 def check_unmasked_events(count: int, mask: NDArray[np.bool_], name: str) -> None:
@@ -55,7 +61,8 @@ def check_unmasked_events(count: int, mask: NDArray[np.bool_], name: str) -> Non
         pixels = int(np.count_nonzero(mask))
         raise AmiwarpError(
             f"{name}: without the pixels that flicker or fire at random, {pixels:,} in all, {count} events are left; "
-            f"record at least {FEWEST_EVENTS} events of edges all over the image"
+            f"record at least {FEWEST_EVENTS} events of edges all over the image",
+            ErrorCode.CALIBRATION_REFUSED,
         )
 
 
@@ -65,7 +72,8 @@ def check_coverage(encoder: Encoder, t_first: int, t_last: int, name: str) -> No
         first, last = encoder.coverage
         raise AmiwarpError(
             f"{name}: encoder samples cover {first} .. {last} us, the events {t_first} .. {t_last} us; "
-            "record the encoder for as long as the events, or select the covered events with a window"
+            "record the encoder for as long as the events, or select the covered events with a window",
+            ErrorCode.CALIBRATION_REFUSED,
         )
 
 
@@ -108,7 +116,8 @@ def wrong_scale(
     )
     return AmiwarpError(
         f"{name}: {what} every {turns:.4f} turns of the encoder, not every turn; {evidence} its scale is off by a "
-        f"factor of {turns:.4f}: read the encoder log again with counts_per_turn (--counts-per-turn) times {turns:.4f}"
+        f"factor of {turns:.4f}: read the encoder log again with counts_per_turn (--counts-per-turn) times {turns:.4f}",
+        ErrorCode.CALIBRATION_REFUSED,
     )
 
 
@@ -120,11 +129,14 @@ def wrong_direction(name: str, cost: float, reversed_cost: float) -> AmiwarpErro
     return AmiwarpError(
         f"{name}: the prism turns against the direction of the encoder: with its angles reversed a still camera "
         f"explains the events ({100 * reversed_cost:.0f} % of the residual remains instead of "
-        f"{100 * min(cost, 1.0):.0f} %); read the encoder log again with the other direction (--direction)"
+        f"{100 * min(cost, 1.0):.0f} %); read the encoder log again with the other direction (--direction)",
+        ErrorCode.CALIBRATION_REFUSED,
     )
 
 
-HOLD_STILL = "hold the camera still for three turns, at any time of the recording, or turn the prism faster"
+HOLD_STILL = (
+    "hold the camera still for three turns, at any time of the recording, or turn the prism faster"
+)
 """Remedy for a camera in fast motion."""
 
 
@@ -136,7 +148,26 @@ def moves_too_fast(name: str, repetition: float, *, short: bool) -> AmiwarpError
     return AmiwarpError(
         f"{name}: the camera moves too fast for the prism: the events of one turn repeat in the next with a correlation"
         f" of {repetition:.2f} at most (0.9 at rest, 0.7 in a calm hand), and no motion of the camera explains them at "
-        f"all times; {HOLD_STILL}{', or record such motion for 40 turns' if short else ''}"
+        f"all times; {HOLD_STILL}{', or record such motion for 40 turns' if short else ''}",
+        ErrorCode.CALIBRATION_REFUSED,
+    )
+
+
+def short_gyroscope(name: str, turns: int, least: int) -> AmiwarpError:
+    """Return the error for a fast camera whose gyroscope covers too few ``turns``."""
+    return AmiwarpError(
+        f"{name}: the camera moves fast, and its gyroscope covers {turns} parts of one and a half turns; record at "
+        f"least {least}",
+        ErrorCode.CALIBRATION_REFUSED,
+    )
+
+
+def unexplained_by_gyroscope(name: str) -> AmiwarpError:
+    """Return the error for a fast camera whose events are not explained with the gyroscope's rotation either."""
+    return AmiwarpError(
+        f"{name}: the gyroscope's rotation and a motion of the parts of the image do not explain the events of single "
+        "turns of the prism; keep away from near things, or move more slowly",
+        ErrorCode.CALIBRATION_REFUSED,
     )
 
 
@@ -144,7 +175,8 @@ def scatters(name: str, turns: int, stated_px: float, most_px: float) -> Amiwarp
     """Return the error for a fast camera if the answers of single turns differ too much for their mean to be used."""
     return AmiwarpError(
         f"{name}: the camera never rests, and the answers of {turns} turns of the prism differ: their mean is "
-        f"uncertain by {stated_px:.2f} px, more than {most_px:g} px; {HOLD_STILL}, or record more turns"
+        f"uncertain by {stated_px:.2f} px, more than {most_px:g} px; {HOLD_STILL}, or record more turns",
+        ErrorCode.CALIBRATION_REFUSED,
     )
 
 
@@ -157,16 +189,24 @@ def check_turned(theta: NDArray[np.float64], name: str, which: str = "the prism"
     if turned < SMALLEST_ROTATION:
         raise AmiwarpError(
             f"{name}: {which} turned {math.degrees(turned):.1f} degrees during the events; "
-            "record at least a quarter turn (90 degrees), better a whole one"
+            "record at least a quarter turn (90 degrees), better a whole one",
+            ErrorCode.CALIBRATION_REFUSED,
         )
 
 
 def check_light(mask: NDArray[np.bool_], summary: BadPixelSummary, name: str) -> None:
-    """Check that the light does not flicker in most of the image, which hides the scene's edges."""
+    """Check that most of the image neither flickers nor is hot, which hides the scene's edges."""
     if mask.mean() > LARGEST_FLICKER:
+        if not summary.lamps_hz:
+            raise AmiwarpError(
+                f"{name}: {100 * mask.mean():.0f} % of the pixels are hot; record with other biases, or cooler",
+                ErrorCode.CALIBRATION_REFUSED,
+            )
         at = " and ".join(f"{hz:.0f}" for hz in summary.lamps_hz)
         raise AmiwarpError(
-            f"{name}: {100 * mask.mean():.0f} % of the pixels flicker at {at} Hz; use daylight or flicker-free lighting"
+            f"{name}: {100 * mask.mean():.0f} % of the pixels flicker at {at} Hz; "
+            "use daylight or flicker-free lighting",
+            ErrorCode.CALIBRATION_REFUSED,
         )
 
 
@@ -202,11 +242,13 @@ def check_nominal(model: str, parameters: Mapping[str, float], nominal: Prism, n
         raise AmiwarpError(
             f"{name}: the calibrated size of the prism is {100 * share:.0f} % of its nominal {size} (nominal apex "
             f"{math.degrees(nominal.apex):.4g} deg): the camera shakes with the prism, or the nominal prism or the "
-            f"focal length is wrong; correct these, or give bounds of {size} if the answer is right"
+            f"focal length is wrong; correct these, or give bounds of {size} if the answer is right",
+            ErrorCode.CALIBRATION_REFUSED,
         )
 
 
-SWAPPED_SHARE, LEAST_SWAPPED = 1.0 / 3.0, 0.05
+SWAPPED_SHARE = 1.0 / 3.0
+LEAST_SWAPPED = 0.05
 """Two prisms look exchanged if, with their nominal apexes exchanged, the largest relative difference of an apex from
 the nominal one is at most this share of that without, which must have this least size."""
 
@@ -214,9 +256,14 @@ the nominal one is at most this share of that without, which must have this leas
 def look_swapped(parameters: Mapping[str, float], nominal: Prism) -> bool:
     """Return whether the apexes of two prisms fit the nominal ones far better the other way round."""
     second = nominal.second
-    if second is None or not {"apex", "second_apex"} <= parameters.keys() or not min(nominal.apex, second.apex) > 0.0:
+    if (
+        second is None
+        or not {"apex", "second_apex"} <= parameters.keys()
+        or not min(nominal.apex, second.apex) > 0.0
+    ):
         return False
-    away, exchanged = _from_nominal(parameters, (nominal.apex, second.apex)), (second.apex, nominal.apex)
+    away = _from_nominal(parameters, (nominal.apex, second.apex))
+    exchanged = (second.apex, nominal.apex)
     return away >= LEAST_SWAPPED and _from_nominal(parameters, exchanged) <= SWAPPED_SHARE * away
 
 
@@ -232,7 +279,9 @@ def _from_nominal(parameters: Mapping[str, float], apexes: tuple[float, float]) 
     return max(abs(apex / stated - 1.0) for apex, stated in zip(found, apexes, strict=True))
 
 
-def swapped_encoders(given: Mapping[str, float], parameters: Mapping[str, float], nominal: Prism) -> str:
+def swapped_encoders(
+    given: Mapping[str, float], parameters: Mapping[str, float], nominal: Prism
+) -> str:
     """Return that the encoders of two prisms seem to be swapped, in words.
 
     ``given`` are the parameters with the encoders as they are, ``parameters`` those with them exchanged.
@@ -241,7 +290,8 @@ def swapped_encoders(given: Mapping[str, float], parameters: Mapping[str, float]
 
     def of_nominal(values: Mapping[str, float]) -> str:
         assert nominal.second is not None
-        first, second = values["apex"] / nominal.apex, values["second_apex"] / nominal.second.apex
+        first = values["apex"] / nominal.apex
+        second = values["second_apex"] / nominal.second.apex
         return f"{100 * first:.0f} and {100 * second:.0f} %"
 
     return (
@@ -267,7 +317,9 @@ def check_size(kind: type[Model], least: float, bound: float, name: str) -> None
     """Check that the size of the orbit by a kind of model may be at least ``least`` under its upper ``bound`` [rad]."""
     if least > bound:
         size = kind.SIZE
-        remedy = "give the prism's nominal apex, or wider bounds" if kind.PRISM else "give wider bounds"
+        remedy = (
+            "give the prism's nominal apex, or wider bounds" if kind.PRISM else "give wider bounds"
+        )
         raise NoSharpOptimumError(
             f"{name}: the image is sharpest for the largest {size} that is tried, {math.degrees(bound):.3g} deg "
             f"({kind.SIZE_HINT}, unless bounds are given): {remedy} ({size}=0:{2.0 * math.degrees(bound):.3g}deg)"
@@ -295,10 +347,13 @@ def check_texture(
     gain = significance(best, still)
     if not gain >= LEAST_SIGNIFICANCE:
         cause = (
-            "no prism turned, its apex is too small for these events, or the encoder is wrong; check prism and encoder"
+            "no prism turned, its apex is too small for these events, or the encoder is wrong; "
+            "check prism and encoder"
         )
         if mover != Model.MOVER:
-            cause = f"the {mover} is too small for these events, or its frequency is wrong; give rpm"
+            cause = (
+                f"the {mover} is too small for these events, or its frequency is wrong; give rpm"
+            )
         raise NoSharpOptimumError(
             f"{name}: the image is as sharp with no motion compensation ({_in_words(gain)}): {cause}, or record more "
             "events"
@@ -308,7 +363,10 @@ def check_texture(
 def check_sharper(gain: float, name: str) -> None:
     """Check that another cause makes the image sharper, by a ``gain`` in standard deviations."""
     if not gain >= LEAST_SIGNIFICANCE:
-        raise AmiwarpError(f"{name}: this makes the image no sharper ({_in_words(gain)})")
+        raise AmiwarpError(
+            f"{name}: this makes the image no sharper ({_in_words(gain)})",
+            ErrorCode.CALIBRATION_REFUSED,
+        )
 
 
 def check_directions(image: Image, inset: int, name: str) -> None:
@@ -320,5 +378,6 @@ def check_directions(image: Image, inset: int, name: str) -> None:
     if coherence > LARGEST_COHERENCE:
         raise AmiwarpError(
             f"{name}: all edges run in one direction (coherence {coherence:.2f} of 1), so motion along them is "
-            "invisible; show the camera edges in at least two directions"
+            "invisible; show the camera edges in at least two directions",
+            ErrorCode.CALIBRATION_REFUSED,
         )

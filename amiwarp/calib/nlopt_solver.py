@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import INT64, finite, guarded, instance, one_of, real, whole
+from amiwarp.results.search_stage import SearchStage
+from amiwarp.validation import one_of
 
 GLOBAL_ALGORITHMS = (
     "GN_DIRECT",
@@ -49,47 +49,26 @@ SAME_OPTIMUM_PX = 1.0
 """Distance from a known optimum below which a search would end there [px]."""
 
 
-@guarded
-@dataclass(frozen=True, kw_only=True)
-class SearchStage:
-    """Record of one run of a search algorithm: its best point and all evaluated points."""
-
-    algorithm: str
-    """Name of the search algorithm, such as ``LN_BOBYQA``."""
-    x: NDArray[np.float64]
-    """Evaluated point with the highest score [px], shape ``(n,)`` for n free parameters."""
-    score: float
-    """Score at the best point; higher is better."""
-    evaluations: int
-    """Number of evaluations of the score in the run."""
-    seconds: float
-    """Run time of the search [s]."""
-    ended: str
-    """Reason why the search ended, in words."""
-    points: NDArray[np.float64] = field(repr=False)
-    """All evaluated points in order [px], shape ``(evaluations, n)``."""
-    scores: NDArray[np.float64] = field(repr=False)
-    """Score of each evaluated point, shape ``(evaluations,)``."""
-
-    def __post_init__(self) -> None:
-        for name in ("algorithm", "ended"):
-            instance(getattr(self, name), str, f"search stage's {name}")
-        whole(self.evaluations, "search stage's evaluations", 0, INT64[1])
-        for name in ("score", "seconds"):
-            real(getattr(self, name), f"search stage's {name}")
-        for name in ("x", "points", "scores"):
-            finite(getattr(self, name), f"search stage's {name}")
-
-
 def best_of(
-    algorithm: str, points: list[NDArray[np.float64]], scores: list[float], *, seconds: float, ended: str
+    algorithm: str,
+    points: list[NDArray[np.float64]],
+    scores: list[float],
+    *,
+    seconds: float,
+    ended: str,
 ) -> SearchStage:
     """Return the record of a run, with the best of its evaluated points."""
     best = int(np.argmax(scores))
     return SearchStage(
-        algorithm=algorithm, x=points[best], score=float(scores[best]), evaluations=len(scores), seconds=seconds,
-        ended=ended, points=np.array(points), scores=np.array(scores),
-    )  # fmt: skip
+        algorithm=algorithm,
+        x=points[best],
+        score=float(scores[best]),
+        evaluations=len(scores),
+        seconds=seconds,
+        ended=ended,
+        points=np.array(points),
+        scores=np.array(scores),
+    )
 
 
 def maximise(
@@ -151,7 +130,13 @@ def maximise(
     began = time.perf_counter()
     nlopt.srand(seed + 1)  # 0 would seed NLopt from the clock
     optimiser = _optimiser(
-        algorithm, low=low, high=high, evaluations=evaluations, tolerance=tolerance, step=step, inner=inner
+        algorithm,
+        low=low,
+        high=high,
+        evaluations=evaluations,
+        tolerance=tolerance,
+        step=step,
+        inner=inner,
     )
     samples = _EvaluationLog(score, evaluations, optimiser.force_stop, known)
     optimiser.set_min_objective(samples.cost)
@@ -163,12 +148,16 @@ def maximise(
     except nlopt.ForcedStop:
         ended = "known optimum" if samples.near_known else "budget"
     except (RuntimeError, ValueError) as error:
-        raise AmiwarpError(f"{algorithm} failed in {len(low)} dimensions: {error}; choose another algorithm") from error
+        raise AmiwarpError(
+            f"{algorithm} failed in {len(low)} dimensions: {error}; choose another algorithm"
+        ) from error
     finally:
         samples.release()
     if samples.failure is not None:
         raise samples.failure
-    return best_of(algorithm, samples.points, samples.scores, seconds=time.perf_counter() - began, ended=ended)
+    return best_of(
+        algorithm, samples.points, samples.scores, seconds=time.perf_counter() - began, ended=ended
+    )
 
 
 class _EvaluationLog:
@@ -189,12 +178,17 @@ class _EvaluationLog:
         self.failure: BaseException | None = None
         self._score: Callable[[NDArray[np.float64]], float] | None = score
         self._stop: Callable[[], None] | None = stop
-        self._most, self._known = most, known
+        self._most = most
+        self._known = known
 
     @property
     def near_known(self) -> bool:
         """Whether the last point is near a known optimum."""
-        return any(math.dist(self.points[-1], k) < SAME_OPTIMUM_PX for k in self._known) if self.points else False
+        return (
+            any(math.dist(self.points[-1], k) < SAME_OPTIMUM_PX for k in self._known)
+            if self.points
+            else False
+        )
 
     def release(self) -> None:
         """Drop the reference to the score function, because NLopt never frees its callbacks."""
@@ -204,13 +198,17 @@ class _EvaluationLog:
         assert self._score is not None
         assert self._stop is not None
         # NLopt's C code may continue after an exception. So the exception is stored here and raised after NLopt stops.
-        if self.failure is not None or len(self.scores) >= self._most:  # some algorithms exceed their budget
+        if (
+            self.failure is not None or len(self.scores) >= self._most
+        ):  # some algorithms exceed their budget
             self._stop()
             return -min(self.scores, default=0.0)
         try:
             value = self._score(x)
             if not math.isfinite(value):
-                raise AmiwarpError(f"sharpness is {value} at the point {x} px; check camera and prism")
+                raise AmiwarpError(
+                    f"sharpness or cost is {value} at the point {x} px; check camera and prism"
+                )
         except BaseException as error:
             self.failure = error
             self._stop()
@@ -222,7 +220,14 @@ class _EvaluationLog:
         return -value
 
 
-_ENDS = {1: "converged", 2: "score reached", 3: "tolerance of the score", 4: "tolerance", 5: "budget", 6: "time"}
+_ENDS = {
+    1: "converged",
+    2: "score reached",
+    3: "tolerance of the score",
+    4: "tolerance",
+    5: "budget",
+    6: "time",
+}
 
 
 def _optimiser(
@@ -240,7 +245,9 @@ def _optimiser(
 
     n = len(low)
     if n < 2 and algorithm in _NEEDS_TWO:
-        raise AmiwarpError(f"{algorithm} needs at least two free parameters; use LN_COBYLA or LN_SBPLX for one")
+        raise AmiwarpError(
+            f"{algorithm} needs at least two free parameters; use LN_COBYLA or LN_SBPLX for one"
+        )
     optimiser = nlopt.opt(getattr(nlopt, algorithm), n)
     if algorithm != "LN_NEWUOA":  # the only algorithm without bounds
         optimiser.set_lower_bounds(low)
@@ -252,8 +259,13 @@ def _optimiser(
     if "MLSL" in algorithm:
         one_of(inner, LOCAL_ALGORITHMS, "algorithm")
         local = _optimiser(
-            inner, low=low, high=high, evaluations=max(20, evaluations // 8), tolerance=max(tolerance, 0.05),
-            step=step, inner=inner,
-        )  # fmt: skip
+            inner,
+            low=low,
+            high=high,
+            evaluations=max(20, evaluations // 8),
+            tolerance=max(tolerance, 0.05),
+            step=step,
+            inner=inner,
+        )
         optimiser.set_local_optimizer(local)
     return optimiser

@@ -13,15 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.calibration import path_of, prepare, zero_time
 from amiwarp.calib.checks import size_warnings
-from amiwarp.calib.nlopt_solver import SearchStage, best_of
-from amiwarp.calib.result import Calibration, StageSummary
+from amiwarp.calib.nlopt_solver import best_of
+from amiwarp.calib.preparation import prepare
 from amiwarp.calib.settings import STAGES, Settings
 from amiwarp.calib.sharpness_search import Search
 from amiwarp.calib.start_burst import without_start_burst
+from amiwarp.calib.without_encoder import path_of, zero_time
 from amiwarp.choices import Sharpness
 from amiwarp.events.recording import MemoryEvents, Recording
+from amiwarp.results.calibration import Calibration, StageSummary
+from amiwarp.results.search_stage import SearchStage
 from amiwarp.tasks import Progress, part, silent
 
 WINDOW_US = 2_000_000
@@ -55,12 +57,17 @@ def calibrate_as_paper(
     source = recording.events
     cut = source.between(source.t_first, source.t_first + WINDOW_US)
     given = dict(start or {})
-    settings = Settings(model="circle", sharpness=Sharpness.PAPER_J, events=len(cut), stages=STAGES[:1], start=given)
+    settings = Settings(
+        model="circle", sharpness=Sharpness.PAPER_J, events=len(cut), stages=STAGES[:1], start=given
+    )
     used = replace(recording, events=MemoryEvents(cut, *source.size))
     searches = prepare(used, settings, device=device)
-    report, share = progress or silent, 1.0 / len(searches)
+    report = progress or silent
+    share = 1.0 / len(searches)
     stages = [
-        _grid_search(search, mounted="phase" in given, progress=part(report, k * share, (k + 1) * share))
+        _grid_search(
+            search, mounted="phase" in given, progress=part(report, k * share, (k + 1) * share)
+        )
         for k, search in enumerate(searches)
     ]
     # without an encoder, both senses of rotation are tried
@@ -76,7 +83,11 @@ def calibrate_as_paper(
         sharpness_name=Sharpness.PAPER_J.value,
         sharpness_before=search.fine.values({**best, search.space.size_name: 0.0}),
         sharpness_after=stage.score,
-        stages=(StageSummary.of("grid", stage, search.space.names, map(search.space.to_values, stage.points)),),
+        stages=(
+            StageSummary.of(
+                "grid", stage, search.space.names, map(search.space.to_values, stage.points)
+            ),
+        ),
         zero_us=zero_time(used, search),
         path=path_of(used, search),
         events=len(cut),
@@ -87,9 +98,11 @@ def calibrate_as_paper(
 
 def _grid_search(search: Search, *, mounted: bool, progress: Progress) -> SearchStage:
     """Return the best point of successively finer grids; ``mounted``: whether the phase of the mount is given."""
-    space, began = search.space, time.perf_counter()
+    space = search.space
+    began = time.perf_counter()
     nominal = space.start
-    size, phase = nominal[space.size_name], nominal["phase"]
+    size = nominal[space.size_name]
+    phase = nominal["phase"]
     size_half = 0.5 * (SIZE_RANGE[1] - SIZE_RANGE[0]) * size
     phase_half = PHASE_RANGE if mounted else math.pi
     columns = SIDE if mounted else round(SIDE * math.pi / PHASE_RANGE)
@@ -105,6 +118,10 @@ def _grid_search(search: Search, *, mounted: bool, progress: Progress) -> Search
                 points.append(v)
                 scores.append(search.fine(v))
                 progress("calibrating, global", len(points) / budget)
-        size, phase = (space.to_values(points[int(np.argmax(scores))])[n] for n in (space.size_name, "phase"))
-        size_half, phase_half, columns = 2.0 * size_half / (SIDE - 1), 2.0 * phase_half / (columns - 1), SIDE
+        size, phase = (
+            space.to_values(points[int(np.argmax(scores))])[n] for n in (space.size_name, "phase")
+        )
+        size_half = 2.0 * size_half / (SIDE - 1)
+        phase_half = 2.0 * phase_half / (columns - 1)
+        columns = SIDE
     return best_of("grid", points, scores, seconds=time.perf_counter() - began, ended="its budget")

@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 
 from amiwarp.brightness.depths import Depths, find_depths, orbit_px
 from amiwarp.brightness.pixel_costs import PixelCosts
-from amiwarp.calib.first_guess import LEAST_REPETITION, calmest_span
-from amiwarp.calib.result import Calibration
-from amiwarp.errors import AmiwarpError
+from amiwarp.calib.calm_span import LEAST_REPETITION, calmest_span
+from amiwarp.calib.photometric.stated_errors import BOUND
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.device_events import read_between
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
-from amiwarp.optics.models import PlateModel
+from amiwarp.optics.models.plate import PlateModel
+from amiwarp.optics.prism import Plate
+from amiwarp.results.calibration import Calibration
 
 LARGEST_INVERSE = 4.0
 """Default of the largest inverse depth that is tried [1/m]."""
@@ -32,7 +34,8 @@ LEAST_EVENTS = 1_000
 """Smallest number of events."""
 ROUNDS = 5
 """Largest number of steps in which depths and phase are found in turn."""
-STEP_RAD, FINE_STEP_RAD = 0.05, 0.01
+STEP_RAD = 0.05
+FINE_STEP_RAD = 0.01
 """Half the distance of the phases at which the derivative of the cost is computed, far from the answer and at the end
 [rad]. The cost rises faster on one side: with 0.05 rad, phases came out 1 to 1.5 deg ahead, with 0.1 rad 4 deg."""
 SLOPE_RAD = 0.01
@@ -50,9 +53,17 @@ LARGEST_STD_RAD = 0.2
 FAR_RAD = 0.05
 """Step of the phase below which the angle between the faces is looked for [rad]."""
 SIGNIFICANT = 5.0
-"""Number of standard deviations from which on faces are at an angle to each other."""
+"""Number of standard deviations above which faces are at an angle to each other."""
+STOCK_WEDGE_RAD = math.radians(1.0 / 60.0)
+"""Largest standard deviation of an angle between the faces that was not found [rad]. Stock glass is parallel within it.
+"""
 WEDGE_FLOOR_PX = 0.004
 """Standard deviation of the motion of all points by faces at an angle, by errors of the method [px]."""
+THICKNESS_SHARE = 0.03
+TILT_RAD = math.radians(1.0)
+INDEX_STD = 0.01
+"""Standard deviations of the plate that is given: a share of its thickness, which is the tolerance of 10 mm of float
+glass (EN 572-2), its tilt [rad] and its refractive index. They scale all inverse depths alike, which no event shows."""
 SETTLED_RAD = 0.002
 """Step of the phase that ends the search [rad]."""
 CLUSTER_PX = 8
@@ -63,30 +74,42 @@ LARGEST_COST = 0.2
 """Largest mean cost of a pair of events [thresholds²] of a scene at rest: without a map it is 0.4."""
 
 
-def costs_at_rest(recording: Recording, model: PlateModel, encoder: Encoder, largest: float, device: Any) -> PixelCosts:
+def costs_at_rest(
+    recording: Recording, model: PlateModel, encoder: Encoder, largest: float, device: Any
+) -> PixelCosts:
     """Return the costs of the pixels over a recording from a camera at rest.
 
     Raises :class:`AmiwarpError` if the camera or the scene moves, the plate does not turn, or there are few events.
     """
-    source, name = recording.events, recording.name
+    source = recording.events
+    name = recording.name
     if len(source) < LEAST_EVENTS:
-        raise AmiwarpError(f"{name}: {len(source)} events do not determine depths; give a longer recording")
+        raise AmiwarpError(
+            f"{name}: {len(source)} events do not determine depths; give a longer recording",
+            ErrorCode.CALIBRATION_REFUSED,
+        )
     turn_us = 60e6 / abs(encoder.rpm) if encoder.rpm else math.inf
     first, last = source.t_first, source.t_last
     if last - first < turn_us:
-        raise AmiwarpError(f"{name}: depths need a whole turn of the plate; give a longer recording")
+        raise AmiwarpError(
+            f"{name}: depths need a whole turn of the plate; give a longer recording"
+        )
     repetition, _ = calmest_span(recording, encoder)
     if repetition < LEAST_REPETITION:
         raise AmiwarpError(
             f"{name}: the events of successive turns differ (correlation {repetition:.2f}): the camera or the scene "
-            "moves, and depths are found from a camera at rest only; record a still scene with a camera on a stand"
+            "moves, and depths are found from a camera at rest only; record a still scene with a camera on a stand",
+            ErrorCode.CALIBRATION_REFUSED,
         )
-    start = round(min(first + turn_us, last + 1 - turn_us))  # in the first turn, the pixels' references are unknown
+    # In the first turn, the pixels' references are unknown
+    start = round(min(first + turn_us, last + 1 - turn_us))
     end = min(source.find(start) + MOST_EVENTS, len(source) - 1)
     stop = max(int(source.slice(end, end + 1).t[0]), round(start + turn_us)) + 1
     events = read_between(source, start, stop)
     margin = orbit_px(model) * largest * MARGIN
-    return PixelCosts(events, source.size, encoder, longest_gap_us=round(turn_us), margin_px=margin, device=device)
+    return PixelCosts(
+        events, source.size, encoder, longest_gap_us=round(turn_us), margin_px=margin, device=device
+    )
 
 
 def check_still(depths: Depths, name: str) -> None:
@@ -95,45 +118,62 @@ def check_still(depths: Depths, name: str) -> None:
         raise AmiwarpError(
             f"{name}: no depths explain the events (mean cost {depths.cost:.2f}, at most {LARGEST_COST} expected): the "
             "camera or the scene moves, or the plate or the phase is wrong; record a still scene, and check thickness "
-            "and tilt"
+            "and tilt",
+            ErrorCode.CALIBRATION_REFUSED,
         )
 
 
 def refine_phase(
-    found: Calibration, recording: Recording, device: Any, report: Callable[[float], None] = lambda share: None
-) -> Calibration:
+    found: Calibration,
+    recording: Recording,
+    device: Any,
+    report: Callable[[float], None] = lambda share: None,
+) -> tuple[Calibration, NDArray[np.float64]]:
     """Return the calibration with the phase that minimises the photometric cost, and its standard deviation.
 
-    Raises :class:`AmiwarpError` as :func:`costs_at_rest`, or if no depths explain the events.
+    The second result is the inverse depth of what each pixel sees, relative to the mean that the calibration states,
+    shape (height, width). Raises :class:`AmiwarpError` as :func:`costs_at_rest`, or if no depths explain the events.
     """
     model = found.model
     assert isinstance(model, PlateModel)
-    encoder = found.encoder_for(recording.encoder, recording.events.t_first, recording.events.t_last)
+    encoder = found.encoder_for(
+        recording.encoder, recording.events.t_first, recording.events.t_last
+    )
     costs = costs_at_rest(recording, model, encoder, LARGEST_INVERSE, device)
-    step, half, wedge = STEP_RAD, STEP_RAD, 0.0
-    known = "wedge_y" in found.parameters
+    step = STEP_RAD
+    half = STEP_RAD
+    wedge = 0.0
+    unseen_wedge = 0.0
+    wedge_is_given = "wedge_y" in found.parameters
     for k in range(ROUNDS):
         half = min(half, max(abs(step), FINE_STEP_RAD))
         depths = find_depths(costs, model, LARGEST_INVERSE)
         here = model.with_depths(depths.inverse_depth)
         good = depths.std < GOOD_SHARE * depths.inverse_depth
         low, high = (np.where(good, _slope(costs, here, by), 0.0) for by in (-half, half))
-        slope, bend = (low + high) / 2.0, (high - low) / (2.0 * half)
+        slope = (low + high) / 2.0
+        bend = (high - low) / (2.0 * half)
         if not float(bend.sum()) > 0.0:
-            raise AmiwarpError(f"{recording.name}: the events do not determine the phase; record a scene with texture")
+            raise AmiwarpError(
+                f"{recording.name}: the events do not determine the phase; record a scene with texture",
+                ErrorCode.CALIBRATION_REFUSED,
+            )
         same = np.ones((1, *slope.shape))
         fit = _newton(slope, bend, same)
-        if abs(float(fit.step[0])) < FAR_RAD and not known:
+        if abs(float(fit.step[0])) < FAR_RAD and not wedge_is_given:
             by_wedge = phase_by_wedge(model, np.where(good, depths.inverse_depth, np.inf))
             joint = _newton(slope, bend, np.stack([same[0], by_wedge]))
-            if wedge or abs(float(joint.step[1])) > SIGNIFICANT * math.hypot(joint.std(1), wedge_floor(model)):
+            wedge_std = math.hypot(joint.std(1), wedge_floor(model))
+            unseen_wedge = min(STOCK_WEDGE_RAD, math.hypot(float(joint.step[1]), wedge_std))
+            if wedge or abs(float(joint.step[1])) > SIGNIFICANT * wedge_std:
                 fit = joint
         step = float(np.clip(fit.step[0], -LONGEST_RAD, LONGEST_RAD))
         wedge += float(fit.step[1]) if len(fit.step) > 1 else 0.0
         model = replace(
-            model, phase=math.remainder(model.phase + step, math.tau),
-            wedge=model.wedge if known else (model.wedge[0], wedge),
-        )  # fmt: skip
+            model,
+            phase=math.remainder(model.phase + step, math.tau),
+            wedge=model.wedge if wedge_is_given else (model.wedge[0], wedge),
+        )
         report((k + 1) / ROUNDS)
         if abs(step) < SETTLED_RAD and half == FINE_STEP_RAD:
             break
@@ -142,11 +182,34 @@ def refine_phase(
     mean = float((weight * depths.inverse_depth).sum() / max(weight.sum(), 1e-30))
     std = math.hypot(fit.std(0), FLOOR_PX / max(mean * orbit_px(model), 1e-9))
     check_known_phase(std, recording.name)
-    found = replace(
-        found, parameters={**found.parameters, "phase": model.phase, "inverse_depth": mean},
-        uncertainty={**found.uncertainty, "phase": std},
-    )  # fmt: skip
-    return with_wedge(found, wedge, math.hypot(fit.std(1), wedge_floor(model))) if wedge else found
+    uncertainty = {
+        **found.uncertainty,
+        "phase": std,
+        "inverse_depth": mean * scale_doubt(model.plate),
+    }
+    parameters = {**found.parameters, "phase": model.phase, "inverse_depth": mean}
+    # Windows without a depth have few events: any depth will do.
+    known = np.isfinite(depths.std)
+    relative = np.where(known, depths.inverse_depth, mean) / max(mean, 1e-9)
+    if wedge:
+        found = replace(found, parameters=parameters, uncertainty=uncertainty)
+        return with_wedge(found, wedge, math.hypot(fit.std(1), wedge_floor(model))), relative
+    if unseen_wedge:
+        # an angle that is too small to be found may be there, and one along the tilt is likely as large
+        for name in ("wedge_x", "wedge_y"):
+            if name not in parameters:
+                parameters[name] = 0.0
+                uncertainty[name] = unseen_wedge
+    return replace(found, parameters=parameters, uncertainty=uncertainty), relative
+
+
+def scale_doubt(plate: Plate) -> float:
+    """Return the standard deviation of the scale of all inverse depths, as a share, by what is given of the plate."""
+    less_tilted = replace(plate, tilt=max(0.0, plate.tilt - TILT_RAD))
+    # one step towards the middle of the allowed indices
+    of_other_glass = replace(plate, index=plate.index + math.copysign(INDEX_STD, 2.0 - plate.index))
+    by_tilt, by_index = (each.shift / plate.shift - 1.0 for each in (less_tilted, of_other_glass))
+    return math.hypot(THICKNESS_SHARE, by_tilt, by_index)
 
 
 def check_known_phase(std: float, name: str) -> None:
@@ -155,7 +218,8 @@ def check_known_phase(std: float, name: str) -> None:
         raise AmiwarpError(
             f"{name}: the events determine the phase of the plate within {math.degrees(std):.0f} deg only (at most "
             f"{math.degrees(LARGEST_STD_RAD):.0f} deg are of use): record for longer, or nearer things with more "
-            "texture, or use a thicker plate; faces that are not parallel, or a wrong thickness or tilt, do this too"
+            "texture, or use a thicker plate; faces that are not parallel, or a wrong thickness or tilt, do this too",
+            ErrorCode.CALIBRATION_REFUSED,
         )
 
 
@@ -164,7 +228,8 @@ def check_known_phase(std: float, name: str) -> None:
 
 def turn_by_wedge(model: PlateModel) -> tuple[float, float]:
     """Return the turn of the axial ray per angle between the faces, along the tilt and across it."""
-    cosine, index = math.cos(model.plate.tilt), model.plate.index
+    cosine = math.cos(model.plate.tilt)
+    index = model.plate.index
     inside = math.sqrt(index**2 - math.sin(model.plate.tilt) ** 2)
     return inside / cosine - 1.0, inside - cosine
 
@@ -176,12 +241,31 @@ def inverse_depth_by_wedge(model: PlateModel) -> float:
 
 def phase_by_wedge(model: PlateModel, inverse_depth: NDArray[Any]) -> NDArray[np.float64]:
     """Return the change of the phase per angle between the faces across the tilt, which moves points alike."""
-    return np.asarray(-turn_by_wedge(model)[1] / (model.plate.shift * np.maximum(inverse_depth, 1e-9)), np.float64)
+    return np.asarray(
+        -turn_by_wedge(model)[1] / (model.plate.shift * np.maximum(inverse_depth, 1e-9)), np.float64
+    )
 
 
 def wedge_floor(model: PlateModel) -> float:
     """Return the standard deviation of the angle between the faces by errors of the method [rad]."""
     return WEDGE_FLOOR_PX / (turn_by_wedge(model)[1] * model.camera.fx)
+
+
+def hidden_by_faces(found: Calibration) -> dict[str, float]:
+    """Return by how much faces that are not parallel may move all points [px rms], by words; nothing if it is given.
+
+    It is the motion at depths that are known from elsewhere: found depths make up for an angle along the tilt. The
+    events do not limit that angle, so that it may be as large as in glass from stock.
+    """
+    model = found.model
+    assert isinstance(model, PlateModel)
+    largest = {name: BOUND * found.uncertainty.get(name, 0.0) for name in ("wedge_x", "wedge_y")}
+    if "wedge_x" in found.uncertainty:
+        largest["wedge_x"] = max(largest["wedge_x"], STOCK_WEDGE_RAD)
+    along, across = turn_by_wedge(model)
+    turn = math.hypot(along * largest["wedge_x"], across * largest["wedge_y"])
+    px = model.camera.fx * turn
+    return {"faces that are not parallel": px} if px > 0.0 else {}
 
 
 def with_wedge(found: Calibration, wedge: float, std: float) -> Calibration:
@@ -193,7 +277,11 @@ def with_wedge(found: Calibration, wedge: float, std: float) -> Calibration:
     assert isinstance(model, PlateModel)
     along = found.parameters.get("wedge_x")
     given = along is not None
-    uncertainty = {**found.uncertainty, "wedge_y": std, **({} if given else {"wedge_x": abs(wedge)})}
+    uncertainty = {
+        **found.uncertainty,
+        "wedge_y": std,
+        **({} if given else {"wedge_x": abs(wedge)}),
+    }
     arcmin = 60.0 * math.degrees(1.0)
     said = (
         f"the faces of the plate are not parallel: {arcmin * wedge:.2g} ± {arcmin * std:.1g} arcmin across the tilt "
@@ -207,9 +295,11 @@ def with_wedge(found: Calibration, wedge: float, std: float) -> Calibration:
             "or use a plate with parallel faces"
         )
     return replace(
-        found, parameters={**found.parameters, "wedge_x": along or 0.0, "wedge_y": wedge}, uncertainty=uncertainty,
+        found,
+        parameters={**found.parameters, "wedge_x": along or 0.0, "wedge_y": wedge},
+        uncertainty=uncertainty,
         warnings=(*found.warnings, said),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -226,7 +316,9 @@ class _Step:
         return math.sqrt(float(self.covariance[k, k]))
 
 
-def _newton(slope: NDArray[np.float64], bend: NDArray[np.float64], by: NDArray[np.float64]) -> _Step:
+def _newton(
+    slope: NDArray[np.float64], bend: NDArray[np.float64], by: NDArray[np.float64]
+) -> _Step:
     """Return the step that minimises the cost.
 
     ``slope``, ``bend``: derivatives of the cost of each pixel by the phase, (height, width); ``by``: derivatives of the
@@ -238,12 +330,16 @@ def _newton(slope: NDArray[np.float64], bend: NDArray[np.float64], by: NDArray[n
     step = -inverse @ gradient
     rest = by * (slope + bend * np.tensordot(step, by, 1))
     height, width = (n // CLUSTER_PX * CLUSTER_PX for n in slope.shape)
-    squares = rest[:, :height, :width].reshape(len(by), height // CLUSTER_PX, CLUSTER_PX, -1, CLUSTER_PX)
+    squares = rest[:, :height, :width].reshape(
+        len(by), height // CLUSTER_PX, CLUSTER_PX, -1, CLUSTER_PX
+    )
     sums = squares.sum(axis=(2, 4)).reshape(len(by), -1)
     return _Step(step, inverse @ (sums @ sums.T) @ inverse)
 
 
 def _slope(costs: PixelCosts, model: PlateModel, by: float) -> Any:
     """Return the derivative of the cost of each pixel by the phase, at a phase changed ``by`` an angle [rad]."""
-    at, plus, minus = (replace(model, phase=model.phase + by + d) for d in (0.0, SLOPE_RAD, -SLOPE_RAD))
+    at, plus, minus = (
+        replace(model, phase=model.phase + by + d) for d in (0.0, SLOPE_RAD, -SLOPE_RAD)
+    )
     return costs.gradient(at, plus, minus, 2.0 * SLOPE_RAD)

@@ -1,311 +1,227 @@
-"""Path of the prism's angle over time, found in the events: without an encoder, or where that tells too little.
+"""Path of the optic's angles over time, found in the events: without an encoder, or where it tells too little.
 
-:func:`varying_paths` finds a smooth path from the repetition of the events alone, if the speed varies much.
-:class:`PathFit` finds ripple and remaining errors by the brightness map that the photometric stage uses too.
+:class:`PathFit` corrects a first path by the brightness map that the photometric stage uses too. The correction of each
+angle is a spline whose coefficients are fitted to the residuals of the events. A first path for a speed that varies
+much comes from ``repetition_path.py``.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.brightness.solver import BrightnessMap, Tiles, off_excess
-from amiwarp.calib.calibration_events import middle_time, thin
-from amiwarp.calib.first_guess import autocorrelation
+from amiwarp.brightness.pairs import off_excess
+from amiwarp.brightness.solver import BrightnessMap
+from amiwarp.brightness.tiles import Tiles
+from amiwarp.calib.path_splines import SAMPLE_US, knots_over, spline_matrix
 from amiwarp.calib.photometric.cost import SLOPE_PX, Cost, size_and_phase_directions
 from amiwarp.calib.photometric.distances import px_per_rad
 from amiwarp.calib.photometric.pairs import check_pairs, collect_everywhere, fine_map_is_determined
-from amiwarp.errors import AmiwarpError
+from amiwarp.calib.thinning import middle_time
+from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.events.each_encoder import each_encoder, together
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
+from amiwarp.optics.models.registry import MODELS
 
 if TYPE_CHECKING:
     from amiwarp.calib.sharpness_search import Search
 
 Vector = NDArray[np.float64]
 
-SAMPLE_US = 1000
-"""Time between samples of a path that was found [us]."""
-
-
-# Smooth path from the repetition of the events. A still scene gives equally many events in each turn, whatever the
-# speed. With time counted in events, ON minus OFF events per cell therefore repeat with a constant period. A smooth
-# speed then follows from the events' times.
-
-MOST_EVENTS = 2_000_000
-"""Largest number of events that are counted, evenly thinned."""
-EVENTS_PER_BIN, FEWEST_BINS, MOST_BINS = 500, 256, 8192
-"""Number of events per bin, and limits of the number of bins."""
-CELL, MOST_CELLS = 8, 1500
-"""Smallest side of the cells in which events are counted [px], and the largest number of cells."""
-COMPONENTS, HARMONICS = 12, 6
-"""Number of principal components of the counts, and of harmonics of the angle that describe each of them."""
-UNLIKE = 0.3
-"""Correlation below which two bins are different views of the scene."""
-LIKE = 0.7
-"""Smallest correlation after a turn, as a share of the largest one."""
-LEAST_CORRELATION = 0.4
-"""Smallest correlation at which events are considered to repeat. It was 0.7 at least where they do, 0.3 by chance."""
-STEPS, LONGEST_STEP = 12, 0.5
-"""Largest number of Gauss-Newton steps, and the largest change of the angle in one of them [rad]."""
-CONVERGED = 0.003
-"""Change of the angle at which the steps end [rad]."""
-GAUGE_HARMONICS = 4
-"""Number of harmonics of the angle by which the path may be changed, to become smooth in time."""
-ENDS = 8
-"""Number of bins at each end of a recording that give the speed there."""
-LEAST_VARIATION = 0.1
-"""Smallest deviation from constant speed that is found by repetition [rad rms]. Smaller ones are left to the map."""
-LEAST_RATIO = 1.3
-"""Smallest ratio of what a constant speed leaves of the counts to what the path leaves. It was 3 at least for ramps."""
-
-
-def varying_paths(recording: Recording) -> list[Encoder]:
-    """Return the path of the prism's angle for each sense of rotation, if its speed varies much; else nothing.
-
-    The angle is 0 in the middle of the recording.
-    """
-    try:
-        t, u, counts = _count(recording)
-    except AmiwarpError:
-        return []
-    if t[-1] <= t[0]:  # all events have the same time
-        return []
-    theta, left = _follow(u, counts)
-    constant = np.asarray(np.polyval(np.polyfit(t, theta, 1), t), np.float64)
-    if float(np.std(theta - constant)) < LEAST_VARIATION:
-        return []
-    if _unexplained(constant, counts)[2] < LEAST_RATIO * left:
-        return []
-    return [_encoder(recording, t, sign * _smooth(t, theta)) for sign in (1.0, -1.0)]
-
-
-def _count(recording: Recording) -> tuple[Vector, Vector, Vector]:
-    """Return for each bin of equally many events its time [us], its angle [rad], and its counts, shape (bins, m).
-
-    Times are from the first event on. The angles assume equally many events in each turn. The counts are principal
-    components of ON minus OFF events per cell. Raises :class:`AmiwarpError` if they do not repeat.
-    """
-    events = thin(recording, MOST_EVENTS)
-    width, height = recording.events.size
-    n, side = len(events), max(CELL, math.ceil(math.sqrt(width * height / MOST_CELLS)))
-    bins, columns = min(max(n // EVENTS_PER_BIN, FEWEST_BINS), MOST_BINS), -(-width // side)
-    cells = columns * -(-height // side)
-    at = np.arange(n) * bins // n * cells + events.y // side * columns + events.x // side
-    counts = np.bincount(at, weights=2.0 * events.p - 1.0, minlength=bins * cells).reshape(bins, cells)
-    counts -= counts.mean(axis=0)
-    along = np.random.default_rng(0).normal(size=(cells, 2 * COMPONENTS))
-    for _ in range(6):  # subspace iteration
-        along = np.linalg.qr(counts.T @ (counts @ along))[0]
-    found: Any = counts @ along
-    found = found @ np.linalg.svd(found, full_matrices=False)[2][:COMPONENTS].T
-    t = (events.t[((np.arange(bins) + 0.5) * n / bins).astype(np.int64)] - events.t[0]).astype(np.float64)
-    period = _period(autocorrelation(found.astype(np.float32)), recording.name)
-    return t, np.asarray(np.arange(bins) * (math.tau / period), np.float64), np.asarray(found, np.float64)
-
-
-def _period(correlation: Vector, name: str) -> float:
-    """Return the lag after which events repeat [bins]: the first strong peak after the correlation has fallen."""
-    inner = correlation[1:-1]
-    peaks = 1 + np.flatnonzero((inner > correlation[:-2]) & (inner >= correlation[2:]))
-    peaks = peaks[peaks > np.argmax(correlation < UNLIKE)]
-    if correlation.min() >= UNLIKE or not len(peaks) or correlation[peaks].max() < LEAST_CORRELATION:
-        raise AmiwarpError(f"{name}: the events do not repeat, so the prism's path cannot be found; use an encoder")
-    first = peaks[correlation[peaks] >= LIKE * correlation[peaks].max()][0]
-    near = peaks[(peaks >= first) & (peaks < 1.3 * first)]
-    return float(near[np.argmax(correlation[near])])
-
-
-def _unexplained(theta: Vector, counts: Vector) -> tuple[Vector, Vector, float]:
-    """Fit the counts by harmonics of the angle. Return an orthonormal basis, the fit's derivative, and the share left.
-
-    The derivative by the angle has the shape of the counts.
-    """
-    k = np.arange(1, HARMONICS + 1)
-    cos, sin = np.cos(np.outer(theta, k)), np.sin(np.outer(theta, k))
-    design = np.concatenate([np.ones((len(theta), 1)), cos, sin], axis=1)
-    fit = np.linalg.lstsq(design, counts, rcond=None)[0]
-    slope = np.concatenate([-k * sin, k * cos], axis=1) @ fit[1:]
-    left = float(((counts - design @ fit) ** 2).sum() / max(float((counts**2).sum()), 1e-30))
-    return np.linalg.qr(design)[0], slope, left
-
-
-def _follow(u: Vector, counts: Vector) -> tuple[Vector, float]:
-    """Return the angles for which functions of the angle explain the counts best, and the share that they leave.
-
-    ``u`` are first angles; a spline with a knot per turn corrects them, because noise gives events in slow turns too.
-    """
-    theta = u.copy()
-    spline = _design(_knots(u, u, 1.0), u).toarray()
-    for _ in range(STEPS):
-        basis, slope, _ = _unexplained(theta, counts)
-        columns = (slope[:, :, None] * spline[:, None, :]).reshape(len(u), -1)
-        columns -= basis @ (basis.T @ columns)
-        residual = counts - basis @ (basis.T @ counts)
-        columns = columns.reshape(-1, spline.shape[1])
-        normal = columns.T @ columns
-        ridge = 1e-6 * float(np.trace(normal)) / len(normal) * np.eye(len(normal))
-        step = spline @ np.linalg.solve(normal + ridge, columns.T @ residual.ravel())
-        step -= step.mean()
-        largest = float(np.abs(step).max())
-        theta += step * min(1.0, LONGEST_STEP / max(largest, 1e-12))
-        if largest < CONVERGED:
-            break
-    return theta, _unexplained(theta, counts)[2]
-
-
-def _smooth(t: Vector, theta: Vector) -> Vector:
-    """Return the path that is smooth in time, with a knot per turn.
-
-    Counts that repeat determine the angle up to a periodic function of itself, which is chosen here.
-    """
-    spline = _design(_knots(t, theta, 1.0), t).toarray()
-    k = np.arange(1, GAUGE_HARMONICS + 1)
-    columns = np.concatenate([spline, np.cos(np.outer(theta, k)), np.sin(np.outer(theta, k))], axis=1)
-    normal = columns.T @ columns + 1e-6 * len(t) * np.eye(columns.shape[1])
-    return np.asarray(spline @ np.linalg.solve(normal, columns.T @ theta)[: spline.shape[1]])
-
-
-def _encoder(recording: Recording, t: Vector, theta: Vector) -> Encoder:
-    """Return the path through the angles ``theta`` at times ``t`` after the first event [us] as regular samples."""
-    first, last = recording.events.t_first, recording.events.t_last
-    times = np.arange(-SAMPLE_US, last - first + 2 * SAMPLE_US, SAMPLE_US, dtype=np.int64)
-    begin = _on_line(t[:ENDS], theta[:ENDS], times[0])
-    end = _on_line(t[-ENDS:], theta[-ENDS:], times[-1])
-    t = np.concatenate([times[:1], t, times[-1:]])
-    theta = np.concatenate([[begin], theta, [end]])
-    theta -= np.interp(middle_time(recording) - first, t, theta)
-    return Encoder(times + first, np.interp(times, t, theta))
-
-
-def _on_line(t: Vector, theta: Vector, at: float) -> float:
-    """Return the angle at the time ``at`` on the line fitted to some angles; the mean if they have the same time."""
-    from_mean = t - t.mean()
-    speed = float(from_mean @ theta) / max(float(from_mean @ from_mean), 1e-30)
-    return float(theta.mean()) + speed * (at - float(t.mean()))
-
-
-# Cubic splines whose knots are equally far apart in the prism's angle.
-
-
-def _knots(t: Vector, theta: Vector, per_turn: float) -> Vector:
-    """Return the knots of a cubic spline over the times ``t``, ``per_turn`` for each turn of the angle ``theta``."""
-    turned = np.maximum.accumulate(np.abs(theta - theta[0])) / math.tau
-    turned += 1e-9 * np.arange(len(t))
-    pieces = max(1, round(float(turned[-1]) * per_turn))
-    inner = np.interp(np.linspace(0.0, float(turned[-1]), pieces + 1), turned, t)
-    before, after = float(inner[1] - inner[0]), float(inner[-1] - inner[-2])
-    steps = np.arange(1, 4)
-    return np.concatenate([inner[0] - before * steps[::-1], inner, inner[-1] + after * steps])
-
-
-def _design(knots: Vector, t: Vector) -> Any:
-    """Return the cubic B-splines of the knots at the times ``t``, constant outside: sparse, shape (n, splines)."""
-    from scipy.interpolate import BSpline
-
-    return BSpline.design_matrix(np.clip(t, knots[3], knots[-4]), knots, 3)
-
-
-# Path from a brightness map: its correction is a spline whose coefficients are fitted to the residuals of the events.
-
-GATE_PAIRS, GATE_TILES = 130_000, 4
+GATE_PAIRS = 130_000
+GATE_TILES = 4
 """Approximate number of pairs of events that tell whether the speed varies, and of tiles of the map."""
-PAIRS, TILES = 300_000, 8
+PAIRS = 300_000
+TILES = 8
 """The same for the path itself."""
 KNOTS_PER_TURN = 8.0
-"""Number of the spline's knots in a turn. They resolve ripple up to the third harmonic."""
+"""Number of the spline's knots in a turn. They resolve ripple up to the third harmonic. Two angles share them: with as
+many for each, a pair of prisms followed the noise (0.036 px instead of 0.023 px)."""
 PAIRS_PER_KNOT = 100
 """Smallest mean number of pairs for each knot; with fewer pairs there are fewer knots."""
 PLAIN_SCALE = 1.0
 """Scale of the Cauchy weights while the residuals may still be large [thresholds]. A smaller one would make the steps
 too short."""
-FIRST_STEPS, MOST_STEPS = 5, 10
+FIRST_STEPS = 5
+MOST_STEPS = 10
 """Number of steps with this scale, and the largest number of all steps."""
 TOLERANCE_PX = 0.001
 """Length of a step at which the path has converged [px rms]."""
 LONGEST_EXTRAPOLATION = 3.0
 """Largest factor by which a step is extended, because the steps before shrank slowly."""
-SEARCH_STEPS, SEARCH_TOLERANCE = 10, 0.03
+SEARCH_STEPS = 10
+SEARCH_TOLERANCE = 0.03
 """Largest number of conjugate-gradient steps for the spline's coefficients, and the residual at which they end."""
 MAP_STEPS = 12
 """Number of conjugate-gradient steps that find the part of a derivative that a change of the map explains."""
 LEAST_DEVIATION_PX = 0.02
 """Smallest deviation from constant speed that is corrected [px rms]."""
-GATE_STEPS, FIRST_SHARE = 2, 0.5
+GATE_STEPS = 2
+FIRST_SHARE = 0.5
 """Number of steps that tell whether the speed varies, and the share of a deviation that the first one finds, as the map
 has adapted to the constant speed."""
 SIGNIFICANT = 5.0
-"""Number of standard deviations from which on a deviation from constant speed is significant."""
+"""Number of standard deviations above which a deviation from constant speed is significant."""
 LARGEST_ERROR_PX = 0.1
 """Largest accepted error of the path [px rms]."""
-
 SPEED_SHARE = 1.0 / 16.0
 """Part of a mean turn over which a speed is measured for the text."""
 MONOTONE = 0.8
 """Smallest share of the range of the speed between the ends of the recording for it to rise or fall."""
 
 
-class PathFit:
-    """Fit of the path of the prism's angle, and of the prism's size, to pairs of events on a brightness map."""
+@dataclass(frozen=True)
+class _Correction:
+    """Spline that corrects one of the angles, and where its coefficients are among those of all."""
 
-    def __init__(self, recording: Recording, search: Search, pairs: int = PAIRS, tiles: int = TILES) -> None:
+    angle: int
+    """Number of the angle."""
+    path: Encoder
+    """Path that it corrects."""
+    knots: Vector
+    ends: tuple[Any, Any]
+    """Its splines at the first and at the second events of the pairs, sparse, shape (pairs, splines) each."""
+    own: slice
+    """Its coefficients."""
+    px: float
+    """How far events move per angle [px rms/rad]."""
+
+    def at_first_events(self, coefficients: Vector) -> Vector:
+        """Return the correction at the first event of each pair [rad], from the coefficients of all angles."""
+        return np.asarray(self.ends[0] @ coefficients[self.own])
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Linearised equations of the pairs for the coefficients of the splines, and the sizes."""
+
+    columns: Any
+    """Derivatives of the residuals by the coefficients, and by the sizes, sparse, shape (pairs, unknowns)."""
+    residual: Vector
+    """Residual of each pair [thresholds]; 0 off the map."""
+    weight: Vector
+    """Weight of each pair; 0 off the map."""
+    used: int
+    """Number of pairs on the map."""
+
+
+class PathFit:
+    """Fit of the path of each angle of the optic, and of its sizes, to pairs of events on a brightness map."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        search: Search,
+        pairs: int = PAIRS,
+        tiles: int = TILES,
+        angles: Sequence[int] | None = None,
+    ) -> None:
         """Collect about ``pairs`` pairs at the answer of ``search``, and solve the map.
 
         The encoder of ``search`` is the first path: a constant speed, or the encoder of the recording if it has one.
+        The paths of ``angles`` are fitted, which are their numbers; by default those of all.
         Raises :class:`AmiwarpError` for too few pairs.
         """
-        space, settings = search.space, search.settings.photometric
-        self._recording, self._first = recording, search.calibration_events.encoder
+        space = search.space
+        settings = search.settings.photometric
+        self._recording = recording
+        self._first = search.calibration_events.encoder
         self._pairs, places = collect_everywhere(recording, search, settings, pairs, tiles)
         self._v = space.to_vector({**space.start, **search.best})
         excess = off_excess(self._pairs, with_leak=False)
 
         def solved_on(tiles: Tiles) -> tuple[Cost, NDArray[np.float32]]:
-            brightness = BrightnessMap(self._pairs, tiles, off_excess=excess, middle_us=space.middle_us)
+            brightness = BrightnessMap(
+                self._pairs,
+                tiles,
+                off_excess=excess,
+                middle_us=space.middle_us,
+            )
             cost = Cost.on(brightness, space, settings.steps)
             cost.warm_up(self._v)
             return cost, brightness.coverage(cost.scale)
 
         self._cost, coverage = solved_on(places)
-        if places.density > 1.0 and not fine_map_is_determined(coverage, len(self._pairs)):
+        is_fine = places.density > 1.0
+        if is_fine and not fine_map_is_determined(coverage, len(self._pairs)):
             self._cost, coverage = solved_on(places.at_density(1.0))
         check_pairs(recording.name, coverage, len(self._pairs))
-        self._along_size = size_and_phase_directions(space, self._v)[0]
-        self._px = px_per_rad(space, self._v)
-        first, last = recording.events.t_first, recording.events.t_last
+
+        # size and phase of each prism in turn
+        self._along_sizes = size_and_phase_directions(space, self._v)[0::2]
         # times of the events of the pairs after the first event of the recording [us], shape (2, pairs)
-        self._t = self._pairs.time.astype(np.float64) * 1e6 + (space.middle_us - first)
+        after_middle_us = self._pairs.time.astype(np.float64) * 1e6
+        self._t = after_middle_us + (space.middle_us - recording.events.t_first)
         self._azimuth = self._pairs.arrays.azimuth.numpy().reshape(4, -1).copy()
+        if angles is None:
+            angles = range(MODELS[space.model].ANGLES)
+        self._corrections = self._splines_of(angles)
+        # Coefficients of the corrections that are applied [rad]
+        self._found = np.zeros(self._corrections[-1].own.stop)
+        # How far events move per coefficient [px rms/rad]
+        self._px = np.zeros(len(self._found))
+        for each in self._corrections:
+            self._px[each.own] = each.px
+        # The last change of these coefficients and of the sizes [px]
+        self._last: Vector | None = None
+
+    def _splines_of(self, angles: Sequence[int]) -> list[_Correction]:
+        """Return the splines that correct some angles, given by their numbers."""
+        first = self._recording.events.t_first
+        last = self._recording.events.t_last
+        paths = each_encoder(self._first)
         times = np.arange(0, last - first + 1, SAMPLE_US, dtype=np.int64)
-        theta = self._first.angle_at(times + first)
-        turns = abs(float(theta[-1] - theta[0])) / math.tau
-        per_turn = min(KNOTS_PER_TURN, max(1.0, len(self._pairs) / PAIRS_PER_KNOT / turns))
-        self._knots = _knots(times.astype(np.float64), theta, per_turn)
-        self._splines = [_design(self._knots, t) for t in self._t]
-        self._found = np.zeros(self._splines[0].shape[1])  # coefficients of the correction that is applied [rad]
-        self._last: Vector | None = None  # the last change of these coefficients and of the size [px]
+        most_per_turn = KNOTS_PER_TURN / len(angles)
+        knots_of_angle = len(self._pairs) / len(angles) / PAIRS_PER_KNOT
+        found: list[_Correction] = []
+        place = 0
+        for angle in angles:
+            path = paths[angle]
+            theta = path.angle_at(times + first)
+            turns = abs(float(theta[-1] - theta[0])) / math.tau
+            per_turn = min(most_per_turn, max(1.0, knots_of_angle / turns))
+            knots = knots_over(times.astype(np.float64), theta, per_turn)
+            at_first = spline_matrix(knots, self._t[0])
+            at_second = spline_matrix(knots, self._t[1])
+            own = slice(place, place + at_first.shape[1])
+            place = own.stop
+            found.append(
+                _Correction(
+                    angle=angle,
+                    path=path,
+                    knots=knots,
+                    ends=(at_first, at_second),
+                    own=own,
+                    px=px_per_rad(self._cost.space, self._v, angle),
+                )
+            )
+        return found
 
     def deviates(self) -> bool:
-        """Return whether the path deviates significantly from the first one, which has a constant speed.
+        """Return whether the paths deviate significantly from the first ones, which have a constant speed.
 
         A step is repeated only if the first one finds a notable part of the deviation.
         """
         for k in range(GATE_STEPS):
-            std_px = self._improve(k)[1]
-            if self._deviation_px() < max((1.0 if k else FIRST_SHARE) * LEAST_DEVIATION_PX, SIGNIFICANT * std_px):
+            _, std_px = self._improve(k)
+            found_share = FIRST_SHARE if k == 0 else 1.0
+            least_px = max(found_share * LEAST_DEVIATION_PX, SIGNIFICANT * std_px)
+            if self._deviation_px() < least_px:
                 return False
         return True
 
     def run(self) -> tuple[Encoder, float]:
-        """Improve the path and the size until the steps are short; return the path and its deviation [px rms].
+        """Improve the paths and the sizes until the steps are short; return the path and its deviation [px rms].
 
-        The deviation is that from constant speed, or from the recording's encoder. Raises :class:`AmiwarpError` if the
-        events do not determine the path.
+        The deviation is measured from constant speed, or from the recording's encoder.
+        Raises :class:`AmiwarpError` if the events do not determine the path.
         """
         for k in range(MOST_STEPS):
             moved_px, std_px = self._improve(k)
@@ -315,123 +231,252 @@ class PathFit:
         if not error_px <= LARGEST_ERROR_PX:
             raise AmiwarpError(
                 f"{self._recording.name}: the prism's speed varies, and the events determine the path of its angle to "
-                f"{error_px:.2f} px only; use an encoder, let the prism turn steadily, or show a scene with more edges"
+                f"{error_px:.2f} px only; use an encoder, let the prism turn steadily, or show a scene with more edges",
+                ErrorCode.CALIBRATION_REFUSED,
             )
-        t = self._first.t - round(self._first.clock_offset_us) - self._recording.events.t_first
-        theta = self._first.angle + _design(self._knots, t.astype(np.float64)) @ self._found
+
+        paths = [*each_encoder(self._first)]
+        for each in self._corrections:
+            paths[each.angle] = self._corrected(each)
+        return together(paths), self._deviation_px()
+
+    def _corrected(self, each: _Correction) -> Encoder:
+        """Return the path of an angle with its correction."""
+        path = each.path
+        t_first = self._recording.events.t_first
+        t = path.t - round(path.clock_offset_us) - t_first
+        spline = spline_matrix(each.knots, t.astype(np.float64))
+        theta = path.angle + spline @ self._found[each.own]
         if self._recording.encoder is not None:  # it keeps its zero: the correction has no mean
-            return replace(self._first, angle=theta), self._deviation_px()
-        theta -= np.interp(middle_time(self._recording) - self._recording.events.t_first, t, theta)
-        return Encoder(self._first.t, theta), self._deviation_px()
+            return replace(path, angle=theta)
+        theta -= np.interp(middle_time(self._recording) - t_first, t, theta)
+        return Encoder(path.t, theta)
 
     def _improve(self, k: int) -> tuple[float, float]:
-        """Take step number ``k``; return its length and the standard deviation of the path [px rms]."""
-        plain = k < FIRST_STEPS
-        self._cost.set_scale(PLAIN_SCALE if plain else max(0.1, 1.5 * self._cost.brightness.residuals.median()))
-        change, size_px, std_px = self._step()
-        step = np.append(change * self._px, size_px)
+        """Take step number ``k``; return its length and the standard deviation of the paths [px rms]."""
+        scale = PLAIN_SCALE
+        if k >= FIRST_STEPS:
+            median = self._cost.brightness.residuals.median()
+            scale = max(0.1, 1.5 * median)
+        self._cost.set_scale(scale)
+        change, sizes_px, std_px = self._step()
+        step = np.append(change * self._px, sizes_px)
         if not np.isfinite(step).all():
             raise self._undetermined()
+
+        # Steps that shrink slowly are extended, as if the rest of the series were taken at once.
         if self._last is not None and k not in (0, FIRST_STEPS):
-            shrunk = float(step @ self._last) / max(float(self._last @ self._last), 1e-30)
-            step = step / (1.0 - min(max(shrunk, -0.5), 1.0 - 1.0 / LONGEST_EXTRAPOLATION))
+            last_square = max(float(self._last @ self._last), 1e-30)
+            shrunk = float(step @ self._last) / last_square
+            most = 1.0 - 1.0 / LONGEST_EXTRAPOLATION
+            step = step / (1.0 - min(max(shrunk, -0.5), most))
         self._last = step
-        change = step[:-1] / self._px
-        self._move(change, float(step[-1]))
-        return self._px * float(np.std(self._splines[0] @ change)), std_px
+        count = len(self._found)
+        change = step[:count] / self._px
+        self._move(change, step[count:])
+        return self._motion_px(change), std_px
+
+    def _motion_px(self, coefficients: Vector) -> float:
+        """Return how far the corrections with some coefficients move events [px rms]."""
+        moved_px = []
+        for each in self._corrections:
+            turned = each.at_first_events(coefficients)
+            moved_px.append(each.px * float(np.std(turned)))
+        return math.hypot(*moved_px)
 
     def _deviation_px(self) -> float:
-        """Return the deviation of the present path from constant speed, or from the encoder [px rms]."""
+        """Return the deviation of the present paths from constant speed, or from the encoder [px rms]."""
         if self._recording.encoder is not None:
-            return self._px * float(np.std(self._splines[0] @ self._found))
+            return self._motion_px(self._found)
+        (only,) = self._corrections  # a speed is found for one angle
         times = np.rint(self._t[0]).astype(np.int64) + self._recording.events.t_first
-        angle = self._first.angle_at(times) + self._splines[0] @ self._found
+        angle = self._first.angle_at(times) + only.at_first_events(self._found)
         t = (self._t[0] - self._t[0].mean()) * 1e-6
-        return self._px * float(np.std(angle - np.polyval(np.polyfit(t, angle, 1), t)))
+        constant_speed = np.polyval(np.polyfit(t, angle, 1), t)
+        return only.px * float(np.std(angle - constant_speed))
 
-    def _step(self) -> tuple[Vector, float, float]:
-        """Return the change of the coefficients [rad] and of the size [px], and the path's standard deviation [px].
+    def _step(self) -> tuple[Vector, Vector, float]:
+        """Return the change of the coefficients [rad] and of the sizes [px], and the paths' standard deviation [px].
 
         The map is eliminated: conjugate gradients use only products with the part of a column that no map explains.
         """
-        from scipy.linalg import cho_factor, cho_solve
-        from scipy.sparse import csr_array, diags, hstack
+        from scipy.linalg import cho_factor
+        from scipy.sparse import diags
 
-        cost, b, n = self._cost, self._cost.brightness, len(self._pairs)
-        cost.residuals(self._v, rounds=2)
-        residual, weight = (getattr(b.residuals, name).numpy()[:n].astype(np.float64) for name in ("values", "weight"))
-        ends, size = self._slopes()
-        good = np.isfinite(residual) & np.isfinite(ends).all(axis=0) & np.isfinite(size) & (weight > 0.0)
-        residual, weight, size = (np.where(good, x, 0.0) for x in (residual, weight, size))
-        ends = np.where(good, ends, 0.0)
-        by_end = [diags(end) @ spline for end, spline in zip(ends, self._splines, strict=True)]
-        columns: Any = hstack([by_end[0] + by_end[1], csr_array(size[:, None])]).tocsr()
-        b.prepare_projection()
-
-        def unexplained(column: Vector) -> Vector:
-            padded = np.zeros(self._pairs.arrays.stride, np.float32)
-            padded[:n] = column
-            left = b.unexplained(wp.array(padded, dtype=float, device=b.device), steps=MAP_STEPS)
-            return np.nan_to_num(left.numpy()[:n].astype(np.float64))
-
-        normal: Vector = (columns.T @ diags(weight) @ columns).toarray()
+        equations = self._equations()
+        columns = equations.columns
+        normal: Vector = (columns.T @ diags(equations.weight) @ columns).toarray()
         ridge = 1e-4 * float(np.median(np.diag(normal))) + 1e-12
         try:
             factor = cho_factor(normal + ridge * np.eye(len(normal)))
         except np.linalg.LinAlgError as error:  # knots without events
             raise self._undetermined() from error
-        left = -(columns.T @ (weight * unexplained(residual)))
-        x, direction = np.zeros(len(left)), cho_solve(factor, left)
-        first = power = float(left @ direction)
+
+        x = self._solve(equations, factor, ridge)
+        of_paths = len(self._found)
+        change = x[:of_paths]
+        # A mean is part of the phase.
+        for each in self._corrections:
+            change[each.own] -= float(np.mean(each.at_first_events(change)))
+        std_px = self._std_px(equations, factor)
+        return change, x[of_paths:], std_px
+
+    def _equations(self) -> _Equations:
+        """Return the equations of the pairs for the splines' coefficients and the sizes, on the map as it is."""
+        from scipy.sparse import csr_array, diags, hstack
+
+        residuals = self._cost.brightness.residuals
+        count = len(self._pairs)
+        self._cost.residuals(self._v, rounds=2)
+        residual = residuals.values.numpy()[:count].astype(np.float64)
+        weight = residuals.weight.numpy()[:count].astype(np.float64)
+        by_ends, by_sizes = self._slopes()
+
+        # Pairs off the map count nothing.
+        good = np.isfinite(residual) & np.isfinite(by_sizes).all(axis=0)
+        good &= np.isfinite(by_ends).all(axis=(0, 1))
+        good &= weight > 0.0
+        by_sizes = np.where(good, by_sizes, 0.0)
+        by_ends = np.where(good, by_ends, 0.0)
+
+        blocks: list[Any] = []
+        for each, (by_first, by_second) in zip(self._corrections, by_ends, strict=True):
+            at_first, at_second = each.ends
+            blocks.append(diags(by_first) @ at_first + diags(by_second) @ at_second)
+        blocks.append(csr_array(by_sizes.T))
+        return _Equations(
+            columns=hstack(blocks).tocsr(),
+            residual=np.where(good, residual, 0.0),
+            weight=np.where(good, weight, 0.0),
+            used=int(np.count_nonzero(good)),
+        )
+
+    def _solve(self, equations: _Equations, factor: Any, ridge: float) -> Vector:
+        """Return the coefficients and sizes that minimise the residuals, by conjugate gradients.
+
+        They are preconditioned by the normal equations for a fixed map, of which ``factor`` is the Cholesky factor.
+        """
+        from scipy.linalg import cho_solve
+
+        columns = equations.columns
+        weight = equations.weight
+        self._cost.brightness.prepare_projection()
+        left = -(columns.T @ (weight * self._unexplained(equations.residual)))
+        x = np.zeros(len(left))
+        direction = cho_solve(factor, left)
+        first_power = float(left @ direction)
+        power = first_power
         for _ in range(SEARCH_STEPS):
-            product = columns.T @ (weight * unexplained(columns @ direction)) + ridge * direction
+            moved = self._unexplained(columns @ direction)
+            product = columns.T @ (weight * moved) + ridge * direction
             length = power / max(float(direction @ product), 1e-30)
             x += length * direction
             left -= length * product
             preconditioned = cho_solve(factor, left)
-            before, power = power, float(left @ preconditioned)
-            if not power > SEARCH_TOLERANCE**2 * first:
+            before = power
+            power = float(left @ preconditioned)
+            if not power > SEARCH_TOLERANCE**2 * first_power:
                 break
             direction = preconditioned + power / before * direction
-        change = x[:-1]
-        spline, variance = self._splines[0], float(weight @ residual**2) / max(int(np.count_nonzero(good)), 1)
-        products, inverse = (spline.T @ spline).toarray() / n, cho_solve(factor, np.eye(len(normal)))[:-1, :-1]
-        std = math.sqrt(variance * float(np.sum(inverse * products)))
-        return change - float(np.mean(spline @ change)), float(x[-1]), self._px * std
+        return x
+
+    def _unexplained(self, column: Vector) -> Vector:
+        """Return the part of a column that no change of the map explains."""
+        brightness = self._cost.brightness
+        count = len(self._pairs)
+        padded = np.zeros(self._pairs.arrays.stride, np.float32)
+        padded[:count] = column
+        on_device = wp.array(padded, dtype=float, device=brightness.device)
+        rest = brightness.unexplained(on_device, steps=MAP_STEPS)
+        of_pairs = rest.numpy()[:count].astype(np.float64)
+        return np.nan_to_num(of_pairs)
+
+    def _std_px(self, equations: _Equations, factor: Any) -> float:
+        """Return the standard deviation of the paths [px rms], from the scatter of the residuals."""
+        from scipy.linalg import cho_solve
+
+        square = float(equations.weight @ equations.residual**2)
+        variance = square / max(equations.used, 1)
+        unknowns = equations.columns.shape[1]
+        inverse = cho_solve(factor, np.eye(unknowns))
+        stds_px: list[float] = []
+        for each in self._corrections:
+            spline, _ = each.ends
+            products = (spline.T @ spline).toarray() / len(self._pairs)
+            own_inverse = inverse[each.own, each.own]
+            own_variance = variance * float(np.sum(own_inverse * products))
+            stds_px.append(each.px * math.sqrt(own_variance))
+        return math.hypot(*stds_px)
 
     def _undetermined(self) -> AmiwarpError:
         return AmiwarpError(
             f"{self._recording.name}: the events do not determine the path of the prism's angle at all times; use "
-            "an encoder, or record a scene with more edges"
+            "an encoder, or record a scene with more edges",
+            ErrorCode.CALIBRATION_REFUSED,
         )
 
     def _slopes(self) -> tuple[Vector, Vector]:
-        """Return the residuals' derivatives by the angle at each event of a pair, shape (2, pairs), and by the size."""
-        b, n = self._cost.brightness, len(self._pairs)
-        ends = [end.numpy()[:n].astype(np.float64) for end in self._cost.by_angle(self._v)]
-        by = SLOPE_PX * self._along_size
-        size = b.find_slope(self._cost.at(self._v + by), self._cost.at(self._v - by), 2.0 * SLOPE_PX)
-        return np.array(ends), size.numpy()[:n].astype(np.float64)
+        """Return the residuals' derivatives by the angles and by the sizes.
 
-    def _move(self, change: Vector, size_px: float) -> None:
-        """Change the coefficients [rad] and the size [px], and turn the angles of the pairs."""
+        The first have the shape (angles, 2, pairs), for the angle at each event of a pair; the second (sizes, pairs).
+        """
+        count = len(self._pairs)
+
+        def on_host(column: Any) -> Vector:
+            return np.asarray(column.numpy()[:count], np.float64)
+
+        by_ends = []
+        for each in self._corrections:
+            first, second = self._cost.by_angle(self._v, each.angle)
+            by_ends.append([on_host(first), on_host(second)])
+        by_sizes = []
+        for along in self._along_sizes:
+            step = SLOPE_PX * along
+            larger = self._cost.at(self._v + step)
+            smaller = self._cost.at(self._v - step)
+            slope = self._cost.brightness.find_slope(larger, smaller, 2.0 * SLOPE_PX)
+            by_sizes.append(on_host(slope))
+        return np.array(by_ends), np.array(by_sizes)
+
+    def _move(self, change: Vector, sizes_px: Vector) -> None:
+        """Change the coefficients [rad] and the sizes [px], and turn the angles of the pairs."""
         self._found += change
-        self._v = self._v + size_px * self._along_size
-        n, azimuth = len(self._pairs), self._azimuth.copy()
-        for k, spline in enumerate(self._splines):
-            turn = (self._azimuth[2 * k, :n] + 1j * self._azimuth[2 * k + 1, :n]) * np.exp(1j * (spline @ self._found))
-            azimuth[2 * k, :n], azimuth[2 * k + 1, :n] = turn.real, turn.imag
+        for along, size_px in zip(self._along_sizes, sizes_px.tolist(), strict=True):
+            self._v = self._v + size_px * along
+        count = len(self._pairs)
+        angles = MODELS[self._cost.space.model].ANGLES
+        azimuth = self._azimuth.copy()
+        for each in self._corrections:
+            for k, spline in enumerate(each.ends):
+                turn = spline @ self._found[each.own]
+                if angles > 1:  # several angles are stored as they are, one as its cosine and sine
+                    azimuth[angles * k + each.angle, :count] += turn
+                    continue
+                cosine = self._azimuth[2 * k, :count]
+                sine = self._azimuth[2 * k + 1, :count]
+                turned = (cosine + 1j * sine) * np.exp(1j * turn)
+                azimuth[2 * k, :count] = turned.real
+                azimuth[2 * k + 1, :count] = turned.imag
         self._pairs.arrays.azimuth.assign(azimuth.astype(np.float32).ravel())
 
 
 def speed_in_words(path: Encoder) -> str:
     """Return how the speed of the prism changes along a path."""
-    first, last = int(path.t[0]) + SAMPLE_US, int(path.t[-1]) - 2 * SAMPLE_US  # the events' times
-    turn = 60e6 / max(abs(path.rpm), 1e-6)
-    edges = np.linspace(first, last, 1 + max(2, round((last - first) / max(SPEED_SHARE * turn, 2.0 * SAMPLE_US))))
+    # The path goes beyond the times of the events.
+    first = int(path.t[0]) + SAMPLE_US
+    last = int(path.t[-1]) - 2 * SAMPLE_US
+    turn_us = 60e6 / max(abs(path.rpm), 1e-6)
+    piece_us = max(SPEED_SHARE * turn_us, 2.0 * SAMPLE_US)
+    pieces = max(2, round((last - first) / piece_us))
+    edges = np.linspace(first, last, 1 + pieces)
     angle = path.angle_at(np.rint(edges).astype(np.int64))
-    rpm = np.abs(np.diff(angle) / np.diff(edges)) * 60e6 / math.tau
-    low, high = float(rpm.min()), float(rpm.max())
-    if abs(rpm[-1] - rpm[0]) >= MONOTONE * (high - low):
-        return f"{'rose' if rpm[-1] > rpm[0] else 'fell'} from {rpm[0]:.0f} to {rpm[-1]:.0f} rpm"
+    rad_per_us = np.diff(angle) / np.diff(edges)
+    rpm = np.abs(rad_per_us) * 60e6 / math.tau
+    low = float(rpm.min())
+    high = float(rpm.max())
+    begin = rpm[0]
+    end = rpm[-1]
+    if abs(end - begin) >= MONOTONE * (high - low):
+        how = "rose" if end > begin else "fell"
+        return f"{how} from {begin:.0f} to {end:.0f} rpm"
     return f"varied between {low:.0f} and {high:.0f} rpm"

@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypedDict
 
-from amiwarp.brightness.solver import SensorTiming
+from amiwarp.brightness.sensor_timing import SensorTiming
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
-from amiwarp.calib.parameters import check_names
-from amiwarp.choices import Sharpness
+from amiwarp.choices import SearchCost, Sharpness
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import MODELS
-from amiwarp.validation import choice, guarded, one_of, real, shown, whole
+from amiwarp.optics.models.registry import MODELS
+from amiwarp.results.parameters import check_names
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import choice, one_of, real, shown, whole
 
 LARGEST_BUDGET = 10**12
 """Upper limit of the settings that give numbers of evaluations and of events."""
@@ -24,6 +25,10 @@ STAGES = ("sharpness", "photometric")
 """Names of the stages of a calibration, in order."""
 GAUSS_NEWTON = "gauss-newton"
 """Name of the Gauss-Newton method in the settings."""
+PHASE = "phase"
+"""Name in the settings of the global search over sums in phase with the prism."""
+SEARCH_IF_UNCLEAR = "GN_DIRECT_L"
+"""Global search of :data:`AUTO` where sums in phase do not tell the motion, and on GPUs, where it takes a few ms."""
 
 
 @guarded
@@ -94,8 +99,12 @@ class Settings:
     the blur by quantisation and timing."""
     sharpness: Sharpness = Sharpness.VARIANCE
     """Measure of sharpness that the search maximises."""
-    global_algorithm: str | None = "GN_DIRECT_L"
-    """NLopt algorithm of the global search; None: no global search, the local search starts at ``start``."""
+    cost: SearchCost = SearchCost.SHARPNESS
+    """What global and local search optimise: the sharpness, or the cost of sums in phase with the prism."""
+    global_algorithm: str | None = AUTO
+    """Global search: an NLopt algorithm; ``phase``, a coarse-to-fine search over sums in phase; or ``auto``, on CPUs
+    ``phase`` where it tells the motion, else ``GN_DIRECT_L``. None: no global search, the local search starts at
+    ``start``."""
     local_algorithm: str = "LN_BOBYQA"
     """NLopt algorithm of the local search that follows the global search."""
     free: tuple[str, ...] | None = None
@@ -106,7 +115,8 @@ class Settings:
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Lower and upper bounds of free parameters by name, in the units of ``start``."""
     global_evaluations: int = 120
-    """Number of evaluations of the global search."""
+    """Number of evaluations of the global search by an NLopt algorithm. Another number than the default makes ``auto``
+    search with ``GN_DIRECT_L``."""
     local_evaluations: int = 200
     """Largest number of evaluations of each local search."""
     tolerance_px: float = 0.002
@@ -128,6 +138,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sharpness", choice(Sharpness, self.sharpness, "sharpness"))
+        object.__setattr__(self, "cost", choice(SearchCost, self.cost, "cost"))
 
     def check(self) -> None:
         """Check the settings.
@@ -139,9 +150,11 @@ class Settings:
         """
         one_of(self.model, (AUTO, *MODELS), "model")
         if self.global_algorithm is not None:
-            one_of(self.global_algorithm, GLOBAL_ALGORITHMS, "algorithm")
+            one_of(self.global_algorithm, (AUTO, PHASE, *GLOBAL_ALGORITHMS), "algorithm")
         one_of(self.local_algorithm, LOCAL_ALGORITHMS, "algorithm")
-        words = isinstance(self.stages, tuple) and all(isinstance(stage, str) for stage in self.stages)
+        words = isinstance(self.stages, tuple) and all(
+            isinstance(stage, str) for stage in self.stages
+        )
         if not words or self.stages not in (STAGES, STAGES[:1]):
             raise AmiwarpError(f"stages is {shown(self.stages)}; expected 'sharpness' or {STAGES}")
         for name in ("global_evaluations", "local_evaluations", "events"):
@@ -169,6 +182,7 @@ class CalibrationOptions(TypedDict, total=False):
     model: str
     budget_px: float | None
     sharpness: Sharpness
+    cost: SearchCost
     global_algorithm: str | None
     local_algorithm: str
     free: str | tuple[str, ...] | None

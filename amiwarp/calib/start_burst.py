@@ -21,20 +21,27 @@ from amiwarp.events.recording import (
     check_window,
     regroup,
 )
-from amiwarp.validation import check_slice, guarded
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import check_slice
 
 FEWEST_EVENTS = 200
 """Smallest number of events at the first time stamp that may be a burst."""
 LEAST_RATIO = 10
 """Smallest ratio of the number of events at the first time stamp to the number at any later one that is compared.
 Where many events share each time stamp because a clock is coarse, the first one has no more than the others."""
-COMPARED, MOST_COMPARED = 4, 1 << 20
+COMPARED = 4
+MOST_COMPARED = 1 << 20
 """Number of later events that are compared, as a multiple of the events at the first time stamp, and its limit."""
 WINDOWS_US = (20, 200, 2000)
 """Lengths of a burst that is spread over several time stamps, or that falls on a tick of a coarse clock [us]."""
-FEWEST_IN_WINDOW, LEAST_WINDOW_RATIO, FEWEST_WINDOWS = 1000, 2.0, 50
+FEWEST_IN_WINDOW = 1000
+LEAST_WINDOW_RATIO = 2.0
+FEWEST_WINDOWS = 50
 """Smallest number of events of such a burst, smallest ratio of it to the number in any later window of that length, and
 smallest number of later windows with events. The rate of a still scene changes by less, and slowly."""
+LARGEST_TAIL = 0.2
+"""Largest share of what such a burst has beyond the usual number of events in a window that the next window has. A
+burst ends. Pixels that begin at their references give many events at first too, which grow fewer slowly."""
 
 
 def without_start_burst(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
@@ -67,7 +74,11 @@ def burst_size(source: EventSource) -> int:
         t = source.slice(count, count + min(COMPARED * count, MOST_COMPARED)).t
         if len(t) and count >= LEAST_RATIO * int(_runs(t).max()):
             return count
-    return next((size for window_us in WINDOWS_US if (size := _size_within(source, window_us))), 0)
+    for window_us in WINDOWS_US:
+        size = _size_within(source, window_us)
+        if size:
+            return size
+    return 0
 
 
 def _size_within(source: EventSource, window_us: int) -> int:
@@ -79,7 +90,11 @@ def _size_within(source: EventSource, window_us: int) -> int:
     t = source.slice(count, count + MOST_COMPARED).t
     # the last window may not be whole, which makes it smaller
     later = _runs((t - first) // window_us)
-    return count if len(later) >= FEWEST_WINDOWS and count >= LEAST_WINDOW_RATIO * int(later.max()) else 0
+    if len(later) < FEWEST_WINDOWS or count < LEAST_WINDOW_RATIO * int(later.max()):
+        return 0
+    usual = float(np.median(later))
+    tail = (float(later[0]) - usual) / (count - usual)
+    return count if tail <= LARGEST_TAIL else 0
 
 
 def _runs(values: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -95,7 +110,9 @@ def reaching_back(path: Encoder, t: int) -> Encoder:
         return path
     speed = (path.angle[1] - path.angle[0]) / (path.t[1] - path.t[0])
     angle = path.angle[0] - speed * (first - t)
-    return replace(path, t=np.concatenate([[t], path.t]), angle=np.concatenate([[angle], path.angle]))
+    return replace(
+        path, t=np.concatenate([[t], path.t]), angle=np.concatenate([[angle], path.angle])
+    )
 
 
 @guarded
@@ -135,7 +152,9 @@ class LaterEvents(EventSource):
         later = self.t_first
         return self.source.between(max(t_start, later), max(t_end, later))
 
-    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+    def blocks(
+        self, *, count: int | None = None, duration_us: int | None = None
+    ) -> Iterator[Events]:
         return regroup(self._chunks(), count=count, duration_us=duration_us)
 
     def _chunks(self) -> Iterator[Events]:

@@ -6,8 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache, wraps
-from importlib.machinery import ExtensionFileLoader
+from functools import cache
 from typing import Any, NamedTuple
 
 import typer
@@ -15,9 +14,10 @@ from typer.core import TyperCommand, TyperGroup
 
 from amiwarp.cli import INTERRUPTED, STOPPED, fail
 from amiwarp.errors import AmiwarpError
-from amiwarp.tasks import interrupts_later
+from amiwarp.workarounds import load_extensions_whole
 
-BAD_INPUT, USAGE = 1, 2
+BAD_INPUT = 1
+USAGE = 2
 
 _UsageError: Any = typer.BadParameter.__base__
 """Class ``UsageError`` of click, taken from Typer, because newer versions of Typer contain their own copy of click."""
@@ -26,8 +26,8 @@ _UsageError: Any = typer.BadParameter.__base__
 class Command(NamedTuple):
     """Entry of the list of commands. Its texts are here so that ``amiwarp --help`` need not load the command."""
 
-    file: str
-    """Module of ``amiwarp.cli`` whose function ``run_NAME`` is the command, with ``_`` for a hyphen."""
+    room: str
+    """Package whose module ``commands`` has the function ``run_NAME``, with ``_`` for a hyphen."""
     summary: str
     """First sentence of the help."""
     example: str
@@ -46,27 +46,27 @@ COMMANDS = {
         "amiwarp warm-up",
     ),
     "info": Command(
-        "recordings",
+        "io",
         "Show a recording's format, events, encoder, camera, prism, IMU, frames, truth, repairs and assumptions.",
         "amiwarp info recording.h5",
     ),
     "view": Command(
-        "view",
+        "viewer",
         "Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand.",
         "amiwarp view recording.h5 --calibration calibration.json",
     ),
     "render": Command(
-        "rendering",
+        "plotting",
         "Write a film of a recording's events, with a prism or without, also in slow motion.",
         "amiwarp render events.raw slow.mp4 --speed 0.05 --window 1:1.5",
     ),
     "convert": Command(
-        "recordings",
+        "io",
         "Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.",
         "amiwarp convert events.raw recording.h5 --encoder encoder.csv --counts-per-turn 4096 --fov-deg 60",
     ),
     "filter": Command(
-        "filtering",
+        "imaging",
         "Keep part of a recording: time, region, polarity; remove hot pixels, noise, and events beyond a rate.",
         "amiwarp filter events.raw calm.h5 --window 1:3 --background-ms 10 --hot-pixels",
     ),
@@ -82,17 +82,17 @@ COMMANDS = {
         "amiwarp translate video.mp4 recording.h5 --apex-deg 1 --rpm 720",
     ),
     "dataset": Command(
-        "studies",
+        "learning",
         "Make thousands of simulated recordings from a specification, with labels, splits and a manifest.",
         "amiwarp dataset shapes.toml shapes --dry-run",
     ),
     "export": Command(
-        "studies",
+        "learning",
         "Export a data set to tar files for WebDataset, or to Parquet files for Hugging Face's datasets.",
         "amiwarp export shapes shapes-tars --to webdataset",
     ),
     "calibrate": Command(
-        "calibration",
+        "calib",
         "Find the prism's parameters by contrast maximisation: those that make the image of warped events sharpest.",
         "amiwarp calibrate recording.h5 calibration.json --figure calibration.png",
     ),
@@ -107,27 +107,37 @@ COMMANDS = {
         "amiwarp board board.pdf --board 9x6 --square-mm 30",
     ),
     "compensate": Command(
-        "calibration",
+        "compensation",
         "Compensate the prism's motion: move every event to its position without the prism.",
         "amiwarp compensate recording.h5 compensated.h5 --calibration calibration.json --iwe iwe.png",
     ),
     "reconstruct": Command(
-        "calibration",
+        "reconstruction",
         "Reconstruct a picture of the scene from the events of a window, or a video from a sliding window.",
         "amiwarp reconstruct recording.h5 picture.png --calibration calibration.json --turns 1",
     ),
+    "phase": Command(
+        "reconstruction",
+        "Write what whole turns tell of each pixel: the scene, its edges, its thresholds, and what moved.",
+        "amiwarp phase recording.h5 calibration.json phase.npz --figure phase.png",
+    ),
+    "export-c": Command(
+        "imaging",
+        "Write the sums in phase as C for a microcontroller, with a test of its integers.",
+        "amiwarp export-c phase-sums --size 32x32 --harmonics 5",
+    ),
     "pixels": Command(
-        "calibration",
+        "reconstruction",
         "Measure the ON and OFF threshold of every pixel, and find hot and dead pixels, from a calibrated recording.",
         "amiwarp pixels recording.h5 calibration.json pixels.npz",
     ),
     "depth": Command(
-        "calibration",
+        "reconstruction",
         "Find the depth of every edge from a camera at rest behind a rotating tilted plate, with its uncertainty.",
         "amiwarp depth recording.h5 calibration.json depth.npz --ply points.ply --figure depth.png",
     ),
     "chart": Command(
-        "studies",
+        "studies.chart",
         "Measure speed and error of the settings on a recording with ground truth, and draw both Pareto fronts.",
         "amiwarp chart --out amiwarp-chart --budget-px 0.3",
     ),
@@ -137,37 +147,37 @@ COMMANDS = {
         "amiwarp design --size 640x480 --fov-deg 60 --tolerance-px 0.5 --out amiwarp-design",
     ),
     "stability": Command(
-        "studies",
+        "studies.stability",
         "Calibrate simulated recordings under growing disturbances, and draw where calibration works and fails.",
         "amiwarp stability --quick --out amiwarp-atlas",
     ),
     "evaluate": Command(
-        "studies",
+        "studies.evaluate",
         "Check the AMI-EV paper's results: compare with a plain event camera on simulated worlds, and write a report.",
         "amiwarp evaluate --out evaluation --only texture",
     ),
     "truth": Command(
-        "recordings",
+        "io",
         "Export the ground truth of a simulated world: optical flow in the DSEC or MVSEC format, poses as TUM files.",
         "amiwarp truth recording.h5 exported --flow dsec --poses tum",
     ),
     "motor": Command(
-        "rig",
+        "live",
         "Set the speed of the prism's motor, stop it, print the controller's status or settings, or check it.",
         "amiwarp motor set --port /dev/ttyACM0 --rpm 720",
     ),
     "record": Command(
-        "rig",
+        "live",
         "Record events and prism angles until the source ends, --seconds have passed, or Ctrl-C.",
         "amiwarp record dv recording.h5 --port find --seconds 10",
     ),
     "live": Command(
-        "rig",
+        "live",
         "Compensate the events of a live stream and show rate, latency, coverage and sharpness on one line.",
         "amiwarp live dv --port find --calibration calibration.json --out compensated.h5",
     ),
     "emulate": Command(
-        "rig",
+        "live",
         "Emulate a prism controller with motor, encoder and index pulse, and inject faults on request.",
         "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplug@10+2",
     ),
@@ -177,7 +187,7 @@ COMMANDS = {
 
 def function_of(name: str) -> Callable[..., None]:
     """Load the module of a command and return the command's function."""
-    module = importlib.import_module(f"amiwarp.cli.{COMMANDS[name].file}")
+    module = importlib.import_module(f"amiwarp.{COMMANDS[name].room}.commands")
     function: Callable[..., None] = getattr(module, f"run_{name.replace('-', '_')}")
     return function
 
@@ -219,7 +229,9 @@ class _Group(TyperGroup):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help with the summaries, without loading the commands."""
-        self.commands = {name: TyperCommand(name, help=one.summary) for name, one in COMMANDS.items()}
+        self.commands = {
+            name: TyperCommand(name, help=one.summary) for name, one in COMMANDS.items()
+        }
         try:
             super().format_help(ctx, formatter)
         finally:
@@ -255,7 +267,8 @@ app = typer.Typer(
 
 @app.callback(invoke_without_command=True)
 def _version(
-    ctx: typer.Context, version: bool = typer.Option(False, "--version", help="Print the version and exit.")
+    ctx: typer.Context,
+    version: bool = typer.Option(False, "--version", help="Print the version and exit."),
 ) -> None:
     if version:
         import amiwarp
@@ -268,20 +281,8 @@ def _version(
 def main() -> None:
     """Run the command line and exit the process."""
     sys.unraisablehook = _repeat_dropped_interrupt
-    for method in ("create_module", "exec_module"):
-        setattr(ExtensionFileLoader, method, _loaded_whole(getattr(ExtensionFileLoader, method)))
+    load_extensions_whole()
     app(prog_name="amiwarp")
-
-
-def _loaded_whole(load: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the loader of compiled modules with Ctrl-C postponed, because some drop it: h5py, and more by Cython."""
-
-    @wraps(load)
-    def whole(*arguments: Any) -> Any:
-        with interrupts_later():
-            return load(*arguments)
-
-    return whole
 
 
 def _repeat_dropped_interrupt(unraisable: Any) -> None:

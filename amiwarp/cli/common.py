@@ -20,14 +20,14 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from amiwarp.errors import AmiwarpError, printable
+from amiwarp.errors import AmiwarpError, ErrorCode, printable
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
-from amiwarp.io import files as output
 from amiwarp.io import read_encoder_csv, read_encoder_triggers
 from amiwarp.io.camera_files import load_camera
-from amiwarp.io.files import check_regular
-from amiwarp.io.formats import LIMITS, Codec, OutputFormat, Rounding
+from amiwarp.io.inputs import check_regular
+from amiwarp.io.output_formats import LIMITS, Codec, OutputFormat, Rounding
+from amiwarp.io.outputs import protecting_files
 from amiwarp.optics.camera import LEAST_FOV, Camera
 from amiwarp.optics.prism import (
     LARGEST_APEX,
@@ -46,7 +46,8 @@ from amiwarp.validation import check_name_lengths, real
 # Options that several commands use. A group of options is a dataclass.
 
 Topic = Annotated[
-    str | None, typer.Option(help="Topic of a ROS bag, or camera of an HDF5 file, if the file holds several.")
+    str | None,
+    typer.Option(help="Topic of a ROS bag, or camera of an HDF5 file, if the file holds several."),
 ]
 """Option that chooses among several streams of events."""
 
@@ -71,20 +72,30 @@ class LayoutOptions:
         ),
     ] = None
     time_unit: Annotated[
-        Literal["s", "ms", "us", "ns"] | None, _in_layout(help="Unit of time in such a file.", show_default=False)
+        Literal["s", "ms", "us", "ns"] | None,
+        _in_layout(help="Unit of time in such a file.", show_default=False),
     ] = None
     polarity: Annotated[
         str | None,
-        _in_layout(help="Meaning of the polarities in such a file: 1=on,2=off.", metavar="VALUE=on|off,..."),
+        _in_layout(
+            help="Meaning of the polarities in such a file: 1=on,2=off.", metavar="VALUE=on|off,..."
+        ),
     ] = None
     scale_xy: Annotated[
-        int | None, _in_layout(min=1, help="Number by which x and y in such a file are divided: 32 for BS-ERGB.")
+        int | None,
+        _in_layout(
+            min=1, help="Number by which x and y in such a file are divided: 32 for BS-ERGB."
+        ),
     ] = None
     chip: Annotated[
-        str | None, _in_layout(help="Chip of the camera, if an AEDAT 2.0 file does not state it: DVS128 ...")
+        str | None,
+        _in_layout(help="Chip of the camera, if an AEDAT 2.0 file does not state it: DVS128 ..."),
     ] = None
     sort: Annotated[
-        bool, _in_layout("--sort", help="Sort the events by time, up to 33 million, which are kept in memory.")
+        bool,
+        _in_layout(
+            "--sort", help="Sort the events by time, up to 33 million, which are kept in memory."
+        ),
     ] = False
 
     def given(self) -> dict[str, Any]:
@@ -116,9 +127,9 @@ class FileOptions(LayoutOptions):
 class CameraOptions:
     """Options for the camera. They override the camera in the recording."""
 
-    fov_deg: Annotated[float | None, in_camera(help="Horizontal field of view of an ideal pinhole camera (deg).")] = (
-        None
-    )
+    fov_deg: Annotated[
+        float | None, in_camera(help="Horizontal field of view of an ideal pinhole camera (deg).")
+    ] = None
     camera: Annotated[
         Path | None,
         in_camera(
@@ -134,7 +145,10 @@ class CameraOptions:
         and the camera file has another one.
         """
         if self.camera is not None and self.fov_deg is not None:
-            raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
+            raise AmiwarpError(
+                "--fov-deg and --camera both describe the camera; give one of them",
+                ErrorCode.OPTIONS,
+            )
         if self.fov_deg is not None:
             return Camera.from_fov(width, height, fov_from(self.fov_deg, "--fov-deg"))
         if self.camera is None:
@@ -142,7 +156,9 @@ class CameraOptions:
         camera = load_camera(self.camera, (width, height))
         if fixed and (camera.width, camera.height) != (width, height):
             sizes = f"{camera.width}x{camera.height} px, the events are {width}x{height} px"
-            raise AmiwarpError(f"{self.camera}: the intrinsics are for {sizes}; give the intrinsics of this camera")
+            raise AmiwarpError(
+                f"{self.camera}: the intrinsics are for {sizes}; give the intrinsics of this camera"
+            )
         return camera
 
 
@@ -150,17 +166,24 @@ class CameraOptions:
 class NominalPrismOptions:
     """Options for the prism as its data sheet describes it."""
 
-    nominal_apex_deg: Annotated[float | None, in_prism(help="Apex angle from the prism's data sheet (deg).")] = None
+    nominal_apex_deg: Annotated[
+        float | None, in_prism(help="Apex angle from the prism's data sheet (deg).")
+    ] = None
     index: Annotated[float | None, in_prism(help="Refractive index of the prism.")] = None
-    flat_side: Annotated[FlatSide | None, in_prism(help="Direction that the prism's flat face points to.")] = None
+    flat_side: Annotated[
+        FlatSide | None, in_prism(help="Direction that the prism's flat face points to.")
+    ] = None
     second_apex_deg: Annotated[
-        float | None, in_prism(help="Apex angle of a second prism behind the first, a Risley pair (deg).")
+        float | None,
+        in_prism(help="Apex angle of a second prism behind the first, a Risley pair (deg)."),
     ] = None
     thickness_mm: Annotated[
-        float | None, in_prism(help="Thickness of a tilted plane-parallel plate instead of a prism (mm).")
+        float | None,
+        in_prism(help="Thickness of a tilted plane-parallel plate instead of a prism (mm)."),
     ] = None
     plate_tilt_deg: Annotated[
-        float | None, in_prism(help="Angle between the normal of the plate and the rotation axis (deg).")
+        float | None,
+        in_prism(help="Angle between the normal of the plate and the rotation axis (deg)."),
     ] = None
 
     def build(self, known: NominalPrism | None) -> NominalPrism | None:
@@ -168,10 +191,16 @@ class NominalPrismOptions:
 
         The apex stays unknown if neither ``known`` nor the options hold one.
         """
-        if isinstance(known, Plate) or self.thickness_mm is not None or self.plate_tilt_deg is not None:
+        if (
+            isinstance(known, Plate)
+            or self.thickness_mm is not None
+            or self.plate_tilt_deg is not None
+        ):
             return self._plate(known if isinstance(known, Plate) else None)
         given = {"index": self.index, "flat_side": self.flat_side}
-        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        changes: dict[str, Any] = {
+            name: value for name, value in given.items() if value is not None
+        }
         prism = replace(known or UnsizedPrism(), **changes)
         if self.nominal_apex_deg is not None:
             apex = apex_from(self.nominal_apex_deg, "--nominal-apex-deg")
@@ -180,18 +209,29 @@ class NominalPrismOptions:
             changes["apex"] = sized.apex
         if self.second_apex_deg is not None:
             if not isinstance(prism, Prism):
-                raise AmiwarpError("--second-apex-deg needs the apex of the first prism; give --nominal-apex-deg")
-            second = Prism(apex_from(self.second_apex_deg, "--second-apex-deg"), prism.index, prism.flat_side)
+                raise AmiwarpError(
+                    "--second-apex-deg needs the apex of the first prism; give --nominal-apex-deg",
+                    ErrorCode.OPTIONS,
+                )
+            second = Prism(
+                apex_from(self.second_apex_deg, "--second-apex-deg"), prism.index, prism.flat_side
+            )
             return replace(prism, second=second)
         return prism if changes else known
 
     def _plate(self, known: Plate | None) -> Plate:
         """Return the plate ``known`` with the values that options give."""
         if self.nominal_apex_deg is not None or self.flat_side is not None:
-            raise AmiwarpError("--nominal-apex-deg and --flat-side are those of a prism; leave them out for a plate")
-        thickness, tilt = self.thickness_mm, self.plate_tilt_deg
+            raise AmiwarpError(
+                "--nominal-apex-deg and --flat-side are those of a prism; leave them out for a plate",
+                ErrorCode.OPTIONS,
+            )
+        thickness = self.thickness_mm
+        tilt = self.plate_tilt_deg
         if known is None and (thickness is None or tilt is None):
-            raise AmiwarpError("a plate needs --thickness-mm and --plate-tilt-deg; give both")
+            raise AmiwarpError(
+                "a plate needs --thickness-mm and --plate-tilt-deg; give both", ErrorCode.OPTIONS
+            )
         plate = known or Plate(0.0, 0.0)
         return Plate(
             plate.thickness if thickness is None else thickness_from(thickness),
@@ -200,7 +240,9 @@ class NominalPrismOptions:
         )
 
 
-def complete(recording: Recording, camera: CameraOptions, prism: NominalPrismOptions | None = None) -> Recording:
+def complete(
+    recording: Recording, camera: CameraOptions, prism: NominalPrismOptions | None = None
+) -> Recording:
     """Return the recording with the camera and the prism that the options give.
 
     Options override the recording. Values without an option stay as recorded.
@@ -229,7 +271,9 @@ class EncoderOptions:
             metavar="triggers:CHANNEL",
         ),
     ] = None
-    counts_per_turn: Annotated[int | None, in_encoder(min=1, help="Encoder counts per turn.")] = None
+    counts_per_turn: Annotated[int | None, in_encoder(min=1, help="Encoder counts per turn.")] = (
+        None
+    )
     counter_bits: Annotated[
         int | None,
         in_encoder(
@@ -239,28 +283,44 @@ class EncoderOptions:
             "Default: inferred from the counts.",
         ),
     ] = None
-    direction: Annotated[Literal["1", "-1"], in_encoder(help="Counting direction; -1: backwards.")] = "1"
+    direction: Annotated[
+        Literal["1", "-1"], in_encoder(help="Counting direction; -1: backwards.")
+    ] = "1"
     second_encoder: Annotated[
-        Path | None, in_encoder(help="Encoder log of the second prism of a Risley pair, in the form of --encoder.")
+        Path | None,
+        in_encoder(
+            help="Encoder log of the second prism of a Risley pair, in the form of --encoder."
+        ),
     ] = None
     second_ratio: Annotated[
         float | None,
-        in_encoder(help="Speed of the second prism of a Risley pair relative to the first, if both are geared."),
+        in_encoder(
+            help="Speed of the second prism of a Risley pair relative to the first, if both are geared."
+        ),
     ] = None
 
     def build(self, source: Path, topic: str | None) -> Encoder | None:
         """Return the encoder of the log or of the recording's triggers, or None if neither is given."""
         if self.second_encoder is not None and self.second_ratio is not None:
-            raise AmiwarpError("--second-encoder and --second-ratio both describe the second prism; give one of them")
+            raise AmiwarpError(
+                "--second-encoder and --second-ratio both describe the second prism; give one of them",
+                ErrorCode.OPTIONS,
+            )
         first = replace(self, second_encoder=None, second_ratio=None)._first(source, topic)
         if self.second_encoder is None and self.second_ratio is None:
             return first
         if first is None:
-            raise AmiwarpError("--second-encoder and --second-ratio need the first prism's encoder; give --encoder too")
+            raise AmiwarpError(
+                "--second-encoder and --second-ratio need the first prism's encoder; give --encoder too",
+                ErrorCode.OPTIONS,
+            )
         if self.second_ratio is not None:
             return first.with_second(self.second_ratio)
         return first.with_second(
-            cast("Encoder", replace(self, encoder=self.second_encoder, encoder_from=None)._first(source, topic))
+            cast(
+                "Encoder",
+                replace(self, encoder=self.second_encoder, encoder_from=None)._first(source, topic),
+            )
         )
 
     def _first(self, source: Path, topic: str | None) -> Encoder | None:
@@ -269,7 +329,9 @@ class EncoderOptions:
         if self.encoder is None:
             if self != EncoderOptions():
                 what = "--counts-per-turn, --counter-bits and --direction describe an encoder log"
-                raise AmiwarpError(f"{what}; give --encoder or --encoder-from too")
+                raise AmiwarpError(
+                    f"{what}; give --encoder or --encoder-from too", ErrorCode.OPTIONS
+                )
             return None
         return read_encoder_csv(
             self.encoder,
@@ -281,25 +343,36 @@ class EncoderOptions:
     def _from_triggers(self, text: str, source: Path, topic: str | None) -> Encoder:
         kind, colon, channel = text.partition(":")
         if kind != "triggers" or (colon and not channel.isdecimal()):
-            raise AmiwarpError(f"--encoder-from {text!r} is unknown; write triggers:CHANNEL, for example triggers:0")
+            raise AmiwarpError(
+                f"--encoder-from {text!r} is unknown; write triggers:CHANNEL, for example triggers:0"
+            )
         if self.encoder is not None or self.counter_bits is not None:
-            raise AmiwarpError("--encoder and --counter-bits describe an encoder log; leave them or --encoder-from out")
+            raise AmiwarpError(
+                "--encoder and --counter-bits describe an encoder log; leave them or --encoder-from out",
+                ErrorCode.OPTIONS,
+            )
         return read_encoder_triggers(
-            source, int(channel or 0), counts_per_turn=self.counts_per_turn or 1, direction=int(self.direction),
+            source,
+            int(channel or 0),
+            counts_per_turn=self.counts_per_turn or 1,
+            direction=int(self.direction),
             topic=topic,
-        )  # fmt: skip
+        )
 
 
 Format = Annotated[
     OutputFormat | None,
     typer.Option(
-        help="Format to write, if the extension means another one: dsec (.h5), evt21 (.raw).", show_default=False
+        help="Format to write, if the extension means another one: dsec (.h5), evt21 (.raw).",
+        show_default=False,
     ),
 ]
 """Option that chooses a format whose extension means another one."""
 
 
-HdfCodec = Annotated[Codec, typer.Option(help="Compression of HDF5. Programs without HDF5's Blosc filter read gzip.")]
+HdfCodec = Annotated[
+    Codec, typer.Option(help="Compression of HDF5. Programs without HDF5's Blosc filter read gzip.")
+]
 """Option for the compression of HDF5."""
 
 
@@ -346,10 +419,11 @@ FORMS = {
 def number(text: str, unit: str, name: str) -> float:
     """Convert a text such as ``1.2deg`` to a value in ``unit``. Angles other than 0 need a suffix.
 
-    ``unit`` is one of ``amiwarp.calib.parameters.units()``; ``name`` is the option for error messages. Raises
+    ``unit`` is one of ``amiwarp.results.parameters.units()``; ``name`` is the option for error messages. Raises
     :class:`AmiwarpError` if the text is not such a value.
     """
-    form, suffix = FORMS[unit][1], _suffix(text, unit)
+    form = FORMS[unit][1]
+    suffix = _suffix(text, unit)
     try:
         value = float(text.strip().removesuffix(suffix))
     except ValueError:
@@ -388,7 +462,9 @@ def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
     return values
 
 
-def radians(degrees: float, name: str, low: float = -LARGEST_PHASE, high: float = LARGEST_PHASE) -> float:
+def radians(
+    degrees: float, name: str, low: float = -LARGEST_PHASE, high: float = LARGEST_PHASE
+) -> float:
     """Convert the value of the option ``name`` to radians. Raises :class:`AmiwarpError` outside low .. high [rad]."""
     return math.radians(real(degrees, name, math.degrees(low), math.degrees(high), " deg"))
 
@@ -436,7 +512,9 @@ def parse_region(text: str) -> tuple[int, int, int, int]:
     """Return the edges of a region [px]."""
     values = numbers(text, 4, "--region")
     if any(value != int(value) for value in values):
-        raise AmiwarpError(f"--region: {text!r} has fractions; give whole pixels: LEFT,TOP,RIGHT,BOTTOM")
+        raise AmiwarpError(
+            f"--region: {text!r} has fractions; give whole pixels: LEFT,TOP,RIGHT,BOTTOM"
+        )
     left, top, right, bottom = (int(value) for value in values)
     return left, top, right, bottom
 
@@ -463,7 +541,9 @@ def span(text: str, first: int, last: int) -> tuple[int, int]:
     except ValueError:
         low, high = 0, 0
     if not colon or not low < high:
-        raise AmiwarpError(f"--window {text!r} is not a time span; write START:END in seconds, for example 0.5:2")
+        raise AmiwarpError(
+            f"--window {text!r} is not a time span; write START:END in seconds, for example 0.5:2"
+        )
     return low, high
 
 
@@ -475,19 +555,28 @@ OUTPUT_FOLDER = "output folder"
 NO_FILE = "no file"
 """Mark in ``Annotated`` of an option with a path that is neither read nor written as a file."""
 
-_FORCE = Annotated[bool, _in_common("--force", help="Replace existing output files. Input files are never replaced.")]
+_FORCE = Annotated[
+    bool,
+    _in_common("--force", help="Replace existing output files. Input files are never replaced."),
+]
 
 
 @dataclass(frozen=True)
 class Common:
     """Options that every command has."""
 
-    json: Annotated[bool, _in_common("--json", help="Print one JSON object on stdout and nothing else.")] = False
+    json: Annotated[
+        bool, _in_common("--json", help="Print one JSON object on stdout and nothing else.")
+    ] = False
     device: Annotated[
         str | None,
-        _in_common(help="Device that runs the kernels: cpu, cuda:0 ... Default: cuda:0 if present, otherwise cpu."),
+        _in_common(
+            help="Device that runs the kernels: cpu, cuda:0 ... Default: cuda:0 if present, otherwise cpu."
+        ),
     ] = None
-    seed: Annotated[int, _in_common(min=0, max=2**31 - 1, help="Seed of the random number generators.")] = 0
+    seed: Annotated[
+        int, _in_common(min=0, max=2**31 - 1, help="Seed of the random number generators.")
+    ] = 0
 
 
 def command(app: typer.Typer, function: Callable[..., None], *, name: str, example: str) -> None:
@@ -501,11 +590,17 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
             parameters += _option_parameters(kind)
             groups[parameter.name] = (kind, [f.name for f in fields(kind)])
         else:
-            parameters.append(parameter.replace(annotation=kind, kind=inspect.Parameter.KEYWORD_ONLY))
+            parameters.append(
+                parameter.replace(annotation=kind, kind=inspect.Parameter.KEYWORD_ONLY)
+            )
     marks = {p.name: getattr(p.annotation, "__metadata__", ()) for p in parameters}
     writes = any(OUTPUT in mark or OUTPUT_FOLDER in mark for mark in marks.values())
     if writes:
-        parameters.append(inspect.Parameter("force", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_FORCE))
+        parameters.append(
+            inspect.Parameter(
+                "force", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_FORCE
+            )
+        )
 
     @functools.wraps(function)
     def run(**values: Any) -> None:
@@ -513,14 +608,18 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
         paths = list(_paths(values))
         for _, path in paths:
             check_name_lengths(path)
-        inputs = [path for name, path in paths if not {OUTPUT, OUTPUT_FOLDER, NO_FILE} & set(marks[name])]
+        inputs = [
+            path for name, path in paths if not {OUTPUT, OUTPUT_FOLDER, NO_FILE} & set(marks[name])
+        ]
         for path in inputs:
-            if path.exists() and not path.is_dir():  # the command itself reports missing files and folders
+            if (
+                path.exists() and not path.is_dir()
+            ):  # the command itself reports missing files and folders
                 check_regular(path)
         outputs = [path for name, path in paths if OUTPUT in marks[name]]
         for key, (kind, names) in groups.items():
             values[key] = kind(**{n: values.pop(n) for n in names})
-        with output.run(inputs, outputs, overwrite=force):
+        with protecting_files(inputs, outputs, overwrite=force):
             function(**values)
 
     del run.__wrapped__  # otherwise Typer would read the signature of ``function``
@@ -559,12 +658,15 @@ def choose_device(name: str | None) -> str:
 
     Raises :class:`AmiwarpError` if the named device is not available.
     """
-    from amiwarp.kernels.launch import start_quietly
+    from amiwarp.kernels.quiet_start import start_quietly
 
     known = start_quietly()
     chosen = name or ("cuda:0" if "cuda:0" in known else "cpu")
     if chosen not in known:
-        raise AmiwarpError(f"device {chosen!r} is not available; choose one of {', '.join(known)}")
+        raise AmiwarpError(
+            f"device {chosen!r} is not available; choose one of {', '.join(known)}",
+            ErrorCode.DEVICE_MISSING,
+        )
     return chosen
 
 
@@ -575,9 +677,18 @@ def progress(what: str, *, average_s: float = 30.0) -> Iterator[Progress]:
     The remaining time follows from the mean speed of the last ``average_s`` [s].
     """
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
     with rich.progress.Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal, speed_estimate_period=average_s
+        *columns,
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+        speed_estimate_period=average_s,
     ) as bar:
         task = bar.add_task(printable(what), total=1.0)
         yield lambda what, share: bar.update(task, completed=share, description=printable(what))
@@ -626,14 +737,16 @@ def table(rows: Iterable[tuple[str, ...]], *headings: str) -> Table:
     grid = Table(box=None, show_header=bool(headings), pad_edge=False, header_style="bold")
     cells = [[Text(printable(cell)) for cell in row] for row in rows]
     for k in range(max((len(row) for row in cells), default=len(headings))):
-        grid.add_column(headings[k] if headings else "", style="dim" if k == 0 and not headings else None)
+        grid.add_column(
+            headings[k] if headings else "", style="dim" if k == 0 and not headings else None
+        )
     for row in cells:
         grid.add_row(*row)
     return grid
 
 
 def assumption_lines(texts: Iterable[str]) -> list[str]:
-    """Return the lines that say what was assumed of an input, :func:`amiwarp.io.file_scan.assumed_texts`."""
+    """Return the lines that say what was assumed of an input, :func:`amiwarp.io.assumptions.assumed_texts`."""
     return [f"note: assumed {text}" for text in texts]
 
 
@@ -641,7 +754,9 @@ def format_notes(d: dict[str, Any]) -> list[str]:
     """Return what the format of the output has changed and left out."""
     lines = []
     if d["rounding"] is not None:
-        lines.append(f"note: rounded to whole pixels ({d['rounding']}); {d['dropped']:,} events outside are dropped")
+        lines.append(
+            f"note: rounded to whole pixels ({d['rounding']}); {d['dropped']:,} events outside are dropped"
+        )
     if d["left_out"]:
         native = d["format"] is OutputFormat.NATIVE
         who = "the new file" if native else f"{LIMITS[d['format']].label} does not hold, and"

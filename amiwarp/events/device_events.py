@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal
@@ -13,164 +13,30 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp import validation
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import recording as checks
-from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, described, regroup, slice_bounds
+from amiwarp.events.device_columns import THREADS, cast, event_column
+from amiwarp.events.recording import (
+    DEFAULT_BLOCK,
+    Events,
+    EventSource,
+    check_coordinates,
+    check_events,
+    check_window,
+    described,
+    regroup,
+    slice_bounds,
+    wrong_polarity,
+)
+from amiwarp.events.recording import check_order as check_events_order
 from amiwarp.kernels import events as kernels
+from amiwarp.kernels.event_times import find_times, take_times
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import (
-    TIME_LIMIT,
-    as_times,
-    check_slice,
-    guarded,
-    instance,
-    on_gpu,
-    one_of,
-    packed,
-    shown,
-    whole,
-)
-
-# Arrays of any library as Warp arrays, through DLPack: without a copy if the type allows, else with a checked copy.
-
-HOST: dict[str, Callable[[str, Any, str], Any]] = {
-    "x": lambda name, values, _: checks.as_coordinate(name, values),
-    "y": lambda name, values, _: checks.as_coordinate(name, values),
-    "t": lambda _, values, unit: as_times(values, unit=unit),
-    "p": lambda _, values, __: checks.as_polarity(values),
-}
-"""Conversion of each column of events in host memory, from its name, its values and the unit of times."""
-
-
-def event_column(name: str, values: Any, device: Any, t_unit: str) -> Any:
-    """Return the column ``x``, ``y``, ``t`` or ``p`` of events as a contiguous Warp array of the type that it needs.
-
-    ``device``: where to put it; None for where the values are. ``t_unit``: unit of times, in ``TIME_UNITS``.
-    """
-    if on_gpu(values):
-        found = converted(name, import_array(values, f"events' {name}"), t_unit)
-    else:
-        host = packed(HOST[name](name, values, t_unit))
-        found = wp.array(host, dtype=wp.dtype_from_numpy(host.dtype), device="cpu", copy=False)
-    return found if device is None else found.to(device)
-
-
-def import_array(values: Any, what: str) -> Any:
-    """Return a contiguous Warp array of the values; truth values become uint8.
-
-    The array that owns the memory is kept alive. Work on it that its library has not finished yet is awaited by Warp's
-    current stream, as DLPack says. Raises :class:`AmiwarpError` if the values cannot be read so.
-    """
-    try:
-        found = values if isinstance(values, wp.array) else wp.from_dlpack(values)
-    except Exception as error:  # every library has its own
-        raise AmiwarpError(f"{what} cannot be read through DLPack: {error}") from error
-    found = found if found.is_contiguous or not found.size else found.contiguous()
-    found = found.view(wp.uint8) if found.dtype is wp.bool else found
-    if not wp.types.type_is_scalar(found.dtype):
-        raise AmiwarpError(f"{what} has values of type {wp.types.type_repr(found.dtype)}; expected numbers")
-    return found
-
-
-def converted(name: str, values: Any, t_unit: str = "us") -> Any:
-    """Return a column in the type that events need, as a checked copy if it has another type."""
-    integers = wp.types.type_is_int(values.dtype)
-    if name == "t":
-        return _times(values, validation.TIME_UNITS[one_of(t_unit, validation.TIME_UNITS, "t_unit")], integers)
-    if name == "p":
-        if values.dtype is wp.uint8:
-            return values  # the caller checks that it is 0 or 1
-        return polarities(values)
-    if values.dtype in (wp.uint16, wp.float32):
-        return values
-    if integers:
-        what = f"{name} holds a coordinate outside 0 .. 65535 px"
-        return _checked(kernels.narrow_integers, values, wp.int64, wp.uint16, what)
-    what = f"{name} holds a coordinate that float32 cannot hold; drop that event"
-    return _checked(kernels.narrow_floats, values, wp.float64, wp.float32, what)
-
-
-def polarities(values: Any) -> Any:
-    """Return polarities as uint8, checked as by :func:`amiwarp.events.recording.as_polarity`."""
-    out = wp.empty(values.shape, dtype=wp.uint8, device=values.device)
-    if values.ndim != 1 or not values.size:  # the caller names the shapes
-        return out
-    none = len(values)
-    first = wp.full(3, none, dtype=int, device=values.device)
-    given = [cast(values, wp.float64)]
-    wp.launch(kernels.narrow_polarities, len(values), inputs=given, outputs=[out, first], device=values.device)
-    minus, zero, other = first.numpy().tolist()
-    if other < none or max(minus, zero) < none:  # the check on the host names the value
-        raise checks.wrong_polarity(values.numpy())
-    return out
-
-
-def _times(values: Any, scale: float, integers: bool) -> Any:
-    """Return times as int64 [us], checked as by :func:`amiwarp.events.recording.as_times`."""
-    if scale == 1.0 and integers:
-        if values.dtype is wp.uint64:
-            return _checked(kernels.narrow_times, values, wp.uint64, wp.int64, "t is beyond 2**62 us of 0")
-        return cast(values, wp.int64)
-    dtype = np.dtype(wp.dtype_to_numpy(values.dtype))
-    what = {
-        3: "t is not finite or beyond 2**62 us of 0",
-        2: f"t holds fractions: {validation.FRACTION_OF_US}",
-        1: f"t reaches beyond {validation.largest_exact_time(dtype):g} us, and {dtype} {validation.COARSE_TIMES}",
-    }
-    inputs = [scale, validation.largest_exact_time(dtype)]
-    return _checked(kernels.round_times, values, wp.float64, wp.int64, what, inputs)
-
-
-def cast(values: Any, dtype: Any) -> Any:
-    """Return the values in another type, without a copy if they have it."""
-    if values.dtype is dtype:
-        return values
-    out = wp.empty(values.shape, dtype=dtype, device=values.device)
-    if values.size:
-        wp.utils.array_cast(values, out)
-    return out
-
-
-def _checked(
-    kernel: Any, values: Any, wide: Any, dtype: Any, what: str | dict[int, str], inputs: Sequence[float] = ()
-) -> Any:
-    """Return a converted copy. Raises :class:`AmiwarpError` if the kernel finds a bad value.
-
-    ``what``: what is wrong, by the kernel's number of the fault if it finds several. ``inputs``: more inputs of the
-    kernel.
-    """
-    if values.ndim != 1:  # the caller names the shapes
-        return wp.empty(values.shape, dtype=dtype, device=values.device)
-    out, bad = wp.empty(values.shape, dtype=dtype, device=values.device), wp.zeros(1, dtype=int, device=values.device)
-    wp.launch(kernel, len(values), inputs=[cast(values, wide), *inputs], outputs=[out, bad], device=values.device)
-    fault = int(bad.numpy()[0])
-    if fault:
-        raise AmiwarpError(f"events' {what if isinstance(what, str) else what[fault]}")
-    return out
-
-
-THREADS = 1 << 15
-"""Number of CUDA threads that look for the limits of events, or for a bad value."""
-
-
-def first_beyond(values: Any, most: float) -> int:
-    """Return the index of the first value of a flat float32 array that is NaN or not within ``most`` of 0.
-
-    The result is the number of values if there is none.
-    """
-    count = values.size
-    if not count:
-        return 0
-    found = wp.full(1, count, dtype=int, device=values.device)
-    threads = min(count, THREADS) if values.device.is_cuda else 1
-    inputs = [values, most, threads]
-    wp.launch(kernels.find_beyond, threads, inputs=inputs, outputs=[found], device=values.device)
-    return int(found.numpy()[0])
-
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import TIME_LIMIT, check_slice, instance, shown, whole
 
 NAMES = ("x", "y", "t", "p")
+"""Names of the columns."""
 COORDINATES = (("uint16", "uint16"), ("float32", "float32"))
 """Types of x and y: of a sensor, or compensated."""
 
@@ -209,7 +75,9 @@ class DeviceEvents:
     _limits: list[int] = field(default_factory=list, repr=False, init=False)
 
     def __post_init__(self) -> None:
-        arrays = {name: instance(getattr(self, name), wp.array, f"events' {name}") for name in NAMES}
+        arrays = {
+            name: instance(getattr(self, name), wp.array, f"events' {name}") for name in NAMES
+        }
         shapes = {name: array.shape for name, array in arrays.items()}
         if any(shape != (self.t.size,) for shape in shapes.values()):
             raise AmiwarpError(f"event arrays have shapes {shapes}; expected one length (n,)")
@@ -217,15 +85,25 @@ class DeviceEvents:
         if len(set(devices.values())) > 1:
             raise AmiwarpError(f"event arrays are on devices {devices}; put them on one device")
         types = {name: array.dtype.__name__ for name, array in arrays.items()}
-        if (types["t"], types["p"]) != ("int64", "uint8") or (types["x"], types["y"]) not in COORDINATES:
+        coordinates = (types["x"], types["y"])
+        if coordinates not in COORDINATES or (types["t"], types["p"]) != ("int64", "uint8"):
             wanted = "x and y both uint16 (whole pixels) or both float32, t int64, p uint8"
             raise AmiwarpError(f"event arrays have types {types}; expected {wanted}")
         if any(array.size and not array.is_contiguous for array in arrays.values()):
-            raise AmiwarpError("event arrays have gaps between their values; DeviceEvents.from_arrays copies them")
+            raise AmiwarpError(
+                "event arrays have gaps between their values; DeviceEvents.from_arrays copies them"
+            )
 
     @classmethod
     def from_arrays(
-        cls, x: Any, y: Any, t: Any, p: Any, *, t_unit: Literal["us", "s"] = "us", device: Any = None
+        cls,
+        x: Any,
+        y: Any,
+        t: Any,
+        p: Any,
+        *,
+        t_unit: Literal["us", "s"] = "us",
+        device: Any = None,
     ) -> DeviceEvents:
         """Create events from arrays of NumPy, Warp, PyTorch, CuPy, JAX or any other library with DLPack.
 
@@ -257,18 +135,24 @@ class DeviceEvents:
         AmiwarpError
             If the arrays differ in length or device; or for values that :meth:`Events.from_arrays` refuses.
         """
-        given = {"x": x, "y": y, "t": t, "p": p}
-        events = cls(*(event_column(name, values, device, t_unit) for name, values in given.items()))
+        events = cls(
+            event_column("x", x, device, t_unit),
+            event_column("y", y, device, t_unit),
+            event_column("t", t, device, t_unit),
+            event_column("p", p, device, t_unit),
+        )
         if not len(events):
             return events
         first, last, right, bottom, polarity, _ = limits(events)
         if not -TIME_LIMIT < first <= last < TIME_LIMIT:
-            raise AmiwarpError(f"times span {first} .. {last} us; expected microseconds within {TIME_LIMIT} us of 0")
+            raise AmiwarpError(
+                f"times span {first} .. {last} us; expected microseconds within {TIME_LIMIT} us of 0"
+            )
         if max(right, bottom) >= int(kernels.BEYOND):
             raise AmiwarpError("events' x or y holds an infinite coordinate; drop that event")
         check_order(events)
         if polarity > 1:
-            raise checks.wrong_polarity(events.p.numpy())
+            raise wrong_polarity(events.p.numpy())
         return events
 
     @classmethod
@@ -290,8 +174,12 @@ class DeviceEvents:
         if len(blocks) == 1:
             return blocks[0]
         pixels = wp.uint16 if all(block.whole_pixels for block in blocks) else wp.float32
-        types = {"x": pixels, "y": pixels, "t": wp.int64, "p": wp.uint8}
-        events = cls(*(join([cast(getattr(block, name), kind) for block in blocks]) for name, kind in types.items()))
+        events = cls(
+            join([cast(block.x, pixels) for block in blocks]),
+            join([cast(block.y, pixels) for block in blocks]),
+            join([block.t for block in blocks]),
+            join([block.p for block in blocks]),
+        )
         wait(events.device)
         return events
 
@@ -302,7 +190,7 @@ class DeviceEvents:
 
     @property
     def whole_pixels(self) -> bool:
-        """Whether the coordinates are those of a sensor, not compensated."""
+        """Whether the coordinates are a sensor's, not compensated."""
         return self.x.dtype is wp.uint16
 
     @property
@@ -334,49 +222,65 @@ class DeviceEvents:
         return DeviceEvents(*(part(getattr(self, name), start, stop) for name in NAMES))
 
     def __repr__(self) -> str:
-        facts = (f"on {self.device}", *(() if self.whole_pixels else ("compensated",)))
-        ends = [int(part(self.t, at, at + 1).numpy()[0]) for at in (0, len(self) - 1)] if len(self) else None
-        return described("DeviceEvents", *facts, span=None if ends is None else (ends[0], ends[1]), count=len(self))
+        facts = [f"on {self.device}"]
+        if not self.whole_pixels:
+            facts.append("compensated")
+        span = None
+        count = len(self)
+        if count:
+            first = int(part(self.t, 0, 1).numpy()[0])
+            last = int(part(self.t, count - 1, count).numpy()[0])
+            span = (first, last)
+        return described("DeviceEvents", *facts, span=span, count=count)
 
 
 def part(values: wp.array, start: int, stop: int) -> wp.array:
     """Return the values with ``0 <= start <= index < stop``: a view, unless it is empty, which Warp does not allow."""
-    return values[start:stop] if start < stop else wp.empty(0, dtype=values.dtype, device=values.device)
+    if start < stop:
+        return values[start:stop]
+    return wp.empty(0, dtype=values.dtype, device=values.device)
 
 
 def join(arrays: Sequence[wp.array]) -> wp.array:
     """Return one array of the values of several arrays on one device, of which there is at least one."""
     if len(arrays) == 1:
         return arrays[0]
-    out = wp.empty(sum(map(len, arrays)), dtype=arrays[0].dtype, device=arrays[0].device)
-    at = 0
-    for values in filter(len, arrays):
-        wp.copy(out, values, dest_offset=at)
-        at += len(values)
+    count = sum(len(values) for values in arrays)
+    out = wp.empty(count, dtype=arrays[0].dtype, device=arrays[0].device)
+    place = 0
+    for values in arrays:
+        if len(values):
+            wp.copy(out, values, dest_offset=place)
+        place += len(values)
     return out
 
 
 def limits(events: DeviceEvents) -> list[int]:
     """Return first and last time [us], largest x and y [px], largest p, and 1 if times decrease anywhere.
 
-    Largest x and y are 0 for compensated events. Found once; those of a part of :class:`DeviceMemoryEvents` are limits
-    of all its events. Raises :class:`AmiwarpError` if there are no events.
+    Largest x and y are 0 for compensated events. They are found once. For a part of :class:`DeviceMemoryEvents`, all
+    but the times are limits of all its events. Raises :class:`AmiwarpError` if there are no events.
     """
     if not len(events):
-        raise AmiwarpError("there are no events, so there is no first or last time; check len() first")
-    if not events._limits:
-        found = wp.array(np.array([2**63 - 1, -(2**63), 0, 0, 0, 0]), dtype=wp.int64, device=events.device)
-        threads = min(len(events), THREADS) if events.device.is_cuda else 1
-        inputs = [events.x, events.y, events.t, events.p, threads]
-        wp.launch(kernels.find_limits, threads, inputs=inputs, outputs=[found], device=events.device)
-        events._limits.extend(found.numpy().tolist())
+        raise AmiwarpError(
+            "there are no events, so there is no first or last time; check len() first"
+        )
+    if events._limits:
+        return events._limits
+    device = events.device
+    none = np.array([2**63 - 1, -(2**63), 0, 0, 0, 0])
+    found = wp.array(none, dtype=wp.int64, device=device)
+    threads = min(len(events), THREADS) if device.is_cuda else 1
+    inputs = [events.x, events.y, events.t, events.p, threads]
+    wp.launch(kernels.find_limits, threads, inputs=inputs, outputs=[found], device=device)
+    events._limits.extend(found.numpy().tolist())
     return events._limits
 
 
 def check_order(events: Events | DeviceEvents, first_index: int = 0) -> None:
     """Raise :class:`AmiwarpError` if an event is earlier than the one before. ``first_index``: of the first event."""
     if isinstance(events, Events):
-        checks.check_order(events, where="events", first_index=first_index)
+        check_events_order(events, where="events", first_index=first_index)
     elif len(events) and limits(events)[5]:
         check_order(events.to_host(), first_index)  # it names the event
 
@@ -386,17 +290,19 @@ def check_inside(events: Events | DeviceEvents, width: int, height: int) -> None
     if not len(events) or not events.whole_pixels:
         return
     if isinstance(events, DeviceEvents):
-        right, bottom = limits(events)[2:4]
+        _, _, right, bottom, _, _ = limits(events)
         if right < width and bottom < height:
             return
         events = events.to_host()  # it names the event; the limits may be of more events
-    checks.check_coordinates(events, width, height, where="events")
+    check_coordinates(events, width, height, where="events")
 
 
 def check_sensor(events: Events | DeviceEvents) -> None:
     """Raise :class:`AmiwarpError` for compensated events; events from a sensor have uint16 coordinates."""
     if not events.whole_pixels:
-        raise AmiwarpError("event coordinates are float32, already compensated; give events from a sensor (uint16)")
+        raise AmiwarpError(
+            "event coordinates are float32, already compensated; give events from a sensor (uint16)"
+        )
 
 
 def time_span(events: Events | DeviceEvents) -> tuple[int, int]:
@@ -408,22 +314,34 @@ def time_span(events: Events | DeviceEvents) -> tuple[int, int]:
 
 def times_at(events: Events | DeviceEvents, indices: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the times of a few events [us]."""
-    if isinstance(events, Events) or events.device.is_cpu:
-        return (events.t if isinstance(events, Events) else events.t.numpy())[indices]
-    return _look_up(kernels.take_times, events.t, indices)
+    times = _times_on_host(events)
+    if times is not None:
+        return times[indices]
+    return _look_up(take_times, events.t, indices)
 
 
 def find_indices(events: Events | DeviceEvents, times: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index of the first event at or after each time."""
-    if isinstance(events, Events) or events.device.is_cpu:
-        return np.searchsorted(events.t if isinstance(events, Events) else events.t.numpy(), times).astype(np.int64)
-    return _look_up(kernels.find_times, events.t, times)
+    on_host = _times_on_host(events)
+    if on_host is not None:
+        return np.searchsorted(on_host, times).astype(np.int64)
+    return _look_up(find_times, events.t, times)
+
+
+def _times_on_host(events: Events | DeviceEvents) -> NDArray[np.int64] | None:
+    """Return the times [us] if they are in memory of the host, without a copy; None if they are on a GPU."""
+    if isinstance(events, Events):
+        return events.t
+    if events.device.is_cpu:
+        return np.asarray(events.t.numpy())
+    return None
 
 
 def _look_up(kernel: Any, t: wp.array, given: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return what a kernel finds in the times of events on a device for each given number."""
     if not len(given):
         return given.copy()
+    # The kernel replaces the numbers by what it finds.
     shared = host_numbers(len(given), wp.int64, t.device)
     shared.numpy()[: len(given)] = given
     launch(kernel, len(given), [t, shared], [shared], device=t.device)
@@ -453,7 +371,7 @@ def host_numbers(n: int, dtype: Any, device: Any) -> wp.array:
 
 
 def device_for(events: Events | DeviceEvents, device: Any) -> Any:
-    """Return the device to compute on: that of events on a device, else ``device``, "cpu" if it is None.
+    """Return the device to compute on: where the events are if they are on a device, else ``device``, "cpu" if None.
 
     Raises :class:`AmiwarpError` if events are on another device than ``device``.
     """
@@ -488,9 +406,6 @@ def _keep_memory(name: str) -> None:
         wp.set_mempool_release_threshold(device, min(1 << 30, device.total_memory // 16))
 
 
-# A source of events that are held on a device.
-
-
 @guarded
 class DeviceMemoryEvents(EventSource):
     """Source of events that are held on a device, for recordings.
@@ -522,11 +437,15 @@ class DeviceMemoryEvents(EventSource):
 
     def __init__(self, events: DeviceEvents, width: int, height: int) -> None:
         instance(events, DeviceEvents, "events on a device")
-        width, height = (whole(size, "frame size", 1, LARGEST_SIZE, " pixels") for size in (width, height))
+        width = whole(width, "frame size", 1, LARGEST_SIZE, " pixels")
+        height = whole(height, "frame size", 1, LARGEST_SIZE, " pixels")
         if len(events):
             _, _, right, bottom, polarity, decreases = limits(events)
-            if right >= width or bottom >= height or polarity > 1 or decreases:  # the check on the host names the event
-                checks.check_events(events.to_host(), width, height, where="events on a device", allow_nan=True)
+            outside = right >= width or bottom >= height
+            if outside or polarity > 1 or decreases:
+                # The check on the host names the event.
+                where = "events on a device"
+                check_events(events.to_host(), width, height, where=where, allow_nan=True)
         self._events = events
         self._size = (width, height)
 
@@ -606,12 +525,15 @@ class DeviceMemoryEvents(EventSource):
         AmiwarpError
             If the end is before the start.
         """
-        checks.check_window(t_start, t_end)
+        check_window(t_start, t_end)
         start, stop = find_indices(self._events, np.array([t_start, t_end])).tolist()
         return self[start:stop]
 
-    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
-        chunks = (self.slice(start, start + DEFAULT_BLOCK) for start in range(0, len(self), DEFAULT_BLOCK))
+    def blocks(
+        self, *, count: int | None = None, duration_us: int | None = None
+    ) -> Iterator[Events]:
+        starts = range(0, len(self), DEFAULT_BLOCK)
+        chunks = (self.slice(start, start + DEFAULT_BLOCK) for start in starts)
         return regroup(chunks, count=count, duration_us=duration_us)
 
 
@@ -622,7 +544,8 @@ class DeviceValues:
         self._values = values
 
     def __getitem__(self, which: slice, /) -> NDArray[Any]:
-        return np.asarray(part(self._values, *slice_bounds(which, len(self._values), "values")).numpy())
+        start, stop = slice_bounds(which, len(self._values), "values")
+        return np.asarray(part(self._values, start, stop).numpy())
 
 
 def device_of(source: EventSource, device: Any) -> Any:

@@ -15,27 +15,25 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_che
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.truth import Instants, StoredInstants, Truth
+from amiwarp.events.other_sensors import ImageStore, ImuSamples
+from amiwarp.events.truth import Truth
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import NominalPrism
+from amiwarp.schema.calls import guarded
+from amiwarp.schema.type_names import not_called
 from amiwarp.validation import (
     INT64,
     TIME_LIMIT,
     as_times,
     check_slice,
-    guarded,
     instance,
-    not_called,
     packed,
     shown,
     whole,
 )
 from amiwarp.validation import array as as_numbers
-
-# Conversion and checks of event arrays: types, time limits, frame and order.
-
 
 SENSOR_DTYPE = np.dtype(np.uint16)
 """Data type of pixel coordinates from a sensor. Compensated events have float32 coordinates instead."""
@@ -45,12 +43,15 @@ def as_coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
     """Return coordinates [px] as uint16 if they are integers, as float32 if they are floating."""
     array = as_numbers(values, f"events' {name}")
     if not array.size:
-        return array.astype(array.dtype if array.dtype in (np.uint16, np.float32) else np.uint16)
+        usable = array.dtype in (np.uint16, np.float32)
+        return array.astype(array.dtype if usable else np.uint16)
     if array.dtype.kind == "f":
         with np.errstate(over="ignore"):
             short = array.astype(np.float32, copy=False)
         if np.isinf(short).any():
-            raise AmiwarpError(f"events' {name} holds a coordinate that is too large for float32; drop that event")
+            raise AmiwarpError(
+                f"events' {name} holds a coordinate that is too large for float32; drop that event"
+            )
         return short
     if array.dtype == np.uint16:
         return array
@@ -84,12 +85,17 @@ def wrong_polarity(values: NDArray[Any]) -> AmiwarpError:
     bad = ~np.isin(values, (-1, 0, 1))
     mixed = not bad.any()
     if mixed:
-        bad = values == (0 if values.flat[int(np.argmax(values != 1))] == -1 else -1)
+        # Both 0 and -1 stand for OFF: the one that comes second is wrong.
+        first_off = values.flat[int(np.argmax(values != 1))]
+        other_off = 0 if first_off == -1 else -1
+        bad = values == other_off
     at = int(np.argmax(bad))
-    given = f"events' p holds {shown(values.flat[at].item())} (number {at})"
+    value = values.flat[at]
+    given = f"events' p holds {shown(value.item())} (number {at})"
     if mixed:
-        return AmiwarpError(f"{given}, but also {'0' if values.flat[at] == -1 else '-1'}; OFF is either 0 or -1")
-    hint = "; if ON is 255 and OFF is 0, give p > 0" if values.flat[at] == 255 else ""
+        other = "0" if value == -1 else "-1"
+        return AmiwarpError(f"{given}, but also {other}; OFF is either 0 or -1")
+    hint = "; if ON is 255 and OFF is 0, give p > 0" if value == 255 else ""
     return AmiwarpError(f"{given}; expected 1 for ON, and 0 or -1 for OFF{hint}")
 
 
@@ -117,17 +123,26 @@ def check_events(
     """
     if not len(events):
         return
-    check_coordinates(events, width, height, where=where, first_index=first_index, allow_nan=allow_nan)
+    check_coordinates(
+        events, width, height, where=where, first_index=first_index, allow_nan=allow_nan
+    )
     fail = partial(_fail, events, where, first_index)
     check_order(events, where=where, first_index=first_index)
     if after_t is not None and events.t[0] < after_t:
         fail(np.ones(1, np.bool_), f"is earlier than the one before ({after_t} us); sort by time")
     if not (events.t[0] > -TIME_LIMIT and events.t[-1] < TIME_LIMIT):  # the times are sorted here
-        fail(np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; drop this event")
+        beyond = np.abs(events.t.astype(np.float64)) >= TIME_LIMIT
+        fail(beyond, f"has a time beyond {TIME_LIMIT} us; drop this event")
 
 
 def check_coordinates(
-    events: Events, width: int, height: int, *, where: str, first_index: int = 0, allow_nan: bool = False
+    events: Events,
+    width: int,
+    height: int,
+    *,
+    where: str,
+    first_index: int = 0,
+    allow_nan: bool = False,
 ) -> None:
     """Check the coordinates of one block of at least one event.
 
@@ -137,16 +152,21 @@ def check_coordinates(
     """
     fail = partial(_fail, events, where, first_index)
     if events.x.dtype == np.uint16:
-        right, bottom = int(events.x.max()), int(events.y.max())
+        right = int(events.x.max())
+        bottom = int(events.y.max())
         if right >= width or bottom >= height:
             remedy = "check the size"
             if right < height and bottom < width:
                 remedy = f"give width {height} and height {width}, if they are swapped"
-            fail((events.x >= width) | (events.y >= height), f"lies outside the {width}x{height} frame; {remedy}")
-    elif allow_nan and bool(np.isinf(events.x).any() or np.isinf(events.y).any()):
-        fail(np.isinf(events.x) | np.isinf(events.y), "has an infinite coordinate; drop it")
-    elif not allow_nan and not bool(np.isfinite(events.x).all() and np.isfinite(events.y).all()):
-        fail(~(np.isfinite(events.x) & np.isfinite(events.y)), "has a coordinate that is not finite; drop it")
+            outside = (events.x >= width) | (events.y >= height)
+            fail(outside, f"lies outside the {width}x{height} frame; {remedy}")
+    elif allow_nan:
+        if np.isinf(events.x).any() or np.isinf(events.y).any():
+            infinite = np.isinf(events.x) | np.isinf(events.y)
+            fail(infinite, "has an infinite coordinate; drop it")
+    elif not (np.isfinite(events.x).all() and np.isfinite(events.y).all()):
+        finite = np.isfinite(events.x) & np.isfinite(events.y)
+        fail(~finite, "has a coordinate that is not finite; drop it")
 
 
 def inside_image(x: NDArray[Any], y: NDArray[Any], width: int, height: int) -> NDArray[np.bool_]:
@@ -156,7 +176,9 @@ def inside_image(x: NDArray[Any], y: NDArray[Any], width: int, height: int) -> N
 
 def _fail(events: Events, where: str, first_index: int, bad: NDArray[np.bool_], what: str) -> None:
     index = int(np.argmax(bad))
-    x, y, t = events.x[index], events.y[index], events.t[index]
+    x = events.x[index]
+    y = events.y[index]
+    t = events.t[index]
     raise AmiwarpError(f"{where}: event {first_index + index} (x={x}, y={y}, t={t} us) {what}")
 
 
@@ -182,7 +204,9 @@ def slice_bounds(which: object, length: int, what: str = "events") -> tuple[int,
             whole(end, f"index of {what}", *INT64)
     start, stop, step = found.indices(length)
     if step != 1:
-        raise AmiwarpError(f"{what} are sliced in steps of {step}; slice without steps, then NumPy arrays with them")
+        raise AmiwarpError(
+            f"{what} are sliced in steps of {step}; slice without steps, then NumPy arrays with them"
+        )
     return start, max(start, stop)
 
 
@@ -196,11 +220,13 @@ def check_window(t_start: int, t_end: int) -> None:
 
 def described(kind: str, *facts: str, span: tuple[int, int] | None, count: int) -> str:
     """Return a representation of at most one line of events: their number, ``facts``, time span and mean rate."""
-    facts = (f"{count:,} event{'' if count == 1 else 's'}", *facts)
+    events = "event" if count == 1 else "events"
+    facts = (f"{count:,} {events}", *facts)
     if span is not None:
         first, last = span
         facts = (*facts, f"t {first} .. {last} us")
-        facts = (*facts, f"{count / (last - first):.3g} Mev/s") if last > first else facts
+        if last > first:
+            facts = (*facts, f"{count / (last - first):.3g} Mev/s")
     return f"{kind}({', '.join(facts)})"
 
 
@@ -247,7 +273,8 @@ class Events:
                 f"events' t is {self.t.dtype}, p is {self.p.dtype}; expected int64 and uint8, to which "
                 "amiwarp.Events.from_arrays converts"
             )
-        if self.x.dtype != self.y.dtype or self.x.dtype not in (np.dtype(np.uint16), np.dtype(np.float32)):
+        of_pixels = (np.dtype(np.uint16), np.dtype(np.float32))
+        if self.x.dtype != self.y.dtype or self.x.dtype not in of_pixels:
             raise AmiwarpError(
                 f"events' x is {self.x.dtype}, y is {self.y.dtype}; expected both uint16, or both float32 for "
                 "compensated events, of which NaN marks those without a position"
@@ -257,7 +284,13 @@ class Events:
 
     @classmethod
     def from_arrays(
-        cls, x: ArrayLike, y: ArrayLike, t: ArrayLike, p: ArrayLike, *, t_unit: Literal["us", "s"] = "us"
+        cls,
+        x: ArrayLike,
+        y: ArrayLike,
+        t: ArrayLike,
+        p: ArrayLike,
+        *,
+        t_unit: Literal["us", "s"] = "us",
     ) -> Events:
         """Create events from arrays of any numeric type, of any library, in host memory.
 
@@ -294,8 +327,12 @@ class Events:
         >>> amiwarp.Events.from_arrays(x=[10, 11], y=[5, 5], t=[0.5, 0.6], p=[1, 0], t_unit="s").t.tolist()
         [500000, 600000]
         """
-        columns = as_coordinate("x", x), as_coordinate("y", y), as_times(t, unit=t_unit), as_polarity(p)
-        events = cls(*(packed(column) for column in columns))
+        events = cls(
+            packed(as_coordinate("x", x)),
+            packed(as_coordinate("y", y)),
+            packed(as_times(t, unit=t_unit)),
+            packed(as_polarity(p)),
+        )
         check_order(events, where="events")
         return events
 
@@ -334,8 +371,12 @@ class Events:
         fields = instance(array, np.ndarray, "structured array").dtype.names
         missing = [name for name in COLUMNS if name not in (fields or ())]
         if fields is None or missing:
-            given = f"fields {', '.join(fields)}" if fields else f"type {array.dtype} without fields"
-            raise AmiwarpError(f"structured array has {given}; field {missing[0]} is missing: give x, y, t and p")
+            given = f"type {array.dtype} without fields"
+            if fields:
+                given = f"fields {', '.join(fields)}"
+            raise AmiwarpError(
+                f"structured array has {given}; field {missing[0]} is missing: give x, y, t and p"
+            )
         return cls.from_arrays(*(array[name] for name in COLUMNS), t_unit=t_unit)
 
     def to_structured(self, dtype: Any = None) -> NDArray[Any]:
@@ -368,18 +409,25 @@ class Events:
         try:
             wanted = np.dtype(own if dtype is None else dtype)
         except Exception as error:  # any that converting an unknown object raises
-            raise AmiwarpError(f"dtype is {shown(dtype)}; give a NumPy data type with the fields x, y, t, p") from error
+            raise AmiwarpError(
+                f"dtype is {shown(dtype)}; give a NumPy data type with the fields x, y, t, p"
+            ) from error
         if wanted.names is None or sorted(wanted.names) != sorted(COLUMNS):
-            raise AmiwarpError(f"dtype is {shown(wanted)}; give one with the fields x, y, t, p and no other")
+            raise AmiwarpError(
+                f"dtype is {shown(wanted)}; give one with the fields x, y, t, p and no other"
+            )
         out = np.empty(len(self), wanted)
         for name in COLUMNS:
             values = getattr(self, name)
             kind = out[name].dtype
             if kind.kind not in "iufb" or out[name].ndim > 1:
-                raise AmiwarpError(f"dtype has {name} of type {kind}; give an integer, floating or boolean type")
+                raise AmiwarpError(
+                    f"dtype has {name} of type {kind}; give an integer, floating or boolean type"
+                )
             with np.errstate(invalid="ignore", over="ignore"):
                 out[name] = values
-            if not np.array_equal(out[name], values, equal_nan=values.dtype.kind == "f" and kind.kind == "f"):
+            both_floating = values.dtype.kind == "f" and kind.kind == "f"
+            if not np.array_equal(out[name], values, equal_nan=both_floating):
                 at = int(np.argmax(out[name] != values))
                 raise AmiwarpError(
                     f"dtype has {name} of type {kind}, which cannot hold {values[at]}; give a wider type"
@@ -416,12 +464,16 @@ class Events:
             return blocks[0]
         if not blocks:
             return cls.empty()
-        x, y, t, p = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("x", "y", "t", "p"))
-        return cls(x, y, t, p)
+        return cls(
+            np.concatenate([block.x for block in blocks]),
+            np.concatenate([block.y for block in blocks]),
+            np.concatenate([block.t for block in blocks]),
+            np.concatenate([block.p for block in blocks]),
+        )
 
     @property
     def whole_pixels(self) -> bool:
-        """Whether the coordinates are those of a sensor, not compensated."""
+        """Whether the coordinates are a sensor's, not compensated."""
         return bool(self.x.dtype == SENSOR_DTYPE)
 
     def __len__(self) -> int:
@@ -446,7 +498,7 @@ class EventSource(Protocol):
     """Source of sorted events: arrays in memory, an indexed file, or a file that is read from its start.
 
     A slice ``source[start:stop]`` gives its events in memory: ``source[:]`` all, ``source[-1000:]`` the last thousand.
-    :meth:`between` gives those of a time window, :meth:`blocks` iterates over all by count or by time. Own sources
+    :meth:`between` gives the events of a time window, :meth:`blocks` iterates over all by count or by time. Own sources
     derive from this class.
     """
 
@@ -470,7 +522,9 @@ class EventSource(Protocol):
 
     def __repr__(self) -> str:
         span = (self.t_first, self.t_last) if len(self) else None
-        return described(type(self).__name__, "{}x{} px".format(*self.size), span=span, count=len(self))
+        return described(
+            type(self).__name__, "{}x{} px".format(*self.size), span=span, count=len(self)
+        )
 
     @property
     def t_first(self) -> int:
@@ -536,7 +590,9 @@ class EventSource(Protocol):
             If a time is no whole number, such as one in seconds, or the end is before the start.
         """
 
-    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+    def blocks(
+        self, *, count: int | None = None, duration_us: int | None = None
+    ) -> Iterator[Events]:
         """Return all events in order, in blocks of equal count or equal duration.
 
         Parameters
@@ -580,7 +636,8 @@ class MemoryEvents(EventSource):
 
     def __init__(self, events: Events, width: int, height: int) -> None:
         instance(events, Events, "events in memory")
-        width, height = (whole(size, "frame size", 1, LARGEST_SIZE, " pixels") for size in (width, height))
+        width = whole(width, "frame size", 1, LARGEST_SIZE, " pixels")
+        height = whole(height, "frame size", 1, LARGEST_SIZE, " pixels")
         # NaN marks compensated events without a position. Only compensated events are float32.
         check_events(events, width, height, where="events in memory", allow_nan=True)
         self._events = events
@@ -613,16 +670,23 @@ class MemoryEvents(EventSource):
         start, stop = np.searchsorted(self._events.t, [t_start, t_end])
         return self._events[start:stop]
 
-    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+    def blocks(
+        self, *, count: int | None = None, duration_us: int | None = None
+    ) -> Iterator[Events]:
         return regroup([self._events], count=count, duration_us=duration_us)
 
     def _nonempty(self) -> Events:
         if not len(self._events):
-            raise AmiwarpError("the recording holds no events, so it has no first or last time; check len() first")
+            raise AmiwarpError(
+                "the recording holds no events, so it has no first or last time; check len() first",
+                ErrorCode.CONTENT_MISSING,
+            )
         return self._events
 
 
-def regroup(chunks: Iterable[Events], *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+def regroup(
+    chunks: Iterable[Events], *, count: int | None = None, duration_us: int | None = None
+) -> Iterator[Events]:
     """Regroup successive chunks of events into blocks of equal count or equal duration.
 
     At most one block is in memory. Raises :class:`AmiwarpError` if both ``count`` and ``duration_us`` are given or one
@@ -631,8 +695,10 @@ def regroup(chunks: Iterable[Events], *, count: int | None = None, duration_us: 
     if count is not None and duration_us is not None:
         raise AmiwarpError("blocks have both count and duration_us; give one of them")
     if duration_us is not None:
-        return _by_duration(chunks, whole(duration_us, "duration_us", 1, TIME_LIMIT, " us per block"))
-    count = DEFAULT_BLOCK if count is None else count
+        duration_us = whole(duration_us, "duration_us", 1, TIME_LIMIT, " us per block")
+        return _by_duration(chunks, duration_us)
+    if count is None:
+        count = DEFAULT_BLOCK
     return _by_count(chunks, whole(count, "count", 1, TIME_LIMIT, " events per block"))
 
 
@@ -645,7 +711,8 @@ def _by_count(chunks: Iterable[Events], count: int) -> Iterator[Events]:
             held.append(chunk[start : start + missing])
             start += missing
             yield Events.concatenate(held)
-            held, missing = [], count
+            held = []
+            missing = count
         if start < len(chunk):
             held.append(chunk[start:])
             missing -= len(chunk) - start
@@ -660,7 +727,8 @@ def _by_duration(chunks: Iterable[Events], duration_us: int) -> Iterator[Events]
     for chunk in chunks:
         if not len(chunk):
             continue
-        origin = int(chunk.t[0]) if origin is None else origin
+        if origin is None:
+            origin = int(chunk.t[0])
         window = (chunk.t - origin) // duration_us
         edges = [0, *(np.flatnonzero(window[1:] != window[:-1]) + 1).tolist(), len(chunk)]
         for start, stop in itertools.pairwise(edges):
@@ -687,149 +755,6 @@ def held_bytes(events: Events | Sized) -> int:
         return OVERHEAD + EVENT_BYTES * len(events)
     return OVERHEAD + events.x.nbytes + events.y.nbytes + events.t.nbytes + events.p.nbytes
 
-
-# Records of other sensors in a recording: samples of an inertial measurement unit (IMU), and frames.
-
-
-@guarded
-@dataclass(frozen=True, slots=True, eq=False)
-class ImuSamples:
-    """Samples of an inertial measurement unit (IMU), in order of time.
-
-    The axes are those of the IMU, as the file stores them. The acceleration includes gravity. A quantity that a sample
-    does not hold is NaN on all three axes.
-
-    Raises
-    ------
-    AmiwarpError
-        If the arrays have other shapes or data types, the times decrease, or a value is not finite, except as above.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> still = np.zeros((2, 3))
-    >>> imu = amiwarp.ImuSamples(np.array([0, 1000]), angular_velocity=still, acceleration=still + [0.0, 0.0, 9.81])
-    >>> len(imu), imu.rate_hz
-    (2, 1000.0)
-    """
-
-    t: NDArray[np.int64]
-    """Times of the samples, on the clock of the events [us], shape ``(n,)``. They do not decrease."""
-    angular_velocity: NDArray[np.float64]
-    """Angular velocity around the axes x, y and z [rad/s], shape ``(n, 3)``."""
-    acceleration: NDArray[np.float64]
-    """Acceleration along the axes x, y and z [m/s^2], shape ``(n, 3)``."""
-
-    def __post_init__(self) -> None:
-        if self.t.dtype != np.int64 or self.t.ndim != 1:
-            raise AmiwarpError(f"IMU times are {self.t.dtype} of shape {self.t.shape}; give int64 of shape (n,)")
-        for name in ("angular_velocity", "acceleration"):
-            values, shape = getattr(self, name), (len(self.t), 3)
-            if values.dtype != np.float64 or values.shape != shape:
-                raise AmiwarpError(
-                    f"IMU {name} is {values.dtype} of shape {values.shape}; give float64 of shape {shape}"
-                )
-            bad = ~(np.isfinite(values).all(axis=1) | np.isnan(values).all(axis=1))
-            if bad.any():
-                at = int(np.argmax(bad))
-                raise AmiwarpError(
-                    f"IMU {name} of sample {at} is {values[at].tolist()}; expected finite numbers, or three NaN for a "
-                    "quantity that the sample does not hold"
-                )
-        if (self.t[1:] < self.t[:-1]).any():
-            raise AmiwarpError("IMU times decrease; give the samples in order of time")
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def __repr__(self) -> str:
-        if not len(self):
-            return "ImuSamples(0 samples)"
-        rate = "" if self.rate_hz is None else f", {self.rate_hz:.4g} Hz"
-        return f"ImuSamples({len(self):,} sample{'s'[: len(self) != 1]}, t {self.t[0]} .. {self.t[-1]} us{rate})"
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Mean rate of the samples [Hz], or None if they span no time."""
-        return mean_rate(self.t)
-
-
-def mean_rate(t: NDArray[np.int64]) -> float | None:
-    """Return the mean rate of records at ordered times ``t`` [us], in Hz, or None if they span no time."""
-    span = int(t[-1]) - int(t[0]) if len(t) else 0
-    return (len(t) - 1) * 1e6 / span if span > 0 else None
-
-
-@not_called("wrap frames as amiwarp.MemoryImages(t, images)")
-class ImageStore(StoredInstants[NDArray[Any]], Protocol):
-    """Protocol of the frames of a recording: grey levels, uint8 or uint16, shape ``(height, width)``.
-
-    All frames have the same size and data type. Their times do not decrease.
-    """
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Size (width, height) of the frames [px]."""
-
-
-@guarded
-class MemoryImages(Instants[NDArray[Any]]):
-    """Frames of a recording that are held in memory.
-
-    Parameters
-    ----------
-    t : numpy.ndarray
-        Times of the frames [us], int64, not decreasing, shape ``(k,)``.
-    images : sequence of numpy.ndarray
-        At least one frame: grey levels, uint8 or uint16, shape ``(height, width)``.
-
-    Raises
-    ------
-    AmiwarpError
-        If the arrays have other shapes or data types, or the times decrease.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> frames = amiwarp.MemoryImages(np.array([0, 40_000]), np.zeros((2, 3, 4), np.uint8))
-    >>> frames.size, len(frames), frames[-1].shape, frames[1:].t.tolist()
-    ((4, 3), 2, (3, 4), [40000])
-    """
-
-    def __init__(self, t: NDArray[np.int64], images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
-        images = [] if isinstance(images, np.ndarray) and not images.ndim else images
-        if t.dtype != np.int64 or t.shape != (len(images),) or not len(t) or (t[1:] < t[:-1]).any():
-            raise AmiwarpError(
-                f"frames have {t.dtype} times of shape {t.shape} for {len(images)} images; give ordered int64 times, "
-                "one per image, and at least one"
-            )
-        first = images[0]
-        for image in images:
-            check_image(image, first.shape, first.dtype)
-        super().__init__(t)
-        self._images = images
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Size (width, height) of the frames [px]."""
-        height, width = self._images[0].shape
-        return width, height
-
-    def _read(self, index: int) -> NDArray[Any]:
-        return self._images[index]
-
-
-def check_image(image: NDArray[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-    """Raise :class:`AmiwarpError` for an image that is no grey image, or not of the given shape and data type."""
-    if image.ndim != 2 or not image.size or image.dtype not in (np.uint8, np.uint16):
-        raise AmiwarpError(
-            f"frame is {image.dtype} of shape {image.shape}; give uint8 or uint16 of shape (height, width)"
-        )
-    if image.shape != shape or image.dtype != dtype:
-        raise AmiwarpError(f"frame is {image.dtype} of shape {image.shape}, earlier ones are {dtype} of {shape}")
-
-
-# A recording: events with their encoder, camera, prism and, if simulated, their ground truth.
 
 MetadataValue: TypeAlias = str | int | float | bool
 """Type of a value in a recording's metadata."""
@@ -897,4 +822,5 @@ class Recording:
     def __repr__(self) -> str:
         others = ("camera", "encoder", "prism", "truth", "imu", "frames")
         held = [name for name in others if getattr(self, name) is not None]
-        return f"Recording({self.name!r}, {self.events!r}, {'with ' + ', '.join(held) if held else 'events only'})"
+        parts = f"with {', '.join(held)}" if held else "events only"
+        return f"Recording({self.name!r}, {self.events!r}, {parts})"

@@ -1,33 +1,21 @@
-"""Ground truth of simulated recordings: of each event, of all pixels at given instants, and poses over time."""
+"""Ground truth of simulated recordings: of each event, and of all pixels at given instants."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar, overload
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.choices import Option
-from amiwarp.errors import AmiwarpError
-from amiwarp.validation import (
-    INT64,
-    array,
-    as_times,
-    check_ascending,
-    check_slice,
-    finite,
-    guarded,
-    instance,
-    not_called,
-    shown,
-    whole,
-)
-
-Item = TypeVar("Item", covariant=True)
-"""What a store returns: an array, or a record."""
+from amiwarp.errors import AmiwarpError, Option
+from amiwarp.events.poses import PoseStore
+from amiwarp.events.stores import Instants, StoredInstants, StoredRows
+from amiwarp.schema.calls import guarded
+from amiwarp.schema.type_names import not_called
+from amiwarp.validation import INT64, array, as_times, check_slice, finite, instance, shown, whole
 
 
 class Cause(Option):
@@ -54,96 +42,6 @@ class Cause(Option):
     def code(self) -> int:
         """Number that represents the cause in arrays and files."""
         return list(Cause).index(self)
-
-
-class StoredRows(Protocol[Item]):
-    """Protocol of rows that are read by slicing, in memory or in a file that is read on demand."""
-
-    def __getitem__(self, which: slice, /) -> Item:
-        """Return the rows in a slice without steps."""
-
-
-class StoredInstants(Protocol[Item]):
-    """Protocol of records at several times, in memory or in a file that is read on demand."""
-
-    @property
-    def t(self) -> NDArray[np.int64]:
-        """Times of the records, on the clock of the events, in order [us], shape ``(k,)``."""
-
-    def __len__(self) -> int:
-        """Return the number of records."""
-
-    def __iter__(self) -> Iterator[Item]:
-        """Yield the records in order, one at a time."""
-
-    @overload
-    def __getitem__(self, which: int, /) -> Item: ...
-    @overload
-    def __getitem__(self, which: slice, /) -> StoredInstants[Item]: ...
-    def __getitem__(self, which: int | slice, /) -> Item | StoredInstants[Item]:
-        """Return the record at ``t[which]``, or the records of a slice, which are read on demand too.
-
-        Negative indices count from the end.
-        """
-
-
-class Instants(Generic[Item]):
-    """Records at several times: one by index, some by slice, or all one after the other."""
-
-    def __init__(self, t: NDArray[np.int64]) -> None:
-        """Take the times of the records [us], shape ``(k,)``."""
-        self._t = t
-
-    @property
-    def t(self) -> NDArray[np.int64]:
-        """Times of the records [us], shape ``(k,)``."""
-        return self._t
-
-    def _read(self, index: int) -> Item:
-        """Return the record at ``t[index]``, where 0 <= index < k."""
-        raise NotImplementedError
-
-    def __len__(self) -> int:
-        return len(self._t)
-
-    def __iter__(self) -> Iterator[Item]:
-        return map(self._read, range(len(self)))
-
-    @overload
-    def __getitem__(self, which: int, /) -> Item: ...
-    @overload
-    def __getitem__(self, which: slice, /) -> Instants[Item]: ...
-    def __getitem__(self, which: int | slice, /) -> Item | Instants[Item]:
-        every = range(len(self))
-        try:
-            found = every[which]
-        except TypeError as error:
-            raise AmiwarpError(f"index of a record is {shown(which)}; give a whole number or a slice") from error
-        except IndexError as error:
-            raise IndexError(f"index {which} is not one of {len(every)} records") from error
-        return self._read(found) if isinstance(found, int) else _Slice(self, found)
-
-    def __repr__(self) -> str:
-        count = len(self)
-        span = f", t {self._t[0]} .. {self._t[-1]} us" if count else ""
-        return f"{type(self).__name__.lstrip('_')}({count:,} record{'s'[: count != 1]}{span})"
-
-
-class _Slice(Instants[Item]):
-    """Some of the records of a store."""
-
-    def __init__(self, store: Instants[Item], which: range) -> None:
-        super().__init__(store.t[np.array(which, np.int64)])
-        self._store, self._which = store, which
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Size (width, height) of the frames [px], if the store has one."""
-        size: tuple[int, int] = self._store.size  # type: ignore[attr-defined]
-        return size
-
-    def _read(self, index: int) -> Item:
-        return self._store._read(self._which[index])
 
 
 @not_called("a NumPy array with one row per event serves")
@@ -215,7 +113,8 @@ class WorldLabels:
     def __post_init__(self) -> None:
         instance(self.name, str, "world labels' name")
         for names in (self.instances, self.categories):
-            if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
+            listed = isinstance(names, tuple | list)
+            if not listed or not all(isinstance(name, str) for name in names):
                 raise AmiwarpError(f"world labels have {shown(names)}; give a tuple of texts")
         if len(self.categories) != len(self.instances):
             given = f"{len(self.instances)} instances and {len(self.categories)} categories"
@@ -279,7 +178,9 @@ class FrameTruth:
             if not np.can_cast(values.dtype, dtype, "same_kind"):
                 raise AmiwarpError(f"truth's {name} is {values.dtype}; give {np.dtype(dtype)}")
             check_truth(f"truth/frames/{name}", values)
-        for name, values in {"rotation": self.rotation, "position": self.position, **self.joints}.items():
+        finite(self.rotation, f"truth's {shown('rotation')}")
+        finite(self.position, f"truth's {shown('position')}")
+        for name, values in self.joints.items():
             finite(values, f"truth's {shown(name)}")
 
 
@@ -301,8 +202,13 @@ MAPS = {
 
 NOT_FINITE: dict[str, Callable[[Any], Any]] = {
     "depth": np.isposinf,
-    **dict.fromkeys(("x", "y", "place"), np.isnan),
-    **{f"{name}{seen}": np.isnan for name in ("flow", "displacement") for seen in ("", "_with_prism")},
+    "x": np.isnan,
+    "y": np.isnan,
+    "place": np.isnan,
+    "flow": np.isnan,
+    "flow_with_prism": np.isnan,
+    "displacement": np.isnan,
+    "displacement_with_prism": np.isnan,
 }
 """Tests for the values that are not finite and have a meaning, such as the depth of the sky, by the last part of a
 dataset's name."""
@@ -312,10 +218,16 @@ def check_truth(name: str, values: NDArray[Any]) -> None:
     """Raise :class:`AmiwarpError` if values of the dataset ``name`` are not finite, except :data:`NOT_FINITE`."""
     if values.dtype.kind != "f" or np.isfinite(values).all():
         return
-    known = NOT_FINITE.get(name.rpartition("/")[2])
-    bad = ~np.isfinite(values) if known is None else ~(np.isfinite(values) | known(values))
+    _, _, last_part = name.rpartition("/")
+    has_meaning = NOT_FINITE.get(last_part)
+    good = np.isfinite(values)
+    if has_meaning is not None:
+        good |= has_meaning(values)
+    bad = ~good
     if bad.any():
-        raise AmiwarpError(f"'{name}' holds {values[bad][0]}, which has no meaning there; give finite numbers")
+        raise AmiwarpError(
+            f"'{name}' holds {values[bad][0]}, which has no meaning there; give finite numbers"
+        )
 
 
 @not_called("simulate(..., truth_hz=...) makes one, recording.truth.frames")
@@ -332,114 +244,6 @@ class MemoryFrames(Instants[FrameTruth]):
 
     def _read(self, index: int) -> FrameTruth:
         return self._frames[index]
-
-
-@guarded
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """Poses of a camera and of moving bodies, and positions of joints, at several times.
-
-    A pose has seven numbers: the position x, y, z in the world [m], and the orientation as a unit quaternion x, y, z,
-    w. The quaternion rotates from the frame of the camera or body to the world's frame. Raises :class:`AmiwarpError`
-    for other shapes, times that do not increase, and values that are not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> poses = amiwarp.Poses(t=np.array([0, 1000]), camera=np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1)))
-    >>> poses[:1].t.tolist()
-    [0]
-    """
-
-    t: NDArray[np.int64]
-    """Times of the poses, on the clock of the events [us], increasing, shape ``(k,)``."""
-    camera: NDArray[np.float64]
-    """Poses of the camera, shape ``(k, 7)``."""
-    bodies: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    """Poses of the moving bodies by name, shape ``(k, 7)`` each."""
-    joints: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    """Positions of named points in the world, such as joints [m], shape ``(k, 3)`` each."""
-
-    def __post_init__(self) -> None:
-        if self.t.ndim != 1 or self.t.dtype != np.int64:
-            raise AmiwarpError(
-                f"poses have {self.t.dtype} times of shape {self.t.shape}; give int64 times [us] of shape (k,)"
-            )
-        check_ascending(self.t, "pose")
-        tables = [("camera", self.camera, 7), *((name, rows, 7) for name, rows in self.bodies.items())]
-        for name, rows, columns in (*tables, *((name, rows, 3) for name, rows in self.joints.items())):
-            if rows.shape != (self.t.size, columns):
-                raise AmiwarpError(
-                    f"poses of {shown(name)} have shape {rows.shape} for {self.t.size} times; give shape "
-                    f"({self.t.size}, {columns})"
-                )
-            finite(rows, f"poses of {shown(name)}")
-
-    @classmethod
-    def concatenate(cls, blocks: Sequence[Poses]) -> Poses:
-        """Join successive tables of poses.
-
-        Parameters
-        ----------
-        blocks : sequence of Poses
-            At least one table. All tables have the same bodies and joints.
-
-        Returns
-        -------
-        Poses
-            The joined table.
-        """
-        if not blocks:
-            raise AmiwarpError("poses are joined of no tables; give at least one")
-        bodies = {name: np.concatenate([block.bodies[name] for block in blocks]) for name in blocks[0].bodies}
-        joints = {name: np.concatenate([block.joints[name] for block in blocks]) for name in blocks[0].joints}
-        camera = np.concatenate([block.camera for block in blocks])
-        return cls(np.concatenate([block.t for block in blocks]), camera, bodies, joints)
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def __getitem__(self, which: slice, /) -> Poses:
-        bodies, joints = ({name: rows[which] for name, rows in table.items()} for table in (self.bodies, self.joints))
-        return Poses(self.t[which], self.camera[which], bodies, joints)
-
-
-def as_poses(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert rotation matrices ``(..., 3, 3)`` and positions ``(..., 3)`` [m] to poses of shape ``(..., 7)``.
-
-    Raises :class:`AmiwarpError` for matrices that are no rotations. SciPy would replace them by the nearest rotation,
-    and never returns for infinite values.
-    """
-    check_rotation(rotation)
-    from scipy.spatial.transform import Rotation
-
-    quaternions = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat()
-    return np.concatenate([position, quaternions.reshape(*position.shape[:-1], 4)], axis=-1)
-
-
-def check_rotation(rotation: NDArray[Any]) -> None:
-    """Raise :class:`AmiwarpError` if an array is not one of rotation matrices, shape ``(..., 3, 3)``."""
-    if rotation.shape[-2:] != (3, 3):
-        raise AmiwarpError(f"rotation has shape {rotation.shape}; expected (3, 3)")
-    if not (np.abs(rotation) <= 1.0 + ROTATION_TOLERANCE).all():  # also refuses NaN
-        raise AmiwarpError("rotation holds a value that is not within -1 .. 1; expected a rotation matrix")
-    product = rotation @ np.swapaxes(rotation, -2, -1)
-    if not (np.abs(product - np.eye(3)) <= ROTATION_TOLERANCE).all() or (np.linalg.det(rotation) < 0.0).any():
-        raise AmiwarpError(
-            "rotation is no rotation matrix: its rows must be orthogonal, of length 1, and right-handed; "
-            "amiwarp's camera looks along z, with x to the right and y down"
-        )
-
-
-ROTATION_TOLERANCE = 0.01
-"""Largest deviation of the products of a rotation matrix's rows from the identity matrix."""
-
-
-def rotation_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation matrix ``(3, 3)`` of a pose of shape ``(7,)``."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
 
 
 @not_called("translate makes one, recording.truth.known")
@@ -460,15 +264,8 @@ class MemoryMasks(Instants[NDArray[np.bool_]]):
 
     def _read(self, index: int) -> NDArray[np.bool_]:
         rows, columns = self._shape
-        return np.unpackbits(self._bits[index], count=rows * columns).reshape(self._shape).astype(np.bool_)
-
-
-@not_called("make poses as amiwarp.Poses(t, camera)")
-class PoseStore(StoredRows[Poses], Protocol):
-    """Protocol of tables of poses: :class:`amiwarp.Poses`, or a file that is read on demand."""
-
-    def __len__(self) -> int:
-        """Return the number of times."""
+        bits = np.unpackbits(self._bits[index], count=rows * columns)
+        return bits.reshape(self._shape).astype(np.bool_)
 
 
 GLASS = {"apex": "rad", "thickness": "m", "plate_tilt": "rad", "index": "", "phase": "rad"}
@@ -516,20 +313,24 @@ class Truth:
         glass = [name for name in GLASS if name in self.parameters]
         shown_names = glass or list(self.parameters)[:3]
         values = [f"{name} {self._in_words(name)}" for name in shown_names]
-        if len(self.parameters) > len(shown_names):
-            values.append(f"{len(self.parameters) - len(shown_names)} more parameters")
+        more = len(self.parameters) - len(shown_names)
+        if more > 0:
+            values.append(f"{more} more parameters")
         per_event = ("points", "causes", "instances", "depths", "places")
         held = [name for name in per_event if getattr(self, f"stored_{name}") is not None]
         parts = [f"{', '.join(held)} of events"] if held else []
-        stores = (("frames", self.frames), ("poses", self.poses), ("masks", self.known))
-        parts += [f"{len(store)} {name}" for name, store in stores if store is not None]
+        stores = {"frames": self.frames, "poses": self.poses, "masks": self.known}
+        for name, store in stores.items():
+            if store is not None:
+                parts.append(f"{len(store)} {name}")
         if self.labels is not None:
             parts.append(f"labels of {len(self.labels.instances)} instances")
         return f"Truth({', '.join(values) or 'no parameters'};\n      {', '.join(parts) or 'nothing else'})"
 
     def _in_words(self, name: str) -> str:
-        """Return a parameter's value, with its unit if it is of the glass; angles in degrees."""
-        value, unit = self.parameters[name], GLASS.get(name, "")
+        """Return a parameter's value, with its unit if it belongs to the glass; angles in degrees."""
+        value = self.parameters[name]
+        unit = GLASS.get(name, "")
         if unit == "rad":
             return f"{math.degrees(value):.5g} deg"
         return f"{value:.5g} {unit}".rstrip()
@@ -553,7 +354,9 @@ class Truth:
             If an index is negative.
         """
         check_slice(start, stop)
-        return None if self.stored_points is None else self.stored_points[start:stop]
+        if self.stored_points is None:
+            return None
+        return self.stored_points[start:stop]
 
     def known_at(self, t_us: ArrayLike, xy: ArrayLike) -> NDArray[np.bool_]:
         """Return whether the scene is known at pixels without the prism.
@@ -573,18 +376,28 @@ class Truth:
             Whether each pixel is known at its time, shape ``(n,)``. Pixels outside the image, NaN and times before the
             first mask are unknown. Everything is known if no masks are stored.
         """
-        times, pixels = as_times(t_us), array(xy, "xy").astype(np.float64)
+        times = as_times(t_us)
+        pixels = array(xy, "xy").astype(np.float64)
         if times.ndim != 1 or pixels.shape != (len(times), 2):
-            raise AmiwarpError(f"t_us has shape {times.shape}, xy {pixels.shape}; expected (n,) and (n, 2)")
+            raise AmiwarpError(
+                f"t_us has shape {times.shape}, xy {pixels.shape}; expected (n,) and (n, 2)"
+            )
         if self.known is None:
             return np.ones(len(times), np.bool_)
-        row = np.searchsorted(self.known.t, times, side="right") - 1
+        mask_of = np.searchsorted(self.known.t, times, side="right") - 1
         found = np.zeros(len(times), np.bool_)
-        for index in np.unique(row[row >= 0]).tolist():
-            mask, which = self.known[index], np.flatnonzero(row == index)
-            inside = np.isfinite(pixels[which].sum(axis=1))
-            x, y = np.rint(np.where(inside[:, None], pixels[which], -1.0)).astype(np.int64).T
-            inside &= (x >= 0) & (x < mask.shape[1]) & (y >= 0) & (y < mask.shape[0])
+        # Mask by mask, because each is read on demand.
+        for index in np.unique(mask_of[mask_of >= 0]).tolist():
+            mask = self.known[index]
+            height, width = mask.shape
+            which = np.flatnonzero(mask_of == index)
+            of_mask = pixels[which]
+            finite_pixels = np.isfinite(of_mask.sum(axis=1))
+            numbers = np.where(finite_pixels[:, None], of_mask, -1.0)
+            x, y = np.rint(numbers).astype(np.int64).T
+            in_columns = (x >= 0) & (x < width)
+            in_rows = (y >= 0) & (y < height)
+            inside = finite_pixels & in_columns & in_rows
             found[which[inside]] = mask[y[inside], x[inside]]
         return found
 
@@ -608,5 +421,14 @@ class Truth:
         """
         points = self.points(start, stop)
         which = slice(start, stop)
-        stores = self.stored_causes, self.stored_instances, self.stored_depths, self.stored_places
-        return EventTruth(points, *(None if store is None else store[which] for store in stores))
+
+        def rows(store: EventValues | None) -> NDArray[Any] | None:
+            return None if store is None else store[which]
+
+        return EventTruth(
+            points,
+            cause=rows(self.stored_causes),
+            instance=rows(self.stored_instances),
+            depth=rows(self.stored_depths),
+            place=rows(self.stored_places),
+        )

@@ -10,14 +10,21 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import CornerMethod
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, check_inside, check_sensor, device_for, limits, wait
+from amiwarp.events.device_events import (
+    DeviceEvents,
+    check_inside,
+    check_sensor,
+    device_for,
+    limits,
+    wait,
+)
 from amiwarp.events.recording import Events, check_events
 from amiwarp.kernels import corners as kernels
-from amiwarp.kernels import events as event_kernels
-from amiwarp.kernels.launch import launch, load
+from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.schema.calls import guarded
 from amiwarp.tasks import cpu_threads
-from amiwarp.validation import TIME_LIMIT, choice, guarded, instance, vector, whole
+from amiwarp.validation import TIME_LIMIT, choice, vector, whole
 
 REDUNDANT_US = 50_000
 """Time after which an event of Arc* is no longer redundant [us], from the paper."""
@@ -27,7 +34,8 @@ PIECE = 1 << 24
 """Largest number of events that are sorted at a time on a GPU."""
 LEAST_SHARED = 1 << 13
 """Smallest number of events for which several CPU threads are worth their start."""
-WIDEST_BAND, NARROWEST_BAND = 5, 3
+WIDEST_BAND = 5
+NARROWEST_BAND = 3
 """Largest and smallest size of a band of rows for several CPU threads, as a power of 2."""
 
 
@@ -119,14 +127,28 @@ class CornerDetector:
     [False False]
     """
 
-    def __init__(self, size: tuple[int, int], *, detector: CornerMethod = CornerMethod.ARC, device: Any = None) -> None:
-        self._width, self._height = (int(side) for side in vector(size, 2, "size of the sensor", _side))
+    def __init__(
+        self,
+        size: tuple[int, int],
+        *,
+        detector: CornerMethod = CornerMethod.ARC,
+        device: Any = None,
+    ) -> None:
+        self._width, self._height = (
+            int(side) for side in vector(size, 2, "size of the sensor", sensor_side)
+        )
         if self._width * self._height > MOST_PIXELS:
-            raise AmiwarpError(f"a sensor of {self._width}x{self._height} has more than {MOST_PIXELS} pixels; crop it")
+            raise AmiwarpError(
+                f"a sensor of {self._width}x{self._height} has more than {MOST_PIXELS} pixels; crop it"
+            )
         self._method = choice(CornerMethod, detector, "detector")
         self._device = wp.get_device("cpu" if device is None else device)
-        kind = PassInOrder if self._device.is_cpu else PassInLists
-        self._pass: PassInOrder | PassInLists = kind(self._width, self._height, self._method, self._device)
+        given = (self._width, self._height, self._method, self._device)
+        self._pass: PassInOrder | PassInLists
+        if self._device.is_cpu:
+            self._pass = PassInOrder(*given)
+        else:
+            self._pass = PassInLists(*given)
         self._last_us: int | None = None
 
     @overload
@@ -172,9 +194,12 @@ class CornerDetector:
             return events
         check_events(events, self._width, self._height, where="events", after_t=self._last_us)
         self._last_us = int(events.t[-1])
-        columns = (np.ascontiguousarray(column) for column in (events.x, events.y, events.t, events.p))
         copy = not self._device.is_cpu
-        return DeviceEvents(*(wp.array(column, device=self._device, copy=copy) for column in columns))
+        columns = [
+            wp.array(np.ascontiguousarray(column), device=self._device, copy=copy)
+            for column in (events.x, events.y, events.t, events.p)
+        ]
+        return DeviceEvents(*columns)
 
     def _check_limits(self, events: DeviceEvents) -> None:
         """Check events on the device."""
@@ -200,82 +225,121 @@ class PassInOrder:
         bits = WIDEST_BAND
         while bits > NARROWEST_BAND and height >> bits < 4 * self._threads:
             bits -= 1
-        bits = bits if self._threads > 1 else height.bit_length()
+        if self._threads == 1:  # one band
+            bits = height.bit_length()
         bands = ((height - 1) >> bits) + 1
-        reach = int(kernels.REACH)
-        self._surface = _surface(width, height, height + 2 * reach * bands, method, device)
+        shared_rows = 2 * int(kernels.REACH) * bands
+        self._surface = _surface(width, height, height + shared_rows, method, device)
         self._surface.band_bits = bits
         self._rule = _rule(method)
-        self._owner = wp.array(np.arange(bands) % self._threads, dtype=int, device=device)
+        thread_of_band = np.arange(bands) % self._threads
+        self._owner = wp.array(thread_of_band, dtype=int, device=device)
 
     def detect(self, events: DeviceEvents, corner: wp.array) -> None:
         """Write to ``corner`` whether each event is one, and update the surfaces."""
-        smallest = 1 if len(events) >= LEAST_SHARED else self._threads
-        inputs = [_columns(events), self._surface, self._rule, self._owner]
-        launch(kernels.detect_in_order, self._threads, inputs, [corner], device=events.device, smallest=smallest)
+        threads = self._threads
+        launch(
+            kernels.detect_in_order,
+            threads,
+            [_columns(events), self._surface, self._rule, self._owner],
+            [corner],
+            device=events.device,
+            smallest=1 if len(events) >= LEAST_SHARED else threads,
+        )
 
 
 class PassInLists:
     """Tests all events of a block at once. Events are sorted into lists, one for each polarity and pixel."""
 
     def __init__(self, width: int, height: int, method: CornerMethod, device: Any) -> None:
-        self._device, self._filters = device, method is CornerMethod.ARC
+        self._device = device
+        self._filters = method is CornerMethod.ARC
         self._surface = _surface(width, height, height, method, device)
         self._rule = _rule(method)
         self._lists = 2 * width * height
 
     def detect(self, events: DeviceEvents, corner: wp.array) -> None:
         """Write to ``corner`` whether each event is one, and update the surfaces."""
-        columns, every = _columns(events), self._sorted(events)
-        lists = self._without_redundant(columns, every, len(events)) if self._filters else every
+        columns = _columns(events)
+        every = self._sorted(events)
+        lists = every
+        if self._filters:
+            lists = self._without_redundant(columns, every, len(events))
         corner.zero_()
-        self._run(kernels.detect_in_lists, len(events), [columns, self._surface, lists, self._rule], [corner])
+        inputs = [columns, self._surface, lists, self._rule]
+        self._run(kernels.detect_in_lists, len(events), inputs, [corner])
         self._run(kernels.store_lists, self._lists, [columns, lists], [self._surface])
         if self._filters:
-            self._run(kernels.store_last, self._lists // 2, [columns, every], [self._surface])
+            pixels = self._lists // 2
+            self._run(kernels.store_last, pixels, [columns, every], [self._surface])
 
     def _sorted(self, events: DeviceEvents) -> Any:
         """Return the lists of all events."""
         n = len(events)
-        keys, order = self._empty(2 * n), self._empty(2 * n)
-        self._run(kernels.key_events, n, [_columns(events), self._surface], [keys, order])
+        keys = self._empty(2 * n)
+        order = self._empty(2 * n)
+        inputs = [_columns(events), self._surface]
+        self._run(kernels.key_events, n, inputs, [keys, order])
         wp.utils.radix_sort_pairs(keys, order, n)
+        edges = self._lists + 1
         lists = kernels.Lists()
-        lists.order, lists.first = order, self._empty(self._lists + 1)
-        self._run(kernels.find_lists, self._lists + 1, [keys, n], [lists.first])
+        lists.order = order
+        lists.first = self._empty(edges)
+        self._run(kernels.find_lists, edges, [keys, n], [lists.first])
         return lists
 
     def _without_redundant(self, columns: Any, lists: Any, n: int) -> Any:
         """Return the lists without redundant events."""
-        fresh, place = wp.zeros(n + 1, dtype=int, device=self._device), self._empty(n + 1)
-        self._run(kernels.mark_fresh, n, [columns, self._surface, lists, self._rule], [fresh])
+        fresh = wp.zeros(n + 1, dtype=int, device=self._device)
+        place = self._empty(n + 1)
+        inputs = [columns, self._surface, lists, self._rule]
+        self._run(kernels.mark_fresh, n, inputs, [fresh])
         wp.utils.array_scan(fresh, place, inclusive=False)
+        edges = self._lists + 1
         kept = kernels.Lists()
-        kept.order, kept.first = self._empty(n), self._empty(self._lists + 1)
+        kept.order = self._empty(n)
+        kept.first = self._empty(edges)
         self._run(kernels.keep_fresh, n, [lists, fresh, place], [kept.order])
-        self._run(kernels.move_lists, self._lists + 1, [lists, place], [kept.first])
+        self._run(kernels.move_lists, edges, [lists, place], [kept.first])
         return kept
 
     def _empty(self, n: int) -> wp.array:
         return wp.empty(n, dtype=int, device=self._device)
 
-    def _run(self, kernel: Any, n: int, inputs: list[Any], outputs: list[Any]) -> None:
+    def _run(
+        self,
+        kernel: Any,
+        n: int,
+        inputs: list[Any],
+        outputs: list[Any],
+    ) -> None:
         launch(kernel, n, inputs, outputs, device=self._device)
 
 
-def _side(value: object, what: str) -> int:
+def sensor_side(value: object, what: str) -> int:
     """Return the width or the height of a sensor [px]."""
     return whole(value, what, 1, LARGEST_SIZE, " pixels")
 
 
-def _surface(width: int, height: int, rows: int, method: CornerMethod, device: Any) -> Any:
+def _surface(
+    width: int,
+    height: int,
+    rows: int,
+    method: CornerMethod,
+    device: Any,
+) -> Any:
     """Return empty surfaces of ``rows`` rows, which include those that bands share."""
+    pixels = width * rows
+    filtered = pixels if method is CornerMethod.ARC else 0
+    never = wp.int64(kernels.NEVER)
+    no_polarity = int(kernels.NO_POLARITY)
     surface = kernels.Surface()
-    surface.width, surface.height, surface.pixels = width, height, width * rows
-    surface.time = wp.full(2 * surface.pixels, wp.int64(kernels.NEVER), dtype=wp.int64, device=device)
-    filtered = surface.pixels if method is CornerMethod.ARC else 0
+    surface.width = width
+    surface.height = height
+    surface.pixels = pixels
+    surface.time = wp.full(2 * pixels, never, dtype=wp.int64, device=device)
     surface.last = wp.zeros(filtered, dtype=wp.int64, device=device)
-    surface.polarity = wp.full(filtered, int(kernels.NO_POLARITY), dtype=wp.uint8, device=device)
+    surface.polarity = wp.full(filtered, no_polarity, dtype=wp.uint8, device=device)
     return surface
 
 
@@ -290,61 +354,8 @@ def _rule(method: CornerMethod) -> Any:
 def _columns(events: DeviceEvents) -> Any:
     """Return the columns of events as the struct that the kernels take."""
     columns = kernels.Columns()
-    columns.x, columns.y, columns.t, columns.p = events.x, events.y, events.t, events.p
+    columns.x = events.x
+    columns.y = events.y
+    columns.t = events.t
+    columns.p = events.p
     return columns
-
-
-# Background activity: events that no earlier event at a neighbouring pixel supports.
-
-SUPPORT_US = 10_000
-"""Default time within which a neighbour supports an event [us]."""
-
-
-@guarded
-def find_background_activity(
-    events: Events, size: tuple[int, int], *, window_us: int = SUPPORT_US
-) -> NDArray[np.bool_]:
-    """Find the events that are probably noise, because no neighbouring pixel fired shortly before.
-
-    Parameters
-    ----------
-    events : Events
-        Events from a sensor, sorted by time.
-    size : tuple of int
-        Sensor size (width, height) [px].
-    window_us : int, optional
-        Longest time since an event at one of the eight neighbours [us], at least 1. Polarities are not compared.
-
-    Returns
-    -------
-    ndarray
-        Whether each event is background activity, bool, shape ``(n,)``.
-
-    Raises
-    ------
-    AmiwarpError
-        If the events are compensated, out of order or outside the sensor, or ``window_us`` is below 1.
-
-    Notes
-    -----
-    Source: Delbruck, "Frame-free dynamic digital vision", 2008. The first event of an edge at each place has no support
-    and is removed too. A single CPU thread passes over the events in their order.
-
-    Examples
-    --------
-    >>> events = amiwarp.Events.from_arrays(x=[3, 4, 9], y=[3, 3, 9], t=[0, 500, 900], p=[1, 1, 0])
-    >>> amiwarp.find_background_activity(events, (16, 16), window_us=1000)
-    array([ True, False,  True])
-    """
-    instance(events, Events, "events")
-    check_sensor(events)
-    width, height = (int(side) for side in vector(size, 2, "size of the sensor", _side))
-    window_us = whole(window_us, "window_us", 1, TIME_LIMIT, " us")
-    check_events(events, width, height, where="events")
-    columns = [wp.array(np.ascontiguousarray(c), device="cpu", copy=False) for c in (events.x, events.y, events.t)]
-    latest = wp.full((width + 2) * (height + 2), wp.int64(event_kernels.NEVER), dtype=wp.int64, device="cpu")
-    background = wp.empty(len(events), dtype=wp.bool, device="cpu")
-    load(event_kernels.mark_background, wp.get_device("cpu"))
-    inputs = [*columns, window_us, width + 2, latest]
-    wp.launch(event_kernels.mark_background, 1, inputs, [background], device="cpu")
-    return np.asarray(background.numpy(), np.bool_)

@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 from amiwarp.choices import Layers
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, EventSource
-from amiwarp.imaging.iwe import PIECE, CanvasShape, Votes
+from amiwarp.imaging.canvas import CanvasShape
+from amiwarp.imaging.iwe import PIECE
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
-from amiwarp.io.files import NewFile, allocate, check_output
-from amiwarp.io.formats import check_ending
+from amiwarp.imaging.votes import Votes
+from amiwarp.io.file_access import allocate
+from amiwarp.io.output_formats import check_ending
+from amiwarp.io.outputs import NewFile, check_output
 from amiwarp.validation import choice
 
 PNG_LEVEL = 7
@@ -37,7 +40,9 @@ MOST_WINDOWS = 100_000
 def brightest(counts: NDArray[Any], percentile: float = PERCENTILE) -> float:
     """Return the event count that is shown brightest: the percentile of the pixels with events, or 1 without events."""
     positive = counts[counts > 0]
-    return float(np.percentile(positive, percentile)) if positive.size else 1.0
+    if not positive.size:
+        return 1.0
+    return float(np.percentile(positive, percentile))
 
 
 def tone(counts: NDArray[Any], top: float | None = None) -> NDArray[np.float32]:
@@ -45,17 +50,25 @@ def tone(counts: NDArray[Any], top: float | None = None) -> NDArray[np.float32]:
 
     ``top``: count that is shown as 1, by default the :func:`brightest`.
     """
-    top = brightest(counts) if top is None else top
-    return np.asarray(np.clip(counts / top, 0.0, 1.0) ** GAMMA, np.float32)
+    if top is None:
+        top = brightest(counts)
+    share = np.clip(counts / top, 0.0, 1.0)
+    return np.asarray(share**GAMMA, np.float32)
 
 
 def in_two_colours(off: NDArray[Any], on: NDArray[Any]) -> NDArray[Any]:
     """Return the brightness of OFF and ON events as colours on black, at most 2, shape ``(height, width, 3)``."""
+    colours = np.array([OFF_ON_BLACK, ON_ON_BLACK], off.dtype)
     # A product of matrices is eight times as fast as two sums over an axis of three.
-    return np.stack([off, on], axis=-1) @ np.array([OFF_ON_BLACK, ON_ON_BLACK], off.dtype)
+    return np.stack([off, on], axis=-1) @ colours
 
 
-def to_picture(image: NDArray[np.float32], layers: Layers, *, top: float | None = None) -> NDArray[np.uint8]:
+def to_picture(
+    image: NDArray[np.float32],
+    layers: Layers,
+    *,
+    top: float | None = None,
+) -> NDArray[np.uint8]:
     """Return an image of events as an 8-bit picture, shape ``(height, width)``; with polarities ``(height, width, 3)``.
 
     Merged: no events is black, many are white. Signed: zero is grey, ON is white, OFF is black. Polarity: OFF is blue,
@@ -68,8 +81,10 @@ def to_picture(image: NDArray[np.float32], layers: Layers, *, top: float | None 
     elif layers is Layers.SIGNED:
         shown = 0.5 + 0.5 * np.sign(image) * tone(np.abs(image), top)
     else:
-        shown = in_two_colours(*tone(image, top))
-    return np.asarray(np.rint(np.clip(shown, 0.0, 1.0) * 255.0), np.uint8)
+        off, on = tone(image, top)
+        shown = in_two_colours(off, on)
+    levels = np.clip(shown, 0.0, 1.0) * 255.0
+    return np.asarray(np.rint(levels), np.uint8)
 
 
 def save_png(path: Path, picture: Any, *, overwrite: bool = False) -> None:
@@ -85,7 +100,9 @@ def save_values(path: Path, image: NDArray[np.float32]) -> None:
 
     check_ending(path, "values of images are written", [".tif"])
     with NewFile(path) as new:
-        first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in image.reshape(-1, *image.shape[-2:]))
+        height, width = image.shape[-2:]
+        layers = np.asarray(image.reshape(-1, height, width), np.float32)
+        first, *more = map(Image.fromarray, layers)
         encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
 
 
@@ -111,7 +128,13 @@ class IweFiles:
     """
 
     def __init__(
-        self, paths: Sequence[Path], source: EventSource, *, window_us: int | None, layers: Layers, device: Any
+        self,
+        paths: Sequence[Path],
+        source: EventSource,
+        *,
+        window_us: int | None,
+        layers: Layers,
+        device: Any,
     ) -> None:
         """Check the output paths. ``window_us`` is the length of a window [us]; None makes one image of all events.
 
@@ -120,13 +143,17 @@ class IweFiles:
         for path in paths:
             check_ending(path, "images of events are written", [".png", ".npy"])
         self.written: list[Path] = []
-        self._layers = layers = choice(Layers, layers, "layers")
-        width, height = source.size
-        self._votes = Votes(CanvasShape(width, height, per_polarity=layers is not Layers.MERGED), device)
+        self._layers = choice(Layers, layers, "layers")
+        per_polarity = self._layers is not Layers.MERGED
+        self._votes = Votes(CanvasShape(*source.size, per_polarity=per_polarity), device)
+
         self._window_us = window_us
-        self._first = source.t_first if len(source) else 0
-        duration = source.t_last - self._first + 1 if len(source) else 1
-        self._count = 1 if window_us is None else -(-duration // window_us)
+        self._first = 0
+        duration = 1
+        if len(source):
+            self._first = source.t_first
+            duration = source.t_last - self._first + 1
+        self._count = 1 if window_us is None else -(-duration // window_us)  # rounded up
         if self._count > MOST_WINDOWS:
             raise AmiwarpError(
                 f"{self._count} windows exceed the limit of {MOST_WINDOWS}; give a longer --iwe-window-ms"
@@ -162,7 +189,8 @@ class IweFiles:
         window = np.zeros(len(events), np.int64)
         if self._window_us is not None:
             window = (events.t - self._first) // self._window_us
-            edges |= set((np.flatnonzero(np.diff(window)) + 1).tolist())
+            begins = np.flatnonzero(np.diff(window)) + 1
+            edges.update(begins.tolist())
         cuts = sorted(edges)
         for start, stop in itertools.pairwise(cuts):
             yield int(window[start]), events[start:stop]
@@ -177,7 +205,8 @@ class IweFiles:
             if path.suffix.lower() == ".npy":
                 self._stack(path, image.shape)[self._window] = image
             else:
-                encode_png(self._begin_file(self._numbered(path, self._window)), to_picture(image, self._layers))
+                part = self._begin_file(self._numbered(path, self._window))
+                encode_png(part, to_picture(image, self._layers))
         self._window += 1
 
     def _stack(self, path: Path, shape: tuple[int, ...]) -> Any:
@@ -185,17 +214,19 @@ class IweFiles:
         if path not in self._stacks:
             part = self._begin_file(path)
             full = (self._count, *shape)
-            flat = np.lib.format.open_memmap(
-                part, mode="w+", dtype=np.float32, shape=shape if self._window_us is None else full
-            )
-            with open(part, "r+b") as file:  # reserve the space: writing a mapped page to a full disk kills the process
+            stored = shape if self._window_us is None else full
+            flat = np.lib.format.open_memmap(part, mode="w+", dtype=np.float32, shape=stored)
+            # Reserve the space: writing a mapped page to a full disk kills the process.
+            with open(part, "r+b") as file:
                 allocate(file.fileno(), 0, os.path.getsize(part))
             self._stacks[path] = flat.reshape(full)
         return self._stacks[path]
 
     def _numbered(self, path: Path, at: int) -> Path:
         """Return the path of one window's image."""
-        return path if self._window_us is None else path.with_name(f"{path.stem}_{at:05d}{path.suffix}")
+        if self._window_us is None:
+            return path
+        return path.with_name(f"{path.stem}_{at:05d}{path.suffix}")
 
     def _check_outputs(self) -> None:
         """Check all output paths before any work; raise :class:`AmiwarpError` if one of them cannot be written."""
@@ -218,7 +249,9 @@ class IweFiles:
         while self._window < self._count:
             self._write_window()
         while self._stacks:  # Windows does not rename a file that is mapped
-            self._stacks.popitem()[1].flush()
+            _, stack = self._stacks.popitem()
+            stack.flush()
+            del stack
         for new in self._unfinished:
             new.commit()
             self.written.append(new.path)

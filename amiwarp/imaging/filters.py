@@ -13,19 +13,32 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
-from amiwarp.events.recording import Events, EventSource, ImuSamples, Recording, check_events
-from amiwarp.events.truth import EventTruth, StoredInstants
-from amiwarp.io import formats
-from amiwarp.io.export import convert
+from amiwarp.events.other_sensors import ImuSamples
+from amiwarp.events.recording import Events, EventSource, Recording, check_events
+from amiwarp.events.stores import StoredInstants
+from amiwarp.events.truth import EventTruth
+from amiwarp.io import output_formats
+from amiwarp.io.conversion import convert
 from amiwarp.io.file_scan import RECORDS
-from amiwarp.io.files import check_output, scratch_folder
-from amiwarp.io.formats import OutputFormat
-from amiwarp.io.native_format import RecordingWriter, copy_records
-from amiwarp.kernels import events as event_kernels
-from amiwarp.kernels.launch import launch, load, start_once
+from amiwarp.io.native.copying import copy_records
+from amiwarp.io.native.writer import RecordingWriter
+from amiwarp.io.output_formats import OutputFormat
+from amiwarp.io.outputs import check_output
+from amiwarp.io.unfinished import scratch_folder
+from amiwarp.kernels.background_activity import (
+    NEVER,
+    mark_background,
+    mark_hot_pixels,
+    mark_over_rate,
+    mark_refractory,
+)
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.loading import load
+from amiwarp.kernels.quiet_start import start_once
 from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.schema.calls import guarded
 from amiwarp.tasks import Progress
-from amiwarp.validation import TIME_LIMIT, guarded, real, vector, whole
+from amiwarp.validation import TIME_LIMIT, real, vector, whole
 
 CREDIT_S = 1e-3
 """Time without events that allows a burst, with a limited rate [s]."""
@@ -72,18 +85,24 @@ class EventFilter:
         if self.window is not None:
             window = vector(self.window, 2, "window", _time)
             if not window[0] < window[1]:
-                raise AmiwarpError(f"window is {self.window}; give start and end [us], the end after the start")
+                raise AmiwarpError(
+                    f"window is {self.window}; give start and end [us], the end after the start"
+                )
             object.__setattr__(self, "window", window)
         if self.region is not None:
             left, top, right, bottom = region = vector(self.region, 4, "region", _pixel)
             if not (left < right and top < bottom):
-                raise AmiwarpError(f"region is {self.region}; give left, top, right and bottom [px] of a part")
+                raise AmiwarpError(
+                    f"region is {self.region}; give left, top, right and bottom [px] of a part"
+                )
             object.__setattr__(self, "region", region)
         if self.polarity is not None:
             object.__setattr__(self, "polarity", whole(self.polarity, "polarity", 0, 1))
         for name in ("refractory_us", "background_us"):
             object.__setattr__(self, name, whole(getattr(self, name), name, 0, TIME_LIMIT, " us"))
-        object.__setattr__(self, "most_per_s", real(self.most_per_s, "most_per_s", 0.0, 1e12, " events/s"))
+        object.__setattr__(
+            self, "most_per_s", real(self.most_per_s, "most_per_s", 0.0, 1e12, " events/s")
+        )
         object.__setattr__(self, "every", whole(self.every, "every", 1, 1 << 31))
 
     def apply(self, events: Events, size: tuple[int, int]) -> Events:
@@ -136,17 +155,21 @@ class RunningFilter:
         self.size = width, height
         self._hot_counts = np.zeros((height, width), np.int64)
         hot = self.chosen.hot_pixels
-        if hot is not None and (np.shape(hot) != (height, width) or np.asarray(hot).dtype != np.bool_):
+        if hot is not None and (
+            np.shape(hot) != (height, width) or np.asarray(hot).dtype != np.bool_
+        ):
             raise AmiwarpError(
                 f"hot_pixels has shape {np.shape(hot)} and type {np.asarray(hot).dtype}; expected booleans of shape "
                 f"({height}, {width}), as find_hot_pixels returns them"
             )
         region = self.chosen.region
         if region is not None and (region[2] > width or region[3] > height):
-            raise AmiwarpError(f"region is {region}; expected a part of the image of {width}x{height} px")
+            raise AmiwarpError(
+                f"region is {region}; expected a part of the image of {width}x{height} px"
+            )
 
     def keep(self, events: Events) -> NDArray[np.bool_]:
-        """Return which of the events that follow those of the last call are kept, bool, shape ``(n,)``."""
+        """Return which events are kept, where the events follow the events of the last call, bool, shape ``(n,)``."""
         check_sensor(events)
         check_events(events, *self.size, where="events", after_t=self._last_t)
         if len(events):
@@ -191,22 +214,29 @@ class RunningFilter:
 
     def _refractory(self, events: Events) -> NDArray[np.bool_]:
         width, height = self.size
-        kernel = event_kernels.mark_refractory
-        return ~self._marked("refractory_us", kernel, events, self.chosen.refractory_us, width, width * height)
+        kernel = mark_refractory
+        return ~self._marked(
+            "refractory_us", kernel, events, self.chosen.refractory_us, width, width * height
+        )
 
     def _background(self, events: Events) -> NDArray[np.bool_]:
         width, height = self.size
         pixels = (width + 2) * (height + 2)  # with a border
-        kernel = event_kernels.mark_background
-        return ~self._marked("background_us", kernel, events, self.chosen.background_us, width + 2, pixels)
+        kernel = mark_background
+        return ~self._marked(
+            "background_us", kernel, events, self.chosen.background_us, width + 2, pixels
+        )
 
     def _marked(
         self, name: str, kernel: Any, events: Events, time_us: int, stride: int, pixels: int
     ) -> NDArray[np.bool_]:
         """Return which events a kernel marks that passes over them in order, and keeps a time of each pixel."""
         if name not in self._latest:
-            self._latest[name] = wp.full(pixels, wp.int64(event_kernels.NEVER), dtype=wp.int64, device="cpu")
-        columns = [wp.array(each, device="cpu", copy=False) for each in (events.x, events.y, events.t)]
+            never = wp.int64(NEVER)
+            self._latest[name] = wp.full(pixels, never, dtype=wp.int64, device="cpu")
+        columns = [
+            wp.array(each, device="cpu", copy=False) for each in (events.x, events.y, events.t)
+        ]
         marks = wp.empty(len(events), dtype=wp.bool, device="cpu")
         load(kernel, wp.get_device("cpu"))
         inputs = [*columns, time_us, stride, self._latest[name]]
@@ -215,13 +245,18 @@ class RunningFilter:
 
     def _rate(self, events: Events) -> NDArray[np.bool_]:
         if "most_per_s" not in self._latest:
-            self._latest["most_per_s"] = wp.full(1, wp.int64(event_kernels.NEVER), dtype=wp.int64, device="cpu")
+            never = wp.int64(NEVER)
+            self._latest["most_per_s"] = wp.full(1, never, dtype=wp.int64, device="cpu")
             self._credit = wp.full(1, self._most_credit, dtype=wp.float64, device="cpu")
         over = wp.empty(len(events), dtype=wp.bool, device="cpu")
-        load(event_kernels.mark_over_rate, wp.get_device("cpu"))
-        inputs = [wp.array(events.t, device="cpu", copy=False), 1e-6 * self.chosen.most_per_s, self._most_credit]
+        load(mark_over_rate, wp.get_device("cpu"))
+        inputs = [
+            wp.array(events.t, device="cpu", copy=False),
+            1e-6 * self.chosen.most_per_s,
+            self._most_credit,
+        ]
         outputs = [self._credit, self._latest["most_per_s"], over]
-        wp.launch(event_kernels.mark_over_rate, 1, inputs, outputs, device="cpu")
+        wp.launch(mark_over_rate, 1, inputs, outputs, device="cpu")
         return ~np.asarray(over.numpy(), np.bool_)
 
     @property
@@ -274,7 +309,11 @@ def described(chosen: EventFilter) -> str:
 def is_given(chosen: EventFilter, name: str) -> bool:
     """Return whether a part of a filter may remove events."""
     value = getattr(chosen, name)
-    return value is not None and not (isinstance(value, int | float) and name != "polarity" and value == NOTHING[name])
+    if value is None:
+        return False
+    if name != "polarity" and isinstance(value, int | float):
+        return bool(value != NOTHING[name])
+    return True
 
 
 NOTHING = {each.name: each.default for each in fields(EventFilter)}
@@ -332,10 +371,11 @@ def find_hot_pixels(events: Events | EventSource, size: tuple[int, int]) -> NDAr
     for block in [events] if isinstance(events, Events) else events.blocks():
         check_sensor(block)
         check_events(block, width, height, where="events")
-        count += np.bincount(block.y.astype(np.int64) * width + block.x, minlength=height * width).astype(np.int32)
+        pixel = block.y.astype(np.int64) * width + block.x
+        count += np.bincount(pixel, minlength=height * width).astype(np.int32)
     hot = wp.empty(height * width, dtype=wp.bool, device="cpu")
     counts = wp.array(count.reshape(height, width), device="cpu")
-    launch(event_kernels.mark_hot_pixels, height * width, [counts], [hot], device="cpu")
+    launch(mark_hot_pixels, height * width, [counts], [hot], device="cpu")
     return np.asarray(hot.numpy().reshape(height, width), np.bool_)
 
 
@@ -387,7 +427,7 @@ def filter_recording(
     chosen : EventFilter
         Which events are kept.
     format : OutputFormat or str, optional
-        The format to write, if not that of the extension.
+        The format to write, if not the extension's.
     progress : callable, optional
         Called with the name of the step and the finished fraction of the task, 0 to 1.
     overwrite : bool, default False
@@ -412,19 +452,25 @@ def filter_recording(
     """
     out_path = Path(out_path)
     check_output(out_path, overwrite=overwrite)
-    output = formats.output_format(out_path, format)
+    output = output_formats.output_format(out_path, format)
     if output is OutputFormat.NATIVE:
         return _write_kept(recording, out_path, chosen, progress, overwrite)
     # Other formats are converted from amiwarp's.
     with scratch_folder(out_path.parent) as folder:
         summary = _write_kept(recording, folder / "kept.h5", chosen, progress, False)
-        written = convert(folder / "kept.h5", out_path, format=output, progress=progress, overwrite=overwrite)
+        written = convert(
+            folder / "kept.h5", out_path, format=output, progress=progress, overwrite=overwrite
+        )
     left_out = tuple(dict.fromkeys((*written.left_out, *summary.left_out)))
     return replace(summary, left_out=left_out, subtracted_us=written.subtracted_us)
 
 
 def _write_kept(
-    recording: Recording, path: Path, chosen: EventFilter, progress: Progress | None, overwrite: bool
+    recording: Recording,
+    path: Path,
+    chosen: EventFilter,
+    progress: Progress | None,
+    overwrite: bool,
 ) -> FilterSummary:
     """Write the kept events in amiwarp's format, with everything else that the recording holds."""
     source = recording.events
@@ -436,11 +482,15 @@ def _write_kept(
     removed_records: dict[str, int] = {}
     lost: tuple[str, ...] = ()
     if chosen.window is not None:
-        imu, frames = _imu_within(imu, chosen.window), _frames_within(frames, chosen.window)
+        imu = _imu_within(imu, chosen.window)
+        frames = _frames_within(frames, chosen.window)
         held = (("imu_samples", recording.imu, imu), ("frames", recording.frames, frames))
-        removed_records = {name: len(whole) - len(part or ()) for name, whole, part in held if whole is not None}
+        for name, all_records, kept_records in held:
+            if all_records is not None:
+                removed_records[name] = len(all_records) - len(kept_records or ())
         # The counts in the metadata are of the whole recording. How many triggers the window has is not known.
-        lost = ("triggers",) if about.get("triggers") and recording.encoder is None else ()
+        if about.get("triggers") and recording.encoder is None:
+            lost = ("triggers",)
         about = {name: value for name, value in about.items() if name not in RECORDS}
         about |= {name: len(part) for name, _, part in held if part is not None}
     earlier = [str(about["filter"])] if "filter" in about else []
@@ -462,10 +512,10 @@ def _write_kept(
             stop = start + len(block)
             kept = running.keep(block)
             known = None if truth is None else _part(truth.of_events(start, stop), kept)
-            part = block[kept]
-            if len(part):
-                writer.append(part, truth=known)
-                kept_times = [*kept_times[:1], int(part.t[0]), int(part.t[-1])]
+            kept_events = block[kept]
+            if len(kept_events):
+                writer.append(kept_events, truth=known)
+                kept_times = [*kept_times[:1], int(kept_events.t[0]), int(kept_events.t[-1])]
             start = stop
             if progress is not None:
                 progress("filtering events", start / len(source))
@@ -497,7 +547,12 @@ def _imu_within(imu: ImuSamples | None, window: tuple[int, int]) -> ImuSamples |
     start, stop = np.searchsorted(imu.t, window).tolist()
     if start == stop:
         return None
-    return ImuSamples(imu.t[start:stop], imu.angular_velocity[start:stop], imu.acceleration[start:stop])
+    return ImuSamples(
+        imu.t[start:stop],
+        imu.angular_velocity[start:stop],
+        imu.acceleration[start:stop],
+        imu.to_camera,
+    )
 
 
 def _frames_within(
@@ -513,4 +568,6 @@ def _frames_within(
 def _part(truth: EventTruth, kept: NDArray[np.bool_]) -> EventTruth:
     """Return the ground truth of the kept events."""
     values = {each.name: getattr(truth, each.name) for each in fields(truth)}
-    return EventTruth(**{name: None if value is None else value[kept] for name, value in values.items()})
+    return EventTruth(
+        **{name: None if value is None else value[kept] for name, value in values.items()}
+    )

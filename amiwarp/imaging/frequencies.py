@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.events.recording import Events
 
-SLOWEST_HZ, FASTEST_HZ = 1.0, 20_000.0
+Integers = NDArray[np.int64]
+
+SLOWEST_HZ = 1.0
+FASTEST_HZ = 20_000.0
 """Lowest and highest frequency that is found [Hz]."""
 BIN = math.log(1.05)
 """Width of the bins of a pixel's histogram of periods, on a logarithmic scale: 5 %."""
@@ -20,9 +24,12 @@ LEAST_SHARE = 0.5
 
 
 def pixel_frequencies(
-    events: Events, size: tuple[int, int], *, starts: NDArray[np.int64] | None = None
+    events: Events,
+    size: tuple[int, int],
+    *,
+    starts: Integers | None = None,
 ) -> NDArray[np.float32]:
-    """Return the dominant frequency of each pixel [Hz], shape ``(height, width)``; NaN where there is none.
+    """Return the dominant frequency of each pixel [Hz], shape ``(height, width)``; NaN if it has none.
 
     A period of a pixel is the time between two changes from OFF to ON: from an ON event that follows an OFF event to
     the next such event. The frequency is the inverse of the mean period in the peak of the histogram of the pixel's
@@ -38,36 +45,91 @@ def pixel_frequencies(
     """
     width, height = size
     found = np.full(height * width, np.nan, np.float32)
+    pixel, periods = _periods(events, width, starts)
+    counts = np.bincount(pixel, minlength=height * width)
+    shortest_us = 1e6 / FASTEST_HZ
+    longest_us = 1e6 / SLOWEST_HZ
+    possible = (periods >= shortest_us) & (periods <= longest_us)
+    if not possible.any():
+        return found.reshape(height, width)
+
+    peaks = _fullest_peaks(pixel[possible], periods[possible])
+    many = peaks.numbers >= FEWEST_PERIODS
+    most = peaks.numbers >= LEAST_SHARE * counts[peaks.pixel]
+    clear = many & most
+    frequencies = 1e6 * peaks.numbers[clear] / peaks.sums[clear]
+    found[peaks.pixel[clear]] = frequencies
+    return found.reshape(height, width)
+
+
+def _periods(
+    events: Events,
+    width: int,
+    starts: Integers | None,
+) -> tuple[Integers, NDArray[np.float64]]:
+    """Return the pixel and the length [us] of each period, in the order of the pixels."""
+    # The changes from OFF to ON of each pixel.
     pixel = events.y.astype(np.int64) * width + events.x
     order = np.argsort(pixel, kind="stable")  # each pixel's events stay in the order of time
-    pixel, t, p = pixel[order], events.t[order], events.p[order]
-    run = np.zeros(len(t), np.int64) if starts is None else np.searchsorted(starts, t, side="right")
+    pixel = pixel[order]
+    t = events.t[order]
+    p = events.p[order]
+    run = np.zeros(len(t), np.int64)
+    if starts is not None:
+        run = np.searchsorted(starts, t, side="right")
     joined = (pixel[1:] == pixel[:-1]) & (run[1:] == run[:-1])
-    rises = np.flatnonzero(joined & (p[1:] == 1) & (p[:-1] == 0)) + 1
-    pixel, run, t = pixel[rises], run[rises], t[rises]
+    turns_on = (p[1:] == 1) & (p[:-1] == 0)
+    rises = np.flatnonzero(joined & turns_on) + 1
+
+    # The periods between them.
+    pixel = pixel[rises]
+    run = run[rises]
     whole = (pixel[1:] == pixel[:-1]) & (run[1:] == run[:-1])
-    pixel, periods = pixel[1:][whole], np.diff(t)[whole].astype(np.float64)
-    counts = np.bincount(pixel, minlength=height * width)
-    possible = (periods >= 1e6 / FASTEST_HZ) & (periods <= 1e6 / SLOWEST_HZ)
-    pixel, periods = pixel[possible], periods[possible]
-    if not len(pixel):
-        return found.reshape(height, width)
-    bins = np.floor(np.log(periods * (FASTEST_HZ * 1e-6)) / BIN).astype(np.int64) + 1
-    row = math.ceil(math.log(FASTEST_HZ / SLOWEST_HZ) / BIN) + 3  # with an empty bin between two pixels
-    keys, inverse, full = np.unique(pixel * row + bins, return_inverse=True, return_counts=True)
-    total = np.bincount(inverse, periods)
-    n_peak, t_peak = full.copy(), total.copy()
+    periods = np.diff(t[rises])
+    return pixel[1:][whole], periods[whole].astype(np.float64)
+
+
+class _Peaks(NamedTuple):
+    """Fullest peak in the histogram of the periods of each pixel."""
+
+    pixel: Integers
+    """The pixel."""
+    numbers: Integers
+    """Number of periods in the peak."""
+    sums: NDArray[np.float64]
+    """Their sum [us]."""
+
+
+def _fullest_peaks(pixel: Integers, periods: NDArray[np.float64]) -> _Peaks:
+    """Return the fullest peak of each pixel that has periods [us]."""
+    # The histogram of each pixel, of its bins that are not empty: number and sum of their periods.
+    over_shortest = periods * (FASTEST_HZ * 1e-6)
+    bins = np.floor(np.log(over_shortest) / BIN).astype(np.int64) + 1
+    # With an empty bin between two pixels
+    bins_of_pixel = math.ceil(math.log(FASTEST_HZ / SLOWEST_HZ) / BIN) + 3
+    keys, inverse, numbers = np.unique(
+        pixel * bins_of_pixel + bins,
+        return_inverse=True,
+        return_counts=True,
+    )
+    sums = np.bincount(inverse, periods)
+
+    # Each bin with those next to it.
+    peak_numbers = numbers.copy()
+    peak_sums = sums.copy()
     adjacent = np.flatnonzero(np.diff(keys) == 1)
-    for own, other in ((adjacent, adjacent + 1), (adjacent + 1, adjacent)):
-        n_peak[own] += full[other]
-        t_peak[own] += total[other]
-    at = keys // row
-    order = np.lexsort((n_peak, at))
-    best = order[np.append(at[order][1:] != at[order][:-1], True)]  # the fullest peak of each pixel
-    clear = (n_peak[best] >= FEWEST_PERIODS) & (n_peak[best] >= LEAST_SHARE * counts[at[best]])
-    best = best[clear]
-    found[at[best]] = 1e6 * n_peak[best] / t_peak[best]
-    return found.reshape(height, width)
+    following = adjacent + 1
+    peak_numbers[adjacent] += numbers[following]
+    peak_sums[adjacent] += sums[following]
+    peak_numbers[following] += numbers[adjacent]
+    peak_sums[following] += sums[adjacent]
+
+    # The last of each pixel, in the order of their numbers.
+    pixel_of_key = keys // bins_of_pixel
+    order = np.lexsort((peak_numbers, pixel_of_key))
+    is_last_of_pixel = np.append(np.diff(pixel_of_key[order]) != 0, True)
+    best = order[is_last_of_pixel]
+    return _Peaks(pixel_of_key[best], peak_numbers[best], peak_sums[best])
 
 
 def strongest(frequencies: NDArray[np.float32], most: int) -> list[tuple[float, int]]:
@@ -75,12 +137,14 @@ def strongest(frequencies: NDArray[np.float32], most: int) -> list[tuple[float, 
 
     Frequencies within 5 % count as one. ``most``: largest number of them.
     """
-    left = frequencies[np.isfinite(frequencies)].astype(np.float64)
+    known = np.isfinite(frequencies)
+    left = frequencies[known].astype(np.float64)
     found: list[tuple[float, int]] = []
     while len(left) and len(found) < most:
         groups = np.floor(np.log(left) / BIN)
         numbers, counts = np.unique(groups, return_counts=True)
-        hz = float(np.median(left[groups == numbers[np.argmax(counts)]]))
+        fullest = numbers[np.argmax(counts)]
+        hz = float(np.median(left[groups == fullest]))
         near = np.abs(np.log(left / hz)) <= BIN
         found.append((hz, int(np.count_nonzero(near))))
         left = left[~near]

@@ -15,9 +15,13 @@ from amiwarp.events.recording import Events
 from amiwarp.events.truth import Truth
 from amiwarp.imaging.iwe import iwe
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Model, ModelError, predicted_error
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.models.comparison import ModelError, predicted_error
+from amiwarp.optics.models.exact import ExactModel
 from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.validation import guarded
+from amiwarp.schema.calls import guarded
+
+Vector = NDArray[np.float64]
 
 STRIP_HALF_WIDTH = 3.0
 """Half width of the strip along an edge in which events count as belonging to it [px]."""
@@ -33,9 +37,9 @@ TRUTH_PERCENTILES = (0.5, 99.5)
 class Edges:
     """Sub-pixel points on the edges of an IWE, found as ridges of the image."""
 
-    xy: NDArray[np.float64]
+    xy: Vector
     """Positions of the edge points [px], shape (n, 2)."""
-    normal: NDArray[np.float64]
+    normal: Vector
     """Unit vectors across the edge, shape (n, 2)."""
     label: NDArray[np.int64]
     """Index of the nearest edge point for each pixel, shape (height, width)."""
@@ -50,29 +54,58 @@ def find_edges(image: NDArray[np.float32]) -> Edges:
     """
     from scipy import ndimage
 
-    def derivative(y: int, x: int) -> NDArray[np.float64]:
-        return np.asarray(ndimage.gaussian_filter(image.astype(np.float64), RIDGE_SCALE, order=(y, x)))
+    pixels = image.astype(np.float64)
 
-    gx, gy = derivative(0, 1), derivative(1, 0)
-    hxx, hxy, hyy = derivative(0, 2), derivative(1, 1), derivative(2, 0)
+    def derivative(y: int, x: int) -> Vector:
+        return np.asarray(ndimage.gaussian_filter(pixels, RIDGE_SCALE, order=(y, x)))
+
+    # Second derivatives across and along an edge: the eigenvalues of the Hessian, and the direction across it.
+    hxx = derivative(0, 2)
+    hxy = derivative(1, 1)
+    hyy = derivative(2, 0)
     half = 0.5 * (hxx - hyy)
     root = np.hypot(half, hxy)
     across = 0.5 * (hxx + hyy) - root  # the smaller eigenvalue
     along = across + 2.0 * root
     angle = 0.5 * np.arctan2(hxy, half) + np.pi / 2  # direction of its eigenvector
-    nx, ny = np.cos(angle), np.sin(angle)
+    nx = np.cos(angle)
+    ny = np.sin(angle)
+
+    # Distance from a pixel's centre to where the first derivative is zero. The ridge crosses the pixel if it is short.
+    gx = derivative(0, 1)
+    gy = derivative(1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         offset = -(gx * nx + gy * ny) / across
-    ridge = (across < 0.0) & (np.abs(offset) <= 0.6) & (np.abs(along) < 0.5 * np.abs(across))
+    crosses = np.abs(offset) <= 0.6
+    is_long = np.abs(along) < 0.5 * np.abs(across)
+    ridge = (across < 0.0) & crosses & is_long
     if not ridge.any():
-        raise AmiwarpError("the image of events has no edges, so blur cannot be measured; give more or sharper events")
-    ridge &= across <= WEAKEST_EDGE * np.quantile(across[ridge], 0.05)
-    rows, cols = np.nonzero(ridge)
-    points = np.stack([cols + offset[ridge] * nx[ridge], rows + offset[ridge] * ny[ridge]], axis=1)
-    nearest = ndimage.distance_transform_edt(~ridge, return_distances=False, return_indices=True)
+        raise AmiwarpError(
+            "the image of events has no edges, so blur cannot be measured; give more or sharper events"
+        )
+    strong = np.quantile(across[ridge], 0.05)
+    ridge &= across <= WEAKEST_EDGE * strong
+
+    rows, columns = np.nonzero(ridge)
+    offset = offset[ridge]
+    nx = nx[ridge]
+    ny = ny[ridge]
+    x = columns + offset * nx
+    y = rows + offset * ny
+
+    # The nearest edge point of each pixel.
+    nearest_row, nearest_column = ndimage.distance_transform_edt(
+        ~ridge,
+        return_distances=False,
+        return_indices=True,
+    )
     index = np.zeros(image.shape, dtype=np.int64)
-    index[rows, cols] = np.arange(len(rows))
-    return Edges(points, np.stack([nx[ridge], ny[ridge]], axis=1), index[nearest[0], nearest[1]])
+    index[rows, columns] = np.arange(len(rows))
+    return Edges(
+        xy=np.stack([x, y], axis=1),
+        normal=np.stack([nx, ny], axis=1),
+        label=index[nearest_row, nearest_column],
+    )
 
 
 @guarded
@@ -118,32 +151,45 @@ def edge_blur(
     """
     of = sharp_xy if of is None else of
     if sharp_xy.ndim != 2 or sharp_xy.shape[1] != 2 or of.shape != sharp_xy.shape:
-        raise AmiwarpError(f"sharp_xy has shape {sharp_xy.shape} and of {of.shape}; give (n, 2) for both")
+        raise AmiwarpError(
+            f"sharp_xy has shape {sharp_xy.shape} and of {of.shape}; give (n, 2) for both"
+        )
     return edge_blurs(sharp_xy, width, height, [of])[0]
 
 
 def edge_blurs(
-    sharp_xy: NDArray[np.float32], width: int, height: int, positions: Sequence[NDArray[np.float32]]
+    sharp_xy: NDArray[np.float32],
+    width: int,
+    height: int,
+    positions: Sequence[NDArray[np.float32]],
 ) -> list[float]:
     """Return the :func:`edge_blur` of the same events at several positions, across the same edges."""
-    none = np.zeros(len(sharp_xy), np.uint8)
-    edges = find_edges(iwe(Events(sharp_xy[:, 0], sharp_xy[:, 1], none.astype(np.int64), none), width, height))
+    zeros = np.zeros(len(sharp_xy), np.uint8)
+    events = Events(sharp_xy[:, 0], sharp_xy[:, 1], zeros.astype(np.int64), zeros)
+    edges = find_edges(iwe(events, width, height))
     with np.errstate(invalid="ignore"):
         pixel = np.rint(sharp_xy)
         inside = ((pixel >= 0) & (pixel < (width, height))).all(axis=1)
-    sharp = sharp_xy[inside].astype(np.float64)
-    cols, rows = pixel[inside].astype(np.int64).T
-    label = edges.label[rows, cols]
+    columns, rows = pixel[inside].astype(np.int64).T
+    label = edges.label[rows, columns]
     normal = edges.normal[label]
-    away = sharp - edges.xy[label]
+    edge_xy = edges.xy[label]
+
+    # Events in the strip along an edge.
+    away = sharp_xy[inside].astype(np.float64) - edge_xy
     across = np.sum(away * normal, axis=1)
     along = away[:, 0] * normal[:, 1] - away[:, 1] * normal[:, 0]
     near = (np.abs(across) < STRIP_HALF_WIDTH) & (np.abs(along) <= 1.0)
-    moved = (np.sum((np.asarray(of, np.float64)[inside] - edges.xy[label]) * normal, axis=1) for of in positions)
-    return [_blur(across, at, near & np.isfinite(at)) for at in moved]
+    blurs = []
+    for xy in positions:
+        moved_away = np.asarray(xy, np.float64)[inside] - edge_xy
+        moved = np.sum(moved_away * normal, axis=1)
+        known = near & np.isfinite(moved)
+        blurs.append(_blur(across, moved, known))
+    return blurs
 
 
-def _blur(across: NDArray[np.float64], moved: NDArray[np.float64], near: NDArray[np.bool_]) -> float:
+def _blur(across: Vector, moved: Vector, near: NDArray[np.bool_]) -> float:
     """Return the weighted standard deviation of ``moved`` [px] over the events ``near`` an edge.
 
     ``across`` holds the signed distances of the events from their nearest edge [px].
@@ -151,22 +197,28 @@ def _blur(across: NDArray[np.float64], moved: NDArray[np.float64], near: NDArray
     weight = _edge_probability(across[near])
     if not weight.sum() > 0.0:
         raise AmiwarpError("no event is near an edge, so blur cannot be measured; give more events")
-    mean = np.average(moved[near], weights=weight)
-    return float(np.sqrt(np.average((moved[near] - mean) ** 2, weights=weight)))
+    moved = moved[near]
+    mean = np.average(moved, weights=weight)
+    variance = np.average((moved - mean) ** 2, weights=weight)
+    return float(np.sqrt(variance))
 
 
-def _edge_probability(across: NDArray[np.float64]) -> NDArray[np.float64]:
+def _edge_probability(across: Vector) -> Vector:
     """Return the probability that each event belongs to the edge rather than to the uniform background.
 
     ``across`` holds the signed distances of events from their nearest edge [px]. The density over all edges is counted
     in bins of 0.1 px. The background is the mean density in the outermost sixth of the strip.
     """
-    bins = np.clip(((across + STRIP_HALF_WIDTH) * 10.0).astype(np.int64), 0, round(20 * STRIP_HALF_WIDTH) - 1)
-    density = np.bincount(bins, minlength=round(20 * STRIP_HALF_WIDTH)).astype(np.float64)
+    count = round(20 * STRIP_HALF_WIDTH)
+    place = (across + STRIP_HALF_WIDTH) * 10.0
+    bins = np.clip(place.astype(np.int64), 0, count - 1)
+    density = np.bincount(bins, minlength=count).astype(np.float64)
     margin = len(density) // 12
-    background = np.concatenate([density[:margin], density[-margin:]]).mean()
+    outermost = np.concatenate([density[:margin], density[-margin:]])
+    background = outermost.mean()
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(density > 0.0, np.maximum(0.0, 1.0 - background / density), 0.0)
+        share = np.maximum(0.0, 1.0 - background / density)
+    share = np.where(density > 0.0, share, 0.0)
     return np.asarray(share[bins])
 
 
@@ -195,8 +247,9 @@ def truth_model(camera: Camera, truth: Truth, flat_side: FlatSide) -> ExactModel
     >>> amiwarp.truth_model(camera, truth, amiwarp.FlatSide.CAMERA).phase
     0.3
     """
-    p = truth.parameters
-    return ExactModel.from_values(camera, Prism(p["apex"], p["index"], flat_side), p)
+    parameters = truth.parameters
+    prism = Prism(parameters["apex"], parameters["index"], flat_side)
+    return ExactModel.from_values(camera, prism, parameters)
 
 
 @guarded
@@ -250,35 +303,47 @@ class PictureQuality:
 
 
 def picture_quality(
-    log: NDArray[np.floating[Any]], truth: NDArray[np.floating[Any]], where: NDArray[np.bool_] | None = None
+    log: NDArray[np.floating[Any]],
+    truth: NDArray[np.floating[Any]],
+    where: NDArray[np.bool_] | None = None,
 ) -> PictureQuality:
     """Compute correlation and PSNR of a picture of log intensity, after a least-squares fit of gain and offset.
 
     ``log``: the picture in any unit, shape (height, width); may be NaN outside ``where``. ``truth``: the true natural
     log intensity, same shape. ``where``: pixels to fit and to judge, same shape, by default all. The truth's range is
-    that of all its pixels, so that PSNRs over different pixels can be compared.
+    taken over all its pixels, so that PSNRs over different pixels can be compared.
     Raises :class:`AmiwarpError` for different shapes, values that are not finite, and a constant picture or truth.
     """
     if where is None:
         where = np.ones(np.shape(truth), np.bool_)
     if not np.shape(log) == np.shape(truth) == where.shape:
         shapes = f"{np.shape(log)}, {np.shape(truth)} and {where.shape}"
-        raise AmiwarpError(f"picture, truth and mask `where` have shapes {shapes}; expected equal shapes")
-    a, b = log[where].astype(np.float64), truth[where].astype(np.float64)
+        raise AmiwarpError(
+            f"picture, truth and mask `where` have shapes {shapes}; expected equal shapes"
+        )
+    a = log[where].astype(np.float64)
+    b = truth[where].astype(np.float64)
     span = float(np.ptp(np.percentile(truth, TRUTH_PERCENTILES)))
-    if not (np.isfinite(a).all() and np.isfinite(b).all() and math.isfinite(span)):
-        raise AmiwarpError("picture or truth is not finite in some pixels; exclude these pixels with the mask `where`")
+    are_finite = np.isfinite(a).all() and np.isfinite(b).all()
+    if not are_finite or not math.isfinite(span):
+        raise AmiwarpError(
+            "picture or truth is not finite in some pixels; exclude these pixels with the mask `where`"
+        )
     if not (a.size and np.ptp(a) > 0.0 and np.ptp(b) > 0.0 and span > 0.0):
         raise AmiwarpError(
             f"picture or truth is constant over the {a.size} pixels of the mask `where`, so no gain can be fitted; "
             "compare pictures with contrast"
         )
-    da, db = a - a.mean(), b - b.mean()
+    da = a - a.mean()
+    db = b - b.mean()
     gain = float(da @ db / (da @ da))
     error = float(np.mean((db - gain * da) ** 2))
+    psnr_db = math.inf
+    if error > 0.0:
+        psnr_db = 10.0 * math.log10(span**2 / error)
     return PictureQuality(
         correlation=float(da @ db / math.sqrt((da @ da) * (db @ db))),
-        psnr_db=10.0 * math.log10(span**2 / error) if error > 0.0 else math.inf,
+        psnr_db=psnr_db,
         gain=gain,
         offset=float(b.mean() - gain * a.mean()),
     )

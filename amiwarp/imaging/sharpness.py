@@ -1,4 +1,7 @@
-"""Sharpness of an image of warped events, and the directions of its edges."""
+"""Sharpness of an image of warped events: five measures with one signature, for all of which higher is sharper.
+
+The last function measures how much the image's edges run in one direction.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,25 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import cast, import_array
-from amiwarp.imaging.iwe import CanvasShape, Image
-from amiwarp.kernels import iwe as kernels
-from amiwarp.kernels.iwe import SEGMENT, STRIP, find_largest, gather_sums, smooth_and_add, smooth_votes, sum_directions
-from amiwarp.kernels.launch import BLOCK_DIM, Program, launch, page_locked
-from amiwarp.validation import array, choice, guarded, on_gpu, real
-
-# Sharpness of an image of warped events: five measures with one signature. For all of them, higher is sharper.
+from amiwarp.events.device_columns import cast, import_array
+from amiwarp.imaging.canvas import CanvasShape, Image
+from amiwarp.kernels.edge_directions import SEGMENT, find_largest, sum_directions
+from amiwarp.kernels.launch import BLOCK_DIM, launch
+from amiwarp.kernels.page_locked_memory import page_locked
+from amiwarp.kernels.program import Program
+from amiwarp.kernels.smoothing import (
+    MOST_UNROLLED,
+    STRIP,
+    gather_sums,
+    smooth,
+    smooth_and_add,
+    smooth_and_sum,
+    smooth_few,
+    smooth_votes,
+    sum_terms,
+)
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import array, choice, on_gpu, real
 
 _Step = tuple[Any, int, list[Any], Any, int]
 """Kernel with its number of threads, its inputs, its output, and the fewest threads of a CPU slice."""
@@ -35,28 +49,41 @@ LEAST_PADDING = 6
 class SharpnessMeter:
     """Measures the sharpness of images of one canvas, after smoothing. Owns its buffers."""
 
-    def __init__(self, canvas: CanvasShape, kind: Sharpness, *, smoothing: float, device: Any) -> None:
+    def __init__(
+        self,
+        canvas: CanvasShape,
+        kind: Sharpness,
+        *,
+        smoothing: float,
+        device: Any,
+    ) -> None:
         """Allocate buffers. ``smoothing``: standard deviation of the Gaussian [canvas px]; 0 disables smoothing."""
         weights = gaussian(smoothing)
         self.kind = choice(Sharpness, kind, "sharpness")
         self.device = wp.get_device(device)
-        self.image = Image(canvas, max(len(weights), LEAST_PADDING), self.device)
+        padding = max(len(weights), LEAST_PADDING)
+        self.image = Image(canvas, padding, self.device)
         """Image whose sharpness is measured [events per pixel]; the caller writes its pixels."""
         self._weights = wp.array(weights, dtype=float, device=device)
         layers, rows, columns = canvas.shape
-        self._n = layers // canvas.parts * rows * columns
-        strips = -(-rows // int(STRIP)) * self.image.frame.blocks
-        unrolled = self.device.is_cuda and 1 < len(weights) <= kernels.MOST_UNROLLED
+        layers_of_part = layers // canvas.parts
+        self._n = layers_of_part * rows * columns
+        unrolled = self.device.is_cuda and 1 < len(weights) <= MOST_UNROLLED
         self.takes_votes = unrolled and self.kind is Sharpness.VARIANCE
         """Whether :meth:`launch` takes votes."""
+
+        # Each thread, or for votes each block of threads, sums over a strip of the image.
         if self.takes_votes:
-            strips = -(-rows * columns // BLOCK_DIM)
+            strips = math.ceil(rows * columns / BLOCK_DIM)
+        else:
+            strips = math.ceil(rows / int(STRIP)) * self.image.frame.blocks
         self._sums = wp.empty((layers, strips), dtype=wp.vec2d, device=device)
         self._host = self._sums
         if self.device.is_cuda:
             self._host = page_locked(self, (layers,), wp.vec2d, self.device)
             # the same memory, into which a kernel writes: a copy would take longer
-            self._sum = wp.array(ptr=self._host.ptr, dtype=wp.vec2d, shape=layers, device=self.device)
+            address = self._host.ptr
+            self._sum = wp.array(ptr=address, dtype=wp.vec2d, shape=layers, device=self.device)
             if len(weights) > 1:
                 _ = self._smoothed  # a captured graph must not allocate it
         self._sums_on_host = self._host.numpy().reshape(canvas.parts, -1, 2)
@@ -70,41 +97,61 @@ class SharpnessMeter:
         if self.device.is_cpu:
             self._program.launch()
             return
-        for kernel, n, inputs, out, _ in self._fused_steps(votes) if self.takes_votes else self._steps():
+        steps = self._fused_steps(votes) if self.takes_votes else self._steps()
+        for kernel, n, inputs, out, _ in steps:
             launch(kernel, n, inputs, [out], device=self.device)
-        threads = self._sum.size * BLOCK_DIM
-        wp.launch(gather_sums, threads, [self._sums], [self._sum], device=self.device, block_dim=BLOCK_DIM)
+        wp.launch(
+            gather_sums,
+            self._sum.size * BLOCK_DIM,
+            [self._sums],
+            [self._sum],
+            device=self.device,
+            block_dim=BLOCK_DIM,
+        )
 
     def _fused_steps(self, votes: Any) -> Iterator[_Step]:
         """Yield what :meth:`_steps` does, in fewer kernels: for the variance on CUDA."""
-        taps, frame, out = len(self._weights), self.image.frame, self._smoothed[0]
+        taps = len(self._weights)
+        frame = self.image.frame
+        blocks = self.image.blocks
+        smoothed = self._smoothed[0]
         if votes is None:
             inputs = [self.image.pixels, self._weights, 1, frame]
-            yield kernels.smooth_few(taps), self.image.blocks, inputs, out, 512
+            yield smooth_few(taps), blocks, inputs, smoothed, 512
         else:
-            yield smooth_votes(taps), self.image.blocks, [votes, self._weights, frame], out, 512
-        threads = self._sums.shape[1] * BLOCK_DIM
-        inputs = [out, self._weights, frame, threads]
-        yield smooth_and_add(taps), self._sums.size * BLOCK_DIM, inputs, self._sums.flatten(), 512
+            inputs = [votes, self._weights, frame]
+            yield smooth_votes(taps), blocks, inputs, smoothed, 512
+        _, strips = self._sums.shape
+        inputs = [smoothed, self._weights, frame, strips * BLOCK_DIM]
+        threads = self._sums.size * BLOCK_DIM
+        yield smooth_and_add(taps), threads, inputs, self._sums.flatten(), 512
 
     def _steps(self) -> Iterator[_Step]:
         """Yield each kernel with its number of threads, inputs, output, and the fewest threads of a CPU slice."""
-        smoothed, frame, width = self.image.pixels, self.image.frame, self.image.width
+        pixels = self.image.pixels
+        frame = self.image.frame
         taps = len(self._weights)
-        if self.device.is_cpu and self.kind is Sharpness.VARIANCE and 1 < taps <= kernels.MOST_UNROLLED:
-            kernel, inputs = kernels.smooth_and_sum(taps), [smoothed, self._weights, frame]
-            yield kernel, self._sums.size, inputs, self._sums.flatten(), 64
+        threads = self._sums.size
+        sums = self._sums.flatten()
+        is_variance = self.kind is Sharpness.VARIANCE
+        if self.device.is_cpu and is_variance and 1 < taps <= MOST_UNROLLED:
+            inputs = [pixels, self._weights, frame]
+            yield smooth_and_sum(taps), threads, inputs, sums, 64
             return
         if taps > 1:
             yield from smoothing_steps(self.image, self._weights, self._smoothed)
-            smoothed = self._smoothed[-1]
-        kernel = kernels.sum_terms(width, list(Sharpness).index(self.kind))
-        yield kernel, self._sums.size, [smoothed, frame, PAPER_ETA], self._sums.flatten(), 64
+            pixels = self._smoothed[-1]
+        number = list(Sharpness).index(self.kind)
+        inputs = [pixels, frame, PAPER_ETA]
+        yield sum_terms(self.image.width, number), threads, inputs, sums, 64
 
     @cached_property
     def _smoothed(self) -> list[Any]:
         """Buffers for the image, smoothed along rows and, if that is stored, along both axes."""
-        return [wp.zeros_like(self.image.pixels) for _ in range(1 if self.takes_votes else 2)]
+        along_rows = wp.zeros_like(self.image.pixels)
+        if self.takes_votes:
+            return [along_rows]
+        return [along_rows, wp.zeros_like(self.image.pixels)]
 
     @cached_property
     def _program(self) -> Program:
@@ -119,7 +166,8 @@ class SharpnessMeter:
         if self.device.is_cuda:
             wp.synchronize_stream(self.device)
         sums = self._sums_on_host
-        few = sums[:, 0] if sums.shape[1] == 1 else sums.sum(axis=1)  # NumPy takes microseconds even for sums of one
+        # NumPy takes microseconds even for sums of one
+        few = sums[:, 0] if sums.shape[1] == 1 else sums.sum(axis=1)
         return [self._score(total, terms) for total, terms in few.tolist()]
 
     @property
@@ -150,11 +198,11 @@ def smoothing_steps(image: Image, weights: wp.array, out: list[wp.array]) -> Ite
 
     ``out``: buffers of the layout of the image for the result of each step.
     """
-    unrolled = image.device.is_cuda and len(weights) <= kernels.MOST_UNROLLED
-    smooth = kernels.smooth_few(len(weights)) if unrolled else kernels.smooth(image.width)
+    unrolled = image.device.is_cuda and len(weights) <= MOST_UNROLLED
+    kernel = smooth_few(len(weights)) if unrolled else smooth(image.width)
     smoothed = image.pixels
     for step, result in zip((1, image.frame.stride), out, strict=True):
-        yield smooth, image.blocks, [smoothed, weights, step, image.frame], result, 512
+        yield kernel, image.blocks, [smoothed, weights, step, image.frame], result, 512
         smoothed = result
 
 
@@ -166,9 +214,10 @@ def gaussian(sigma: float) -> NDArray[np.float32]:
     sigma = real(sigma, "smoothing", 0.0, LARGEST_SMOOTHING, " px, a standard deviation")
     if sigma < 1e-6:  # the weights of the neighbours are 0 in float32
         return np.ones(1, dtype=np.float32)
-    k = np.arange(math.ceil(3.0 * sigma) + 1)
-    weights = np.exp(-0.5 * (k / sigma) ** 2)
-    return (weights / (weights[0] + 2.0 * weights[1:].sum())).astype(np.float32)
+    places = np.arange(math.ceil(3.0 * sigma) + 1)
+    weights = np.exp(-0.5 * (places / sigma) ** 2)
+    total = weights[0] + 2.0 * weights[1:].sum()
+    return (weights / total).astype(np.float32)
 
 
 def random_variance(smoothing: float) -> float:
@@ -177,9 +226,12 @@ def random_variance(smoothing: float) -> float:
     ``smoothing``: standard deviation of the Gaussian [px].
     """
     weights = gaussian(smoothing).astype(np.float64)
-    both = np.concatenate([weights[:0:-1], weights])
+    both_sides = np.concatenate([weights[:0:-1], weights])
+    square = float(both_sides @ both_sides)
+    of_neighbours = float(both_sides[1:] @ both_sides[:-1])
     # Bilinear votes share an event by 1 - u and u, with u from 0 to 1: 2/3 is the mean of (1 - u)² + u².
-    return ((2.0 * float(both @ both) + float(both[1:] @ both[:-1])) / 3.0) ** 2
+    along_an_axis = (2.0 * square + of_neighbours) / 3.0
+    return along_an_axis**2
 
 
 def relative_variance(variance: float, mean: float, smoothing: float) -> float:
@@ -224,7 +276,7 @@ def sharpness(
     smoothing : float, optional
         Standard deviation of a Gaussian applied first [px]; 0 disables it.
     device : str or warp.Device, optional
-        Device to compute on, by default that of the image.
+        Device to compute on, by default the image's.
 
     Returns
     -------
@@ -248,22 +300,26 @@ def sharpness(
     on_device = on_gpu(image) or isinstance(image, wp.array)
     image = cast(import_array(image, "image"), wp.float32) if on_device else array(image, "image")
     if image.ndim not in (2, 3) or not image.size or (image.ndim == 3 and len(image) > 2):
-        raise AmiwarpError(f"image has shape {image.shape}; expected (height, width) or (2, height, width)")
+        raise AmiwarpError(
+            f"image has shape {image.shape}; expected (height, width) or (2, height, width)"
+        )
     stack = image.reshape((-1, *image.shape[-2:]))
     canvas = CanvasShape(stack.shape[2], stack.shape[1], per_polarity=len(stack) == 2)
     if not on_device and not np.all(np.isfinite(stack)):
-        raise AmiwarpError(f"image of shape {image.shape} holds a value that is not finite; replace it")
+        raise AmiwarpError(
+            f"image of shape {image.shape} holds a value that is not finite; replace it"
+        )
     if device is None:
         device = image.device if on_device else "cpu"
     meter = SharpnessMeter(canvas, kind, smoothing=smoothing, device=device)
     meter.image.write(stack.to(meter.device) if on_device else stack)
     found = meter.measure()
     if not meter.finite:
-        raise AmiwarpError(f"image of shape {image.shape} holds a value that is not finite; replace it")
+        raise AmiwarpError(
+            f"image of shape {image.shape} holds a value that is not finite; replace it"
+        )
     return found
 
-
-# How much the edges in an image run in one direction.
 
 EDGE_SMOOTHING_PX = 1.5
 """Standard deviation of the Gaussian that smooths an image before its gradients are computed [px]."""
@@ -276,20 +332,29 @@ FEW_SEGMENTS = 512
 def edge_coherence(image: Image, inset: int) -> float:
     """Return the coherence of an image's edge directions, |Σ g² e^{2iφ}| / Σ g² over gradients (g, φ), 0 to 1.
 
-    It is 1 if all edges are parallel. Gradients are those of the sum of all layers. Noise has no direction and lowers
-    the coherence, so weak gradients are left out, and so are pixels within ``inset`` of the image's border.
+    It is 1 if all edges are parallel. The gradients are taken of the sum of all layers. Noise has no direction and
+    lowers the coherence, so weak gradients are left out, and so are pixels within ``inset`` of the image's border.
     """
-    device, (layers, rows, columns) = image.device, image.shape
+    device = image.device
+    layers, rows, columns = image.shape
     weights = wp.array(gaussian(EDGE_SMOOTHING_PX), dtype=float, device=device)
-    buffers = [wp.zeros_like(image.pixels) for _ in range(2)]
-    for kernel, n, inputs, out, smallest in smoothing_steps(image, weights, buffers):
+    along_rows = wp.zeros_like(image.pixels)
+    smoothed = wp.zeros_like(image.pixels)
+    for kernel, n, inputs, out, smallest in smoothing_steps(image, weights, [along_rows, smoothed]):
         launch(kernel, n, inputs, [out], device=device, smallest=smallest)
-    n = max(0, rows - 2 * inset) * max(0, -(-(columns - 2 * inset) // int(SEGMENT)))
-    largest: Any = wp.zeros(max(1, n), dtype=float, device=device)
-    inputs = [buffers[1], image.frame, layers, inset]
-    launch(find_largest, n, inputs, [largest], device=device, smallest=FEW_SEGMENTS)
+
+    inner_rows = max(0, rows - 2 * inset)
+    inner_columns = max(0, columns - 2 * inset)
+    segments = inner_rows * math.ceil(inner_columns / int(SEGMENT))
+    largest: Any = wp.zeros(max(1, segments), dtype=float, device=device)
+    inputs = [smoothed, image.frame, layers, inset]
+    launch(find_largest, segments, inputs, [largest], device=device, smallest=FEW_SEGMENTS)
+
     limit = STRONG * float(largest.numpy().max())
-    sums: Any = wp.zeros(max(1, n), dtype=wp.vec3d, device=device)
-    launch(sum_directions, n, [*inputs, limit], [sums], device=device, smallest=FEW_SEGMENTS)
+    sums: Any = wp.zeros(max(1, segments), dtype=wp.vec3d, device=device)
+    inputs.append(limit)
+    launch(sum_directions, segments, inputs, [sums], device=device, smallest=FEW_SEGMENTS)
     total, x, y = sums.numpy().sum(axis=0).tolist()
-    return math.hypot(x, y) / total if total > 0.0 else 0.0
+    if not total > 0.0:
+        return 0.0
+    return math.hypot(x, y) / total

@@ -3,19 +3,13 @@
 :func:`open_recording` reads every format. :class:`RecordingWriter` writes the native format.
 """
 
-from amiwarp.io.encoder_files import read_encoder_csv, read_encoder_triggers
-from amiwarp.io.export import ConversionSummary, convert
-from amiwarp.io.formats import Format, detect_format, open_recording
-from amiwarp.io.native_format import RecordingWriter, save_recording
+import lazy_loader
 
-__all__ = [
-    "ConversionSummary",
-    "Format",
-    "RecordingWriter",
-    "convert",
-    "detect_format",
-    "open_recording",
-    "read_encoder_csv",
-    "read_encoder_triggers",
-    "save_recording",
-]
+from amiwarp.io.conversion import ConversionSummary, convert
+from amiwarp.io.encoder_csv import read_encoder_csv
+from amiwarp.io.encoder_triggers import read_encoder_triggers
+from amiwarp.io.formats import Format, detect_format, open_recording
+from amiwarp.io.native.copying import save_recording
+from amiwarp.io.native.writer import RecordingWriter
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io import aedat3, aedat4_events
-from amiwarp.io.aedat2 import Aedat2Decoder
-from amiwarp.io.aedat2_header import CHIPS
-from amiwarp.io.dat import DatDecoder
+from amiwarp.io.aedat import aedat3, aedat4_events
+from amiwarp.io.aedat.aedat2_decoder import Aedat2Decoder
+from amiwarp.io.aedat.aedat2_header import CHIPS
 from amiwarp.io.decoding import words_on
-from amiwarp.validation import guarded, instance, one_of
+from amiwarp.io.prophesee.dat_decoder import DatDecoder
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import instance, one_of
 
 if TYPE_CHECKING:
     from amiwarp.events.device_events import DeviceEvents
@@ -62,15 +63,17 @@ class BytesDecoder:
     def __init__(self, format: str, *, chip: str | None = None, device: Any = None) -> None:
         import warp as wp
 
-        from amiwarp.kernels.launch import start_once
+        from amiwarp.kernels.quiet_start import start_once
 
         start_once()
         self._format = one_of(format, FORMATS, "format of the bytes")
         self._device = wp.get_device("cpu" if device is None else device)
-        if (chip is None) == (self._format == "aedat2"):
-            said = "needs a chip; give one of " + ", ".join(CHIPS) if chip is None else "needs no chip; leave it out"
-            raise AmiwarpError(f"format {self._format} {said}")
-        self._dat = self._aedat2 = None
+        if self._format == "aedat2" and chip is None:
+            raise AmiwarpError(f"format aedat2 needs a chip; give one of {', '.join(CHIPS)}")
+        if self._format != "aedat2" and chip is not None:
+            raise AmiwarpError(f"format {self._format} needs no chip; leave it out")
+        self._dat: DatDecoder | None = None
+        self._aedat2: Aedat2Decoder | None = None
         if self._format in ("dat1", "dat2"):
             self._dat = DatDecoder(self._format[-1], self._device)
         elif chip is not None:
@@ -79,7 +82,7 @@ class BytesDecoder:
         self._source: int | None = None
 
     def decode(self, data: Any) -> DeviceEvents:
-        """Return the events in the bytes that follow those of the last call.
+        """Return the events in the bytes that follow the bytes of the last call.
 
         Parameters
         ----------
@@ -93,7 +96,7 @@ class BytesDecoder:
         Returns
         -------
         events : DeviceEvents
-            The events on the decoder's device, in the order of the bytes. Times [us] are those of the file; those of
+            The events on the decoder's device, in the order of the bytes. Times [us] are as in the file, but times of
             DAT and AEDAT 2.0 run on where their 32 bits wrap. Neither order nor places are checked: a pixel outside the
             frame is a large number. Of AEDAT 3.1, the events of the first source are returned, without invalid ones.
             Edges, frames and samples are left out.
@@ -103,14 +106,31 @@ class BytesDecoder:
         AmiwarpError
             If the data have another type, do not end with a whole record, or hold a packet that is damaged or cut off.
         """
-        word = np.dtype("<u1" if self._format in ("aedat3", "aedat4") else "<u4")
-        record = 1 if word.itemsize == 1 else RECORD_BYTES
-        words = words_on(self._device, data, word, "records" if record > 1 else "packets", self._format, record)
+        if self._format in ("aedat3", "aedat4"):
+            packets = words_on(
+                self._device,
+                data,
+                word=np.dtype("<u1"),
+                what="packets",
+                version=self._format,
+                record=1,
+            )
+            if self._format == "aedat3":
+                return self._decode_aedat3(packets)
+            return self._decode_aedat4(packets)
+        records = words_on(
+            self._device,
+            data,
+            word=np.dtype("<u4"),
+            what="records",
+            version=self._format,
+            record=RECORD_BYTES,
+        )
         if self._dat is not None:
-            return self._dat.decode(words)
-        if self._aedat2 is not None:
-            return self._aedat2.decode(words)[0]
-        return self._decode_aedat3(words) if self._format == "aedat3" else self._decode_aedat4(words)
+            return self._dat.decode(records)
+        assert self._aedat2 is not None
+        events, _ = self._aedat2.decode(records)
+        return events
 
     def _decode_aedat3(self, data: Any) -> DeviceEvents:
         """Return the events of packets of AEDAT 3.1."""
@@ -121,9 +141,12 @@ class BytesDecoder:
         if self._source is None and packets.size:
             self._source = int(packets["source"][0])
         packets = packets[packets["source"] == self._source]
-        addresses = np.uint64(data.ptr or 0) + packets["start"].astype(np.uint64)
+        first_address = np.uint64(data.ptr or 0)
+        addresses = first_address + packets["start"].astype(np.uint64)
         counts = packets["events"].astype(np.int64)
-        return aedat3.decode_packets(addresses, counts, packets["overflow"].astype(np.int64) << 31, self._device)
+        # The stored times have 31 bits. A packet says how often they have wrapped.
+        wrapped_us = packets["overflow"].astype(np.int64) << 31
+        return aedat3.decode_packets(addresses, counts, wrapped_us, self._device)
 
     def _decode_aedat4(self, data: Any) -> DeviceEvents:
         """Return the events of packets of AEDAT 4."""
@@ -134,14 +157,15 @@ class BytesDecoder:
         found = aedat4_events.decode_packets(packets, self._device)
         damaged = np.flatnonzero(found.counts < 0)
         if damaged.size:
-            raise self._damaged(int(packets["address"][damaged[0]]) - int(data.ptr))
+            address = packets["address"][damaged[0]]
+            raise self._damaged(int(address) - int(data.ptr))
         return found.events
 
     def _listed(self, data: Any, kernel: Any, kind: Any) -> NDArray[Any]:
         """Return the packets in some bytes, as a kernel lists them."""
         import warp as wp
 
-        from amiwarp.kernels.launch import load
+        from amiwarp.kernels.loading import load
 
         load(kernel, self._device)
         room = MOST_PACKETS

@@ -1,7 +1,7 @@
 """Files of cameras: JSON of this package, YAML of ROS and of Kalibr, and ``calib.txt``.
 
-ROS's layout is that of `camera_calibration_parsers <https://wiki.ros.org/camera_calibration_parsers>`_, with the
-distortion models of ``sensor_msgs/CameraInfo``; Kalibr's is its `camchain
+The layout of ROS is described in `camera_calibration_parsers <https://wiki.ros.org/camera_calibration_parsers>`_, with
+the distortion models of ``sensor_msgs/CameraInfo``; Kalibr's is its `camchain
 <https://github.com/ethz-asl/kalibr/wiki/yaml-formats>`_.
 """
 
@@ -15,13 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import errors_name, open_input, write_text
-from amiwarp.io.formats import check_ending
-from amiwarp.io.json_files import LARGEST_INTEGER, camera_from_json, read_json
-from amiwarp.io.plain_files import read_calib
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential, camera_to_json
-from amiwarp.validation import guarded, one_of, real, shown, vector, whole
+from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.io.inputs import errors_name, open_input
+from amiwarp.io.json_files import read_json
+from amiwarp.io.output_formats import check_ending
+from amiwarp.io.outputs import write_text
+from amiwarp.optics.camera import Camera, camera_from_json, camera_to_json
+from amiwarp.optics.distortion import Fisheye, RadialTangential
+from amiwarp.schema.calls import guarded
+from amiwarp.schema.records import LARGEST_INTEGER
+from amiwarp.validation import one_of, real, shown, vector, whole
 
 ROS_MODELS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4, "fisheye": 4}
 """Distortion models of ROS that this package has, with their numbers of coefficients."""
@@ -66,7 +69,10 @@ def load_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
     if ending == ".json":
         data = read_json(path, "a camera")
         with errors_name(path, lambda: "is not a camera file"):
-            return camera_from_json(data["camera"], "camera") if "camera" in data else camera_from_json(data)
+            # A calibration holds its camera.
+            if "camera" in data:
+                return camera_from_json(data["camera"], "camera")
+            return camera_from_json(data)
     if ending in (".yaml", ".yml"):
         with errors_name(path, lambda: "is not a camera file"):
             return _camera_from_yaml(_read_yaml(path))
@@ -76,7 +82,9 @@ def load_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
 
 
 @guarded
-def save_camera(path: str | os.PathLike[str], camera: Camera, *, layout: str = "ros", overwrite: bool = False) -> None:
+def save_camera(
+    path: str | os.PathLike[str], camera: Camera, *, layout: str = "ros", overwrite: bool = False
+) -> None:
     """Write a camera to a file.
 
     Parameters
@@ -118,73 +126,103 @@ def _read_yaml(path: Path) -> Any:
     with open_input(path) as file:
         text = file.read(MOST_YAML_BYTES + 1)
     if len(text) > MOST_YAML_BYTES:
-        raise AmiwarpError(f"{path}: is larger than {MOST_YAML_BYTES >> 10} KiB, so it is no camera; give another file")
+        raise AmiwarpError(
+            f"{path}: is larger than {MOST_YAML_BYTES >> 10} KiB, so it is no camera; give another file",
+            ErrorCode.FORMAT_UNKNOWN,
+        )
     try:
         return yaml.safe_load(text)
     except RecursionError as error:
-        raise AmiwarpError(f"{path}: is nested too deeply, so it is no camera; give another file") from error
+        raise AmiwarpError(
+            f"{path}: is nested too deeply, so it is no camera; give another file",
+            ErrorCode.FORMAT_UNKNOWN,
+        ) from error
     except yaml.MarkedYAMLError as error:
         line = "" if error.problem_mark is None else f" in line {error.problem_mark.line + 1}"
-        raise AmiwarpError(f"{path}: is not YAML: {error.problem}{line}; correct it") from error
+        raise AmiwarpError(
+            f"{path}: is not YAML: {error.problem}{line}; correct it", ErrorCode.FORMAT_UNKNOWN
+        ) from error
 
 
 def _camera_from_yaml(data: Any) -> Camera:
     """Return the camera of the content of a YAML file, in ROS's or in Kalibr's layout."""
     if isinstance(data, dict) and "camera_matrix" in data:
         return _from_ros(data)
-    chain = {name: given for name, given in data.items() if _has_model(given)} if isinstance(data, dict) else {}
-    if len(chain) > 1:
-        raise AmiwarpError(f"holds {len(chain)} cameras ({', '.join(map(str, chain))}); leave one of them in the file")
-    for name, given in chain.items():
-        return _from_kalibr(given, str(name))
-    raise AmiwarpError("holds neither camera_matrix (ROS) nor cam0.camera_model (Kalibr); give a file of one of them")
-
-
-def _has_model(given: Any) -> bool:
-    return isinstance(given, dict) and "camera_model" in given
+    cameras: dict[Any, dict[str, Any]] = {}
+    if isinstance(data, dict):
+        for name, given in data.items():
+            if isinstance(given, dict) and "camera_model" in given:
+                cameras[name] = given
+    if len(cameras) > 1:
+        raise AmiwarpError(
+            f"holds {len(cameras)} cameras ({', '.join(map(str, cameras))}); leave one of them in the file"
+        )
+    if not cameras:
+        raise AmiwarpError(
+            "holds neither camera_matrix (ROS) nor cam0.camera_model (Kalibr); give a file of one of them",
+            ErrorCode.FORMAT_UNKNOWN,
+        )
+    [(name, given)] = cameras.items()
+    return _from_kalibr(given, str(name))
 
 
 def _from_ros(data: dict[str, Any]) -> Camera:
-    size = [whole(_field(data, name), f"field {name}", 1, LARGEST_INTEGER) for name in ("image_width", "image_height")]
+    width = whole(_field(data, "image_width"), "field image_width", 1, LARGEST_INTEGER)
+    height = whole(_field(data, "image_height"), "field image_height", 1, LARGEST_INTEGER)
     matrix = np.reshape(_numbers(data, "camera_matrix", (9,)), (3, 3))
     # Files that name no model are older than the field, and plumb_bob was the only one then.
     model = one_of(data.get("distortion_model", "plumb_bob"), ROS_MODELS, "field distortion_model")
     counts = (4, 5) if model == "plumb_bob" else (ROS_MODELS[model],)
-    k = _numbers(data, "distortion_coefficients", counts)
-    return Camera.from_opencv(matrix, k, (size[0], size[1]), fisheye=model in FISHEYES)
+    coefficients = _numbers(data, "distortion_coefficients", counts)
+    return Camera.from_opencv(matrix, coefficients, (width, height), fisheye=model in FISHEYES)
 
 
 def _from_kalibr(data: dict[str, Any], name: str) -> Camera:
     one_of(data["camera_model"], ("pinhole",), f"field {name}.camera_model")
-    model = one_of(data.get("distortion_model", "none"), KALIBR_MODELS, f"field {name}.distortion_model")
+    model = one_of(
+        data.get("distortion_model", "none"), KALIBR_MODELS, f"field {name}.distortion_model"
+    )
     fx, fy, cx, cy = _numbers(data, "intrinsics", (4,), name)
-    given = _field(data, "resolution", f"{name}.")
-    width, height = vector(given, 2, f"field {name}.resolution", lambda v, what: whole(v, what, 1, LARGEST_INTEGER))
-    k = _numbers(data, "distortion_coeffs", (KALIBR_MODELS[model],), name) if KALIBR_MODELS[model] else None
+
+    def side(value: Any, what: str) -> int:
+        return whole(value, what, 1, LARGEST_INTEGER)
+
+    resolution = _field(data, "resolution", f"{name}.")
+    width, height = vector(resolution, 2, f"field {name}.resolution", side)
+    coefficients = None
+    if KALIBR_MODELS[model]:
+        coefficients = _numbers(data, "distortion_coeffs", (KALIBR_MODELS[model],), name)
     matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-    return Camera.from_opencv(matrix, k, (width, height), fisheye=model in FISHEYES)
+    return Camera.from_opencv(matrix, coefficients, (width, height), fisheye=model in FISHEYES)
 
 
 def _field(data: dict[str, Any], name: str, prefix: str = "") -> Any:
     if data.get(name) is None:
-        raise AmiwarpError(f"field {prefix}{name} is missing; add this field")
+        raise AmiwarpError(f"field {prefix}{name} is missing; add this field", ErrorCode.FIELD)
     return data[name]
 
 
-def _numbers(data: dict[str, Any], name: str, counts: tuple[int, ...], where: str = "") -> list[float]:
-    """Return a list of numbers, or those of a matrix with ``data``, whose count is one of ``counts``."""
+def _numbers(
+    data: dict[str, Any], name: str, counts: tuple[int, ...], where: str = ""
+) -> list[float]:
+    """Return the numbers of a list, or of a matrix with ``data``, whose count is one of ``counts``."""
     prefix = f"{where}." if where else ""
-    given, full = _field(data, name, prefix), f"{prefix}{name}"
+    given = _field(data, name, prefix)
+    full = f"{prefix}{name}"
     if isinstance(given, dict):
-        given, full = _field(given, "data", f"{full}."), f"{full}.data"
+        given = _field(given, "data", f"{full}.")
+        full = f"{full}.data"
     if not isinstance(given, list) or len(given) not in counts:
         expected = " or ".join(map(str, counts))
-        raise AmiwarpError(f"field {full} is {shown(given)}; expected a list of {expected} numbers")
+        raise AmiwarpError(
+            f"field {full} is {shown(given)}; expected a list of {expected} numbers",
+            ErrorCode.FIELD,
+        )
     return [_number(value, f"field {full}") for value in given]
 
 
 def _number(value: Any, what: str) -> float:
-    """Return a number. PyYAML takes those without a point, such as 1e-05 of ROS, for text."""
+    """Return a number. PyYAML takes numbers without a point, such as 1e-05 of ROS, for text."""
     try:
         return real(float(value) if isinstance(value, str) else value, what)
     except ValueError:
@@ -196,31 +234,54 @@ def _matrix(values: Sequence[float], columns: int) -> dict[str, Any]:
 
 
 def _to_ros(camera: Camera, name: str) -> dict[str, Any]:
-    matrix, k = camera.to_opencv()
-    model = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[len(k)]
+    matrix, coefficients = camera.to_opencv()
+    models = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}
+    projection = np.c_[matrix, np.zeros(3)]
     return {
         "image_width": camera.width,
         "image_height": camera.height,
         "camera_name": name,
         "camera_matrix": _matrix(matrix.ravel().tolist(), 3),
-        "distortion_model": model,
-        "distortion_coefficients": _matrix(k.tolist(), len(k)),
+        "distortion_model": models[len(coefficients)],
+        "distortion_coefficients": _matrix(coefficients.tolist(), len(coefficients)),
         "rectification_matrix": _matrix(np.eye(3).ravel().tolist(), 3),
-        "projection_matrix": _matrix(np.c_[matrix, np.zeros(3)].ravel().tolist(), 4),
+        "projection_matrix": _matrix(projection.ravel().tolist(), 4),
     }
 
 
 def _to_kalibr(camera: Camera) -> dict[str, Any]:
     lens = camera.distortion
-    k = [] if lens is None else camera.to_opencv()[1].tolist()
-    if isinstance(lens, RadialTangential) and any(k[4:]):
-        raise AmiwarpError(f"Kalibr's radtan has no coefficients after p2, the lens has {lens}; write layout='ros'")
+    model = "none"
+    coefficients: list[float] = []
+    if lens is not None:
+        model = "equidistant" if isinstance(lens, Fisheye) else "radtan"
+        _, opencv_coefficients = camera.to_opencv()
+        coefficients = opencv_coefficients.tolist()
+    if isinstance(lens, RadialTangential) and any(coefficients[4:]):
+        raise AmiwarpError(
+            f"Kalibr's radtan has no coefficients after p2, the lens has {lens}; write layout='ros'"
+        )
     return {
         "cam0": {
             "camera_model": "pinhole",
             "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-            "distortion_model": "none" if lens is None else "equidistant" if isinstance(lens, Fisheye) else "radtan",
-            "distortion_coeffs": k[:4],
+            "distortion_model": model,
+            "distortion_coeffs": coefficients[:4],
             "resolution": [camera.width, camera.height],
         }
     }
+
+
+def read_calib(path: Path, width: int, height: int) -> Camera:
+    """Return the camera of a ``calib.txt``. Raises :class:`AmiwarpError` unless it holds nine finite numbers."""
+    wanted = "expected a camera as text (fx fy cx cy k1 k2 p1 p2 k3), or as .json or .yaml"
+    with errors_name(path, lambda: wanted):
+        with open_input(path) as file:
+            words = file.read(10_000).decode("utf-8").split()
+        numbers = [float(word) for word in words]
+        if len(numbers) != 9 or not np.isfinite(numbers).all():
+            raise AmiwarpError(
+                f"{path}: has {len(numbers)} numbers; expected finite fx fy cx cy k1 k2 p1 p2 k3"
+            )
+        fx, fy, cx, cy = numbers[:4]
+        return Camera(width, height, fx, fy, cx, cy, RadialTangential(*numbers[4:]))

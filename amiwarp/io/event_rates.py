@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from amiwarp.events.recording import Events, EventSource
 from amiwarp.io.file_scan import FileEvents
 
+Integers = NDArray[np.int64]
+
 MOST_BINS = 1 << 19
 """Largest number of time bins in which the events of the whole recording are counted."""
+
 MOST_EXACT = 1_000_000
-"""Largest number of events that are read to count them in bins finer than those of the whole recording."""
+"""Largest number of events that are read to count them in finer bins."""
 
 
 class EventRates:
@@ -25,26 +28,34 @@ class EventRates:
 
     def __init__(self, source: EventSource) -> None:
         self._source = source
-        self._first, self._stop = source.t_first, source.t_last + 1
-        bins = min(MOST_BINS, self._stop - self._first)
+        self._first = source.t_first
+        self._stop = source.t_last + 1
+        duration_us = self._stop - self._first
+        bins = min(MOST_BINS, duration_us)
         share = np.arange(bins + 1, dtype=np.float64) / bins
-        self._edges = self._first + np.rint(share * (self._stop - self._first)).astype(np.int64)
+        elapsed = np.rint(share * duration_us)
+        self._edges = self._first + elapsed.astype(np.int64)
         self._counts = np.zeros((2, bins), np.int64)
         self._blocks: Iterator[Events] = iter(source.blocks())
-        self._read = (np.zeros((2, bins + 1), np.int64), self._first)  # number of events before each edge; time read
+        nothing = np.zeros((2, bins + 1), np.int64)
+        self._read = (nothing, self._first)
+        """Number of OFF and ON events before each edge, and the time up to which events are read [us]. They are one
+        value, because another thread reads them."""
 
     @property
     def share(self) -> float:
         """Share of the recording's duration that is counted, 0 to 1."""
-        return (self._read[1] - self._first) / (self._stop - self._first)
+        _, read_us = self._read
+        duration_us = self._stop - self._first
+        return (read_us - self._first) / duration_us
 
     def fill(self, seconds: float) -> bool:
         """Count events for about ``seconds`` [s], at least one block. Return whether all events are counted."""
-        until, read_us = time.perf_counter() + seconds, self._read[1]
+        until = time.perf_counter() + seconds
+        _, read_us = self._read
         for block in self._blocks:
             if len(block):
-                low, high = np.searchsorted(self._edges, (block.t[0], block.t[-1]), side="right") - 1
-                self._counts[:, low : high + 1] += counted(block, self._edges[low : high + 2])
+                self._count(block)
                 read_us = int(block.t[-1])
             if time.perf_counter() >= until:
                 break
@@ -55,41 +66,82 @@ class EventRates:
         self._read = sums, read_us
         return read_us == self._stop
 
-    def curve(self, start_us: int, end_us: int, bins: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _count(self, block: Events) -> None:
+        """Count the events of a block in the bins."""
+        ends = [block.t[0], block.t[-1]]
+        first_bin, last_bin = np.searchsorted(self._edges, ends, side="right") - 1
+        edges = self._edges[first_bin : last_bin + 2]
+        self._counts[:, first_bin : last_bin + 1] += counted(block, edges)
+
+    def curve(
+        self,
+        start_us: int,
+        end_us: int,
+        bins: int,
+    ) -> tuple[Integers, NDArray[np.float64]]:
         """Return the rates of OFF and ON events between two times in about ``bins`` bins of equal length, or nearly so.
 
         Returns edges of the bins on the events' clock [us], shape ``(n + 1,)``, and rates [1/s], shape ``(2, n)``, NaN
         where the recording is not read yet.
-        Bins finer than those of the whole recording are counted if the time between holds few events. Otherwise, the
+        Bins finer than the bins of the whole recording are counted if the time between holds few events. Otherwise, the
         curve has fewer bins. Times outside the recording have rate 0.
         """
-        start_us, end_us = int(start_us), max(int(end_us), int(start_us) + 1)
-        edges = np.unique(start_us + (end_us - start_us) * np.arange(bins + 1, dtype=np.int64) // bins)
-        finest = (self._stop - self._first) / (len(self._edges) - 1)
-        fine = edges[1] - edges[0] < 4.0 * finest and finest > 1.0
-        counts = self._exact(edges) if fine else None
-        if fine and counts is None:
-            within = (self._edges > start_us) & (self._edges < end_us)
-            edges = np.concatenate([[start_us], self._edges[within], [end_us]])
-            edges = edges[np.unique(np.r_[0 : len(edges) - 1 : max(1, len(edges) // bins), len(edges) - 1])]
-        if counts is None:
-            sums, read_us = self._read
-            before = np.searchsorted(self._edges, edges)  # a bin of the recording belongs to where it begins
-            counts = np.diff(sums[:, np.minimum(before, sums.shape[1] - 1)], axis=1).astype(np.float64)
-            if read_us < self._stop:
-                counts[:, edges[1:] > read_us] = np.nan
-        return edges, counts / np.diff(edges) * 1e6
+        start_us = int(start_us)
+        end_us = max(int(end_us), start_us + 1)
+        index = np.arange(bins + 1, dtype=np.int64)
+        duration_us = end_us - start_us
+        edges = np.unique(start_us + duration_us * index // bins)
 
-    def _exact(self, edges: NDArray[np.int64]) -> NDArray[np.int64] | None:
+        finest_us = (self._stop - self._first) / (len(self._edges) - 1)
+        bin_us = edges[1] - edges[0]
+        is_fine = bin_us < 4.0 * finest_us and finest_us > 1.0
+        if is_fine:
+            counts = self._exact(edges)
+            if counts is not None:
+                return edges, counts / np.diff(edges) * 1e6
+            edges = self._edges_within(start_us, end_us, bins)
+        return edges, self._from_sums(edges) / np.diff(edges) * 1e6
+
+    def _edges_within(self, start_us: int, end_us: int, bins: int) -> Integers:
+        """Return edges of about ``bins`` bins that are edges of the whole recording's bins, except the two ends."""
+        within = (self._edges > start_us) & (self._edges < end_us)
+        edges = np.concatenate([[start_us], self._edges[within], [end_us]])
+        last = len(edges) - 1
+        step = max(1, len(edges) // bins)
+        kept = [*range(0, last, step), last]
+        return edges[np.unique(kept)]
+
+    def _from_sums(self, edges: Integers) -> NDArray[np.float64]:
+        """Return the numbers of OFF and ON events in bins, from what was counted; NaN where nothing was read."""
+        sums, read_us = self._read
+        # A bin of the recording belongs to where it begins.
+        before = np.searchsorted(self._edges, edges)
+        last = sums.shape[1] - 1
+        sums_at_edges = sums[:, np.minimum(before, last)]
+        counts = np.diff(sums_at_edges, axis=1).astype(np.float64)
+        if read_us < self._stop:
+            unread = edges[1:] > read_us
+            counts[:, unread] = np.nan
+        return counts
+
+    def _exact(self, edges: Integers) -> Integers | None:
         """Return the numbers of OFF and ON events in bins, read from the source; None if there are too many."""
-        if isinstance(self._source, FileEvents):  # would be read from its start
+        # Such a file would be read from its start.
+        if isinstance(self._source, FileEvents):
             return None
-        first, stop = (self._source.find(int(t)) for t in (edges[0], edges[-1]))
-        return None if stop - first > MOST_EXACT else counted(self._source.slice(first, stop), edges)
+        first = self._source.find(int(edges[0]))
+        stop = self._source.find(int(edges[-1]))
+        if stop - first > MOST_EXACT:
+            return None
+        events = self._source.slice(first, stop)
+        return counted(events, edges)
 
 
-def counted(events: Events, edges: NDArray[np.int64]) -> NDArray[np.int64]:
+def counted(events: Events, edges: Integers) -> Integers:
     """Return the numbers of OFF and ON events in time bins, shape ``(2, n)``."""
-    at = np.searchsorted(events.t, edges)
-    on = np.diff(np.concatenate([[0], np.cumsum(events.p, dtype=np.int64)])[at])
-    return np.array([np.diff(at) - on, on])
+    event_at_edge = np.searchsorted(events.t, edges)
+    on_until = np.cumsum(events.p, dtype=np.int64)
+    on_before = np.concatenate([[0], on_until])
+    both = np.diff(event_at_edge)
+    on = np.diff(on_before[event_at_edge])
+    return np.array([both - on, on])

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events, Recording
-from amiwarp.io.file_scan import FileEvents, Packet, read_pieces
-from amiwarp.io.files import errors_name, open_input
+from amiwarp.io.event_packets import Packet
+from amiwarp.io.file_pieces import read_pieces
+from amiwarp.io.file_scan import FileEvents
+from amiwarp.io.inputs import errors_name, open_input
 
 HEADER = struct.Struct("<12s4B2H")
 """Start of a file: signature, three parts of the version, type, width and height [px]."""
@@ -24,17 +26,25 @@ def open_es(path: Path) -> Recording:
     """Open an Event Stream file. Its rows are counted from the bottom, so they are flipped."""
     with errors_name(path, lambda: "reading the header"), open_input(path) as file:
         head = file.read(HEADER.size)
-        if len(head) < HEADER.size - 4:  # generic events have no size
-            raise AmiwarpError("the header ends beyond the file, which is truncated")
-        _, major, minor, patch, kind, width, height = HEADER.unpack(head.ljust(HEADER.size, b"\0"))
+        # Generic events have no size.
+        if len(head) < HEADER.size - 4:
+            raise AmiwarpError(
+                "the header ends beyond the file, which is truncated", ErrorCode.FILE_DAMAGED
+            )
+        padded = head.ljust(HEADER.size, b"\0")
+        _, major, minor, patch, kind, width, height = HEADER.unpack(padded)
         if major != 2:
-            raise AmiwarpError(f"has the version {major}.{minor}.{patch}; expected 2; convert the file")
+            raise AmiwarpError(
+                f"has the version {major}.{minor}.{patch}; expected 2; convert the file",
+                ErrorCode.FORMAT_UNKNOWN,
+            )
         name = TYPES.get(kind, f"unknown (type {kind})")
         if name not in ("dvs", "atis"):
             raise AmiwarpError(f"holds {name} events; expected dvs or atis")
     source = partial(_packets, path, name == "atis", height)
     events = FileEvents(path, source, size=(width, height))
-    return Recording(events=events, metadata={"format": "es", **events.metadata}, name=path.stem)
+    metadata = {"format": "es", **events.metadata}
+    return Recording(events=events, metadata=metadata, name=path.stem)
 
 
 def _packets(path: Path, atis: bool, height: int, notes: dict[str, int]) -> Iterator[Packet]:
@@ -43,10 +53,10 @@ def _packets(path: Path, atis: bool, height: int, notes: dict[str, int]) -> Iter
 
     from amiwarp.kernels.event_arrays import new_event_arrays
     from amiwarp.kernels.event_stream import EVENT_BYTES, Progress, decode_stream
-    from amiwarp.kernels.launch import load, start_once
+    from amiwarp.kernels.loading import load
+    from amiwarp.kernels.quiet_start import start_once
 
     start_once()
-
     load(decode_stream, wp.get_device("cpu"))
     now = 0
     rest = b""
@@ -55,7 +65,8 @@ def _packets(path: Path, atis: bool, height: int, notes: dict[str, int]) -> Iter
         most = data.size // int(EVENT_BYTES)
         arrays = new_event_arrays(most, "cpu")
         found = wp.empty(1, dtype=Progress, device="cpu")
-        inputs = [wp.array(data, dtype=wp.uint8, device="cpu", copy=False), int(atis), height, now, arrays]
+        values = wp.array(data, dtype=wp.uint8, device="cpu", copy=False)
+        inputs = [values, int(atis), height, now, arrays]
         wp.launch(decode_stream, 1, inputs, [found], device="cpu")
         used, count, now = found.numpy()[0].tolist()
         rest = data[used:].tobytes()
@@ -63,4 +74,9 @@ def _packets(path: Path, atis: bool, height: int, notes: dict[str, int]) -> Iter
             notes["truncated_bytes"] = len(rest)
         else:
             notes.pop("truncated_bytes", None)
-        yield Events(*(getattr(arrays, name).numpy()[:count] for name in ("x", "y", "t", "p")))
+        yield Events(
+            arrays.x.numpy()[:count],
+            arrays.y.numpy()[:count],
+            arrays.t.numpy()[:count],
+            arrays.p.numpy()[:count],
+        )

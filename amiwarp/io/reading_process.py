@@ -2,11 +2,10 @@
 
 HDF5 with its filters and the readers of ROS bags trust a file's content. The process that runs them is started by
 ``subprocess``, not ``multiprocessing``, so that a user's script is not imported again. It runs functions of amiwarp
-that return a JSON value and arrays, which are sent through pipes. The second part of this file runs in the process.
+that return a JSON value and arrays, which are sent through pipes. :mod:`amiwarp.io.reading_server` runs in the process.
 """
 
 import contextlib
-import importlib
 import json
 import os
 import signal
@@ -14,24 +13,24 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 import weakref
 from collections.abc import Callable, Iterator
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import input_folder, input_path
+from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.io.inputs import input_folder, input_path
+from amiwarp.io.reading_server import advance, begin, forget, prepare
 
 CPU_SECONDS = 3.0
 """Processor time that a file of at most :data:`SMALL_BYTES` may take [s]; see :class:`Allowance`. Unlike elapsed time,
 it does not depend on the machine's load."""
+
 SMALL_BYTES = 10_000_000
-"""Size from which on the processor time grows with the size of the file [bytes]."""
+"""Size above which the processor time grows with the size of the file [bytes]."""
 
 MEMORY_BYTES = 1 << 30
 """Limit of the additional memory of one request [bytes]."""
@@ -53,9 +52,10 @@ CRASHES = [
 ]
 """Signals by which the system ends a program with an error of its own. Others come from other programs."""
 
-START = "import sys; sys.path[:] = sys.argv[1:]; from amiwarp.io.reading_process import serve; serve()"
+START = (
+    "import sys; sys.path[:] = sys.argv[1:]; from amiwarp.io.reading_server import serve; serve()"
+)
 """Python program that the reading process runs."""
-
 
 Function: TypeAlias = str | Callable[..., Any]
 """Function of amiwarp that the process runs: itself, or ``module:function`` if only the process imports its module."""
@@ -82,7 +82,10 @@ class Allowance:
     def exceeded(self) -> AmiwarpError:
         """Return the error to raise for a file that takes too long."""
         whole = f"{self.seconds:.3g} s of processor time"
-        return AmiwarpError(f"reading took over {whole}, the limit for its size; the file is damaged")
+        return AmiwarpError(
+            f"reading took over {whole}, the limit for its size; the file is damaged",
+            ErrorCode.FILE_DAMAGED,
+        )
 
 
 def _size(path: Path) -> int:
@@ -91,7 +94,8 @@ def _size(path: Path) -> int:
         files = path.iterdir() if path.is_dir() else [path]
         return sum(file.stat().st_size for file in files)
     except OSError:
-        return 0  # the request reports it
+        # The request reports it.
+        return 0
 
 
 class ReadingProcess:
@@ -115,8 +119,10 @@ class ReadingProcess:
                 start_new_session=True,
             )
         self._preparing = False
-        self._keeps = False  # whether the process keeps values for the present reader
-        self._allowance = Allowance()  # of the request that was sent last
+        self._keeps = False
+        """Whether the process keeps values for the present reader."""
+        self._allowance = Allowance()
+        """Allowance of the request that was sent last."""
         self._requests: Any = self._child.stdin
         self._replies: Any = self._child.stdout
         self.close = weakref.finalize(self, _end, self._child, self.owner)
@@ -132,7 +138,11 @@ class ReadingProcess:
         return self.close.alive and self.owner == os.getpid() and self._child.poll() is None
 
     def call(
-        self, function: Function, *arguments: Any, allowance: Allowance | None = None, share: float = 1.0
+        self,
+        function: Function,
+        *arguments: Any,
+        allowance: Allowance | None = None,
+        share: float = 1.0,
     ) -> tuple[Any, list[NDArray[Any]]]:
         """Run a function of amiwarp, and return its JSON value and its arrays, each of shape ``(n,)``.
 
@@ -140,7 +150,7 @@ class ReadingProcess:
         ------
         AmiwarpError
             If the function raises, or if the process crashes or exceeds this ``share`` of the ``allowance``. By
-            default, the allowance is that of the paths among the arguments.
+            default, the allowance is for the paths among the arguments.
         """
         self.send(function, *arguments, allowance=allowance, share=share)
         return self.receive()
@@ -150,7 +160,13 @@ class ReadingProcess:
         self.send(prepare, module)
         self._preparing = True
 
-    def send(self, function: Function, *arguments: Any, allowance: Allowance | None = None, share: float = 1.0) -> None:
+    def send(
+        self,
+        function: Function,
+        *arguments: Any,
+        allowance: Allowance | None = None,
+        share: float = 1.0,
+    ) -> None:
         """Send a call to the process; :meth:`receive` returns its result.
 
         A path among the arguments is an input: it is checked and noted here, and sent as an absolute path.
@@ -162,11 +178,15 @@ class ReadingProcess:
         if self._allowance.left <= 0.0:
             raise self._allowance.exceeded()
         self._cpu_s = max(self._allowance.left * share, LEAST_SECONDS)
-        arguments = tuple(_absolute(value) if isinstance(value, Path) else value for value in arguments)
-        limits = {"cpu_s": self._cpu_s, "memory_bytes": MEMORY_BYTES}
-        request = json.dumps({"function": name_of(function), "arguments": arguments, **limits}).encode()
+        sent = [_absolute(value) if isinstance(value, Path) else value for value in arguments]
+        request = {
+            "function": name_of(function),
+            "arguments": sent,
+            "cpu_s": self._cpu_s,
+            "memory_bytes": MEMORY_BYTES,
+        }
         try:
-            self._requests.write(request + b"\n")
+            self._requests.write(json.dumps(request).encode() + b"\n")
             self._requests.flush()
         except OSError as error:
             raise self._ended() from error
@@ -181,12 +201,13 @@ class ReadingProcess:
                 if array.size:
                     self._fill(array.view(np.uint8).data)
         except BaseException:
-            self.close()  # the rest of this reply must not be read as the next reply
+            # The rest of this reply must not be read as the next reply.
+            self.close()
             raise
         self._keeps = reply["keeps"]
         self._allowance.left -= reply["cpu_s"]
         if "error" in reply:
-            raise AmiwarpError(reply["error"])
+            raise AmiwarpError(reply["error"], ErrorCode(reply.get("code", ErrorCode.INVALID)))
         return reply["result"], arrays
 
     def forget(self) -> None:
@@ -207,10 +228,15 @@ class ReadingProcess:
             self._allowance.left -= self._cpu_s
             return self._allowance.exceeded()
         if code < 0 and -code in CRASHES:
-            return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
+            return AmiwarpError(
+                f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged",
+                ErrorCode.FILE_DAMAGED,
+            )
         if code < 0:
             name = signal.Signals(-code).name
-            return AmiwarpError(f"the reading process was ended by {name}; check that enough memory is free, and retry")
+            return AmiwarpError(
+                f"the reading process was ended by {name}; check that enough memory is free, and retry"
+            )
         remedy = f"check that '{sys.executable}' is Python and that enough memory is free"
         return AmiwarpError(f"the reading process ended with code {code}; {remedy}")
 
@@ -218,10 +244,12 @@ class ReadingProcess:
 @contextlib.contextmanager
 def _signals_blocked() -> Iterator[None]:
     """Postpone the signals that end a command, and let a process that is started meanwhile never get them."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
+    # Windows has no such signals.
+    if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+    ending = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ending)
     try:
         yield
     finally:
@@ -249,7 +277,10 @@ def _end(child: subprocess.Popen[bytes], owner: int) -> None:
 
 _idle: list[ReadingProcess] = []
 """List of at most one reading process that waits for the next reader."""
-_idle_lock = threading.RLock()  # garbage collection may run a finalizer that gives back a process at any point
+
+
+# Garbage collection may run a finalizer that gives back a process at any point
+_idle_lock = threading.RLock()
 
 
 def borrow() -> ReadingProcess:
@@ -263,7 +294,8 @@ def borrow() -> ReadingProcess:
 
 def start_ahead(module: str) -> None:
     """Start a reading process that imports ``module``, for the first reader, while this process does other things."""
-    with contextlib.suppress(OSError, AmiwarpError):  # the first reader tries again, and reports it
+    # The first reader tries again, and reports an error.
+    with contextlib.suppress(OSError, AmiwarpError):
         process = ReadingProcess()
         process.prepare(module)
         _keep_idle(process)
@@ -274,7 +306,8 @@ def give_back(process: ReadingProcess) -> None:
     if process.close.alive and process.owner == os.getpid():
         with contextlib.suppress(AmiwarpError):
             process.forget()
-            _keep_idle(process)  # its next reader finds out whether it is still alive
+            # Its next reader finds out whether it is still alive.
+            _keep_idle(process)
             return
     process.close()
 
@@ -333,161 +366,3 @@ def packets(function: Function, *arguments: Any) -> Iterator[Any]:
                     process.receive()
     finally:
         give_back(process)
-
-
-# The part that runs in the process: it reads requests and sends results.
-
-PACKET = 1 << 17
-"""Number of events that are joined to one packet before it is sent."""
-
-PACKET_S = 2.0
-"""Processor time after which packets are sent, however few they are [s]. A request has a limit of time."""
-
-Reply = tuple[Any, list[NDArray[Any]]]
-"""Reply to a request: a JSON value, and arrays of shape ``(n,)``."""
-
-_state: dict[str, Any] = {}
-"""Values that are kept between requests, by name."""
-
-
-def serve() -> None:
-    """Serve requests until the other process closes its pipe or ends."""
-    requests = sys.stdin.buffer
-    replies = os.fdopen(os.dup(1), "wb")
-    # Text that a library prints must not mix with the replies.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    with contextlib.suppress(BrokenPipeError):
-        while line := requests.readline():
-            request = json.loads(line)
-            head, arrays, cpu_s = _answer(request)
-            encoded = json.dumps({**head, "keeps": bool(_state), "cpu_s": cpu_s}).encode()
-            replies.write(struct.pack("<I", len(encoded)) + encoded)
-            for array in arrays:
-                replies.write(array.data if array.size else b"")
-            replies.flush()
-    os._exit(0)
-
-
-def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]], float]:
-    """Run the function of a request. Return its result or its error, its arrays, and the processor time [s]."""
-    module, _, name = request["function"].partition(":")
-    try:
-        function = getattr(importlib.import_module(module), name)
-    except Exception as error:  # the file is not to blame
-        return {"error": f"amiwarp cannot be loaded: {_said(error)}; install it again"}, [], 0.0
-    began = time.process_time()
-    _limit(request["cpu_s"], request["memory_bytes"])
-    head, arrays = _outcome(function, request)
-    _limit_cpu(0.0)
-    return head, arrays, time.process_time() - began
-
-
-def _outcome(function: Callable[..., Reply], request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]]]:
-    """Return the result of a function, or its error, and its arrays."""
-    try:
-        result, arrays = function(*request["arguments"])
-        arrays = [np.ascontiguousarray(array) for array in arrays]
-        return {"result": result, "arrays": [(array.dtype.str, array.size) for array in arrays]}, arrays
-    except AmiwarpError as error:
-        return {"error": str(error)}, []
-    except MemoryError:
-        most = request["memory_bytes"] >> 20
-        return {"error": f"needs over {most} MiB of memory at once; the file is damaged or too large"}, []
-    except BaseException as error:  # panics of compiled decoders derive from BaseException
-        return {"error": _said(error)}, []
-
-
-def _said(error: BaseException) -> str:
-    """Return the message of an exception as one line, or the name of its type."""
-    return " ".join(str(error).split())[:300] or type(error).__name__
-
-
-def _limit(cpu_s: float, memory_bytes: int) -> None:
-    """Limit processor time and memory of one request, if the system supports it."""
-    _limit_cpu(cpu_s)
-    with contextlib.suppress(ImportError, OSError, ValueError):
-        import resource
-
-        _set_limit(resource.RLIMIT_CORE, 0)
-        taken = int(os.pread(_memory_sizes(), 64, 0).split()[0]) * resource.getpagesize()
-        _set_limit(resource.RLIMIT_AS, taken + memory_bytes)
-
-
-def _limit_cpu(cpu_s: float) -> None:
-    """End this process after some processor time [s], if the system supports it; 0: never."""
-    if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_PROF, cpu_s)
-
-
-_limits: dict[int, tuple[int, int]] = {}
-"""Limit and hard limit that were set last, by resource."""
-
-
-def _set_limit(which: int, soft: int) -> None:
-    """Set the limit of a resource, unless it is set already."""
-    import resource
-
-    before, hard = _limits.get(which) or resource.getrlimit(which)
-    soft = soft if hard < 0 else min(soft, hard)
-    if soft != before or which not in _limits:
-        resource.setrlimit(which, (soft, hard))
-        _limits[which] = soft, hard
-
-
-@cache
-def _memory_sizes() -> int:
-    """Open the file in which Linux shows the memory that this process takes."""
-    return os.open("/proc/self/statm", os.O_RDONLY)
-
-
-def prepare(module: str) -> Reply:
-    """Import a module of which a function will be called. An error of the import is reported by that call."""
-    with contextlib.suppress(Exception):
-        importlib.import_module(module)
-    return None, []
-
-
-def keep(name: str, value: Any) -> None:
-    """Keep a value between requests, until :func:`forget` is called."""
-    _state[name] = value
-
-
-def kept(name: str) -> Any:
-    """Return a value that :func:`keep` stored."""
-    return _state[name]
-
-
-def forget() -> Reply:
-    """Close and drop all values that were kept for a reader."""
-    for value in _state.values():
-        with contextlib.suppress(Exception):
-            value.close()
-    _state.clear()
-    return None, []
-
-
-def begin(function: str, *arguments: Any) -> Reply:
-    """Start a generator of packets. Its first argument is a dictionary for counts."""
-    module, _, name = function.partition(":")
-    notes: dict[str, int] = {}
-    keep("notes", notes)
-    keep("packets", getattr(importlib.import_module(module), name)(notes, *arguments))
-    return None, []
-
-
-def advance() -> Reply:
-    """Return the counts and the next packets of the started generator, joined; no arrays at the end."""
-    found: list[tuple[NDArray[Any], ...]] = []
-    for packet in _next_packets(kept("packets")):
-        found.append(packet)
-    return kept("notes"), [np.concatenate(parts) for parts in zip(*found, strict=True)]
-
-
-def _next_packets(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[NDArray[Any], ...]]:
-    """Yield packets until they hold at least :data:`PACKET` events, or took :data:`PACKET_S`, if they hold few."""
-    count, began = 0, time.process_time()
-    for packet in source:
-        count += len(packet[0])
-        yield packet
-        if count >= PACKET or time.process_time() - began > PACKET_S:
-            return

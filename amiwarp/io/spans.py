@@ -59,26 +59,40 @@ def read_span(source: EventSource, start_us: int, length_us: int, *, most_events
 
     If the window holds more than ``most_events``, read about this number in evenly spaced runs.
     """
-    first, stop = (source.find(t) for t in (start_us, start_us + length_us))
+    first = source.find(start_us)
+    stop = source.find(start_us + length_us)
     count = stop - first
     if count <= most_events:
-        return Span(source.t_first, start_us, length_us, count, source.slice(first, stop), (slice(first, stop),))
-    starts, length = (first + np.arange(RUNS) * count // RUNS).tolist(), most_events // RUNS
-    runs = tuple(slice(k, k + length) for k in starts)
-    events = Events.concatenate(list(_runs(source, starts, length)))
-    return Span(source.t_first, start_us, length_us, count, events, runs)
+        events = source.slice(first, stop)
+        runs: tuple[slice, ...] = (slice(first, stop),)
+    else:
+        starts = (first + np.arange(RUNS) * count // RUNS).tolist()
+        length = most_events // RUNS
+        events = Events.concatenate(list(_runs(source, starts, length)))
+        runs = tuple(slice(start, start + length) for start in starts)
+    return Span(
+        first_us=source.t_first,
+        start_us=start_us,
+        length_us=length_us,
+        count=count,
+        events=events,
+        runs=runs,
+    )
 
 
 def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Events]:
     """Yield runs of ``length`` events. A file that can only be read from its start is read in one pass."""
     if not isinstance(source, FileEvents):
-        yield from (source.slice(k, k + length) for k in starts)
+        for start in starts:
+            yield source.slice(start, start + length)
         return
     seen = 0
     for block in source.blocks():
-        yield from (block[max(k - seen, 0) : max(k + length - seen, 0)] for k in starts if k < seen + len(block))
+        for start in starts:
+            if start < seen + len(block):
+                yield block[max(start - seen, 0) : max(start + length - seen, 0)]
         seen += len(block)
-        starts = [k for k in starts if k + length > seen]
+        starts = [start for start in starts if start + length > seen]
         if not starts:
             return
 
@@ -91,14 +105,17 @@ def span_blocks(source: EventSource, span: Span) -> Iterator[Events]:
         yield from blocks_between(source, span.start_us, span.start_us + span.length_us)
 
 
-def blocks_between(source: EventSource, start_us: int, end_us: int, *, count: int = BLOCK) -> Iterator[Events]:
+def blocks_between(
+    source: EventSource, start_us: int, end_us: int, *, count: int = BLOCK
+) -> Iterator[Events]:
     """Yield the events with ``start_us <= t < end_us`` in blocks of ``count``, none of them empty."""
     yield from regroup(_pieces_between(source, start_us, end_us), count=count)
 
 
 def _pieces_between(source: EventSource, start_us: int, end_us: int) -> Iterator[Events]:
     """Yield the events with ``start_us <= t < end_us`` in pieces as they are read."""
-    if isinstance(source, FileEvents):  # can only be read from its start
+    if isinstance(source, FileEvents):
+        # It can only be read from its start.
         for block in source.blocks():
             first, stop = np.searchsorted(block.t, (start_us, end_us))
             yield block[first:stop]

@@ -29,7 +29,7 @@ class Block:
     events: int
     """Number of events, with invalid ones."""
     base: wp.int64
-    """Time that is added to those of the events [us]: the packet's overflow."""
+    """Time that is added to the times of the events [us]: the packet's overflow."""
 
 
 @wp.struct
@@ -57,7 +57,9 @@ def count_valid(blocks: wp.array(dtype=Block), start: int, counts: wp.array(dtyp
 
 
 @wp.kernel
-def decode_polarity(blocks: wp.array(dtype=Block), places: wp.array(dtype=int), start: int, events: EventArrays):
+def decode_polarity(
+    blocks: wp.array(dtype=Block), places: wp.array(dtype=int), start: int, events: EventArrays
+):
     """Write the valid events of each block, from a place on."""
     index = wp.tid() + start
     block = blocks[index]
@@ -69,13 +71,18 @@ def decode_polarity(blocks: wp.array(dtype=Block), places: wp.array(dtype=int), 
             now = block.base + load_number(block.address, at + wp.int64(4), 4, 1)
             column = wp.uint16((word >> wp.uint32(17)) & wp.uint32(0x7FFF))
             row = wp.uint16((word >> wp.uint32(2)) & wp.uint32(0x7FFF))
-            store_event(events, event, column, row, now, wp.uint8((word >> wp.uint32(1)) & wp.uint32(1)))
+            store_event(
+                events, event, column, row, now, wp.uint8((word >> wp.uint32(1)) & wp.uint32(1))
+            )
             event += 1
 
 
 @wp.kernel
 def list_packets(
-    data: wp.array(dtype=wp.uint8), most: int, packets: wp.array(dtype=Packet), result: wp.array(dtype=int)
+    data: wp.array(dtype=wp.uint8),
+    most: int,
+    packets: wp.array(dtype=Packet),
+    result: wp.array(dtype=int),
 ):
     """List the packets that follow one another, at most ``most``. One thread, since each one's size leads to the next.
 
@@ -93,9 +100,14 @@ def list_packets(
         events = number_at(whole, at + wp.int64(20), 4, 1)
         size = width * events
         behind = at + HEADER_BYTES + size
-        lowest = wp.min(wp.min(width, events), overflow)  # below 0 also for a header that is cut off
+        # Below 0 also for a header that is cut off
+        lowest = wp.min(wp.min(width, events), overflow)
         is_header = lowest >= wp.int64(0) and kind <= wp.int64(255) and source <= wp.int64(0x7FFF)
-        is_whole = size <= LARGEST_PACKET and behind <= whole.size and (kind != POLARITY or width == EVENT_BYTES)
+        is_whole = (
+            size <= LARGEST_PACKET
+            and behind <= whole.size
+            and (kind != POLARITY or width == EVENT_BYTES)
+        )
         if not (is_header and is_whole):
             wrong = int(at)
         else:

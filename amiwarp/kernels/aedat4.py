@@ -151,7 +151,12 @@ def unpack_events(
 
 
 @wp.kernel
-def list_packets(data: wp.array(dtype=wp.uint8), most: int, packets: wp.array(dtype=Span), result: wp.array(dtype=int)):
+def list_packets(
+    data: wp.array(dtype=wp.uint8),
+    most: int,
+    packets: wp.array(dtype=Span),
+    result: wp.array(dtype=int),
+):
     """List the packets that follow one another, at most ``most``. One thread, since each one's size leads to the next.
 
     ``result``: number of packets; position of the first one that is cut off or holds no events, or -1.

@@ -12,15 +12,27 @@ from amiwarp.kernels.launch import launch
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
+
 PINHOLE = wp.constant(0)
+
+
 RADIAL_TANGENTIAL = wp.constant(1)
+
+
 FISHEYE = wp.constant(2)
-RATIONAL = wp.constant(3)  # radial-tangential with a denominator; apart, so that a lens without one needs no division
+
+
+# Radial-tangential with a denominator; apart, so that a lens without one needs no division
+RATIONAL = wp.constant(3)
+
 
 NEWTON_STEPS = wp.constant(12)
-LARGEST_RESIDUAL = wp.constant(
-    1.0e-6
-)  # largest error of a converged inverse relative to 1 + radius: 1e-3 px at a focal length of 1000 px
+
+
+# Largest error of a converged inverse relative to 1 + radius: 1e-3 px at a focal length of 1000 px
+LARGEST_RESIDUAL = wp.constant(1.0e-6)
+
+
 NAN = wp.constant(float("nan"))
 
 
@@ -36,8 +48,10 @@ class CameraParams:
     height: int
     kind: int
     k: wp.types.vector(length=8, dtype=float)
-    limit: float  # largest tangent (radial-tangential) or angle (fisheye) with one-to-one distortion
-    rays: wp.array2d(dtype=wp.vec3)  # bearing of each pixel centre, NaN if invalid; empty for a pinhole
+    # Largest tangent (radial-tangential) or angle (fisheye) with one-to-one distortion
+    limit: float
+    # Bearing of each pixel centre, NaN if invalid; empty for a pinhole
+    rays: wp.array2d(dtype=wp.vec3)
 
 
 @wp.struct
@@ -101,7 +115,8 @@ def undistort_radial_tangential(c: CameraParams, d: wp.vec2) -> wp.vec3:
     p = wp.vec2(d[0], d[1])
     if wp.length(p) > 0.9 * c.limit:
         p = p * (0.9 * c.limit / wp.length(p))
-    steps = int(NEWTON_STEPS)  # a variable, so that Warp does not unroll the loop, which is slow to compile
+    # A variable, so that Warp does not unroll the loop, which is slow to compile
+    steps = int(NEWTON_STEPS)
     for _ in range(steps):
         last = wp.vec2(p[0], p[1])
         p = p - wp.inverse(jacobian_radial_tangential(c, p)) * (distort_radial_tangential(c, p) - d)
@@ -134,10 +149,13 @@ def undistort_fisheye(c: CameraParams, d: wp.vec2) -> wp.vec3:
     if radius < 1.0e-8:
         return wp.normalize(wp.vec3(d[0], d[1], 1.0))
     angle = float(wp.min(radius, 0.9 * c.limit))
-    steps = int(NEWTON_STEPS)  # a variable, so that Warp does not unroll the loop, which is slow to compile
+    # A variable, so that Warp does not unroll the loop, which is slow to compile
+    steps = int(NEWTON_STEPS)
     for _ in range(steps):
         before = float(angle)
-        angle = wp.clamp(angle - (fisheye_radius(c, angle) - radius) / fisheye_slope(c, angle), 0.0, c.limit)
+        angle = wp.clamp(
+            angle - (fisheye_radius(c, angle) - radius) / fisheye_slope(c, angle), 0.0, c.limit
+        )
         if angle == before:
             break
     if not (wp.abs(fisheye_radius(c, angle) - radius) < LARGEST_RESIDUAL * (1.0 + radius)):
@@ -206,109 +224,21 @@ def fill_rays(c: CameraParams, start: int, rays: wp.array2d(dtype=wp.vec3)):
 
 
 @wp.kernel
-def pixels_to_rays(c: CameraParams, xy: wp.array(dtype=wp.vec2), start: int, rays: wp.array(dtype=wp.vec3)):
+def pixels_to_rays(
+    c: CameraParams, xy: wp.array(dtype=wp.vec2), start: int, rays: wp.array(dtype=wp.vec3)
+):
     """Compute the unit bearing of one pixel per thread."""
     i = start + wp.tid()
     rays[i] = pixel_to_ray(c, xy[i])
 
 
 @wp.kernel
-def rays_to_pixels(c: CameraParams, rays: wp.array(dtype=wp.vec3), start: int, xy: wp.array(dtype=wp.vec2)):
+def rays_to_pixels(
+    c: CameraParams, rays: wp.array(dtype=wp.vec3), start: int, xy: wp.array(dtype=wp.vec2)
+):
     """Compute the pixel of one bearing per thread."""
     i = start + wp.tid()
     xy[i] = ray_to_pixel(c, rays[i])
-
-
-# -- rotation of the camera, and growth of the image
-
-
-@wp.struct
-class CameraRotationParams:
-    """Angular velocity at time 0 [rad/s], angular acceleration [rad/s²], and growth of the image [1/s]."""
-
-    velocity: wp.vec3
-    acceleration: wp.vec3
-    growth: float
-
-
-@wp.func
-def rotation_vector(camera_rotation: CameraRotationParams, time: float) -> wp.vec3:
-    """Return the camera's rotation from time 0 to ``time`` [s], as axis times angle [rad]."""
-    return camera_rotation.velocity * time + camera_rotation.acceleration * (0.5 * time * time)
-
-
-@wp.func
-def undo_camera_rotation(
-    camera: CameraParams, xy: wp.vec2, camera_rotation: CameraRotationParams, time: float
-) -> wp.vec2:
-    """Return the pixel that the scene point seen at ``xy`` at ``time`` [s] has at time 0.
-
-    A camera that moves forward by the share g of all distances sees the image grow by 1 / (1 - g). From g = 1 on, it is
-    behind the scene, and pixels are NaN.
-    """
-    rotation = rotation_vector(camera_rotation, time)
-    angle = wp.length(rotation)
-    size = 1.0 - camera_rotation.growth * time
-    if angle < 1.0e-9 and size == 1.0:
-        return xy
-    ray = pixel_to_ray(camera, xy)
-    ray = wp.quat_rotate(wp.quat_from_axis_angle(rotation / wp.max(angle, 1.0e-9), angle), ray)
-    return ray_to_pixel(camera, wp.vec3(size * ray[0], size * ray[1], wp.where(size > 0.0, ray[2], -1.0)))
-
-
-@wp.func
-def undo_camera_rotation(
-    camera: PinholeParams, xy: wp.vec2, camera_rotation: CameraRotationParams, time: float
-) -> wp.vec2:
-    """Return the pixel at time 0, for a camera without distortion."""
-    rotation = rotation_vector(camera_rotation, time)
-    angle = wp.length(rotation)
-    size = 1.0 - camera_rotation.growth * time
-    if angle < 1.0e-9 and size == 1.0:
-        return xy
-    ray = wp.vec3((xy[0] - camera.cx) * camera.inverse_fx, (xy[1] - camera.cy) * camera.inverse_fy, 1.0)
-    ray = wp.quat_rotate(wp.quat_from_axis_angle(rotation / wp.max(angle, 1.0e-9), angle), ray)
-    scale = wp.where(wp.min(ray[2], size) > 1.0e-6, size / ray[2], NAN)
-    return wp.vec2(camera.fx * (ray[0] * scale) + camera.cx, camera.fy * (ray[1] * scale) + camera.cy)
-
-
-# Rotations of directions, as three floats; see :mod:`amiwarp.kernels.refraction`.
-
-# Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
-
-
-@wp.func
-def rotate_by_deflection(x: float, y: float, z: float, w0: float, w1: float, sine: float, versine: float):
-    """Rotate a direction about z × w = (-w1, w0, 0) by Rodrigues' formula.
-
-    A positive ``sine`` rotates the optical axis towards w.
-    """
-    d = w0 * x + w1 * y
-    g = z * sine - d * versine
-    return x + g * w0, y + g * w1, z - z * versine - d * sine
-
-
-@wp.func
-def sine_versine(a: float):
-    """Return sine and 1 - cosine of an angle up to pi/2.
-
-    Computed by their series, with equal bits on every device.
-    """
-    b = a * a
-    s = 1.0 / 120.0 + b * (-1.0 / 5040.0 + b * (1.0 / 362880.0 - b / 39916800.0))
-    v = 1.0 / 720.0 + b * (-1.0 / 40320.0 + b * (1.0 / 3628800.0 - b / 479001600.0))
-    return a * (1.0 + b * (-1.0 / 6.0 + b * s)), b * (0.5 + b * (-1.0 / 24.0 + b * v))
-
-
-@wp.func
-def rotate(r: wp.mat33, x: float, y: float, z: float):
-    """Return the matrix product r · (x, y, z)."""
-    a = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z
-    b = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z
-    return a, b, r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
-
-
-# From a camera to its parameters, on the host.
 
 
 FEW_RAYS = 1 << 12
@@ -319,9 +249,14 @@ FEW_RAYS = 1 << 12
 def camera_params(camera: Any, device: str) -> CameraParams:
     """Return the camera's parameters on ``device``, with a table of bearing vectors if the lens distorts."""
     c = CameraParams()
-    c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
-    c.width, c.height = camera.width, camera.height
-    c.kind, c.limit = int(PINHOLE), 1.0e30
+    c.fx = camera.fx
+    c.fy = camera.fy
+    c.cx = camera.cx
+    c.cy = camera.cy
+    c.width = camera.width
+    c.height = camera.height
+    c.kind = int(PINHOLE)
+    c.limit = 1.0e30
     d = camera.distortion
     if d is None:
         c.rays = wp.empty((0, 0), dtype=wp.vec3, device=device)
@@ -329,10 +264,12 @@ def camera_params(camera: Any, device: str) -> CameraParams:
     k = astuple(d)  # eight numbers, or four of a fisheye lens
     if len(k) == 8:
         below = (d.k4, d.k5, d.k6)
-        c.kind = int(RATIONAL if any(below) else RADIAL_TANGENTIAL)
+        kind = RATIONAL if any(below) else RADIAL_TANGENTIAL
+        c.kind = int(kind)
         c.limit = fold_radius(d.k1, d.k2, d.k3, below=below, largest=100.0)
     else:
-        c.kind, c.limit = int(FISHEYE), fold_radius(d.k1, d.k2, d.k3, d.k4, largest=0.999 * math.pi / 2)
+        c.kind = int(FISHEYE)
+        c.limit = fold_radius(d.k1, d.k2, d.k3, d.k4, largest=0.999 * math.pi / 2)
     c.k = type(c.k)(*k, *(0.0,) * (8 - len(k)))
     rays = wp.empty((camera.height, camera.width), dtype=wp.vec3, device=device)
     launch(fill_rays, rays.size, [c], [rays], device=device, smallest=FEW_RAYS)
@@ -346,8 +283,12 @@ def pinhole_params(camera: Any) -> Any:
     if camera.distortion is not None:
         return None
     c = PinholeParams()
-    c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
-    c.inverse_fx, c.inverse_fy = 1.0 / camera.fx, 1.0 / camera.fy
+    c.fx = camera.fx
+    c.fy = camera.fy
+    c.cx = camera.cx
+    c.cy = camera.cy
+    c.inverse_fx = 1.0 / camera.fx
+    c.inverse_fy = 1.0 / camera.fy
     return c
 
 
@@ -363,5 +304,8 @@ def fold_radius(*k: float, below: tuple[float, ...] = (), largest: float) -> flo
         d = np.array([1.0, *below])
         slope = np.convolve(slope, d) - np.convolve([1.0, *k], 2.0 * np.arange(len(d)) * d)
     roots = np.concatenate([np.roots(slope), np.roots([1.0, *below])])
-    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
-    return min(largest, 1.0 / math.sqrt(real.max())) if len(real) else largest
+    is_real = np.abs(roots.imag) < 1e-9 * np.abs(roots)
+    found = roots.real[is_real & (roots.real > 0.0)]
+    if not len(found):
+        return largest
+    return min(largest, 1.0 / math.sqrt(found.max()))

@@ -46,7 +46,7 @@ ROWS = 16
 #endif
 """)
 def fletcher32(address: wp.uint64, size: wp.uint64) -> wp.uint64:
-    """Return the checksum of ``size`` bytes in memory, as :func:`amiwarp.io.hdf5_files.checksum`. Only for CPUs.
+    """Return the checksum of ``size`` bytes in memory, as :func:`amiwarp.io.hdf5.chunks.checksum`. Only for CPUs.
 
     Words are added to 16 pairs of sums, in rows of 16. A sum of up to 360 rows, and the sum of these sums, fit 32 bits.
     """
@@ -67,18 +67,18 @@ class Checksums:
         self._idle: list[tuple[RecordedLaunch, NDArray[np.uint64]]] = [_recorded()]
 
     def __call__(self, parts: Sequence[bytes | memoryview]) -> list[int]:
-        """Return the checksum of each block, as :func:`amiwarp.io.hdf5_files.checksum`."""
-        return [value for first in range(0, len(parts), ROWS) for value in self._run(parts[first : first + ROWS])]
-
-    def _run(self, parts: Sequence[bytes | memoryview]) -> list[int]:
+        """Return the checksum of each block, as :func:`amiwarp.io.hdf5.chunks.checksum`."""
         try:
             launch, table = self._idle.pop()
         except IndexError:
             launch, table = _recorded()
-        table[:, 1] = 0
-        table[: len(parts), :2] = [(np.frombuffer(part, np.uint8).ctypes.data, len(part)) for part in parts]
-        launch.repeat()
-        found: list[int] = table[: len(parts), 2].tolist()
+        found: list[int] = []
+        for first in range(0, len(parts), ROWS):
+            blocks = [np.frombuffer(part, np.uint8) for part in parts[first : first + ROWS]]
+            table[:, 1] = 0
+            table[: len(blocks), :2] = [(block.ctypes.data, len(block)) for block in blocks]
+            launch.repeat()
+            found += table[: len(blocks), 2].tolist()
         self._idle.append((launch, table))
         return found
 

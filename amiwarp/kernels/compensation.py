@@ -8,7 +8,8 @@ import numpy as np
 import warp as wp
 
 from amiwarp.kernels.camera import camera_params, pinhole_params
-from amiwarp.kernels.launch import launch, load, specialised
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.loading import load, specialised
 from amiwarp.kernels.native_code import (
     load_float,
     load_int64,
@@ -18,6 +19,7 @@ from amiwarp.kernels.native_code import (
     store_uint8,
     store_uint32,
 )
+from amiwarp.kernels.plain_models import even, is_even
 from amiwarp.kernels.prism_angle import (
     THETA_U32_RAD,
     EncoderParams,
@@ -27,7 +29,8 @@ from amiwarp.kernels.prism_angle import (
     theta_u32_at,
     theta_u32_on,
 )
-from amiwarp.kernels.refraction import PairParams, displace, even, is_even, state_of
+from amiwarp.kernels.prism_pair import PairParams
+from amiwarp.kernels.refraction import displace, state_of
 
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -93,7 +96,9 @@ def state_at_time(model: Any, encoder: EncoderParams, azimuths: wp.array(dtype=f
 
 
 @wp.func
-def state_at_time(model: PairParams, encoder: EncoderParams, azimuths: wp.array(dtype=float), t: wp.int64):
+def state_at_time(
+    model: PairParams, encoder: EncoderParams, azimuths: wp.array(dtype=float), t: wp.int64
+):
     """Return the state of both prisms at event time ``t`` [us]."""
     second = radians(theta_u32_at(of_second(encoder), t))
     w0, w1 = state_of(model, radians(theta_u32_at(encoder, t)), second)
@@ -103,15 +108,23 @@ def state_at_time(model: PairParams, encoder: EncoderParams, azimuths: wp.array(
 @wp.func
 def displace_event(model: Any, camera: Any, columns: Columns, w0: float, w1: float, i: int):
     """Return the compensated position [px] of event ``i``."""
-    x, y = displace(model, camera, float(load_uint16(columns.x, i)), float(load_uint16(columns.y, i)), w0, w1)
+    x, y = displace(
+        model, camera, float(load_uint16(columns.x, i)), float(load_uint16(columns.y, i)), w0, w1
+    )
     return x, y
 
 
 @wp.func
 def displace_block(
-    model: Any, camera: Any, azimuths: wp.array(dtype=float), columns: Columns, turns: wp.array(dtype=wp.uint32),
-    first: int, xs: wp.array(dtype=float), ys: wp.array(dtype=float),
-):  # fmt: skip
+    model: Any,
+    camera: Any,
+    azimuths: wp.array(dtype=float),
+    columns: Columns,
+    turns: wp.array(dtype=wp.uint32),
+    first: int,
+    xs: wp.array(dtype=float),
+    ys: wp.array(dtype=float),
+):
     """Compute the compensated positions [px] of a block of events."""
     for k in range(BLOCK):
         w0, w1 = state_at_turn(model, azimuths, load_uint32(turns, k))
@@ -191,7 +204,9 @@ class LaunchPlan:
         """Number of events per thread of the kernel; columns are padded to a multiple of this number."""
         self._camera = camera_params(model.camera, name)
         self._pinhole = pinhole_params(model.camera) or self._camera
-        self._model, self._limits, self._azimuths = model.params(name), wp.vec2(*self.size), azimuths(name)
+        self._model = model.params(name)
+        self._limits = wp.vec2(*self.size)
+        self._azimuths = azimuths(name)
         load(specialised(self.kernel, [self._model, self._pinhole]), device)
 
     def padded(self, n: int) -> int:
@@ -204,25 +219,37 @@ class LaunchPlan:
 
     def device_columns(self, events: Any) -> list[wp.array]:
         """Return x, y and t of events on the device, padded, without a copy if they need no padding."""
+        padded = self.padded(len(events))
+        if padded == len(events):
+            return [events.x, events.y, events.t]
         columns: list[wp.array] = []
         for values in (events.x, events.y, events.t):
-            padded = self.padded(len(events))
-            column = values if padded == len(events) else wp.zeros(padded, dtype=values.dtype, device=values.device)
-            if column is not values:
-                wp.copy(column, values)
+            column = wp.zeros(padded, dtype=values.dtype, device=values.device)
+            wp.copy(column, values)
             columns.append(column)
         return columns
 
-    def run(self, columns: list[wp.array], encoder: Any, max_x: int, max_y: int, *, all_cores: bool = True) -> Any:
+    def run(
+        self,
+        columns: list[wp.array],
+        encoder: Any,
+        max_x: int,
+        max_y: int,
+        *,
+        all_cores: bool = True,
+    ) -> Any:
         """Compensate padded columns x, y, t, with these largest coordinates [px]; return new ``Columns``."""
-        padded, device = len(columns[0]), columns[0].device
+        padded = len(columns[0])
+        device = columns[0].device
         c = Columns()
         c.x, c.y, c.t = columns
-        c.out_x, c.out_y = (wp.empty(padded, dtype=float, device=device) for _ in range(2))
+        c.out_x = wp.empty(padded, dtype=float, device=device)
+        c.out_y = wp.empty(padded, dtype=float, device=device)
         c.inside = wp.empty(padded, dtype=wp.uint8, device=device)
         inputs = self.inputs(encoder, c, outside=self.any_outside(max_x, max_y))
         blocks = padded // self.block
-        launch(self.kernel, blocks, inputs, [], device=device, smallest=512 if all_cores else blocks)
+        smallest = 512 if all_cores else blocks
+        launch(self.kernel, blocks, inputs, [], device=device, smallest=smallest)
         return c
 
     def inputs(self, encoder: Any, columns: Any, *, outside: bool) -> list[Any]:

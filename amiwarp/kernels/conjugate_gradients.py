@@ -7,9 +7,7 @@ the next kernel adds them up itself. Nothing is copied to the host, and the resu
 
 import warp as wp
 
-from amiwarp.kernels.native_code import ends_run, sum_run
-
-# Prior for map unknowns that no equation determines: damping, and links between neighbouring nodes.
+from amiwarp.kernels.warp_sums import ends_run, sum_run
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,7 +22,7 @@ class Prior:
     damping: wp.array(dtype=float)  # one element
     linked: int  # 1 if there are links, else 0
     columns: int
-    held: int  # index from which on the unknowns are fixed
+    held: int  # index of the first fixed unknown; all later ones are fixed, too
     smooth: wp.array(dtype=float)  # one element: weight of a link between equal neighbours
     right: wp.array(dtype=float)  # weight of the link to the next node; 0 in a tile's last column
     down: wp.array(dtype=float)  # weight of the link to the node below; 0 in a tile's last row
@@ -103,9 +101,8 @@ def link(
 
 
 FIXED = wp.constant(wp.float64(4294967296.0))  # 2**32: fixed-point units per 1 in the sums
-NO_PREVIOUS = wp.constant(
-    wp.float64(1.0e300)
-)  # initial value of the previous r·z, so that the first search direction is z
+# Initial value of the previous r·z, so that the first search direction is z
+NO_PREVIOUS = wp.constant(wp.float64(1.0e300))
 CPU_WIDTH = 4096  # number of unknowns per CPU thread
 
 
@@ -173,7 +170,9 @@ def take_total(sums: wp.array2d(dtype=wp.int64), i: int) -> float:
 
 
 @wp.kernel
-def add_multiple(vector: wp.array(dtype=float), factor: float, start: int, out: wp.array(dtype=float)):
+def add_multiple(
+    vector: wp.array(dtype=float), factor: float, start: int, out: wp.array(dtype=float)
+):
     """Add a vector times a factor."""
     i = start + wp.tid()
     out[i] = out[i] + factor * vector[i]
@@ -188,7 +187,9 @@ def gather(sums: wp.array2d(dtype=wp.int64), start: int, out: wp.array(dtype=flo
 
 
 @wp.kernel
-def gather_diagonal(sums: wp.array2d(dtype=wp.int64), prior: Prior, start: int, out: wp.array(dtype=float)):
+def gather_diagonal(
+    sums: wp.array2d(dtype=wp.int64), prior: Prior, start: int, out: wp.array(dtype=float)
+):
     """Compute the diagonal of the operator from the equations' sums and the prior, and clear the sums."""
     i = start + wp.tid()
     if i < out.shape[0]:
@@ -219,7 +220,9 @@ def gather_diagonal(sums: wp.array2d(dtype=wp.int64), prior: Prior, start: int, 
     }
 #endif
 """)
-def take_totals(sums: wp.array2d(dtype=wp.int64), first: int, last: int, out: wp.array(dtype=float)):
+def take_totals(
+    sums: wp.array2d(dtype=wp.int64), first: int, last: int, out: wp.array(dtype=float)
+):
     """Store :func:`take_total` of the elements from ``first`` to ``last`` in ``out``. For CPUs."""
 
 
@@ -266,7 +269,9 @@ def add_prior_product(u: Unknowns, prior: Prior, first: int, last: int):
     return 0.0;
 #endif
 """)
-def dot_range(a: wp.array(dtype=float), b: wp.array(dtype=float), first: int, last: int) -> wp.float64:
+def dot_range(
+    a: wp.array(dtype=float), b: wp.array(dtype=float), first: int, last: int
+) -> wp.float64:
     """Return the part of a·b from ``first`` to ``last``. For CPUs."""
 
 
@@ -295,7 +300,9 @@ def dot_range(a: wp.array(dtype=float), b: wp.array(dtype=float), first: int, la
     return 0.0;
 #endif
 """)
-def descend_range(image: wp.array(dtype=float), u: Unknowns, step: float, first: int, last: int) -> wp.float64:
+def descend_range(
+    image: wp.array(dtype=float), u: Unknowns, step: float, first: int, last: int
+) -> wp.float64:
     """Compute :func:`descend` from ``first`` to ``last``, and return the part of r·z. For CPUs."""
 
 
@@ -395,7 +402,9 @@ def update_search_direction(width: int, start: int, u: Unknowns, dots: Dots):
 
 
 @wp.kernel
-def update_search_direction_with(z: wp.array(dtype=float), width: int, start: int, u: Unknowns, dots: Dots):
+def update_search_direction_with(
+    z: wp.array(dtype=float), width: int, start: int, u: Unknowns, dots: Dots
+):
     """Compute the search direction p = z + b p for a given z, where b is :func:`next_ratio`."""
     thread = start + wp.tid()
     ratio = next_ratio(dots, thread)
@@ -403,7 +412,9 @@ def update_search_direction_with(z: wp.array(dtype=float), width: int, start: in
 
 
 @wp.kernel
-def finish_product(sums: wp.array2d(dtype=wp.int64), prior: Prior, width: int, start: int, u: Unknowns, dots: Dots):
+def finish_product(
+    sums: wp.array2d(dtype=wp.int64), prior: Prior, width: int, start: int, u: Unknowns, dots: Dots
+):
     """Compute q = (Aᵀ W A + prior) p from the sums, and partial sums of p·q."""
     thread = start + wp.tid()
     total = wp.float64(0.0)
@@ -443,7 +454,9 @@ def descend(width: int, start: int, image: wp.array(dtype=float), u: Unknowns, d
 
 
 @wp.kernel
-def sum_seen(image: wp.array(dtype=float), width: int, start: int, partial: wp.array2d(dtype=wp.float64)):
+def sum_seen(
+    image: wp.array(dtype=float), width: int, start: int, partial: wp.array2d(dtype=wp.float64)
+):
     """Compute partial sums of the squares of a map, and of the number of its nodes that are not 0."""
     thread = start + wp.tid()
     squares = wp.float64(0.0)
@@ -457,7 +470,11 @@ def sum_seen(image: wp.array(dtype=float), width: int, start: int, partial: wp.a
 
 @wp.kernel
 def dot(
-    a: wp.array(dtype=float), b: wp.array(dtype=float), width: int, start: int, partial: wp.array(dtype=wp.float64)
+    a: wp.array(dtype=float),
+    b: wp.array(dtype=float),
+    width: int,
+    start: int,
+    partial: wp.array(dtype=wp.float64),
 ):
     """Compute partial sums of a·b."""
     thread = start + wp.tid()

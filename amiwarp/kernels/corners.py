@@ -23,13 +23,22 @@ LARGE_CIRCLE = (
     (0, -4), (-1, -4), (-2, -3), (-3, -2), (-4, -1), (-4, 0), (-4, 1), (-3, 2), (-2, 3), (-1, 4),
 )  # fmt: skip
 SMALL, LARGE = wp.constant(len(SMALL_CIRCLE)), wp.constant(len(LARGE_CIRCLE))
-SmallColumns, LargeColumns = wp.types.vector(len(SMALL_CIRCLE), int), wp.types.vector(len(LARGE_CIRCLE), int)
-SmallTimes, LargeTimes = wp.types.vector(len(SMALL_CIRCLE), wp.int64), wp.types.vector(len(LARGE_CIRCLE), wp.int64)
-SMALL_X, SMALL_Y = (wp.constant(SmallColumns(*values)) for values in zip(*SMALL_CIRCLE, strict=True))
-LARGE_X, LARGE_Y = (wp.constant(LargeColumns(*values)) for values in zip(*LARGE_CIRCLE, strict=True))
+SmallColumns = wp.types.vector(len(SMALL_CIRCLE), int)
+LargeColumns = wp.types.vector(len(LARGE_CIRCLE), int)
+SmallTimes = wp.types.vector(len(SMALL_CIRCLE), wp.int64)
+LargeTimes = wp.types.vector(len(LARGE_CIRCLE), wp.int64)
+SMALL_X, SMALL_Y = (
+    wp.constant(SmallColumns(*values)) for values in zip(*SMALL_CIRCLE, strict=True)
+)
+LARGE_X, LARGE_Y = (
+    wp.constant(LargeColumns(*values)) for values in zip(*LARGE_CIRCLE, strict=True)
+)
 
-REACH = wp.constant(4)  # radius of the larger circle [px]; events closer to the border are no corners
-SMALL_LEAST, SMALL_MOST = wp.constant(3), wp.constant(6)  # length of the newest arc of a corner [px]
+# Radius of the larger circle [px]; events closer to the border are no corners
+REACH = wp.constant(4)
+# Length of the newest arc of a corner [px]
+SMALL_LEAST = wp.constant(3)
+SMALL_MOST = wp.constant(6)
 LARGE_LEAST, LARGE_MOST = wp.constant(4), wp.constant(8)
 AHEAD = wp.constant(12)  # events between the request for memory and its use
 NEVER = wp.constant(wp.int64(-(2**63)))  # time of a pixel without events
@@ -54,7 +63,8 @@ class Rule:
     """What a corner is."""
 
     complement: int  # 1 if all pixels but an arc may also be the newest
-    redundant_us: wp.int64  # an event is redundant if the one before at its pixel has its polarity and is so recent
+    # An event is redundant if the one before at its pixel has its polarity and is so recent
+    redundant_us: wp.int64
 
 
 @wp.struct
@@ -97,9 +107,12 @@ def newest_arc(times: Any, n: int, least: int, most: int) -> int:
         at = wp.where(times[j] > newest, j, at)
         newest = wp.max(times[j], newest)
     oldest, seen = wp.int64(newest), wp.int64(newest)  # of the arc, and of all pixels added so far
-    left, right, size = at + n - 1, at + 1, int(1)
+    left = at + n - 1
+    right = at + 1
+    size = int(1)
     for count in range(2, most + 1):
-        before, after = times[left - wp.where(left >= n, n, 0)], times[right - wp.where(right >= n, n, 0)]
+        before = times[left - wp.where(left >= n, n, 0)]
+        after = times[right - wp.where(right >= n, n, 0)]
         newer = wp.max(before, after)
         seen = wp.min(seen, newer)
         in_arc = count <= least or newer >= oldest
@@ -235,7 +248,9 @@ def detect_in_order(
     k = start + wp.tid()
     for i in range(events.t.shape[0]):
         prefetch_event(events, surface, owner, k, i + AHEAD)
-        x, y, p = int(events.x[i]), int(events.y[i]), int(events.p[i])
+        x = int(events.x[i])
+        y = int(events.y[i])
+        p = int(events.p[i])
         first = wp.max(y - REACH, 0) >> surface.band_bits
         last = wp.min(y + REACH, surface.height - 1) >> surface.band_bits
         for band in range(first, last + 1):
@@ -245,14 +260,24 @@ def detect_in_order(
                 if band == y >> surface.band_bits:
                     corner[i] = False
                     if fresh and has_circles(surface, x, y):
-                        corner[i] = is_corner(surface, p * surface.pixels + pixel, surface.width, rule)
+                        corner[i] = is_corner(
+                            surface, p * surface.pixels + pixel, surface.width, rule
+                        )
 
 
 @wp.kernel
-def key_events(events: Columns, surface: Surface, start: int, keys: wp.array(dtype=int), order: wp.array(dtype=int)):
+def key_events(
+    events: Columns,
+    surface: Surface,
+    start: int,
+    keys: wp.array(dtype=int),
+    order: wp.array(dtype=int),
+):
     """Write the number of the list of each event, and its index."""
     i = start + wp.tid()
-    keys[i] = int(events.p[i]) * surface.pixels + int(events.y[i]) * surface.width + int(events.x[i])
+    keys[i] = (
+        int(events.p[i]) * surface.pixels + int(events.y[i]) * surface.width + int(events.x[i])
+    )
     order[i] = i
 
 
@@ -271,7 +296,14 @@ def find_lists(keys: wp.array(dtype=int), n: int, start: int, first: wp.array(dt
 
 
 @wp.kernel
-def mark_fresh(events: Columns, surface: Surface, lists: Lists, rule: Rule, start: int, fresh: wp.array(dtype=int)):
+def mark_fresh(
+    events: Columns,
+    surface: Surface,
+    lists: Lists,
+    rule: Rule,
+    start: int,
+    fresh: wp.array(dtype=int),
+):
     """Write 1 for each position in the lists whose event is not redundant, else 0."""
     k = start + wp.tid()
     i = lists.order[k]
@@ -292,7 +324,11 @@ def mark_fresh(events: Columns, surface: Surface, lists: Lists, rule: Rule, star
 
 @wp.kernel
 def keep_fresh(
-    lists: Lists, fresh: wp.array(dtype=int), place: wp.array(dtype=int), start: int, order: wp.array(dtype=int)
+    lists: Lists,
+    fresh: wp.array(dtype=int),
+    place: wp.array(dtype=int),
+    start: int,
+    order: wp.array(dtype=int),
 ):
     """Write the events that are not redundant, without gaps: ``place`` is the number of them before each position."""
     k = start + wp.tid()
@@ -309,7 +345,12 @@ def move_lists(lists: Lists, place: wp.array(dtype=int), start: int, first: wp.a
 
 @wp.kernel
 def detect_in_lists(
-    events: Columns, surface: Surface, lists: Lists, rule: Rule, start: int, corner: wp.array(dtype=wp.bool)
+    events: Columns,
+    surface: Surface,
+    lists: Lists,
+    rule: Rule,
+    start: int,
+    corner: wp.array(dtype=wp.bool),
 ):
     """Test the event at each position in the lists; later positions than their end are skipped."""
     k = start + wp.tid()
@@ -319,7 +360,9 @@ def detect_in_lists(
         past.t = events.t
         past.lists = lists
         past.event = lists.order[k]
-        x, y, p = int(events.x[past.event]), int(events.y[past.event]), int(events.p[past.event])
+        x = int(events.x[past.event])
+        y = int(events.y[past.event])
+        p = int(events.p[past.event])
         if has_circles(surface, x, y):
             at = p * surface.pixels + y * surface.width + x
             corner[past.event] = is_corner(past, at, surface.width, rule)
@@ -346,87 +389,3 @@ def store_last(events: Columns, lists: Lists, start: int, surface: Surface):
     if last >= 0:
         surface.last[pixel] = events.t[last]
         surface.polarity[pixel] = events.p[last]
-
-
-# Association of corner events to tracks, in their order. Each track is in the list of the cell of its last event.
-
-
-@wp.struct
-class CornerChains:
-    """Corner events, and the lists of the tracks in each cell of a grid whose cells are as large as the radius."""
-
-    x: wp.array(dtype=wp.float64)
-    y: wp.array(dtype=wp.float64)
-    t: wp.array(dtype=wp.int64)
-    cell: wp.array(dtype=int)  # of each event; cells at the border of the grid are empty
-    columns: int
-    radius: wp.float64
-    gap: wp.int64
-    head: wp.array(dtype=int)  # first track of each cell, or -1
-    after: wp.array(dtype=int)  # next track in the list of each track, or -1
-    last: wp.array(dtype=int)  # last event of each track
-
-
-@wp.func
-def unlink(chains: CornerChains, cell: int, before: int, track: int):
-    """Remove a track from the list of a cell, in which it follows the track ``before``, or is the first for -1."""
-    if before < 0:
-        chains.head[cell] = chains.after[track]
-    else:
-        chains.after[before] = chains.after[track]
-
-
-@wp.func
-def remove(chains: CornerChains, track: int):
-    """Remove a track from the list of the cell of its last event."""
-    cell, before = chains.cell[chains.last[track]], int(-1)
-    at = int(chains.head[cell])
-    while at != track:
-        before = int(at)
-        at = int(chains.after[at])
-    unlink(chains, cell, before, track)
-
-
-@wp.func
-def remove_old(chains: CornerChains, cell: int, now: wp.int64):
-    """Remove the tracks of a cell whose last event is too old."""
-    before, track = int(-1), int(chains.head[cell])
-    while track >= 0:
-        if now - chains.t[chains.last[track]] > chains.gap:
-            unlink(chains, cell, before, track)
-        else:
-            before = int(track)
-        track = int(chains.after[track])
-
-
-@wp.func
-def nearest_track(chains: CornerChains, i: int) -> int:
-    """Return the track whose last event is nearest to event ``i``, or -1 if none is within radius and gap."""
-    best, least = int(-1), wp.float64(chains.radius * chains.radius)
-    for k in range(9):
-        cell = chains.cell[i] + (k / 3 - 1) * chains.columns + k % 3 - 1
-        remove_old(chains, cell, chains.t[i])
-        track = int(chains.head[cell])
-        while track >= 0:
-            dx, dy = chains.x[chains.last[track]] - chains.x[i], chains.y[chains.last[track]] - chains.y[i]
-            square = dx * dx + dy * dy
-            best, least = wp.where(square <= least, track, best), wp.min(least, square)
-            track = int(chains.after[track])
-    return best
-
-
-@wp.kernel
-def link_events(chains: CornerChains, number: wp.array(dtype=int)):
-    """Write the number of each event's track. One thread takes all events."""
-    tracks = int(0)
-    for i in range(chains.t.shape[0]):
-        track = nearest_track(chains, i)
-        if track < 0:
-            track = int(tracks)
-            tracks += 1
-        else:
-            remove(chains, track)
-        chains.last[track] = i
-        chains.after[track] = chains.head[chains.cell[i]]
-        chains.head[chains.cell[i]] = track
-        number[i] = track

@@ -68,7 +68,12 @@ class Parts:
 
 
 @wp.kernel
-def survey_ecf(data: wp.array(dtype=wp.uint8), chunks: wp.array(dtype=Chunk), start: int, parts: wp.array(dtype=Parts)):
+def survey_ecf(
+    data: wp.array(dtype=wp.uint8),
+    chunks: wp.array(dtype=Chunk),
+    start: int,
+    parts: wp.array(dtype=Parts),
+):
     """Find where the parts of each chunk begin, and damage."""
     index = wp.tid() + start
     chunk = chunks[index]
@@ -195,7 +200,9 @@ def write_packed(data: wp.array(dtype=wp.uint8), chunk: Chunk, at: int, events: 
 
 
 @wp.func
-def write_packed_columns(data: wp.array(dtype=wp.uint8), chunk: Chunk, at: int, events: EventArrays):
+def write_packed_columns(
+    data: wp.array(dtype=wp.uint8), chunk: Chunk, at: int, events: EventArrays
+):
     """Write columns and polarities that stand in one number each."""
     for group in range((chunk.count + 3) // 4):
         place = at + 6 * group
@@ -210,7 +217,9 @@ def write_packed_columns(data: wp.array(dtype=wp.uint8), chunk: Chunk, at: int, 
 
 
 @wp.func
-def write_rows(data: wp.array(dtype=wp.uint8), chunk: Chunk, begin: int, y: wp.array(dtype=wp.uint16)):
+def write_rows(
+    data: wp.array(dtype=wp.uint8), chunk: Chunk, begin: int, y: wp.array(dtype=wp.uint16)
+):
     """Write the rows of a chunk."""
     at = begin
     event = chunk.place
@@ -223,7 +232,9 @@ def write_rows(data: wp.array(dtype=wp.uint8), chunk: Chunk, begin: int, y: wp.a
 
 
 @wp.func
-def write_polarities(data: wp.array(dtype=wp.uint8), chunk: Chunk, begin: int, p: wp.array(dtype=wp.uint8)):
+def write_polarities(
+    data: wp.array(dtype=wp.uint8), chunk: Chunk, begin: int, p: wp.array(dtype=wp.uint8)
+):
     """Write the polarities of a chunk."""
     at = begin
     event = chunk.place
@@ -236,7 +247,9 @@ def write_polarities(data: wp.array(dtype=wp.uint8), chunk: Chunk, begin: int, p
 
 
 @wp.func
-def write_columns(data: wp.array(dtype=wp.uint8), chunk: Chunk, begin: int, x: wp.array(dtype=wp.uint16)):
+def write_columns(
+    data: wp.array(dtype=wp.uint8), chunk: Chunk, begin: int, x: wp.array(dtype=wp.uint16)
+):
     """Write the columns of a chunk. A word holds one, and a bit for each of the five next ones, the nearest first.
 
     The last word may tell of columns behind the last event, which the encoder does not clear.

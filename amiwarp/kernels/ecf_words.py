@@ -39,7 +39,9 @@ def word_at(data: wp.array(dtype=wp.uint8), at: int, stop: int) -> int:
 @wp.func
 def long_word_at(data: wp.array(dtype=wp.uint8), at: int, stop: int) -> wp.uint32:
     """Return a word of 32 bits."""
-    return wp.uint32(word_at(data, at, stop)) | (wp.uint32(word_at(data, at + 2, stop)) << wp.uint32(16))
+    return wp.uint32(word_at(data, at, stop)) | (
+        wp.uint32(word_at(data, at + 2, stop)) << wp.uint32(16)
+    )
 
 
 @wp.func
@@ -89,7 +91,14 @@ def polarity_run(data: wp.array(dtype=wp.uint8), at: int, stop: int) -> Run:
 @wp.func
 def events_of(mask: int) -> int:
     """Return the number of events of a word of columns: the first one, and one for each of five bits."""
-    return 1 + (mask & 1) + ((mask >> 1) & 1) + ((mask >> 2) & 1) + ((mask >> 3) & 1) + ((mask >> 4) & 1)
+    return (
+        1
+        + (mask & 1)
+        + ((mask >> 1) & 1)
+        + ((mask >> 2) & 1)
+        + ((mask >> 3) & 1)
+        + ((mask >> 4) & 1)
+    )
 
 
 @wp.func
@@ -111,5 +120,8 @@ def numbers_of(first: wp.uint32, second: wp.uint32, third: wp.uint32, part: wp.u
     second_number = (first & ((one << part) - one)) | ((second >> two_parts) << part)
     third_number = (second & ((one << two_parts) - one)) | ((third >> three_parts) << two_parts)
     return wp.vec4i(
-        int(first >> part), int(second_number), int(third_number), int(third & ((one << three_parts) - one))
+        int(first >> part),
+        int(second_number),
+        int(third_number),
+        int(third & ((one << three_parts) - one)),
     )

@@ -1,4 +1,11 @@
-"""Equations of a brightness map on a CPU, which processes chains of event pairs in vectorised loops."""
+"""Equations of a brightness map on a CPU, which processes chains of event pairs in vectorised loops.
+
+Most pairs of a pixel begin where the pair before them ends. Successive pairs with a common position form a chain. A
+block of pairs stores the positions of its chains one after the other, so that each is loaded once, and added to once. A
+thread processes a block.
+
+:mod:`amiwarp.kernels.equations_cuda` does the same on CUDA, so that each device compiles only what it runs.
+"""
 
 import warp as wp
 
@@ -15,11 +22,6 @@ from amiwarp.kernels.equations import (
 )
 from amiwarp.kernels.native_code import load_float, load_int, store_float
 
-# Chains of event pairs on the brightness map, for CPUs.
-#
-# Most pairs of a pixel begin where the pair before them ends. Successive pairs with a common position form a chain. A
-# block of pairs stores the positions of its chains one after the other, so that each is loaded once, and added to once.
-
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = wp.constant(64)  # number of pairs per CPU thread; arrays are padded to whole blocks
@@ -35,7 +37,8 @@ class Chains:
     cell: wp.array(dtype=int)  # index of the map node up and left of each position
     x: wp.array(dtype=float)  # fractions to the next node
     y: wp.array(dtype=float)
-    weight: wp.array(dtype=float)  # weight of the pair that ends at each position; 0 at the start of a chain
+    # Weight of the pair that ends at each position; 0 at the start of a chain
+    weight: wp.array(dtype=float)
     count: wp.array(dtype=int)  # number of positions in each block
     end: wp.array(dtype=wp.uint8)  # place of each pair's second position in its block
 
@@ -62,14 +65,24 @@ class Chains:
     ((int*)chains.count.data)[block] = n;
     for (; n % 8 > 0; ++n) cell[n] = 0, x[n] = 0.0f, y[n] = 0.0f;
 """)
-def join_pairs(cells: wp.array(dtype=int), parts: wp.array(dtype=float), stride: int, chains: Chains, block: int):
+def join_pairs(
+    cells: wp.array(dtype=int),
+    parts: wp.array(dtype=float),
+    stride: int,
+    chains: Chains,
+    block: int,
+):
     """Store the positions of a block of pairs without those that a pair shares with the one before."""
 
 
 @wp.kernel
 def make_chains(
-    cells: wp.array(dtype=int), parts: wp.array(dtype=float), stride: int, start: int, chains: Chains
-):  # fmt: skip
+    cells: wp.array(dtype=int),
+    parts: wp.array(dtype=float),
+    stride: int,
+    start: int,
+    chains: Chains,
+):
     """Store the positions of one block of pairs per thread, from the arrays of ``Geometry``."""
     join_pairs(cells, parts, stride, chains, start + wp.tid())
 
@@ -82,7 +95,12 @@ def make_chains(
     for (int k = 0; k < 64; ++k) to[end[k]] = from[k];
 """)
 def move_to_ends(
-    ends: wp.array(dtype=float), place: int, values: wp.array(dtype=float), first: int, chains: Chains, block: int
+    ends: wp.array(dtype=float),
+    place: int,
+    values: wp.array(dtype=float),
+    first: int,
+    chains: Chains,
+    block: int,
 ):
     """Store the values of a block of pairs at the places of their second positions; the other places become 0.
 
@@ -125,9 +143,15 @@ def weigh_chains(weight: wp.array(dtype=float), start: int, chains: Chains):
 #endif
 """)
 def interpolate(
-    levels: wp.array(dtype=float), vector: wp.array(dtype=float), columns: int, cells: wp.array(dtype=int),
-    x: wp.array(dtype=float), y: wp.array(dtype=float), first: int, n: int,
-):  # fmt: skip
+    levels: wp.array(dtype=float),
+    vector: wp.array(dtype=float),
+    columns: int,
+    cells: wp.array(dtype=int),
+    x: wp.array(dtype=float),
+    y: wp.array(dtype=float),
+    first: int,
+    n: int,
+):
     """Compute the brightness at ``n`` positions, a multiple of 8 of at most 128, from element 16 of ``levels`` on.
 
     The positions are the elements of ``cells``, ``x`` and ``y`` from ``first`` on, as in :class:`Chains`.
@@ -135,7 +159,13 @@ def interpolate(
 
 
 @wp.func
-def find_levels(levels: wp.array(dtype=float), chains: Chains, vector: wp.array(dtype=float), columns: int, block: int):
+def find_levels(
+    levels: wp.array(dtype=float),
+    chains: Chains,
+    vector: wp.array(dtype=float),
+    columns: int,
+    block: int,
+):
     """Compute the brightness at the positions of a block, from element 16 of ``levels`` (144 elements) on.
 
     The difference of a pair is the level at its second position minus the element before. Element 15 is 0.
@@ -151,7 +181,9 @@ def find_levels(levels: wp.array(dtype=float), chains: Chains, vector: wp.array(
     float* out = (float*)values.data;
     for (int j = 0; j < n; ++j) out[j] = weight[j] * (at[j] - at[j - 1]);
 """)
-def weighted_differences(values: wp.array(dtype=float), levels: wp.array(dtype=float), chains: Chains, block: int):
+def weighted_differences(
+    values: wp.array(dtype=float), levels: wp.array(dtype=float), chains: Chains, block: int
+):
     """Compute weight · (L(second) - L(first)) of each pair in a block, at the place of its second position."""
 
 
@@ -161,7 +193,9 @@ def weighted_differences(values: wp.array(dtype=float), levels: wp.array(dtype=f
     float* out = (float*)values.data;
     for (int k = 0; k < 64; ++k) out[k] = at[end[k]] - at[end[k] - 1];
 """)
-def pair_differences(values: wp.array(dtype=float), levels: wp.array(dtype=float), chains: Chains, block: int):
+def pair_differences(
+    values: wp.array(dtype=float), levels: wp.array(dtype=float), chains: Chains, block: int
+):
     """Compute L(second) - L(first) of the 64 pairs in a block, in their order."""
 
 
@@ -215,7 +249,11 @@ unrolled, see :func:`amiwarp.kernels.native_code.add_word_pairs`.
 #endif
 """)
 def add_differences(
-    sums: wp.array(dtype=wp.int64), values: wp.array(dtype=float), chains: Chains, columns: int, block: int
+    sums: wp.array(dtype=wp.int64),
+    values: wp.array(dtype=float),
+    chains: Chains,
+    columns: int,
+    block: int,
 ):
     """Add the transpose of the differences of a block times their values to the sums; see :data:`ADD_SHARES`.
 
@@ -242,12 +280,6 @@ def add_differences(
 def add_weights(sums: wp.array(dtype=wp.int64), chains: Chains, columns: int, block: int):
     """Add the squares of the bilinear weights of a block's positions, times the weights of the pairs that they end or
     begin, to the sums; see :data:`ADD_SHARES`."""
-
-
-# All equations of a brightness map together, on a CPU: a thread processes a block of pairs in vectorised loops.
-#
-# :mod:`amiwarp.kernels.equations_cuda` and :mod:`amiwarp.kernels.equations_cuda` do the same on CUDA. So each device
-# compiles only what it runs.
 
 
 @wp.kernel
@@ -292,7 +324,8 @@ def apply_transpose(
     for k in range(BLOCK):
         w = load_float(weight, BLOCK * block + k)
         product = w * load_float(residual, BLOCK * block + k)
-        store_float(products, k, wp.where(w > 0.0, product, 0.0))  # the residual of a pair off the map is NaN
+        # The residual of a pair off the map is NaN
+        store_float(products, k, wp.where(w > 0.0, product, 0.0))
     move_to_ends(values, 0, products, 0, chains, block)
     if atlas.with_leak > 0.0 or atlas.with_off != 0:
         for k in range(BLOCK):
@@ -317,7 +350,9 @@ def subtract(
     find_levels(levels, chains, vector, atlas.columns, block)
     pair_differences(values, levels, chains, block)
     for k in range(BLOCK):
-        store_float(values, k, load_float(values, k) + sensor_terms(vector, atlas, pairs, BLOCK * block + k))
+        store_float(
+            values, k, load_float(values, k) + sensor_terms(vector, atlas, pairs, BLOCK * block + k)
+        )
     for k in range(BLOCK):
         i = BLOCK * block + k
         rest = load_float(residual, i) - load_float(values, k)

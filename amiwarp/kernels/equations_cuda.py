@@ -1,4 +1,11 @@
-"""Equations of a brightness map on CUDA, which adds the ends of event pairs in the order of the map."""
+"""Equations of a brightness map on CUDA, which adds the ends of event pairs in the order of the map.
+
+A thread computes the value of one pair. A pair has two ends: the positions of its two events. Other threads add the
+values to the nodes of the map, a thread an end. In the order of the map, neighbouring threads add to the same nodes. A
+warp first adds up what its threads have for each cell, so that few of them add to the sums.
+
+On CPUs, :mod:`amiwarp.kernels.equations_cpu` does the same.
+"""
 
 import warp as wp
 
@@ -15,12 +22,7 @@ from amiwarp.kernels.equations import (
     residual_of,
     weight_of,
 )
-from amiwarp.kernels.native_code import ends_run, run_starts, sum_run
-
-# Ends of event pairs in the order of the brightness map, for CUDA.
-#
-# A pair has two ends: the positions of its two events. In the order of the map, neighbouring threads add to the same
-# nodes. A warp first adds up what its threads have for each cell, so that few of them add to the sums.
+from amiwarp.kernels.warp_sums import ends_run, run_starts, sum_run
 
 wp.set_module_options({"enable_backward": False})
 
@@ -34,7 +36,8 @@ class Ends:
     """
 
     order: wp.array(dtype=int)  # number of each end
-    cell: wp.array(dtype=int)  # index of the map node up and left of each end; the number of nodes for unused elements
+    # Index of the map node up and left of each end; the number of nodes for unused elements
+    cell: wp.array(dtype=int)
     part: wp.array(dtype=wp.vec2)  # fractions (x, y) to the next node
 
 
@@ -47,13 +50,20 @@ def continues_previous(geometry: Geometry, i: int) -> bool:
     if geometry.cell[i] < 0 or geometry.cell[i] != geometry.cell[before]:
         return False
     same_x = geometry.part[i] == geometry.part[geometry.stride + before]
-    return same_x and geometry.part[geometry.stride + i] == geometry.part[2 * geometry.stride + before]
+    return (
+        same_x and geometry.part[geometry.stride + i] == geometry.part[2 * geometry.stride + before]
+    )
 
 
 @wp.kernel
 def list_ends(
-    geometry: Geometry, count: int, nodes: int, start: int, cell: wp.array(dtype=int), order: wp.array(dtype=int)
-):  # fmt: skip
+    geometry: Geometry,
+    count: int,
+    nodes: int,
+    start: int,
+    cell: wp.array(dtype=int),
+    order: wp.array(dtype=int),
+):
     """List the cell and the number of the first and the second end of each of ``count`` pairs."""
     end = start + wp.tid()
     second = end >= geometry.stride
@@ -82,7 +92,7 @@ def take_fractions(geometry: Geometry, start: int, ends: Ends):
 
 @wp.func
 def value_at(values: wp.array(dtype=float), number: int, stride: int, squared: int) -> float:
-    """Return the value of the pair that ends here, minus that of the pair that begins here; or plus, if squared."""
+    """Return the value of the pair that ends here, minus (plus if squared) the value of the pair that begins here."""
     i = number % stride
     sign = wp.where(squared != 0, 1.0, -1.0)
     if number < stride:
@@ -102,12 +112,13 @@ def add_ends(
     start: int,
     sums: wp.array(dtype=wp.int64),
 ):
-    """Add each pair's value times the bilinear weights of its second end, minus those of its first, to the sums.
+    """Add each pair's value times the bilinear weights of its second end, minus the weights of its first, to the sums.
 
     With ``squared``, add its value times the squares of the bilinear weights of both ends.
     """
     end = start + wp.tid()
-    cell = ends.cell[wp.min(end, 2 * stride - 1)]  # no warp has ends and further threads: the stride is 64 n
+    # No warp has ends and further threads: the stride is 64 n
+    cell = ends.cell[wp.min(end, 2 * stride - 1)]
     used = end < 2 * stride and cell < sums.shape[0] - EXTRA
     share = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if used:
@@ -124,12 +135,6 @@ def add_ends(
     if last and used:
         add_two(sums, cell, to_fixed(upper_left), to_fixed(upper_right))
         add_two(sums, cell + columns, to_fixed(lower_left), to_fixed(lower_right))
-
-
-# All equations of a brightness map together, on CUDA: residuals, weights, and the value of each pair.
-#
-# A thread processes one pair. :mod:`amiwarp.kernels.equations_cuda` adds the values to the nodes of the map. On CPUs
-# :mod:`amiwarp.kernels.equations_cpu` does both.
 
 
 @wp.kernel
@@ -168,7 +173,8 @@ def weigh_residuals(
     i = wp.min(thread, pairs.count - 1)
     value = float(0.0)
     if thread < pairs.count:
-        value = wp.where(weight[i] > 0.0, weight[i] * residual[i], 0.0)  # the residual of a pair off the map is NaN
+        # The residual of a pair off the map is NaN
+        value = wp.where(weight[i] > 0.0, weight[i] * residual[i], 0.0)
         flow[i] = value
     add_extra(sums, atlas, pairs, i, value)
 
@@ -191,7 +197,11 @@ def subtract(
 
 @wp.kernel
 def add_sensor_diagonal(
-    pairs: Pairs, atlas: Atlas, weight: wp.array(dtype=float), start: int, sums: wp.array(dtype=wp.int64)
+    pairs: Pairs,
+    atlas: Atlas,
+    weight: wp.array(dtype=float),
+    start: int,
+    sums: wp.array(dtype=wp.int64),
 ):
     """Compute sums += diag(Aᵀ W A) for the leak and the OFF threshold."""
     thread = start + wp.tid()

@@ -46,5 +46,12 @@ def new_event_arrays(count: int, device: Any) -> Any:
     ((int64_t*)events.t.data)[i] = now;
     ((uint8_t*)events.p.data)[i] = polarity;
 """)
-def store_event(events: EventArrays, i: int, column: wp.uint16, row: wp.uint16, now: wp.int64, polarity: wp.uint8):
+def store_event(
+    events: EventArrays,
+    i: int,
+    column: wp.uint16,
+    row: wp.uint16,
+    now: wp.int64,
+    polarity: wp.uint8,
+):
     """Store event ``i`` in contiguous arrays."""

@@ -35,7 +35,7 @@ def decode_stream(
     events: EventArrays,
     progress: wp.array(dtype=Progress),
 ):
-    """Decode events of a DVS, or those of an ATIS that are change detections, from the time ``before`` [us] on.
+    """Decode events of a DVS, or the change detections of an ATIS, from the time ``before`` [us] on.
 
     Rows count from the bottom. One that lies outside becomes a large number.
     """
@@ -62,7 +62,9 @@ def decode_stream(
                 column = int(data[at + 1]) | (int(data[at + 2]) << 8)
                 row = int(data[at + 3]) | (int(data[at + 4]) << 8)
                 polarity = wp.uint8(kind >> (bits - 1))
-                store_event(events, event, wp.uint16(column), wp.uint16(height - 1 - row), now, polarity)
+                store_event(
+                    events, event, wp.uint16(column), wp.uint16(height - 1 - row), now, polarity
+                )
                 event += 1
             at += EVENT_BYTES
     result = Progress()

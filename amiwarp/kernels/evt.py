@@ -226,7 +226,13 @@ def after_block(place: Place, state: State, change: Change) -> Place:
 
 
 @wp.kernel
-def merge_blocks(changes: wp.array(dtype=Change), size: int, bits: int, start: int, groups: wp.array(dtype=Change)):
+def merge_blocks(
+    changes: wp.array(dtype=Change),
+    size: int,
+    bits: int,
+    start: int,
+    groups: wp.array(dtype=Change),
+):
     """Find what each group of ``size`` blocks changes."""
     group = wp.tid() + start
     change = changes[group * size]
@@ -237,7 +243,10 @@ def merge_blocks(changes: wp.array(dtype=Change), size: int, bits: int, start: i
 
 @wp.kernel
 def link_groups(
-    groups: wp.array(dtype=Change), bits: int, states: wp.array(dtype=State), places: wp.array(dtype=Place)
+    groups: wp.array(dtype=Change),
+    bits: int,
+    states: wp.array(dtype=State),
+    places: wp.array(dtype=Place),
 ):
     """Find the state and the place at the start of each group, and at the end of all. One thread.
 
@@ -267,7 +276,7 @@ def link_blocks(
     states: wp.array(dtype=State),
     places: wp.array(dtype=Place),
 ):
-    """Find the state and the place at the start of each block, from those of its group of ``size`` blocks."""
+    """Find the state and the place at the start of each block, from its group of ``size`` blocks."""
     group = wp.tid() + start
     state = group_states[group]
     place = group_places[group]

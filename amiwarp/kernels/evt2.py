@@ -68,7 +68,13 @@ def pixels_of(word: wp.uint64, swapped: int) -> wp.uint32:
 
 
 @wp.kernel
-def survey_evt2(words: wp.array(dtype=Any), length: int, swapped: int, start: int, changes: wp.array(dtype=Change)):
+def survey_evt2(
+    words: wp.array(dtype=Any),
+    length: int,
+    swapped: int,
+    start: int,
+    changes: wp.array(dtype=Change),
+):
     """Note what each block of ``length`` words changes."""
     block = wp.tid() + start
     change = unchanged()

@@ -122,7 +122,9 @@ def last_of(words: wp.array(dtype=wp.uint16), kind: int, start: int, stop: int) 
 
 
 @wp.kernel
-def survey_evt3(words: wp.array(dtype=wp.uint16), length: int, start: int, changes: wp.array(dtype=Change)):
+def survey_evt3(
+    words: wp.array(dtype=wp.uint16), length: int, start: int, changes: wp.array(dtype=Change)
+):
     """Note what each block of ``length`` words changes."""
     block = wp.tid() + start
     begin = block * length
@@ -169,7 +171,9 @@ def survey_evt3(words: wp.array(dtype=wp.uint16), length: int, start: int, chang
         change.base = word & 0x7FF
         change.polarity = (word >> 11) & 1
     at = wp.max(at, begin)
-    change.moved = 12 * count_words(words, VECTOR_12, at, end) + 8 * count_words(words, VECTOR_8, at, end)
+    change.moved = 12 * count_words(words, VECTOR_12, at, end) + 8 * count_words(
+        words, VECTOR_8, at, end
+    )
     changes[block] = change
 
 

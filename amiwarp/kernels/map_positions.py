@@ -1,14 +1,16 @@
-"""Positions of event pairs on the brightness map, for :mod:`amiwarp.brightness.solver`."""
+"""Positions of event pairs on the brightness map, for :mod:`amiwarp.brightness.positions`."""
 
 from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import NAN, CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
+from amiwarp.kernels.camera import NAN, CameraParams, PinholeParams
+from amiwarp.kernels.camera_rotation import CameraRotationParams, undo_camera_rotation
 from amiwarp.kernels.equations import Atlas, Geometry, Pairs
 from amiwarp.kernels.equations_cpu import BLOCK, interpolate
 from amiwarp.kernels.native_code import load_float, load_int, load_uint16, store_float, store_int
-from amiwarp.kernels.refraction import advanced, compensate, displace, even, is_even, is_plain, plain, state_of
+from amiwarp.kernels.plain_models import even, is_even, is_plain, plain
+from amiwarp.kernels.refraction import advanced, compensate, displace, state_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -80,7 +82,13 @@ def without_path(pairs: Pairs, k: int, i: int, xy: wp.vec2) -> wp.vec2:
 
 @wp.func
 def compensated_position(
-    model: Any, camera: CameraParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
+    model: Any,
+    camera: CameraParams,
+    camera_rotation: CameraRotationParams,
+    pairs: Pairs,
+    drift: float,
+    i: int,
+    k: int,
 ) -> wp.vec2:
     """Return the compensated position [px] of the first (k = 0) or second event of a pair, at the given drift."""
     w = drifted_state(model, pairs, drift, k, i)
@@ -94,12 +102,20 @@ def compensated_position(
 
 @wp.func
 def compensated_position(
-    model: Any, camera: PinholeParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
+    model: Any,
+    camera: PinholeParams,
+    camera_rotation: CameraRotationParams,
+    pairs: Pairs,
+    drift: float,
+    i: int,
+    k: int,
 ) -> wp.vec2:
     """Return the compensated position for a camera without distortion, and pixels that are not slow."""
     w = drifted_state(model, pairs, drift, k, i)
     u, v = displace(model, camera, float(pairs.x[i]), float(pairs.y[i]), w[0], w[1])
-    xy = undo_camera_rotation(camera, wp.vec2(u, v), camera_rotation, pairs.time[k * pairs.stride + i])
+    xy = undo_camera_rotation(
+        camera, wp.vec2(u, v), camera_rotation, pairs.time[k * pairs.stride + i]
+    )
     return without_path(pairs, k, i, xy)
 
 
@@ -177,13 +193,17 @@ def event_node(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, k:
     This function is for a camera without distortion and rotation, and without drift.
     """
     w0, w1 = event_state(model, pairs, k, i)
-    u, v = displace(model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1)
+    u, v = displace(
+        model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1
+    )
     cell, x, y = node_at(atlas, load_int(pairs.tile, i), u, v)
     return cell, x, y
 
 
 @wp.kernel
-def place_still(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, start: int, geometry: Geometry):
+def place_still(
+    model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, start: int, geometry: Geometry
+):
     """Compute the positions as :func:`place_pairs` does, without branches; see :func:`event_node`."""
     i = start + wp.tid()
     a, ax, ay = event_node(model, camera, pairs, atlas, 0, i)
@@ -193,9 +213,15 @@ def place_still(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, s
 
 @wp.func
 def displace_block(
-    model: Any, camera: PinholeParams, pairs: Pairs, k: int, first: int, drifts: int, x: wp.array(dtype=float),
+    model: Any,
+    camera: PinholeParams,
+    pairs: Pairs,
+    k: int,
+    first: int,
+    drifts: int,
+    x: wp.array(dtype=float),
     y: wp.array(dtype=float),
-):  # fmt: skip
+):
     """Compute the compensated positions [px] of the first (k = 0) or second events of a block of pairs.
 
     If ``drifts`` is 1, ``x`` and ``y`` hold the states at these events before.
@@ -205,14 +231,22 @@ def displace_block(
         w0, w1 = event_state(model, pairs, k, i)
         w0 = wp.where(drifts == 1, load_float(x, j), w0)
         w1 = wp.where(drifts == 1, load_float(y, j), w1)
-        u, v = displace(model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1)
+        u, v = displace(
+            model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1
+        )
         store_float(x, j, u)
         store_float(y, j, v)
 
 
 @wp.func
 def drift_block(
-    model: Any, pairs: Pairs, drift: float, k: int, first: int, x: wp.array(dtype=float), y: wp.array(dtype=float)
+    model: Any,
+    pairs: Pairs,
+    drift: float,
+    k: int,
+    first: int,
+    x: wp.array(dtype=float),
+    y: wp.array(dtype=float),
 ):
     """Compute the states at the first (k = 0) or second events of a block of pairs, at the given drift."""
     for j in range(BLOCK):
@@ -223,9 +257,14 @@ def drift_block(
 
 @wp.func
 def undo_rotations(
-    camera: PinholeParams, camera_rotation: CameraRotationParams, pairs: Pairs, k: int, first: int,
-    x: wp.array(dtype=float), y: wp.array(dtype=float),
-):  # fmt: skip
+    camera: PinholeParams,
+    camera_rotation: CameraRotationParams,
+    pairs: Pairs,
+    k: int,
+    first: int,
+    x: wp.array(dtype=float),
+    y: wp.array(dtype=float),
+):
     """Move the positions of a block of pairs to where they are at time 0."""
     for j in range(BLOCK):
         at = undo_camera_rotation(
@@ -238,9 +277,16 @@ def undo_rotations(
 
 @wp.func
 def compensate_block(
-    model: Any, camera: PinholeParams, pairs: Pairs, drift: float, camera_rotation: CameraRotationParams, k: int,
-    first: int, x: wp.array(dtype=float), y: wp.array(dtype=float),
-):  # fmt: skip
+    model: Any,
+    camera: PinholeParams,
+    pairs: Pairs,
+    drift: float,
+    camera_rotation: CameraRotationParams,
+    k: int,
+    first: int,
+    x: wp.array(dtype=float),
+    y: wp.array(dtype=float),
+):
     """Compute the compensated positions [px] of the first (k = 0) or second events of a block of pairs."""
     drifts = wp.min(pairs.slope.shape[0], 1)
     if drifts == 1:
@@ -252,12 +298,19 @@ def compensate_block(
     else:
         displace_block(model, camera, pairs, k, first, drifts, x, y)
     moves = wp.length_sq(camera_rotation.velocity) + wp.length_sq(camera_rotation.acceleration)
-    if moves + camera_rotation.growth * camera_rotation.growth > 0.0:
+    moves = (
+        moves
+        + camera_rotation.growth * camera_rotation.growth
+        + float(camera_rotation.path.shape[0])
+    )
+    if moves > 0.0:
         undo_rotations(camera, camera_rotation, pairs, k, first, x, y)
 
 
 @wp.func
-def load_origins(atlas: Atlas, pairs: Pairs, first: int, left: wp.array(dtype=float), top: wp.array(dtype=float)):
+def load_origins(
+    atlas: Atlas, pairs: Pairs, first: int, left: wp.array(dtype=float), top: wp.array(dtype=float)
+):
     """Load the origins of the tiles of a block of pairs.
 
     A compiler does not vectorise a loop that loads from places which it finds in the loop, and stores results.
@@ -270,18 +323,28 @@ def load_origins(atlas: Atlas, pairs: Pairs, first: int, left: wp.array(dtype=fl
 
 @wp.func
 def find_nodes(
-    atlas: Atlas, pairs: Pairs, first: int, left: wp.array(dtype=float), top: wp.array(dtype=float),
-    x: wp.array(dtype=float), y: wp.array(dtype=float), cells: wp.array(dtype=int),
-):  # fmt: skip
+    atlas: Atlas,
+    pairs: Pairs,
+    first: int,
+    left: wp.array(dtype=float),
+    top: wp.array(dtype=float),
+    x: wp.array(dtype=float),
+    y: wp.array(dtype=float),
+    cells: wp.array(dtype=int),
+):
     """Replace the positions of a block by the fractions between map nodes, and compute the nodes.
 
     ``left`` and ``top`` are the origins of the tiles, see :func:`load_origins`.
     """
     for j in range(BLOCK):
         cell, u, v = node_from(
-            atlas, load_int(pairs.tile, first + j), load_float(left, j), load_float(top, j), load_float(x, j),
+            atlas,
+            load_int(pairs.tile, first + j),
+            load_float(left, j),
+            load_float(top, j),
+            load_float(x, j),
             load_float(y, j),
-        )  # fmt: skip
+        )
         store_int(cells, j, cell)
         store_float(x, j, u)
         store_float(y, j, v)
@@ -289,9 +352,16 @@ def find_nodes(
 
 @wp.func
 def find_block_nodes(
-    atlas: Atlas, pairs: Pairs, first: int, ax: wp.array(dtype=float), ay: wp.array(dtype=float),
-    bx: wp.array(dtype=float), by: wp.array(dtype=float), a: wp.array(dtype=int), b: wp.array(dtype=int),
-):  # fmt: skip
+    atlas: Atlas,
+    pairs: Pairs,
+    first: int,
+    ax: wp.array(dtype=float),
+    ay: wp.array(dtype=float),
+    bx: wp.array(dtype=float),
+    by: wp.array(dtype=float),
+    a: wp.array(dtype=int),
+    b: wp.array(dtype=int),
+):
     """Compute the map nodes of a block of pairs, given their positions, which the fractions replace."""
     left = wp.zeros(shape=(64,), dtype=float)
     top = wp.zeros(shape=(64,), dtype=float)
@@ -302,21 +372,43 @@ def find_block_nodes(
 
 @wp.func
 def store_block(
-    geometry: Geometry, first: int, ax: wp.array(dtype=float), ay: wp.array(dtype=float), bx: wp.array(dtype=float),
-    by: wp.array(dtype=float), a: wp.array(dtype=int), b: wp.array(dtype=int),
-):  # fmt: skip
+    geometry: Geometry,
+    first: int,
+    ax: wp.array(dtype=float),
+    ay: wp.array(dtype=float),
+    bx: wp.array(dtype=float),
+    by: wp.array(dtype=float),
+    a: wp.array(dtype=int),
+    b: wp.array(dtype=int),
+):
     """Store the map nodes and fractions of a block of pairs."""
     for j in range(BLOCK):
         u, v = load_float(ax, j), load_float(ay, j)
-        store_geometry(geometry, first + j, load_int(a, j), u, v, load_int(b, j), load_float(bx, j), load_float(by, j))
+        store_geometry(
+            geometry,
+            first + j,
+            load_int(a, j),
+            u,
+            v,
+            load_int(b, j),
+            load_float(bx, j),
+            load_float(by, j),
+        )
 
 
 @wp.func
 def store_changes(
-    atlas: Atlas, image: wp.array(dtype=float), first: int, ax: wp.array(dtype=float), ay: wp.array(dtype=float),
-    bx: wp.array(dtype=float), by: wp.array(dtype=float), a: wp.array(dtype=int), b: wp.array(dtype=int),
+    atlas: Atlas,
+    image: wp.array(dtype=float),
+    first: int,
+    ax: wp.array(dtype=float),
+    ay: wp.array(dtype=float),
+    bx: wp.array(dtype=float),
+    by: wp.array(dtype=float),
+    a: wp.array(dtype=int),
+    b: wp.array(dtype=int),
     change: wp.array(dtype=float),
-):  # fmt: skip
+):
     """Store how much the brightness changes from the first to the second event of each pair; NaN off the map."""
     before = wp.zeros(shape=(80,), dtype=float)
     after = wp.zeros(shape=(80,), dtype=float)

@@ -1,12 +1,28 @@
-"""Mirror with two tilts: rotation of a bearing to what the mirror at rest would show, and back."""
+"""Mirror with two tilts: rotation of a bearing to what the mirror at rest would show, and back.
+
+The state of the optic is the angles of both commands, as for a pair of prisms.
+"""
 
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.compensation import state_at_time
 from amiwarp.kernels.native_code import load_uint16, store_float
-from amiwarp.kernels.prism_angle import THETA_U16_RAD, EncoderParams, of_second, radians, theta_u32_at
-from amiwarp.kernels.refraction import advanced, compensate_direction, deflect, state_at, state_of
+from amiwarp.kernels.prism_angle import (
+    THETA_U16_RAD,
+    EncoderParams,
+    of_second,
+    radians,
+    theta_u32_at,
+)
+from amiwarp.kernels.refraction import (
+    advanced,
+    compensate_direction,
+    deflect,
+    state_at,
+    state_of,
+    state_of_angles,
+)
 from amiwarp.kernels.vibration import rotate_by_vector
 from amiwarp.kernels.votes import EventArrays, load_states, stored_state
 
@@ -25,13 +41,16 @@ class MirrorParams:
     second: wp.vec3  # rotation vector by the second tilt [rad]
 
 
-# -- state: the angles of both commands, as for a pair of prisms
-
-
 @wp.func
 def state_of(model: MirrorParams, first: float, second: float):
     """Return the state from what is stored for an event: the angles of both commands [rad]."""
     return first + model.phase, second + model.second_phase
+
+
+@wp.func
+def state_of_angles(model: MirrorParams, first: float, second: float) -> wp.vec2:
+    """Return the state from the true angles of both commands, phases included [rad]."""
+    return wp.vec2(first, second)
 
 
 @wp.func
@@ -47,7 +66,9 @@ def state_at(model: MirrorParams, theta: wp.array(dtype=float), i: int) -> wp.ve
 
 
 @wp.func
-def state_at_time(model: MirrorParams, encoder: EncoderParams, azimuths: wp.array(dtype=float), t: wp.int64):
+def state_at_time(
+    model: MirrorParams, encoder: EncoderParams, azimuths: wp.array(dtype=float), t: wp.int64
+):
     """Return the state at event time ``t`` [us]."""
     second = radians(theta_u32_at(of_second(encoder), t))
     w0, w1 = state_of(model, radians(theta_u32_at(encoder, t)), second)
@@ -62,7 +83,9 @@ def stored_state(model: MirrorParams, events: EventArrays, i: int):
 
 
 @wp.func
-def load_states(model: MirrorParams, events: EventArrays, first: int, states: wp.array(dtype=float)):
+def load_states(
+    model: MirrorParams, events: EventArrays, first: int, states: wp.array(dtype=float)
+):
     """Load what :func:`stored_state` returns for a block of 64 events."""
     for k in range(64):
         a, b = stored_state(model, events, first + k)
@@ -70,11 +93,10 @@ def load_states(model: MirrorParams, events: EventArrays, first: int, states: wp
         store_float(states, 2 * k + 1, b)
 
 
-# -- reflection
-
-
 @wp.func
-def turn_by_mirror(m: MirrorParams, sign: float, x: float, y: float, z: float, w0: float, w1: float):
+def turn_by_mirror(
+    m: MirrorParams, sign: float, x: float, y: float, z: float, w0: float, w1: float
+):
     """Rotate a direction as the tilted mirror and then the one at rest do, or back with ``sign`` -1.
 
     Two reflections are a rotation by twice the angle between their normals.

@@ -8,12 +8,13 @@ import warp as wp
 
 from amiwarp.kernels.conjugate_gradients import Prior, add_fixed
 from amiwarp.kernels.equations import Atlas, Geometry, bilinear, fraction, fractions_of
-from amiwarp.kernels.native_code import wait_for_block
+from amiwarp.kernels.shared_memory import wait_for_block
 
 OPTIONS = {"enable_backward": False}
 wp.set_module_options(OPTIONS)
 
-HAT = wp.constant(8.0 / 3.0)  # energy of a bilinear hat function of any width under links of weight 1
+# Energy of a bilinear hat function of any width under links of weight 1
+HAT = wp.constant(8.0 / 3.0)
 
 
 @wp.func
@@ -54,7 +55,9 @@ def add_coarse_diagonal(
     if geometry.cell[i] < 0:
         return
     a = coarse_coordinates(atlas, geometry.cell[i], fractions_of(geometry, 0, i), spacing)
-    b = coarse_coordinates(atlas, geometry.cell[geometry.stride + i], fractions_of(geometry, 1, i), spacing)
+    b = coarse_coordinates(
+        atlas, geometry.cell[geometry.stride + i], fractions_of(geometry, 1, i), spacing
+    )
     wa = bilinear(fraction(a))
     wb = bilinear(fraction(b))
     na = upper_left(a, columns)
@@ -69,7 +72,12 @@ def add_coarse_diagonal(
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
-def divide(diagonal: wp.array(dtype=float), residual: wp.array(dtype=float), start: int, out: wp.array(dtype=float)):
+def divide(
+    diagonal: wp.array(dtype=float),
+    residual: wp.array(dtype=float),
+    start: int,
+    out: wp.array(dtype=float),
+):
     """Compute the correction on the finest grid: the residual divided by the diagonal."""
     i = start + wp.tid()
     if i < out.shape[0]:
@@ -143,9 +151,16 @@ def restrict(
     }
 """)
 def restrict_row(
-    fine: wp.array(dtype=float), fine_rows: int, fine_columns: int, columns: int, diagonal: wp.array(dtype=float),
-    least: float, row: int, coarse: wp.array(dtype=float), correction: wp.array(dtype=float),
-):  # fmt: skip
+    fine: wp.array(dtype=float),
+    fine_rows: int,
+    fine_columns: int,
+    columns: int,
+    diagonal: wp.array(dtype=float),
+    least: float,
+    row: int,
+    coarse: wp.array(dtype=float),
+    correction: wp.array(dtype=float),
+):
     """Compute :func:`restrict` for one row of the coarser grid. ``least`` is the prior's part of the diagonal."""
 
 
@@ -164,7 +179,17 @@ def restrict_rows(
     """Compute residual and correction as :func:`restrict` does, one row of the coarser grid per thread. For CPUs."""
     least = prior_part(prior, four)
     row = start + wp.tid()
-    restrict_row(fine, fine_rows, fine_columns, fine_columns / 2 + 1, diagonal, least, row, coarse, correction)
+    restrict_row(
+        fine,
+        fine_rows,
+        fine_columns,
+        fine_columns / 2 + 1,
+        diagonal,
+        least,
+        row,
+        coarse,
+        correction,
+    )
 
 
 @wp.func
@@ -181,8 +206,12 @@ def prolonged(coarse: wp.array(dtype=float), first: int, fine_columns: int, i: i
 
 @wp.kernel(module="unique", module_options=OPTIONS)
 def prolong(
-    coarse: wp.array(dtype=float), fine_rows: int, fine_columns: int, start: int, fine: wp.array(dtype=float)
-):  # fmt: skip
+    coarse: wp.array(dtype=float),
+    fine_rows: int,
+    fine_columns: int,
+    start: int,
+    fine: wp.array(dtype=float),
+):
     """Interpolate the coarser grid's correction and add it to the finer grid's."""
     i = start + wp.tid()
     if i < fine_rows * fine_columns:
@@ -199,7 +228,7 @@ def prolong_to_finest(
     start: int,
     out: wp.array(dtype=float),
 ):
-    """Compute the correction on the finest grid (:func:`divide`), and add that of the coarser, interpolated."""
+    """Compute the correction on the finest grid (:func:`divide`), and add the coarser one, interpolated."""
     i = start + wp.tid()
     if i < out.shape[0]:
         correction = residual[i] / diagonal[i]
@@ -269,15 +298,23 @@ def correct_small(
     if (fine_columns % 2) to[fine_columns - 1] += 0.5f * (above[fine_columns / 2] + below[fine_columns / 2]);
 """)
 def prolong_row(
-    coarse: wp.array(dtype=float), columns: int, fine_columns: int, row: int, fine: wp.array(dtype=float)
-):  # fmt: skip
+    coarse: wp.array(dtype=float),
+    columns: int,
+    fine_columns: int,
+    row: int,
+    fine: wp.array(dtype=float),
+):
     """Compute :func:`prolong` for one row of the finer grid."""
 
 
 @wp.kernel
 def prolong_rows(
-    coarse: wp.array(dtype=float), columns: int, fine_columns: int, start: int, fine: wp.array(dtype=float)
-):  # fmt: skip
+    coarse: wp.array(dtype=float),
+    columns: int,
+    fine_columns: int,
+    start: int,
+    fine: wp.array(dtype=float),
+):
     """Add the correction as :func:`prolong` does, one row of the finer grid per thread. For CPUs."""
     prolong_row(coarse, columns, fine_columns, start + wp.tid(), fine)
 
@@ -289,7 +326,11 @@ def prolong_rows(
     for (int i = first; i < last; ++i) to[i] = r[i] / d[i];
 """)
 def divide_range(
-    diagonal: wp.array(dtype=float), residual: wp.array(dtype=float), first: int, last: int, out: wp.array(dtype=float)
+    diagonal: wp.array(dtype=float),
+    residual: wp.array(dtype=float),
+    first: int,
+    last: int,
+    out: wp.array(dtype=float),
 ):
     """Compute :func:`divide` from ``first`` to ``last``."""
 

@@ -1,8 +1,9 @@
-"""Native code for what Warp's language lacks: vector loads and stores on CPUs; warps and shared memory on CUDA."""
+"""Native code for what Warp's language lacks: unstrided loads and stores, and additions to pairs of elements.
+
+With them, CPU compilers vectorise a loop.
+"""
 
 import warp as wp
-
-# Unstrided loads and stores, and additions to pairs of elements. With them, CPU compilers vectorise a loop.
 
 wp.set_module_options({"enable_backward": False})
 
@@ -67,18 +68,26 @@ def store_int(values: wp.array(dtype=int), i: int, value: int):
     """Store ``value`` as element ``i`` of a contiguous array of int32."""
 
 
-@wp.func_native("for (int k = 0; k < n; ++k) ((float*)out.data)[k] = ((const float*)values.data)[first + k];")
+@wp.func_native(
+    "for (int k = 0; k < n; ++k) ((float*)out.data)[k] = ((const float*)values.data)[first + k];"
+)
 def copy_floats(out: wp.array(dtype=float), values: wp.array(dtype=float), first: int, n: int):
     """Copy ``values[first : first + n]`` of contiguous arrays of float32."""
 
 
-@wp.func_native("for (int k = 0; k < n; ++k) ((uint8_t*)out.data)[k] = ((const uint8_t*)values.data)[first + k];")
+@wp.func_native(
+    "for (int k = 0; k < n; ++k) ((uint8_t*)out.data)[k] = ((const uint8_t*)values.data)[first + k];"
+)
 def copy_bytes(out: wp.array(dtype=wp.uint8), values: wp.array(dtype=wp.uint8), first: int, n: int):
     """Copy ``values[first : first + n]`` of contiguous arrays of uint8."""
 
 
-@wp.func_native("for (int k = 0; k < n; ++k) ((int64_t*)out.data)[k] = ((const int64_t*)values.data)[first + k];")
-def copy_int64s(out: wp.array(dtype=wp.int64), values: wp.array(dtype=wp.int64), first: int, n: int):
+@wp.func_native(
+    "for (int k = 0; k < n; ++k) ((int64_t*)out.data)[k] = ((const int64_t*)values.data)[first + k];"
+)
+def copy_int64s(
+    out: wp.array(dtype=wp.int64), values: wp.array(dtype=wp.int64), first: int, n: int
+):
     """Copy ``values[first : first + n]`` of contiguous arrays of int64."""
 
 
@@ -112,7 +121,10 @@ def largest_of(values: wp.array(dtype=wp.uint16), first: int, stop: int) -> int:
     }
 """)
 def load_pairs(
-    out: wp.array(dtype=float), pairs: wp.array(dtype=float), indices: wp.array(dtype=wp.uint16), first: int
+    out: wp.array(dtype=float),
+    pairs: wp.array(dtype=float),
+    indices: wp.array(dtype=wp.uint16),
+    first: int,
 ):
     """Copy the pairs of floats at ``indices[first : first + 64]`` of a table of pairs, one load each. For CPUs.
 
@@ -140,7 +152,11 @@ def load_pairs(
     }
 """)
 def add_word_pairs(
-    sums: wp.array(dtype=int), places: wp.array(dtype=int), shares: wp.array(dtype=int), columns: int, n: int
+    sums: wp.array(dtype=int),
+    places: wp.array(dtype=int),
+    shares: wp.array(dtype=int),
+    columns: int,
+    n: int,
 ):
     """Add four shares to the 2 x 2 elements at each of ``n`` places of an image, two in one 64-bit addition.
 
@@ -159,9 +175,12 @@ def add_word_pairs(
 #endif
 """)
 def prefetch_events(
-    x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
-    p: wp.array(dtype=wp.uint8), first: int,
-):  # fmt: skip
+    x: wp.array(dtype=wp.uint16),
+    y: wp.array(dtype=wp.uint16),
+    t: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8),
+    first: int,
+):
     """Fetch the columns of 64 events into a core's cache, while it goes on."""
 
 
@@ -182,7 +201,11 @@ def prefetch_words(sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), 
     for (int k = 0; k < n; ++k) sum[place[k]] += word[k];
 """)
 def add_words(
-    sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), words: wp.array(dtype=wp.int64), first: int, n: int
+    sums: wp.array(dtype=wp.int64),
+    places: wp.array(dtype=int),
+    words: wp.array(dtype=wp.int64),
+    first: int,
+    n: int,
 ):
     """Add ``words[first : first + n]`` at their places, modulo 2**64. For CPUs, if no other thread adds there."""
 
@@ -220,9 +243,17 @@ def add_words(
     }
 """)
 def read_words(
-    out: wp.array(dtype=float), at: int, words: wp.array(dtype=wp.int64), low: int, start: int, size: int, steps: int,
-    parts: int, bins: int, n: int,
-):  # fmt: skip
+    out: wp.array(dtype=float),
+    at: int,
+    words: wp.array(dtype=wp.int64),
+    low: int,
+    start: int,
+    size: int,
+    steps: int,
+    parts: int,
+    bins: int,
+    n: int,
+):
     """Compute all bins of ``n`` pixels of a voxel grid from the words of :mod:`amiwarp.kernels.tensors`.
 
     ``low`` is the number of bits of the lower field, ``size`` the number of pixels of an image, ``parts`` the number of
@@ -249,7 +280,11 @@ def read_words(
     }
 """)
 def add_squares(
-    sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), shares: wp.array(dtype=wp.int64), stride: int, n: int
+    sums: wp.array(dtype=wp.int64),
+    places: wp.array(dtype=int),
+    shares: wp.array(dtype=wp.int64),
+    stride: int,
+    n: int,
 ):
     """Add four shares to the sums at each of ``n`` places, and four more ``stride`` sums further. For CPUs."""
 
@@ -265,102 +300,3 @@ def add_squares(
 """)
 def count_places(sums: wp.array(dtype=int), places: wp.array(dtype=int), n: int):
     """Add 1 to the count at each of ``n`` places. For CPUs, if no other thread adds there."""
-
-
-# Sums over neighbouring threads of a CUDA warp, in fixed order.
-#
-# A run is a sequence of neighbouring threads of a warp with the same key. On a CPU each thread is a run. All threads of
-# a warp must call these functions.
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const unsigned lane = threadIdx.x & 31u;
-    const int before = __shfl_up_sync(0xffffffffu, key, 1);
-    return (int)((__ballot_sync(0xffffffffu, before != key) | 1u) & (0xffffffffu >> (31u - lane)));
-#endif
-    return 1;
-""")
-def run_starts(key: int) -> int:
-    """Return the threads of the warp, up to this one, at which runs start, as bits."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const int lane = threadIdx.x & 31, first = 31 - __clz(starts);
-    for (int step = 1; step < 32; step *= 2) {
-        const float other = __shfl_up_sync(0xffffffffu, value, step);
-        if (lane - step >= first) value += other;
-    }
-#endif
-    return value;
-""")
-def sum_run(value: float, starts: int) -> float:
-    """Return the sum of a value over the threads of the run up to this one, added in fixed order."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const int after = __shfl_down_sync(0xffffffffu, key, 1);
-    return (threadIdx.x & 31) == 31 || after != key;
-#endif
-    return true;
-""")
-def ends_run(key: int) -> bool:
-    """Return whether this thread is the last one of its run."""
-
-
-# Shared memory of a block of CUDA threads: the windows of :mod:`amiwarp.kernels.tiles`.
-#
-# The memory is used by address. The address is looked up once, while an array's name would be looked up at every vote.
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __shared__ int words[3 * 61 * 64];
-    unsigned address = (unsigned)__cvta_generic_to_shared(words);
-    asm volatile("" : "+r"(address));  // keeps the compiler from looking it up repeatedly
-    return (int)address;
-#endif
-    return 0;
-""")
-def window() -> int:
-    """Return the address of the block's windows in shared memory; 0 on a CPU."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    asm volatile("bar.sync 0;" ::: "memory");
-#endif
-""")
-def wait_for_block():
-    """Wait until all threads of the block arrive here."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    asm volatile("st.shared.u32 [%0], %1;" :: "r"(address), "r"(value) : "memory");
-#endif
-""")
-def set_word(address: int, value: int):
-    """Store a word in shared memory at an address."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    asm volatile("red.shared.add.u32 [%0], %1;" :: "r"(address), "r"(value));
-#endif
-""")
-def add_to_word(address: int, value: int):
-    """Add to a word in shared memory at an address, atomically."""
-
-
-@wp.func_native("""
-    int value = 0;
-#if defined(__CUDA_ARCH__)
-    asm volatile("ld.shared.u32 %0, [%1];" : "=r"(value) : "r"(address) : "memory");
-#endif
-    return value;
-""")
-def get_word(address: int) -> int:
-    """Load a word from shared memory at an address."""

@@ -124,15 +124,19 @@ def mark_pairs(s: Sorted, window: Window, start: int, flag: wp.array(dtype=int))
 def mark_ends(s: Sorted, start: int, flag: wp.array(dtype=int)):
     """Mark the first and the last event of each pixel as candidates for pairs.
 
-    The flags follow those of :func:`mark_pairs`: ``count`` flags for first events, then ``count`` for last events.
+    The flags follow the flags of :func:`mark_pairs`: ``count`` flags for first events, then ``count`` for last events.
     """
     i = start + wp.tid()
     flag[s.count + i] = wp.where(i == 0 or s.key[wp.max(i - 1, 0)] != s.key[i], 1, 0)
-    flag[2 * s.count + i] = wp.where(i == s.count - 1 or s.key[wp.min(i + 1, s.count - 1)] != s.key[i], 1, 0)
+    flag[2 * s.count + i] = wp.where(
+        i == s.count - 1 or s.key[wp.min(i + 1, s.count - 1)] != s.key[i], 1, 0
+    )
 
 
 @wp.kernel
-def mark_spans(s: Sorted, edges: wp.array(dtype=wp.int64), start: int, fired: wp.array(dtype=wp.uint8)):
+def mark_spans(
+    s: Sorted, edges: wp.array(dtype=wp.int64), start: int, fired: wp.array(dtype=wp.uint8)
+):
     """Mark the pixels that fire in each time span between two successive ``edges`` [us]."""
     i = start + wp.tid()
     t = s.t[i]
@@ -152,9 +156,13 @@ def mark_spans(s: Sorted, edges: wp.array(dtype=wp.int64), start: int, fired: wp
 
 @wp.kernel
 def mark_quiet(
-    fired: wp.array(dtype=wp.uint8), tile_of: wp.array2d(dtype=int), at_least: int, base: int, start: int,
+    fired: wp.array(dtype=wp.uint8),
+    tile_of: wp.array2d(dtype=int),
+    at_least: int,
+    base: int,
+    start: int,
     flag: wp.array(dtype=int),
-):  # fmt: skip
+):
     """Mark the spans of each pixel that belong to at least ``at_least`` consecutive spans without an event."""
     place = start + wp.tid()
     row, column = pixel_at(place, tile_of.shape[1])
@@ -169,7 +177,9 @@ def mark_quiet(
         if k < spans:
             flag[base + place * spans + k] = 0
             if inside:
-                quiet = wp.where(fired[k * pixels + row * tile_of.shape[1] + column] == wp.uint8(0), 1, 0)
+                quiet = wp.where(
+                    fired[k * pixels + row * tile_of.shape[1] + column] == wp.uint8(0), 1, 0
+                )
         if quiet == 1:
             run += 1
         else:
@@ -193,7 +203,15 @@ def angle_after(encoder: EncoderParams, t: wp.int64, late: wp.float64) -> float:
 
 
 @wp.func
-def store_time(encoder: EncoderParams, window: Window, pairs: Pairs, k: int, i: int, t: wp.int64, late: wp.float64):
+def store_time(
+    encoder: EncoderParams,
+    window: Window,
+    pairs: Pairs,
+    k: int,
+    i: int,
+    t: wp.int64,
+    late: wp.float64,
+):
     """Store time and angle of an event, ``late`` [us] after its time stamp.
 
     The angle is cosine and sine of one prism's angle, or the angles of both prisms of a pair.
@@ -211,7 +229,9 @@ def store_time(encoder: EncoderParams, window: Window, pairs: Pairs, k: int, i: 
 
 
 @wp.func
-def store_pair(encoder: EncoderParams, window: Window, pairs: Pairs, i: int, first: wp.int64, second: wp.int64):
+def store_pair(
+    encoder: EncoderParams, window: Window, pairs: Pairs, i: int, first: wp.int64, second: wp.int64
+):
     """Store the times and angles of both events of a pair."""
     store_time(encoder, window, pairs, 0, i, first, window.late_first)
     store_time(encoder, window, pairs, 1, i, second, window.late_second)
@@ -219,9 +239,16 @@ def store_pair(encoder: EncoderParams, window: Window, pairs: Pairs, i: int, fir
 
 @wp.kernel
 def write_pairs(
-    s: Sorted, window: Window, encoder: EncoderParams, tile_of: wp.array2d(dtype=int), flag: wp.array(dtype=int),
-    place: wp.array(dtype=int), kinds: int, start: int, pairs: Pairs,
-):  # fmt: skip
+    s: Sorted,
+    window: Window,
+    encoder: EncoderParams,
+    tile_of: wp.array2d(dtype=int),
+    flag: wp.array(dtype=int),
+    place: wp.array(dtype=int),
+    kinds: int,
+    start: int,
+    pairs: Pairs,
+):
     """Write the marked pairs that include an event: those with the next event, and with ``kinds`` = 3 open ends."""
     at = start + wp.tid()
     event = s.order[at]
@@ -246,7 +273,13 @@ def write_pairs(
 
 
 @wp.kernel
-def write_spans(edges: wp.array(dtype=wp.int64), window: Window, encoder: EncoderParams, start: int, pairs: Pairs):
+def write_spans(
+    edges: wp.array(dtype=wp.int64),
+    window: Window,
+    encoder: EncoderParams,
+    start: int,
+    pairs: Pairs,
+):
     """Write times and angles of a pair from the beginning to the end of each time span between ``edges`` [us]."""
     span = start + wp.tid()
     store_pair(encoder, window, pairs, span, edges[span], edges[span + 1])
@@ -254,10 +287,15 @@ def write_spans(edges: wp.array(dtype=wp.int64), window: Window, encoder: Encode
 
 @wp.kernel
 def write_quiet(
-    spans: Pairs, tile_of: wp.array2d(dtype=int), base: int, flag: wp.array(dtype=int), place: wp.array(dtype=int),
-    start: int, pairs: Pairs,
-):  # fmt: skip
-    """Write the marked pairs of spans without an event; ``spans`` are those of :func:`write_spans`."""
+    spans: Pairs,
+    tile_of: wp.array2d(dtype=int),
+    base: int,
+    flag: wp.array(dtype=int),
+    place: wp.array(dtype=int),
+    start: int,
+    pairs: Pairs,
+):
+    """Write the marked pairs of spans without an event; ``spans`` come from :func:`write_spans`."""
     candidate = start + wp.tid()
     if flag[base + candidate] == 0:
         return
@@ -280,7 +318,12 @@ def write_quiet(
 @wp.func
 def tile_at(tile_of: wp.array2d(dtype=int), x: float, y: float) -> int:
     """Return the tile of the pixel nearest to a position; -1 outside, and for NaN."""
-    inside = x >= -0.5 and y >= -0.5 and x < float(tile_of.shape[1]) - 0.5 and y < float(tile_of.shape[0]) - 0.5
+    inside = (
+        x >= -0.5
+        and y >= -0.5
+        and x < float(tile_of.shape[1]) - 0.5
+        and y < float(tile_of.shape[0]) - 0.5
+    )
     if not inside:
         return -1
     return tile_of[int(wp.floor(y + 0.5)), int(wp.floor(x + 0.5))]
@@ -288,9 +331,12 @@ def tile_at(tile_of: wp.array2d(dtype=int), x: float, y: float) -> int:
 
 @wp.kernel
 def mark_same_tile(
-    places: wp.array(dtype=wp.vec4), tile_of: wp.array2d(dtype=int), start: int, tile: wp.array(dtype=int),
+    places: wp.array(dtype=wp.vec4),
+    tile_of: wp.array2d(dtype=int),
+    start: int,
+    tile: wp.array(dtype=int),
     flag: wp.array(dtype=int),
-):  # fmt: skip
+):
     """Mark pairs whose events both fall on one tile, which becomes the tile of the pair."""
     i = start + wp.tid()
     a = tile_at(tile_of, places[i][0], places[i][1])
@@ -300,14 +346,18 @@ def mark_same_tile(
 
 
 @wp.kernel
-def mark_listed(tile: wp.array(dtype=int), listed: wp.array(dtype=int), start: int, flag: wp.array(dtype=int)):
+def mark_listed(
+    tile: wp.array(dtype=int), listed: wp.array(dtype=int), start: int, flag: wp.array(dtype=int)
+):
     """Mark pairs whose tile is listed (1, else 0)."""
     i = start + wp.tid()
     flag[i] = listed[tile[i]]
 
 
 @wp.kernel
-def mark_square(pairs: Pairs, left: int, top: int, side: int, start: int, flag: wp.array(dtype=int)):
+def mark_square(
+    pairs: Pairs, left: int, top: int, side: int, start: int, flag: wp.array(dtype=int)
+):
     """Mark pairs of the pixels in a square of the sensor [px]."""
     i = start + wp.tid()
     x = int(pairs.x[i]) - left
@@ -331,7 +381,9 @@ def copy_pair(pairs: Pairs, i: int, out: Pairs, at: int):
 
 
 @wp.kernel
-def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, out: Pairs):
+def select(
+    pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, out: Pairs
+):
     """Copy the marked pairs to contiguous arrays."""
     i = start + wp.tid()
     if flag[i] != 0:
@@ -354,8 +406,13 @@ def hold_out(every: int, start: int, on: wp.array(dtype=wp.uint8)):
 
 
 @wp.kernel
-def keep_nodes(nodes: wp.array(dtype=wp.uint8), on: wp.array(dtype=wp.uint8), stride: int, start: int,
-               cell: wp.array(dtype=int)):  # fmt: skip
+def keep_nodes(
+    nodes: wp.array(dtype=wp.uint8),
+    on: wp.array(dtype=wp.uint8),
+    stride: int,
+    start: int,
+    cell: wp.array(dtype=int),
+):
     """Leave out pairs of two events if either event lies off ``nodes``."""
     i = start + wp.tid()
     if cell[i] < 0 or on[i] > wp.uint8(1):
@@ -392,7 +449,12 @@ def mark_hot(count: wp.array2d(dtype=int), tile: int, start: int, tile_of: wp.ar
     low = int(0)
     if own > 8.0:
         for k in range(25):
-            n = float(count[mirrored(i / columns + k / 5 - 2, rows), mirrored(i % columns + k % 5 - 2, columns)])
+            n = float(
+                count[
+                    mirrored(i / columns + k / 5 - 2, rows),
+                    mirrored(i % columns + k % 5 - 2, columns),
+                ]
+            )
             if own > 3.0 * n + 5.0 * wp.sqrt(n) + 8.0:
                 low += 1
     tile_of[i] = wp.where(low >= 19, -1, tile)

@@ -6,7 +6,8 @@ from amiwarp.kernels.equations import Pairs
 
 wp.set_module_options({"enable_backward": False})
 
-UNIT = wp.constant(1 << 24)  # sums are integers in this fraction, so that the order of the terms does not matter
+# Sums are integers in this fraction, so that the order of the terms does not matter
+UNIT = wp.constant(1 << 24)
 LARGEST = wp.constant(1.0e6)  # largest magnitude of a term
 
 
@@ -20,7 +21,12 @@ def add_to_pixel(pairs: Pairs, i: int, value: float, width: int, sums: wp.array(
 
 @wp.kernel
 def add_costs(
-    pairs: Pairs, residual: wp.array(dtype=float), scale: float, width: int, start: int, sums: wp.array(dtype=wp.int64)
+    pairs: Pairs,
+    residual: wp.array(dtype=float),
+    scale: float,
+    width: int,
+    start: int,
+    sums: wp.array(dtype=wp.int64),
 ):
     """Add log(1 + (r / scale)²) of each pair's residual r to its pixel; a pair off the map has a residual of 1."""
     i = start + wp.tid()
@@ -30,9 +36,14 @@ def add_costs(
 
 @wp.kernel
 def add_products(
-    pairs: Pairs, a: wp.array(dtype=float), b: wp.array(dtype=float), weight: wp.array(dtype=float), width: int,
-    start: int, sums: wp.array(dtype=wp.int64),
-):  # fmt: skip
+    pairs: Pairs,
+    a: wp.array(dtype=float),
+    b: wp.array(dtype=float),
+    weight: wp.array(dtype=float),
+    width: int,
+    start: int,
+    sums: wp.array(dtype=wp.int64),
+):
     """Add a · b · weight of each pair to its pixel; nothing for a pair off the map."""
     i = start + wp.tid()
     add_to_pixel(pairs, i, a[i] * b[i] * weight[i], width, sums)

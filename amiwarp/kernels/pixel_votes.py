@@ -1,6 +1,6 @@
 """Votes into the image of warped events (IWE) on a CPU: four sums of integers per event, nearest or bilinear.
 
-An image has one 32-bit sum of weights, in units of 1/256 event, for each pixel. The weights are those of
+An image has one 32-bit sum of weights, in units of 1/256 event, for each pixel. The weights are the weights of
 :mod:`amiwarp.kernels.votes`, so that the image is the same as on CUDA to the last bit. They are integers: the image
 does not depend on the order of events or the number of threads. Two sums next to each other are added as one 64-bit
 word. The caller moves the sums to 64-bit totals before a sum can overflow, at the latest after :data:`CAPACITY` events.
@@ -12,7 +12,8 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
+from amiwarp.kernels.camera import CameraParams
+from amiwarp.kernels.camera_rotation import CameraRotationParams, undo_camera_rotation
 from amiwarp.kernels.native_code import (
     add_word_pairs,
     copy_bytes,
@@ -24,7 +25,8 @@ from amiwarp.kernels.native_code import (
     store_float,
     store_int,
 )
-from amiwarp.kernels.refraction import displace, even, is_even, is_plain, plain, state_of
+from amiwarp.kernels.plain_models import even, is_even, is_plain, plain
+from amiwarp.kernels.refraction import displace, state_of
 from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, load_states
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -35,7 +37,12 @@ CAPACITY = (1 << 23) - 1  # number of events that the sums of all slices hold to
 
 @wp.func
 def displace_block(
-    model: Any, camera: Any, events: EventArrays, first: int, x: wp.array(dtype=float), y: wp.array(dtype=float)
+    model: Any,
+    camera: Any,
+    events: EventArrays,
+    first: int,
+    x: wp.array(dtype=float),
+    y: wp.array(dtype=float),
 ):
     """Compute the compensated positions of a block of events."""
     states = wp.zeros(shape=(128,), dtype=float)
@@ -43,7 +50,9 @@ def displace_block(
     for k in range(BLOCK):
         w0, w1 = state_of(model, load_float(states, 2 * k), load_float(states, 2 * k + 1))
         i = first + k
-        u, v = displace(model, camera, float(load_uint16(events.x, i)), float(load_uint16(events.y, i)), w0, w1)
+        u, v = displace(
+            model, camera, float(load_uint16(events.x, i)), float(load_uint16(events.y, i)), w0, w1
+        )
         store_float(x, k, u)
         store_float(y, k, v)
 
@@ -108,7 +117,13 @@ def vote_block(
 
 @wp.kernel
 def vote_event_blocks(
-    model: Any, camera: Any, events: EventArrays, canvas: Canvas, count: int, start: int, sums: wp.array(dtype=int)
+    model: Any,
+    camera: Any,
+    events: EventArrays,
+    canvas: Canvas,
+    count: int,
+    start: int,
+    sums: wp.array(dtype=int),
 ):
     """Compensate and vote the events of one block per thread."""
     first = (start + wp.tid()) * BLOCK
@@ -142,7 +157,9 @@ def vote_rotating_camera_blocks(
     y = wp.zeros(shape=(64,), dtype=float)
     displace_block(model, camera, events, first, x, y)
     for k in range(n):
-        xy = undo_camera_rotation(camera, wp.vec2(x[k], y[k]), camera_rotation, events.time[first + k])
+        xy = undo_camera_rotation(
+            camera, wp.vec2(x[k], y[k]), camera_rotation, events.time[first + k]
+        )
         store_float(x, k, xy[0])
         store_float(y, k, xy[1])
     vote_block(events, canvas, first, n, x, y, sums)

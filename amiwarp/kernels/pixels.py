@@ -1,4 +1,9 @@
-"""Pixels of the simulator: photoreceptors, thresholds, and the events that they generate."""
+"""Event generation of the simulator: one thread per pixel steps through a chunk and writes the events as keys.
+
+Times are ticks of 1/16 us since the start of the chunk, in integers, so that results do not depend on where a chunk
+begins. An event is an int64 key, ``time | pixel | reversed lag | polarity``. Sorted keys give the same stream for any
+order of the threads.
+"""
 
 import warp as wp
 
@@ -13,31 +18,36 @@ from amiwarp.kernels.prism_view import (
     texels_ahead,
 )
 
-# Event generation of the simulator: one thread per pixel steps through a chunk and writes the events as keys.
-#
-# Times are ticks of 1/16 us since the start of the chunk, in integers, so that results do not depend on where a chunk
-# begins. An event is an int64 key, ``time | pixel | reversed lag | polarity``. Sorted keys give the same stream for any
-# order of the threads.
-
 OPTIONS = {"enable_backward": False}
 wp.set_module_options(OPTIONS)
+
 
 TICKS = wp.constant(16)  # ticks per microsecond
 HALF_TICKS = wp.constant(8)
 TICK_BITS = wp.constant(4)
-LOW_BITS = wp.constant(22)  # lowest bits of a key: lag (19), cause (2), polarity (1); pixel and time are above them
+
+# Lowest bits of a key: lag (19), cause (2), polarity (1); pixel and time are above them
+LOW_BITS = wp.constant(22)
 LOW_MASK = wp.constant((1 << 22) - 1)
 SIGNAL = wp.constant(0)  # codes of the causes of an event, as in amiwarp.Cause
 SHOT_NOISE = wp.constant(1)
 LEAK = wp.constant(2)
 HOT_PIXEL = wp.constant(3)
-LEAK_SHARE = wp.constant(1.5)  # an ON event is a leak if the level rises by less than this multiple of the drift
-SMALLEST_LEAK = wp.constant(0.1)  # smallest leak relative to the mean leak, so that jitter cannot stop the leak
+
+# An ON event is a leak if the level rises by less than this multiple of the drift
+LEAK_SHARE = wp.constant(1.5)
+
+# Smallest leak relative to the mean leak, so that jitter cannot stop the leak
+SMALLEST_LEAK = wp.constant(0.1)
 LARGEST_LAG = wp.constant((1 << 19) - 1)
-LAG_ZERO = wp.constant(16)  # ticks added to the lag, because rounding a time stamp may make the lag slightly negative
+
+# Ticks added to the lag, because rounding a time stamp may make the lag slightly negative
+LAG_ZERO = wp.constant(16)
 NEVER = wp.constant(wp.int64(-(1 << 60)))
 NO_NOISE = wp.constant(wp.int64(1 << 60))
-SMALLEST_THRESHOLD = wp.constant(0.1)  # smallest threshold relative to the nominal one, which mismatch cannot undercut
+
+# Smallest threshold relative to the nominal one, which mismatch cannot undercut
+SMALLEST_THRESHOLD = wp.constant(0.1)
 UNREACHED = wp.constant(1.0e6)  # threshold of a dead pixel [log intensity], which no light crosses
 PAST_STEP = wp.constant(2.0)  # fraction of a step that means: after the end of the step
 
@@ -100,7 +110,8 @@ class Sink:
     """
 
     keys: wp.array2d(dtype=wp.int64)  # keys of the events; axes: segment, position in the segment
-    count: wp.array2d(dtype=int)  # first column: events of each segment, including those that did not fit
+    # First column: events of each segment, including those that did not fit
+    count: wp.array2d(dtype=int)
     run: int  # number of consecutive pixels that share a segment
 
 
@@ -159,7 +170,9 @@ def append_key(sink: Sink, shift: int, index: int, t: wp.int64, stamp: wp.int64,
 def latency(s: SensorParams, rng: wp.uint32):
     """Return a random latency [ticks] from a threshold crossing to its time stamp, and the generator's next state."""
     late = s.latency
-    if s.jitter > 0.0:  # nearly Gaussian: sum of four uniform numbers, within 3.5 standard deviations
+    if (
+        s.jitter > 0.0
+    ):  # nearly Gaussian: sum of four uniform numbers, within 3.5 standard deviations
         four = wp.randf(rng) + wp.randf(rng) + wp.randf(rng) + wp.randf(rng)
         late = wp.max(late + s.jitter * 1.7320508 * (four - 2.0), 0.0)
     return late, rng
@@ -201,7 +214,15 @@ def thin_noise(p: Pixel, s: SensorParams, slope: float, f: float, noise: bool) -
 
 @wp.func
 def fire_event(
-    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, slope: float, f: float, noise: bool
+    p: Pixel,
+    s: SensorParams,
+    sink: Sink,
+    index: int,
+    t0: wp.int64,
+    span: Interval,
+    slope: float,
+    f: float,
+    noise: bool,
 ) -> Pixel:
     """Return the pixel after an event at fraction ``f`` of the step, and write that event, if f < 1."""
     if f < 1.0:
@@ -216,17 +237,28 @@ def fire_event(
         late, rng = latency(s, rng)
         stamp = (t + wp.int64(late) + wp.int64(HALF_TICKS)) >> wp.int64(TICK_BITS)
         p.last_stamp = wp.max(stamp, p.last_stamp + wp.int64(1))
-        append_key(sink, span.shift, index, t, p.last_stamp, 2 * cause_of(p, span, slope, noise) + on)
+        append_key(
+            sink, span.shift, index, t, p.last_stamp, 2 * cause_of(p, span, slope, noise) + on
+        )
         p.blind_until = wp.where(s.refractory > wp.int64(0), t + s.refractory, NEVER)
         if noise or p.next_noise < p.blind_until:
-            p.next_noise = wp.max(t, p.blind_until) + draw_waiting_time(p.noise + p.hot, wp.randf(rng))
+            p.next_noise = wp.max(t, p.blind_until) + draw_waiting_time(
+                p.noise + p.hot, wp.randf(rng)
+            )
         p.rng = next_state(s, rng)
     return p
 
 
 @wp.func
 def generate_events(
-    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, slope: float, quiet: bool
+    p: Pixel,
+    s: SensorParams,
+    sink: Sink,
+    index: int,
+    t0: wp.int64,
+    span: Interval,
+    slope: float,
+    quiet: bool,
 ):
     """Generate all events of a step in which the level, minus the leaking reference, rises by ``slope``.
 
@@ -249,7 +281,17 @@ def generate_events(
         due = p.next_noise
         f = wp.min(signal, wp.max(float(due - t0) * span.per_tick, f))
         p = thin_noise(p, s, rise, f, f < signal)
-        p = fire_event(p, s, sink, index, t0, span, rise, wp.where(p.next_noise == due, f, PAST_STEP), f < signal)
+        p = fire_event(
+            p,
+            s,
+            sink,
+            index,
+            t0,
+            span,
+            rise,
+            wp.where(p.next_noise == due, f, PAST_STEP),
+            f < signal,
+        )
         if s.leak_jitter > 0.0 and f < 1.0:
             change = span.share * jittered_leak(p, s) * p.on - span.drift
             span.drift += change
@@ -301,10 +343,19 @@ def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
 
 
 @wp.kernel
-def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, start: int, pixels: wp.array(dtype=Pixel)):
+def start_pixels(
+    view: View,
+    steps: Steps,
+    sensor: SensorParams,
+    seed: int,
+    start: int,
+    pixels: wp.array(dtype=Pixel),
+):
     """Initialise every pixel with the level that it sees at the start."""
     i = start + wp.tid()
-    pixels[i] = new_pixel(sensor, seed, i, see_level(view, steps.at[steps.margin], ray_in_prism_frame(view, i)))
+    pixels[i] = new_pixel(
+        sensor, seed, i, see_level(view, steps.at[steps.margin], ray_in_prism_frame(view, i))
+    )
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
@@ -316,7 +367,7 @@ def set_pixels(
     sensor: SensorParams,
     pixels: wp.array(dtype=Pixel),
 ):
-    """Replace drawn thresholds and hot rates by those of a map, which are relative and in events per tick.
+    """Replace drawn thresholds and hot rates by the values of a map, which are relative and in events per tick.
 
     A threshold of NaN stays as drawn. Dead pixels get thresholds that no light crosses.
     """
@@ -324,7 +375,11 @@ def set_pixels(
     p = pixels[i]
     reference = p.level
     if not dead[i]:
-        reference = wp.where(wp.isnan(on[i]), p.reference, p.level - (p.level - p.reference) * sensor.on * on[i] / p.on)
+        reference = wp.where(
+            wp.isnan(on[i]),
+            p.reference,
+            p.level - (p.level - p.reference) * sensor.on * on[i] / p.on,
+        )
     p.reference = reference
     p.on = wp.where(wp.isnan(on[i]), p.on, sensor.on * on[i])
     p.off = wp.where(wp.isnan(off[i]), p.off, sensor.off * off[i])
@@ -366,8 +421,17 @@ def shift_times(p: Pixel, passed: wp.int64) -> Pixel:
     return p
 
 
-@wp.kernel(module="unique", module_options=OPTIONS)  # so that each device compiles only what it runs
-def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), start: int, sink: Sink):
+@wp.kernel(
+    module="unique", module_options=OPTIONS
+)  # so that each device compiles only what it runs
+def run_pixels(
+    view: View,
+    steps: Steps,
+    sensor: SensorParams,
+    pixels: wp.array(dtype=Pixel),
+    start: int,
+    sink: Sink,
+):
     """Advance one pixel per thread through all steps of a chunk."""
     i = start + wp.tid()
     p = pixels[i]
@@ -384,7 +448,12 @@ def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(
 
 @wp.kernel(module="unique", module_options=OPTIONS)
 def run_pixels_ahead(
-    view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), start: int, sink: Sink
+    view: View,
+    steps: Steps,
+    sensor: SensorParams,
+    pixels: wp.array(dtype=Pixel),
+    start: int,
+    sink: Sink,
 ):
     """Generate the same events as :func:`run_pixels`, bit for bit.
 
@@ -397,7 +466,8 @@ def run_pixels_ahead(
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):
         n = wp.min(AHEAD, steps.count - block * AHEAD)
-        at = locate_texels(view, texels_ahead(view.prism, view.second, steps.ahead[block], ray))
+        met = texels_ahead(view.prism, view.second, view.steered, steps.ahead[block], ray)
+        at = locate_texels(view, met)
         levels = levels_ahead(view, steps, block, n, at)
         j = int(0)
         while j < n:
@@ -405,297 +475,3 @@ def run_pixels_ahead(
             t0 += wp.int64(steps.ticks)
             j += 1
     pixels[i] = shift_times(p, t0)
-
-
-# Photoreceptors of the simulated pixels: first-order low-pass filters whose bandwidth is proportional to the light.
-#
-# These kernels replace those above if the sensor's bandwidth is limited, or if its leak has jitter. The level of a
-# pixel is then the output of its photoreceptor. The input is linear in time between two instants, and the filter's
-# equation is solved exactly for it, so that the events hardly depend on the length of the steps.
-
-MOST_PIECES = wp.constant(16)  # largest number of pieces per step; divides the ticks of a step, a multiple of 16
-LARGEST_BEND = wp.constant(0.01)  # largest deviation of the level from a straight line within a piece [ON thresholds]
-SMALL_ANGLE = wp.constant(0.1)  # duration [time constants] below which a series is more precise in float32
-SMALL_CHANGE = wp.constant(0.3)  # change of the log intensity below which a series is more precise in float32
-
-
-@wp.struct
-class Input:
-    """Input of a photoreceptor at one instant: the light on its pixel."""
-
-    level: float  # log intensity of the light
-    light: float  # exponential of the level
-
-
-@wp.func
-def last_input(level: float) -> Input:
-    """Return the photoreceptor's input at a level, with the exponential computed."""
-    result = Input()
-    result.level = level
-    result.light = wp.exp(level)
-    return result
-
-
-@wp.func
-def next_input(level: float, last: Input) -> Input:
-    """Return the photoreceptor's input for a level. ``last`` saves the exponential if it has the same level."""
-    result = Input()
-    result.level = level
-    result.light = last.light
-    if level != last.level:
-        result.light = wp.exp(level)
-    return result
-
-
-@wp.func
-def mean_light(before: Input, after: Input) -> float:
-    """Return the mean of exp(level) over an interval in which the level changes linearly."""
-    change = after.level - before.level
-    if wp.abs(change) > SMALL_CHANGE:
-        return (after.light - before.light) / change
-    return 0.5 * (before.light + after.light) * (1.0 - change * change / 12.0)
-
-
-@wp.func
-def filter_level(level: float, before: float, after: float, angle: float) -> float:
-    """Return the filter's output at the end of an interval; ``level`` is that at its beginning.
-
-    The input changes linearly from ``before`` to ``after``. ``angle`` is the duration in time constants. The output
-    starts anew at the input after an instant without light, which is NaN.
-    """
-    lag = angle * (0.5 - angle * (1.0 / 6.0 - angle / 24.0))
-    if angle > SMALL_ANGLE:
-        lag = 1.0 - (1.0 - wp.exp(-angle)) / angle
-    result = level + angle * (1.0 - lag) * (before - level) + lag * (after - before)
-    return wp.where(wp.isnan(level) or wp.isnan(before), after, result)
-
-
-@wp.func
-def piece_count(level: float, before: float, after: float, angle: float, tolerance: float) -> int:
-    """Return the number of pieces of a step, within which the filter's output is nearly linear: a power of two.
-
-    A chord leaves a curve by at most an eighth of the largest second derivative, which is that at the beginning.
-    """
-    bend = wp.abs(angle * (angle * (level - before) + after - before)) / (8.0 * tolerance)
-    n = int(1)
-    while n < MOST_PIECES and bend > float(n * n):
-        n *= 2
-    return n
-
-
-@wp.func
-def advance_filtered(
-    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, before: Input, after: Input
-) -> Pixel:
-    """Advance a pixel by one step, in which its photoreceptor's input changes from ``before`` to ``after``."""
-    n = piece_count(p.level, before.level, after.level, s.bandwidth * mean_light(before, after), LARGEST_BEND * p.on)
-    piece = Interval()
-    piece.ticks = span.ticks / n
-    piece.per_tick = span.per_tick * float(n)
-    piece.shift = span.shift
-    piece.share = 1.0 / float(n)
-    x0 = before
-    j = int(0)
-    while j < n:
-        j += 1
-        between = wp.lerp(before.level, after.level, piece.share * float(j))
-        x1 = next_input(wp.where(j == n, after.level, between), after)
-        level = x1.level
-        if s.bandwidth > 0.0:
-            level = filter_level(p.level, x0.level, x1.level, s.bandwidth * piece.share * mean_light(x0, x1))
-        piece.drift = piece.share * jittered_leak(p, s) * p.on
-        p = advance_pixel(p, s, sink, index, t0 + wp.int64((j - 1) * piece.ticks), piece, level)
-        x0 = x1
-    return p
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)  # so that each device compiles only what it runs
-def run_filtered_pixels(
-    view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), seen: wp.array(dtype=float),
-    start: int, sink: Sink,
-):  # fmt: skip
-    """Advance one pixel per thread through all steps of a chunk; ``seen``: its photoreceptor's last input."""
-    i = start + wp.tid()
-    p = pixels[i]
-    before = last_input(seen[i])
-    span = whole_step(steps, sensor, p)
-    ray = ray_in_prism_frame(view, i)
-    t0 = wp.int64(0)
-    for k in range(steps.count):
-        after = next_input(see_level(view, steps.at[steps.margin + k + 1], ray), before)
-        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
-        before = after
-        t0 += wp.int64(steps.ticks)
-        reconverge()
-    pixels[i] = shift_times(p, t0)
-    seen[i] = before.level
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)
-def run_filtered_pixels_ahead(
-    view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), seen: wp.array(dtype=float),
-    start: int, sink: Sink,
-):  # fmt: skip
-    """Generate the same events as :func:`run_filtered_pixels`, faster on a CPU."""
-    i = start + wp.tid()
-    p = pixels[i]
-    before = last_input(seen[i])
-    span = whole_step(steps, sensor, p)
-    ray = ray_in_prism_frame(view, i)
-    t0 = wp.int64(0)
-    for block in range(steps.ahead.shape[0]):
-        n = wp.min(AHEAD, steps.count - block * AHEAD)
-        at = locate_texels(view, texels_ahead(view.prism, view.second, steps.ahead[block], ray))
-        levels = levels_ahead(view, steps, block, n, at)
-        j = int(0)
-        while j < n:
-            after = next_input(levels[j], before)
-            p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
-            before = after
-            t0 += wp.int64(steps.ticks)
-            j += 1
-    pixels[i] = shift_times(p, t0)
-    seen[i] = before.level
-
-
-# Event simulation from a table of the luminance that each pixel sees at every time step.
-
-
-@wp.func
-def table_level(light: wp.array2d(dtype=float), sensor: SensorParams, k: int, i: int) -> float:
-    """Return the log intensity of pixel ``i`` in row ``k`` of a table of luminance."""
-    return wp.log(light[k, i] + sensor.dark)
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)
-def start_world_pixels(
-    light: wp.array2d(dtype=float), steps: Steps, sensor: SensorParams, seed: int, start: int,
-    pixels: wp.array(dtype=Pixel),
-):  # fmt: skip
-    """Set the state of every pixel at the start of the recording, whose luminance is the first row of ``light``."""
-    i = start + wp.tid()
-    pixels[i] = new_pixel(sensor, seed, i, table_level(light, sensor, 0, i))
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)
-def run_world_pixels(
-    light: wp.array2d(dtype=float),
-    steps: Steps,
-    sensor: SensorParams,
-    pixels: wp.array(dtype=Pixel),
-    start: int,
-    sink: Sink,
-):
-    """Simulate pixels over the steps of a chunk, and write the keys of their events to ``sink``.
-
-    Counterpart of :func:`run_pixels`, which uses maps. ``light``: luminance of each pixel at the end of each step;
-    axes: step, pixel.
-    """
-    i = start + wp.tid()
-    p = pixels[i]
-    span = whole_step(steps, sensor, p)
-    t0 = wp.int64(0)
-    for k in range(steps.count):
-        p = advance_pixel(p, sensor, sink, i, t0, span, table_level(light, sensor, k, i))
-        t0 += wp.int64(steps.ticks)
-        reconverge()
-    pixels[i] = shift_times(p, t0)
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)
-def run_filtered_world_pixels(
-    light: wp.array2d(dtype=float),
-    steps: Steps,
-    sensor: SensorParams,
-    pixels: wp.array(dtype=Pixel),
-    seen: wp.array(dtype=float),
-    start: int,
-    sink: Sink,
-):
-    """Simulate pixels whose photoreceptors have limited bandwidth; see :func:`run_world_pixels`.
-
-    ``seen``: last log intensity that entered each photoreceptor.
-    """
-    i = start + wp.tid()
-    p = pixels[i]
-    before = last_input(seen[i])
-    span = whole_step(steps, sensor, p)
-    t0 = wp.int64(0)
-    for k in range(steps.count):
-        after = next_input(table_level(light, sensor, k, i), before)
-        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
-        before = after
-        t0 += wp.int64(steps.ticks)
-        reconverge()
-    pixels[i] = shift_times(p, t0)
-    seen[i] = before.level
-
-
-# Event simulation from images of the log intensity, of many cameras in one launch.
-
-
-@wp.struct
-class Cameras:
-    """Cameras of one size, whose pixels follow each other camera by camera."""
-
-    pixels: int  # number of pixels of a camera
-    seed: wp.array(dtype=int)  # seed of each camera
-    starts: wp.array(dtype=wp.uint8)  # 1 for each camera that begins at the end of the chunk
-
-
-@wp.func
-def starting_pixel(cameras: Cameras, sensor: SensorParams, i: int, level: float) -> Pixel:
-    """Return the state of a pixel whose camera starts at a level; ``i``: number among the pixels of all cameras."""
-    camera = i / cameras.pixels
-    return new_pixel(sensor, cameras.seed[camera], i - camera * cameras.pixels, level)
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)
-def run_camera_pixels(
-    levels: wp.array2d(dtype=float), cameras: Cameras, steps: Steps, sensor: SensorParams,
-    pixels: wp.array(dtype=Pixel), start: int, sink: Sink,
-):  # fmt: skip
-    """Simulate the pixels of cameras over a chunk, as :func:`run_world_pixels` does.
-
-    ``levels``: log intensity at the end of each step; axes: step, pixel. Cameras that begin take the last row.
-    """
-    i = start + wp.tid()
-    if cameras.starts[i / cameras.pixels] != wp.uint8(0):
-        pixels[i] = starting_pixel(cameras, sensor, i, levels[steps.count - 1, i])
-        return
-    p = pixels[i]
-    span = whole_step(steps, sensor, p)
-    t0 = wp.int64(0)
-    for k in range(steps.count):
-        p = advance_pixel(p, sensor, sink, i, t0, span, levels[k, i])
-        t0 += wp.int64(steps.ticks)
-        reconverge()
-    pixels[i] = shift_times(p, t0)
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)
-def run_filtered_camera_pixels(
-    levels: wp.array2d(dtype=float), cameras: Cameras, steps: Steps, sensor: SensorParams,
-    pixels: wp.array(dtype=Pixel), seen: wp.array(dtype=float), start: int, sink: Sink,
-):  # fmt: skip
-    """Simulate pixels whose photoreceptors have limited bandwidth; see :func:`run_camera_pixels`.
-
-    ``seen``: last log intensity that entered each photoreceptor.
-    """
-    i = start + wp.tid()
-    if cameras.starts[i / cameras.pixels] != wp.uint8(0):
-        seen[i] = levels[steps.count - 1, i]
-        pixels[i] = starting_pixel(cameras, sensor, i, seen[i])
-        return
-    p = pixels[i]
-    before = last_input(seen[i])
-    span = whole_step(steps, sensor, p)
-    t0 = wp.int64(0)
-    for k in range(steps.count):
-        after = next_input(levels[k, i], before)
-        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
-        before = after
-        t0 += wp.int64(steps.ticks)
-        reconverge()
-    pixels[i] = shift_times(p, t0)
-    seen[i] = before.level

@@ -76,7 +76,9 @@ def seen_from(m: PlateParams, x: float, y: float, z: float, w: wp.vec2) -> wp.ve
 
 
 @wp.func
-def move_direction(m: PlateParams, inverse_depth: float, x: float, y: float, z: float, w0: float, w1: float):
+def move_direction(
+    m: PlateParams, inverse_depth: float, x: float, y: float, z: float, w0: float, w1: float
+):
     """Return the direction from the resting centre to the point at an inverse depth [1/m] on the ray of a pixel."""
     k = inverse_depth * plate_shift(m, x, y, z, w0, w1)
     b = bent_by_wedge(m, x, y, z, wp.vec2(w0, w1))
@@ -116,17 +118,26 @@ def inverse_depth_at(m: PlateMapParams, x: float, y: float) -> float:
 def compensate(model: PlateMapParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
     """Return the pixel without the plate of what a pixel sees."""
     ray = pixel_to_ray(camera, xy)
-    x, y, z = move_direction(model.plate, inverse_depth_at(model, xy[0], xy[1]), ray[0], ray[1], ray[2], w[0], w[1])
+    x, y, z = move_direction(
+        model.plate, inverse_depth_at(model, xy[0], xy[1]), ray[0], ray[1], ray[2], w[0], w[1]
+    )
     return ray_to_pixel(camera, wp.vec3(x, y, z))
 
 
 @wp.func
-def displace(model: PlateMapParams, camera: PinholeParams, x: float, y: float, w0: float, w1: float):
+def displace(
+    model: PlateMapParams, camera: PinholeParams, x: float, y: float, w0: float, w1: float
+):
     """Return the compensated position of an event, for a camera without distortion."""
     a, b, c = move_direction(
-        model.plate, model.table[int(y), int(x)], (x - camera.cx) * camera.inverse_fx,
-        (y - camera.cy) * camera.inverse_fy, 1.0, w0, w1,
-    )  # fmt: skip
+        model.plate,
+        model.table[int(y), int(x)],
+        (x - camera.cx) * camera.inverse_fx,
+        (y - camera.cy) * camera.inverse_fy,
+        1.0,
+        w0,
+        w1,
+    )
     return camera.fx * (a / c) + camera.cx, camera.fy * (b / c) + camera.cy
 
 
@@ -150,5 +161,7 @@ def compensate_at_depths(
     i = start + wp.tid()
     phi = theta[i] + model.phase
     ray = pixel_to_ray(camera, xy[i])
-    x, y, z = move_direction(model, inverse_depth[i], ray[0], ray[1], ray[2], wp.cos(phi), wp.sin(phi))
+    x, y, z = move_direction(
+        model, inverse_depth[i], ray[0], ray[1], ray[2], wp.cos(phi), wp.sin(phi)
+    )
     out[i] = ray_to_pixel(camera, wp.vec3(x, y, z))

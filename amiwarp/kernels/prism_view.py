@@ -3,7 +3,7 @@
 import warp as wp
 
 from amiwarp.kernels.camera import NAN, CameraParams, pixel_to_ray
-from amiwarp.kernels.refraction import (
+from amiwarp.kernels.exact import (
     ExactParams,
     compensate_about_axis,
     compensate_uneven,
@@ -11,15 +11,20 @@ from amiwarp.kernels.refraction import (
     ray_without_prism,
     refract_in_prism_frame,
 )
+from amiwarp.kernels.steerer import with_transverse
 
 wp.set_module_options({"enable_backward": False})
 
-AHEAD = wp.constant(16)  # number of instants that a CPU computes together: columns of the next four types
-Instants = wp.types.matrix(shape=(13, 16), dtype=float)  # rows: azimuth (cos, sin), to_texel, azimuth of the second
+# Number of instants that a CPU computes together: columns of the next four types
+AHEAD = wp.constant(16)
+# Rows: azimuth (cos, sin), to_texel, `second` of the instant
+Instants = wp.types.matrix(shape=(13, 16), dtype=float)
 TexelCoordinates = wp.types.matrix(shape=(2, 16), dtype=float)  # rows: x and y, texel coordinates
-TexelPieces = wp.types.matrix(shape=(3, 16), dtype=float)  # rows: texel index (bits of an int), x and y in it
+# Rows: texel index (bits of an int), x and y in it
+TexelPieces = wp.types.matrix(shape=(3, 16), dtype=float)
 Levels = wp.types.vector(length=16, dtype=float)  # log intensity at each instant
-SMALLEST_DEPTH = wp.constant(1.0e-3)  # smallest z of a direction that counts as in front of the camera
+# Smallest z of a direction that counts as in front of the camera
+SMALLEST_DEPTH = wp.constant(1.0e-3)
 
 
 @wp.struct
@@ -28,8 +33,12 @@ class View:
 
     camera: CameraParams
     prism: ExactParams
-    second: ExactParams  # second prism of a pair, about the same axis; without one, its apex angle is 0
-    maps: wp.array(dtype=wp.vec4)  # coefficients of bilinear interpolation of log intensity at each texel, slot by slot
+    second: (
+        ExactParams  # second prism of a pair, about the same axis; without one, its apex angle is 0
+    )
+    # Coefficients of bilinear interpolation of log intensity at each texel, slot by slot
+    maps: wp.array(dtype=wp.vec4)
+    steered: int  # 1 if the camera looks through a beam steerer, else 0
     width: int  # width of a map [texels]
     height: int  # height of a map [texels]
 
@@ -39,7 +48,8 @@ class Step:
     """Instant: the end of one step and the start of the next."""
 
     azimuth: wp.vec2  # cosine and sine of the true azimuth of the prism
-    second: wp.vec2  # the same for the second prism
+    # The same for the second prism; or what a beam steerer adds to x and y of an observed unit direction
+    second: wp.vec2
     to_texel: wp.mat33  # matrix from the prism's frame to homogeneous texel coordinates
     before: int  # slot of the map before this time
     after: int  # slot of the map after this time
@@ -51,7 +61,8 @@ class Steps:
     """Table of the equally spaced instants of a chunk; entry ``margin`` is the start of the chunk."""
 
     at: wp.array(dtype=Step)
-    ahead: wp.array(dtype=Instants)  # ends of the steps in blocks of 16, for CPUs; the last end is repeated
+    # Ends of the steps in blocks of 16, for CPUs; the last end is repeated
+    ahead: wp.array(dtype=Instants)
     angle: wp.array(dtype=float)  # true azimuth of the prism [rad]
     turn: wp.array(dtype=float)  # change of the azimuth until the next instant [rad]
     second_angle: wp.array(dtype=float)  # the same two arrays for the second prism
@@ -108,19 +119,33 @@ def level_at(view: View, step: Step, u: float, v: float) -> float:
 
 
 @wp.func
-def behind_second(m: ExactParams, x: float, y: float, z: float, w0: float, w1: float):
-    """Return a direction behind the second prism of a pair, in the prism's frame; the same one if there is none."""
-    a, b, c = x, y, z
+def behind_second(m: ExactParams, steered: int, x: float, y: float, z: float, w0: float, w1: float):
+    """Return a direction behind the second prism of a pair, in the prism's frame; the same one if there is none.
+
+    With ``steered`` 1, a beam steerer is there, which adds (w0, w1) to the transverse part of observed directions.
+    """
+    a = x
+    b = y
+    c = z
     if m.sin_apex != 0.0:
-        a, b, c = refract_in_prism_frame(m.sin_apex, m.cos_apex, m.index2, x, y, z, w0, w1, m.flat_to_scene)
+        a, b, c = refract_in_prism_frame(
+            m.sin_apex, m.cos_apex, m.index2, x, y, z, w0, w1, m.flat_to_scene
+        )
+    if steered == 1:
+        a, b, c = with_transverse(x, y, z, -w0, -w1)
     return a, b, c
 
 
 @wp.func
-def ray_without_prisms(prism: ExactParams, second: ExactParams, ray: wp.vec3, w: wp.vec2, w2: wp.vec2) -> wp.vec3:
-    """Return the direction of the scene point that a camera's ray sees through the prism, or both prisms of a pair."""
+def ray_without_prisms(
+    prism: ExactParams, second: ExactParams, steered: int, ray: wp.vec3, w: wp.vec2, w2: wp.vec2
+) -> wp.vec3:
+    """Return the direction of the scene point that a camera's ray sees through the prism, or both prisms of a pair.
+
+    ``steered`` and ``w2``: as for :func:`behind_second`.
+    """
     seen = ray_without_prism(prism, ray, w)
-    x, y, z = behind_second(second, seen[0], seen[1], seen[2], w2[0], w2[1])
+    x, y, z = behind_second(second, steered, seen[0], seen[1], seen[2], w2[0], w2[1])
     return wp.vec3(x, y, z)
 
 
@@ -134,7 +159,9 @@ def depth_or_nan(depth: float) -> float:
 def see_level(view: View, step: Step, ray: wp.vec3) -> float:
     """Return the log intensity that a bearing, in the prism's frame, sees at an instant; NaN if no light passes."""
     w = step.azimuth
-    x, y, z = ray[0], ray[1], ray[2]
+    x = ray[0]
+    y = ray[1]
+    z = ray[2]
     if view.prism.uneven == 1:
         x, y, z = compensate_uneven(view.prism, x, y, z, w[0], w[1])
     else:
@@ -142,14 +169,16 @@ def see_level(view: View, step: Step, ray: wp.vec3) -> float:
         shift = prism_shift(view.prism, along, ray[2])
         x, y = ray[0] + shift * w[0], ray[1] + shift * w[1]
         z = wp.sqrt(ray[2] * ray[2] - shift * (2.0 * along + shift))
-    x, y, z = behind_second(view.second, x, y, z, step.second[0], step.second[1])
+    x, y, z = behind_second(view.second, view.steered, x, y, z, step.second[0], step.second[1])
     h = step.to_texel * wp.vec3(x, y, z)
     depth = depth_or_nan(h[2])
     return level_at(view, step, h[0] / depth, h[1] / depth)
 
 
 @wp.func
-def texels_ahead(prism: ExactParams, second: ExactParams, m: Instants, ray: wp.vec3) -> TexelCoordinates:
+def texels_ahead(
+    prism: ExactParams, second: ExactParams, steered: int, m: Instants, ray: wp.vec3
+) -> TexelCoordinates:
     """Return the texel coordinates, rows x and y, that a bearing sees at several instants; see :func:`see_level`.
 
     LLVM vectorises this loop because it has no branches, no vector types and only contiguous loads. It is a ``while``
@@ -157,9 +186,9 @@ def texels_ahead(prism: ExactParams, second: ExactParams, m: Instants, ray: wp.v
     """
     met = TexelCoordinates()
     j = int(0)
-    while j < AHEAD and (prism.uneven == 1 or second.sin_apex != 0.0):
+    while j < AHEAD and (prism.uneven == 1 or second.sin_apex != 0.0 or steered == 1):
         x, y, z = compensate_about_axis(prism, ray[0], ray[1], ray[2], m[0, j], m[1, j])
-        x, y, z = behind_second(second, x, y, z, m[11, j], m[12, j])
+        x, y, z = behind_second(second, steered, x, y, z, m[11, j], m[12, j])
         depth = depth_or_nan(m[8, j] * x + m[9, j] * y + m[10, j] * z)
         met[0, j] = (m[2, j] * x + m[3, j] * y + m[4, j] * z) / depth
         met[1, j] = (m[5, j] * x + m[6, j] * y + m[7, j] * z) / depth
@@ -201,7 +230,9 @@ def levels_ahead(view: View, steps: Steps, block: int, n: int, at: TexelPieces) 
     first = steps.margin + block * AHEAD + 1
     j = int(0)
     while j < n:
-        levels[j] = blend_maps(view, steps.at[first + j], wp.cast(at[0, j], int), at[1, j], at[2, j])
+        levels[j] = blend_maps(
+            view, steps.at[first + j], wp.cast(at[0, j], int), at[1, j], at[2, j]
+        )
         j += 1
     return levels
 
@@ -227,7 +258,7 @@ def scene_bearings(
     i = start + wp.tid()
     w = wp.vec2(wp.cos(theta[i][0]), wp.sin(theta[i][0]))
     w2 = wp.vec2(wp.cos(theta[i][1]), wp.sin(theta[i][1]))
-    out[i] = ray_without_prisms(view.prism, view.second, pixel_to_ray(view.camera, xy[i]), w, w2)
+    out[i] = ray_without_prisms(view.prism, view.second, 0, pixel_to_ray(view.camera, xy[i]), w, w2)
 
 
 @wp.kernel

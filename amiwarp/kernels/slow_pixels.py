@@ -1,4 +1,4 @@
-"""Equations of slow pixels, for :mod:`amiwarp.brightness.solver`.
+"""Equations of slow pixels, for :mod:`amiwarp.brightness.slow_pixels`.
 
 A photoreceptor is a first-order low-pass filter whose rate is proportional to the light, as in
 :mod:`amiwarp.kernels.pixels`. An event tells the filter's output, not the brightness at the event.
@@ -11,14 +11,16 @@ import warp as wp
 from amiwarp.kernels.camera import NAN, CameraParams
 from amiwarp.kernels.equations import Atlas, Pairs, interpolated
 from amiwarp.kernels.map_positions import contracted_position, event_state, lag_of, node_at
-from amiwarp.kernels.pixels import filter_level
+from amiwarp.kernels.photoreceptors import filter_level
 from amiwarp.kernels.refraction import advanced, compensate
 
 wp.set_module_options({"enable_backward": False})
 
 STEPS = wp.constant(16)  # number of steps in which the filter's equation is solved
-MEMORY = wp.constant(6.0)  # time before an event from which the filter is followed [time constants at median light]
-MOST_THRESHOLDS = wp.constant(8.0)  # largest difference from the median brightness that is used [ON thresholds]
+# Time before an event from which the filter is followed [time constants at median light]
+MEMORY = wp.constant(6.0)
+# Largest difference from the median brightness that is used [ON thresholds]
+MOST_THRESHOLDS = wp.constant(8.0)
 
 
 @wp.struct
@@ -27,12 +29,15 @@ class Photoreceptor:
 
     threshold: float  # ON threshold [log intensity]
     middle: float  # median brightness [ON thresholds]
-    turn: wp.array(dtype=float)  # angle of the prism per time constant at the median brightness, by tile [rad]
+    # Angle of the prism per time constant at the median brightness, by tile [rad]
+    turn: wp.array(dtype=float)
     ahead: float  # angle by which the prism is ahead of the effective phase [rad]
 
 
 @wp.func
-def brightness_at_position(image: wp.array(dtype=float), atlas: Atlas, tile: int, xy: wp.vec2) -> float:
+def brightness_at_position(
+    image: wp.array(dtype=float), atlas: Atlas, tile: int, xy: wp.vec2
+) -> float:
     """Return the brightness of a tile's map at a position [px]; NaN off the tile."""
     cell, fx, fy = node_at(atlas, tile, xy[0], xy[1])
     if cell < 0:
@@ -42,9 +47,15 @@ def brightness_at_position(image: wp.array(dtype=float), atlas: Atlas, tile: int
 
 @wp.func
 def brightness_before(
-    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), k: int, i: int,
+    model: Any,
+    camera: CameraParams,
+    pairs: Pairs,
+    atlas: Atlas,
+    image: wp.array(dtype=float),
+    k: int,
+    i: int,
     angle: float,
-) -> float:  # fmt: skip
+) -> float:
     """Return the brightness at the pixel of an event when the prism's angle was smaller by ``angle`` [rad]."""
     w0, w1 = event_state(model, pairs, k, i)
     w = advanced(model, w0, w1, -angle)
@@ -54,16 +65,25 @@ def brightness_before(
 
 @wp.kernel
 def find_time_constants(
-    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), filter: Photoreceptor,
-    every: int, start: int, out: wp.array2d(dtype=float),
-):  # fmt: skip
+    model: Any,
+    camera: CameraParams,
+    pairs: Pairs,
+    atlas: Atlas,
+    image: wp.array(dtype=float),
+    filter: Photoreceptor,
+    every: int,
+    start: int,
+    out: wp.array2d(dtype=float),
+):
     """Compute the time constant at both events of every ``every``-th pair, relative to that at the median brightness.
 
     It is 1 off the map. For the threshold 0, the brightness is computed instead, NaN off the map.
     """
     number = start + wp.tid()
     for k in range(2):
-        level = brightness_before(model, camera, pairs, atlas, image, k, number * every, -filter.ahead)
+        level = brightness_before(
+            model, camera, pairs, atlas, image, k, number * every, -filter.ahead
+        )
         if filter.threshold > 0.0:
             away = wp.clamp(level - filter.middle, -MOST_THRESHOLDS, MOST_THRESHOLDS)
             level = wp.where(wp.isnan(level), 1.0, wp.exp(-filter.threshold * away))
@@ -72,16 +92,24 @@ def find_time_constants(
 
 @wp.func
 def filtered(
-    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), k: int, i: int,
+    model: Any,
+    camera: CameraParams,
+    pairs: Pairs,
+    atlas: Atlas,
+    image: wp.array(dtype=float),
+    k: int,
+    i: int,
     filter: Photoreceptor,
-) -> float:  # fmt: skip
+) -> float:
     """Return the output of the filter at an event.
 
     A dark pixel remembers for longer than :data:`MEMORY`: its output begins on the contracted orbit.
     """
     width = MEMORY / float(STEPS)  # step [time constants at median light]
     turn = filter.turn[pairs.tile[i]]
-    before = float(brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * turn - filter.ahead))
+    before = float(
+        brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * turn - filter.ahead)
+    )
     w0, w1 = event_state(model, pairs, k, i)
     begun = advanced(model, w0, w1, -MEMORY * turn)
     pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
@@ -89,10 +117,13 @@ def filtered(
     level = float(brightness_at_position(image, atlas, pairs.tile[i], xy))
     if wp.isnan(level):
         level = before
-    steps = int(STEPS)  # a variable, so that Warp does not unroll the loop, which takes minutes to compile for CUDA
+    # A variable, so that Warp does not unroll the loop, which takes minutes to compile for CUDA
+    steps = int(STEPS)
     for j in range(steps):
         past = MEMORY - float(j + 1) * width
-        after = brightness_before(model, camera, pairs, atlas, image, k, i, past * turn - filter.ahead)
+        after = brightness_before(
+            model, camera, pairs, atlas, image, k, i, past * turn - filter.ahead
+        )
         if wp.isnan(after):
             after = before
         light = wp.exp(filter.threshold * (0.5 * (before + after) - filter.middle))
@@ -103,9 +134,15 @@ def filtered(
 
 @wp.kernel
 def find_offsets(
-    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float),
-    filter: Photoreceptor, start: int, offset: wp.array(dtype=float),
-):  # fmt: skip
+    model: Any,
+    camera: CameraParams,
+    pairs: Pairs,
+    atlas: Atlas,
+    image: wp.array(dtype=float),
+    filter: Photoreceptor,
+    start: int,
+    offset: wp.array(dtype=float),
+):
     """Compute the difference between the filter's output and the brightness on the contracted orbit, for a pair."""
     i = start + wp.tid()
     total = float(0.0)

@@ -29,7 +29,7 @@ def read_numbers(
 
     ``ends``: positions of the ends of lines; ``separator``: character that may stand between two numbers, as spaces and
     tabs; ``powers``: powers of ten. ``faults`` is 1 for a block with a line that does not consist of as many plain
-    decimal numbers as ``values`` has rows. The values are those of a correctly rounded conversion.
+    decimal numbers as ``values`` has rows. The values are correctly rounded.
     """
     block = wp.tid() + start
     width = values.shape[0]

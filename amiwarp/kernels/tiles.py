@@ -9,24 +9,30 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
-from amiwarp.kernels.native_code import add_to_word, get_word, load_uint32, set_word, wait_for_block, window
+from amiwarp.kernels.camera import CameraParams
+from amiwarp.kernels.camera_rotation import CameraRotationParams, undo_camera_rotation
+from amiwarp.kernels.native_code import load_uint32
 from amiwarp.kernels.prism_angle import THETA_U16_RAD
 from amiwarp.kernels.refraction import displace, state_of
+from amiwarp.kernels.shared_memory import add_to_word, get_word, set_word, wait_for_block, window
 from amiwarp.kernels.votes import Canvas, dither_offset, events_of
 
-# Fast math is on: these sums need not equal those of a CPU bit for bit.
+# Fast math is on: these sums need not equal a CPU's bit for bit.
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 TILE = 32  # width and height of a tile [sensor px]
-COLUMNS = wp.constant(61)  # columns of a window [canvas px]; odd, so that a column spreads over all memory banks
+# Columns of a window [canvas px]; odd, so that a column spreads over all memory banks
+COLUMNS = wp.constant(61)
 ROWS = wp.constant(64)  # rows of a window [canvas px]
 SIZE = wp.constant(4 * 61 * 64)  # size of a window [bytes]
 THREADS = wp.constant(256)  # number of threads per block
 BLOCKS = 4  # number of resident blocks per multiprocessor
-AT_ONCE = wp.constant(3)  # number of candidates voted per reading of an event; their windows fill 48 KiB
-FEW_EVENTS = wp.constant(1024)  # chunks with fewer events are voted faster into the image than through a window
-CHUNK = 1 << 17  # events per chunk: at most 63 * 2**25 votes of 1/256, so that no word of the window overflows
+# Number of candidates voted per reading of an event; their windows fill 48 KiB
+AT_ONCE = wp.constant(3)
+# Chunks with fewer events are voted faster into the image than through a window
+FEW_EVENTS = wp.constant(1024)
+# Events per chunk: at most 63 * 2**25 votes of 1/256, so that no word of the window overflows
+CHUNK = 1 << 17
 
 
 @wp.struct
@@ -160,25 +166,41 @@ def drifted_theta(motion: Motion, events: TileEvents, candidate: int, i: int, tu
 
 
 @wp.func
-def without_camera_rotation(motion: Still, camera: Any, x: float, y: float, events: TileEvents, candidate: int, i: int):
+def without_camera_rotation(
+    motion: Still, camera: Any, x: float, y: float, events: TileEvents, candidate: int, i: int
+):
     """Return the position of an event unchanged, for candidates without camera rotation."""
     return x, y
 
 
 @wp.func
 def without_camera_rotation(
-    motion: Motion, camera: CameraParams, x: float, y: float, events: TileEvents, candidate: int, i: int
+    motion: Motion,
+    camera: CameraParams,
+    x: float,
+    y: float,
+    events: TileEvents,
+    candidate: int,
+    i: int,
 ):
     """Return the position of an event with the candidate's camera rotation removed."""
     if events.time.shape[0] == 0:
         return x, y
-    xy = undo_camera_rotation(camera, wp.vec2(x, y), motion.camera_rotation[candidate], events.time[i])
+    xy = undo_camera_rotation(
+        camera, wp.vec2(x, y), motion.camera_rotation[candidate], events.time[i]
+    )
     return xy[0], xy[1]
 
 
 @wp.func
 def displace_event(
-    model: Any, camera: Any, motion: Any, events: TileEvents, candidate: int, i: int, event: UnpackedEvent
+    model: Any,
+    camera: Any,
+    motion: Any,
+    events: TileEvents,
+    candidate: int,
+    i: int,
+    event: UnpackedEvent,
 ):
     """Return the position of an event under a candidate, relative to the window's corner [canvas px]."""
     angle = float(drifted_theta(motion, events, candidate, i, event.turn)) * THETA_U16_RAD
@@ -191,17 +213,35 @@ def displace_event(
 
 
 @wp.func
-def add_outside(layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), r: int, c: int, v: int):
+def add_outside(
+    layout: Layout,
+    canvas: Canvas,
+    chunk: Chunk,
+    image: wp.array(dtype=wp.int64),
+    r: int,
+    c: int,
+    v: int,
+):
     """Add ``v`` to the image at row ``r`` and column ``c``, both relative to the window's corner."""
     row = chunk.row + r
     col = chunk.column + c
     if row >= 0 and col >= 0 and row < canvas.rows - 2 and col < canvas.columns - 2 and v != 0:
-        wp.atomic_add(image, layout.first + chunk.layer * layout.layer + row * layout.stride + col, wp.int64(v))
+        wp.atomic_add(
+            image,
+            layout.first + chunk.layer * layout.layer + row * layout.stride + col,
+            wp.int64(v),
+        )
 
 
 @wp.func
 def cast_outside(
-    layout: Layout, canvas: Canvas, chunk: Chunk, image: wp.array(dtype=wp.int64), u: float, v: float, weight: int
+    layout: Layout,
+    canvas: Canvas,
+    chunk: Chunk,
+    image: wp.array(dtype=wp.int64),
+    u: float,
+    v: float,
+    weight: int,
 ):
     """Vote into the image at a position [canvas px] relative to the window's corner.
 
@@ -213,7 +253,9 @@ def cast_outside(
     x = to_int(u * fine) << wp.where(canvas.nearest != 0, 8, 0)
     y = to_int(v * fine) << wp.where(canvas.nearest != 0, 8, 0)
     b = ((x & 255) * (y & 255) + 128) >> 8
-    add_outside(layout, canvas, chunk, image, y >> 8, x >> 8, weight * (256 - (x & 255) - (y & 255) + b))
+    add_outside(
+        layout, canvas, chunk, image, y >> 8, x >> 8, weight * (256 - (x & 255) - (y & 255) + b)
+    )
     add_outside(layout, canvas, chunk, image, y >> 8, (x >> 8) + 1, weight * ((x & 255) - b))
     add_outside(layout, canvas, chunk, image, (y >> 8) + 1, x >> 8, weight * ((y & 255) - b))
     add_outside(layout, canvas, chunk, image, (y >> 8) + 1, (x >> 8) + 1, weight * b)
@@ -235,7 +277,9 @@ def cast_nearest(window: int, weight: int, u: float, v: float) -> int:
     r = to_int(v)
     inside = wp.uint32(c) < wp.uint32(COLUMNS) and wp.uint32(r) < wp.uint32(ROWS)
     # without a branch: a vote outside the window adds 0 to the first word
-    add_to_word(window + wp.where(inside, 4 * (r * COLUMNS + c), 0), wp.where(inside, weight << 8, 0))
+    add_to_word(
+        window + wp.where(inside, 4 * (r * COLUMNS + c), 0), wp.where(inside, weight << 8, 0)
+    )
     return wp.where(inside, 0, 1)
 
 
@@ -244,7 +288,9 @@ def cast_bilinear(window: int, weight: int, u: float, v: float) -> int:
     """Add a bilinear vote to four pixels of the window; return 1 if it is not entirely inside."""
     x = to_int(u * 256.0)
     y = to_int(v * 256.0)
-    inside = wp.uint32(x) < wp.uint32(256 * (COLUMNS - 1)) and wp.uint32(y) < wp.uint32(256 * (ROWS - 1))
+    inside = wp.uint32(x) < wp.uint32(256 * (COLUMNS - 1)) and wp.uint32(y) < wp.uint32(
+        256 * (ROWS - 1)
+    )
     fx = x & 255
     fy = y & 255
     b = (fx * fy + 128) >> 8
@@ -259,9 +305,16 @@ def cast_bilinear(window: int, weight: int, u: float, v: float) -> int:
 
 @wp.func
 def cast_event(
-    model: Any, camera: Any, motion: Any, events: TileEvents, nearest: int, window: int, candidate: int, i: int,
+    model: Any,
+    camera: Any,
+    motion: Any,
+    events: TileEvents,
+    nearest: int,
+    window: int,
+    candidate: int,
+    i: int,
     event: UnpackedEvent,
-) -> int:  # fmt: skip
+) -> int:
     """Vote event ``i`` under a candidate; return 1 if the vote is not entirely inside the window."""
     u, v = displace_event(model, camera, motion, events, candidate, i, event)
     if nearest != 0:
@@ -297,22 +350,40 @@ def clear_window(window: int, thread: int, many: int):
 
 @wp.func
 def flush_window(
-    layout: Layout, canvas: Canvas, chunk: Chunk, images: wp.array2d(dtype=wp.int64), window: int, first: int,
-    thread: int, many: int,
-):  # fmt: skip
+    layout: Layout,
+    canvas: Canvas,
+    chunk: Chunk,
+    images: wp.array2d(dtype=wp.int64),
+    window: int,
+    first: int,
+    thread: int,
+    many: int,
+):
     """Add the windows of ``many`` candidates in shared memory to their images."""
     wait_for_block()
     for i in range(thread, many * COLUMNS * ROWS, THREADS):
         at = i % (COLUMNS * ROWS)
         image = images[first + i / (COLUMNS * ROWS)]
-        add_outside(layout, canvas, chunk, image, at / COLUMNS, at % COLUMNS, get_word(window + 4 * i))
+        add_outside(
+            layout, canvas, chunk, image, at / COLUMNS, at % COLUMNS, get_word(window + 4 * i)
+        )
 
 
 @wp.func
 def cast_remaining(
-    models: wp.array(dtype=Any), camera: Any, motion: Any, events: TileEvents, canvas: Canvas, layout: Layout,
-    chunk: Chunk, images: wp.array2d(dtype=wp.int64), first: int, left: int, i: int, event: UnpackedEvent,
-):  # fmt: skip
+    models: wp.array(dtype=Any),
+    camera: Any,
+    motion: Any,
+    events: TileEvents,
+    canvas: Canvas,
+    layout: Layout,
+    chunk: Chunk,
+    images: wp.array2d(dtype=wp.int64),
+    first: int,
+    left: int,
+    i: int,
+    event: UnpackedEvent,
+):
     """Vote into the images of the candidates whose bits are set in ``left``."""
     for k in range(wp.where(left != 0, AT_ONCE, 0)):
         if ((left >> k) & 1) != 0:
@@ -322,21 +393,36 @@ def cast_remaining(
 
 @wp.func
 def cast_directly(
-    models: wp.array(dtype=Any), camera: Any, motion: Any, events: TileEvents, canvas: Canvas, layout: Layout,
-    chunk: Chunk, images: wp.array2d(dtype=wp.int64), first: int, thread: int,
-):  # fmt: skip
+    models: wp.array(dtype=Any),
+    camera: Any,
+    motion: Any,
+    events: TileEvents,
+    canvas: Canvas,
+    layout: Layout,
+    chunk: Chunk,
+    images: wp.array2d(dtype=wp.int64),
+    first: int,
+    thread: int,
+):
     """Vote a chunk of events into the images of up to :data:`AT_ONCE` candidates, without windows."""
     every = (1 << wp.min(AT_ONCE, images.shape[0] - first)) - 1
     for i in range(chunk.start + thread, chunk.stop, THREADS):
         event = unpack(int(load_uint32(events.packed, i)), chunk, canvas, layout, i)
-        cast_remaining(models, camera, motion, events, canvas, layout, chunk, images, first, every, i, event)
+        cast_remaining(
+            models, camera, motion, events, canvas, layout, chunk, images, first, every, i, event
+        )
 
 
 @wp.kernel(launch_bounds=(int(THREADS), BLOCKS))
 def vote_tiles(
-    models: wp.array(dtype=Any), camera: Any, events: TileEvents, motion: Any, canvas: Canvas, layout: Layout,
+    models: wp.array(dtype=Any),
+    camera: Any,
+    events: TileEvents,
+    motion: Any,
+    canvas: Canvas,
+    layout: Layout,
     images: wp.array2d(dtype=wp.int64),
-):  # fmt: skip
+):
     """Vote one chunk of events under up to :data:`AT_ONCE` candidates per block."""
     block, thread = wp.tid()
     chunk = events.chunks[block % events.chunks.shape[0]]
@@ -357,10 +443,16 @@ def vote_tiles(
         packed = int(load_uint32(events.packed, wp.min(i + THREADS, chunk.stop - 1)))
         left = cast_event(a, camera, motion, events, canvas.nearest, words, first, i, event)
         if many > 1:
-            left += 2 * cast_event(b, camera, motion, events, canvas.nearest, words + SIZE, first + 1, i, event)
+            left += 2 * cast_event(
+                b, camera, motion, events, canvas.nearest, words + SIZE, first + 1, i, event
+            )
         if many > 2:
-            left += 4 * cast_event(c, camera, motion, events, canvas.nearest, words + 2 * SIZE, first + 2, i, event)
-        cast_remaining(models, camera, motion, events, canvas, layout, chunk, images, first, left, i, event)
+            left += 4 * cast_event(
+                c, camera, motion, events, canvas.nearest, words + 2 * SIZE, first + 2, i, event
+            )
+        cast_remaining(
+            models, camera, motion, events, canvas, layout, chunk, images, first, left, i, event
+        )
     flush_window(layout, canvas, chunk, images, words, first, thread, many)
 
 

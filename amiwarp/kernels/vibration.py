@@ -19,9 +19,11 @@ class VibrationParams:
     phase_sin: float  # sine of the phase
     backward: wp.vec2  # rotation about x and y by the backward circle at φ = 0 [rad]
     roll: wp.vec2  # rotation about the optical axis: factors of cos φ and sin φ [rad]
-    second: wp.vec2  # rotation about x and y by the forward circle of the second harmonic at φ = 0 [rad]
+    # Rotation about x and y by the forward circle of the second harmonic at φ = 0 [rad]
+    second: wp.vec2
     second_backward: wp.vec2  # the same of its backward circle [rad]
-    third: wp.vec2  # rotation about x and y by the forward circle of the third harmonic at φ = 0 [rad]
+    # Rotation about x and y by the forward circle of the third harmonic at φ = 0 [rad]
+    third: wp.vec2
     third_backward: wp.vec2  # the same of its backward circle [rad]
 
 
@@ -36,7 +38,9 @@ def rotate_by_vector(x: float, y: float, z: float, a: float, b: float, c: float)
     v = 1.0 / 720.0 + r2 * (-1.0 / 40320.0 + r2 * (1.0 / 3628800.0 - r2 / 479001600.0))
     s = 1.0 + r2 * (-1.0 / 6.0 + r2 * s)
     v = 0.5 + r2 * (-1.0 / 24.0 + r2 * v)
-    p, q, r = b * z - c * y, c * x - a * z, a * y - b * x
+    p = b * z - c * y
+    q = c * x - a * z
+    r = a * y - b * x
     return (
         x + s * p + v * (b * r - c * q),
         y + s * q + v * (c * p - a * r),
@@ -45,7 +49,9 @@ def rotate_by_vector(x: float, y: float, z: float, a: float, b: float, c: float)
 
 
 @wp.func
-def rotate_by_vibration(m: VibrationParams, sign: float, x: float, y: float, z: float, w0: float, w1: float):
+def rotate_by_vibration(
+    m: VibrationParams, sign: float, x: float, y: float, z: float, w0: float, w1: float
+):
     """Rotate a direction by the camera's rotation from rest at φ = (w0, w1), or back with ``sign`` -1."""
     t0, t1 = w0 * w0 - w1 * w1, 2.0 * w0 * w1  # cosine and sine of 2φ
     u0, u1 = w0 * t0 - w1 * t1, w0 * t1 + w1 * t0  # and of 3φ
@@ -60,7 +66,9 @@ def rotate_by_vibration(m: VibrationParams, sign: float, x: float, y: float, z: 
 
 
 @wp.func
-def compensate_direction(model: VibrationParams, x: float, y: float, z: float, w0: float, w1: float):
+def compensate_direction(
+    model: VibrationParams, x: float, y: float, z: float, w0: float, w1: float
+):
     """Return the direction that the camera at rest would observe."""
     a, b, c = rotate_by_vibration(model, 1.0, x, y, z, w0, w1)
     return a, b, c

@@ -12,7 +12,7 @@ import warp as wp
 
 from amiwarp.kernels.native_code import load_float, load_pairs, load_uint16, store_float
 from amiwarp.kernels.prism_angle import THETA_U16_RAD, EncoderParams, of_second, theta_u32_at
-from amiwarp.kernels.refraction import PairParams
+from amiwarp.kernels.prism_pair import PairParams
 
 OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(OPTIONS)
@@ -71,7 +71,9 @@ def dither_offset(i: int):
     h = (h ^ (h >> wp.uint32(13))) * MIX_2
     h = h ^ (h >> wp.uint32(16))
     scale = 1.0 / 65536.0
-    return float(int(h & wp.uint32(0xFFFF))) * scale - 0.5, float(int(h >> wp.uint32(16))) * scale - 0.5
+    return float(int(h & wp.uint32(0xFFFF))) * scale - 0.5, float(
+        int(h >> wp.uint32(16))
+    ) * scale - 0.5
 
 
 @wp.func
@@ -130,21 +132,27 @@ def theta_u16_at(encoder: EncoderParams, t: wp.int64) -> wp.uint16:
 
 
 @wp.kernel
-def turn_events(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, turn: wp.array(dtype=wp.uint16)):
+def turn_events(
+    encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, turn: wp.array(dtype=wp.uint16)
+):
     """Compute theta_u16 of each event: the prism angle at its time, rounded to 1/65536 turn."""
     i = start + wp.tid()
     turn[i] = theta_u16_at(encoder, t[i])
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
-def turn_second(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, turn: wp.array(dtype=wp.uint16)):
+def turn_second(
+    encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, turn: wp.array(dtype=wp.uint16)
+):
     """Compute theta_u16 of the second prism at each event."""
     i = start + wp.tid()
     turn[i] = theta_u16_at(of_second(encoder), t[i])
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
-def time_events(t: wp.array(dtype=wp.int64), middle: wp.int64, start: int, time: wp.array(dtype=float)):
+def time_events(
+    t: wp.array(dtype=wp.int64), middle: wp.int64, start: int, time: wp.array(dtype=float)
+):
     """Compute the time of each event from the middle of the window [s]."""
     i = start + wp.tid()
     time[i] = float(int(t[i] - middle)) * 1.0e-6
@@ -152,11 +160,17 @@ def time_events(t: wp.array(dtype=wp.int64), middle: wp.int64, start: int, time:
 
 @wp.kernel
 def layer_events(
-    p: wp.array(dtype=wp.uint8), parts: int, per_polarity: int, start: int, layer: wp.array(dtype=wp.uint8)
+    p: wp.array(dtype=wp.uint8),
+    parts: int,
+    per_polarity: int,
+    start: int,
+    layer: wp.array(dtype=wp.uint8),
 ):
     """Assign an image to each event: by its part (event i belongs to part i modulo ``parts``), then by its polarity."""
     i = start + wp.tid()
-    layer[i] = wp.uint8((i % parts) * (1 + per_polarity) + per_polarity * wp.where(p[i] != wp.uint8(0), 1, 0))
+    layer[i] = wp.uint8(
+        (i % parts) * (1 + per_polarity) + per_polarity * wp.where(p[i] != wp.uint8(0), 1, 0)
+    )
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
@@ -173,7 +187,11 @@ def fold_keys(
     i = start + wp.tid()
     bin_of = wp.int64((wp.uint32(turn[i]) * wp.uint32(bins)) >> wp.uint32(16))
     pixel = (wp.int64(y[i]) << wp.int64(16)) | wp.int64(x[i])
-    keys[i] = (bin_of << wp.int64(33)) | (pixel << wp.int64(1)) | wp.int64(wp.where(layer[i] != wp.uint8(0), 1, 0))
+    keys[i] = (
+        (bin_of << wp.int64(33))
+        | (pixel << wp.int64(1))
+        | wp.int64(wp.where(layer[i] != wp.uint8(0), 1, 0))
+    )
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)

@@ -13,18 +13,21 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
+from amiwarp.kernels.camera import CameraParams
+from amiwarp.kernels.camera_rotation import CameraRotationParams, undo_camera_rotation
 from amiwarp.kernels.native_code import load_uint8, load_uint16
 from amiwarp.kernels.refraction import displace, state_of
 from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, stored_state
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-TRASH = wp.constant(4096)  # number of words for votes outside the image, large enough that no word overflows
+# Number of words for votes outside the image, large enough that no word overflows
+TRASH = wp.constant(4096)
 CAPACITY = wp.constant(1024)  # number of events at which a word overflows
 FIELD_CARRY = wp.constant(wp.int64(1 << 18))  # value of a carry out of the fields fx, fy, b
 ONE_EVENT = wp.constant(wp.uint64(1 << 54))  # one event in the field n
-CARRIES = wp.constant(wp.uint64((1 << 63) | (1 << 53) | (1 << 35) | (1 << 17)))  # highest bit of each field
+# Highest bit of each field
+CARRIES = wp.constant(wp.uint64((1 << 63) | (1 << 53) | (1 << 35) | (1 << 17)))
 
 
 @wp.struct
@@ -36,7 +39,9 @@ class Cells:
 
 
 @wp.func
-def add_to_totals(cells: Cells, cell: int, width: int, n: wp.int64, fx: wp.int64, fy: wp.int64, b: wp.int64):
+def add_to_totals(
+    cells: Cells, cell: int, width: int, n: wp.int64, fx: wp.int64, fy: wp.int64, b: wp.int64
+):
     """Add the moments of a cell, in the units of its word, to the 64-bit totals of its four pixels."""
     wp.atomic_add(cells.totals, cell, wp.int64(256) * n - fx - fy + b)
     wp.atomic_add(cells.totals, cell + 1, fx - b)
@@ -60,7 +65,9 @@ def add_carries_to_totals(cells: Cells, cell: int, width: int, carry: wp.uint64)
     fy = carry_bit(carry, 35)
     b = carry_bit(carry, 53)
     n = wp.int64(CAPACITY) * carry_bit(carry, 63) - b
-    add_to_totals(cells, cell, width, n, FIELD_CARRY * fx, FIELD_CARRY * fy - fx, FIELD_CARRY * b - fy)
+    add_to_totals(
+        cells, cell, width, n, FIELD_CARRY * fx, FIELD_CARRY * fy - fx, FIELD_CARRY * b - fy
+    )
 
 
 @wp.func
@@ -76,7 +83,12 @@ def add_vote_atomically(cells: Cells, cell: int, width: int, word: wp.uint64):
 def vote_at(canvas: Canvas, x: float, y: float, layer: int):
     """Return whether a position lies on the canvas, its cell and its word; the word is empty if it does not."""
     inside, cell, fx, fy, b = cell_at(canvas, x, y, layer)
-    word = (wp.uint64(b) << wp.uint64(36)) | (wp.uint64(fy) << wp.uint64(18)) | wp.uint64(fx) | ONE_EVENT
+    word = (
+        (wp.uint64(b) << wp.uint64(36))
+        | (wp.uint64(fy) << wp.uint64(18))
+        | wp.uint64(fx)
+        | ONE_EVENT
+    )
     return inside, cell, wp.where(inside == 1, word, wp.uint64(0))
 
 
@@ -100,7 +112,9 @@ def repeat_vote(events: EventArrays, i: int, word: wp.uint64) -> wp.uint64:
 def event_vote(model: Any, camera: Any, events: EventArrays, canvas: Canvas, i: int):
     """Compute prism angle, displacement and vote of one event."""
     w0, w1 = event_state(model, events, i)
-    x, y = displace(model, camera, float(load_uint16(events.x, i)), float(load_uint16(events.y, i)), w0, w1)
+    x, y = displace(
+        model, camera, float(load_uint16(events.x, i)), float(load_uint16(events.y, i)), w0, w1
+    )
     dx, dy = dither_offset(i)
     layer = int(load_uint8(events.layer, i)) * canvas.layer
     inside, cell, word = vote_at(canvas, x + canvas.dither * dx, y + canvas.dither * dy, layer)
@@ -108,7 +122,9 @@ def event_vote(model: Any, camera: Any, events: EventArrays, canvas: Canvas, i: 
 
 
 @wp.kernel
-def vote_events(model: Any, camera: Any, events: EventArrays, canvas: Canvas, start: int, cells: Cells):
+def vote_events(
+    model: Any, camera: Any, events: EventArrays, canvas: Canvas, start: int, cells: Cells
+):
     """Vote one event per thread, with a check of every addition for overflow."""
     i = start + wp.tid()
     _inside, cell, word = event_vote(model, camera, events, canvas, i)
@@ -132,12 +148,22 @@ def vote_rotating_camera(
     xy = undo_camera_rotation(camera, wp.vec2(x, y), camera_rotation, events.time[i])
     dx, dy = dither_offset(i)
     layer = int(events.layer[i]) * canvas.layer
-    _inside, cell, word = vote_at(canvas, xy[0] + canvas.dither * dx, xy[1] + canvas.dither * dy, layer)
+    _inside, cell, word = vote_at(
+        canvas, xy[0] + canvas.dither * dx, xy[1] + canvas.dither * dy, layer
+    )
     add_vote_atomically(cells, cell, canvas.columns, word)
 
 
 @wp.kernel
-def vote_quickly(model: Any, camera: Any, events: EventArrays, canvas: Canvas, trash: int, start: int, cells: Cells):
+def vote_quickly(
+    model: Any,
+    camera: Any,
+    events: EventArrays,
+    canvas: Canvas,
+    trash: int,
+    start: int,
+    cells: Cells,
+):
     """Vote one event per thread without checking for carries. For CUDA.
 
     Votes outside the canvas are counted in the trash words.

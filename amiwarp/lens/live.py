@@ -4,49 +4,62 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from math import tau as TWO_PI
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.first_guess import ANGLE_RANGES
+from amiwarp.calib.camera_rates import ANGLE_RANGES
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder, starts_of_runs
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import starts_of_runs
 from amiwarp.events.recording import Events, MemoryEvents, Recording, held_bytes
 from amiwarp.lens import poses
 from amiwarp.lens.board import Board, Corners, opencv
-from amiwarp.lens.calibration import GOOD_POSES, TWO_BOARDS, LensCalibration, LensWork, coverage_of, lacking
-from amiwarp.lens.corner_fit import first_pose, fit_lens, tilt_of
+from amiwarp.lens.calibration import TWO_BOARDS, LensWork
+from amiwarp.lens.corner_fit import fit_lens
+from amiwarp.lens.projection import first_pose, tilt_of
+from amiwarp.lens.result import GOOD_POSES, LensCalibration, coverage_of, lacking
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.models.exact import ExactModel
 from amiwarp.optics.prism import NominalPrism, as_wedge
 from amiwarp.tasks import Progress, silent
 
 SETTLED_TURNS = 5
-"""Length of a still span from which on it is used before it ends [turns]: three, and one to settle on either side."""
-MOST_BYTES, MOST_SAMPLES = 1 << 27, 1 << 14
+"""Length at which a still span is used before it ends [turns]: three, and one to settle on either side."""
+MOST_BYTES = 1 << 27
+MOST_SAMPLES = 1 << 14
 """Limits of a turn: the memory of its events [bytes], about ten millions, and its number of encoder samples. Without a
 full turn within them, what waits is dropped."""
 SAME_PX = 5.0
-"""A pose whose corners are all nearer than this to those of an earlier pose tells nothing new [px]."""
+"""A pose whose corners are all nearer than this to the corners of an earlier pose tells nothing new [px]."""
 
 
 class StillSpans:
     """Finds the still spans of a stream, turn by turn, by the rule of :func:`~amiwarp.lens.poses.still_poses`.
 
-    It consumes a session's events and encoder samples, and keeps those of the present span. ``found`` is called once
-    with each span, at most three turns of it, when it is :data:`SETTLED_TURNS` long or ends.
+    It consumes a session's events and encoder samples, and keeps what belongs to the present span. ``found`` is called
+    once with each span, at most three turns of it, when it is :data:`SETTLED_TURNS` long or ends.
     """
 
     def __init__(
-        self, name: str, size: tuple[int, int], prism: NominalPrism | None, found: Callable[[Recording], None]
+        self,
+        name: str,
+        size: tuple[int, int],
+        prism: NominalPrism | None,
+        found: Callable[[Recording], None],
     ) -> None:
-        self._name, self._size, self._prism, self._found = name, size, prism, found
+        self._name = name
+        self._size = size
+        self._prism = prism
+        self._found = found
         self.turns = self.samples = 0
         """Number of turns of the prism, and number of encoder samples so far."""
         self._t: NDArray[np.int64] = np.zeros(0, np.int64)
         self._angle: NDArray[np.float64] = np.zeros(0)
-        self._held, self._last_us = 0, -(1 << 62)
+        self._held = 0
+        self._last_us = -(1 << 62)
         self._restart(0)
 
     def append(self, events: Events) -> None:
@@ -57,14 +70,20 @@ class StillSpans:
         self._advance()
 
     def append_encoder(
-        self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None, *, second: bool = False
+        self,
+        t_us: NDArray[np.int64],
+        angle: NDArray[np.float64],
+        index_t_us: object = None,
+        *,
+        second: bool = False,
     ) -> None:
         """Take samples of the prism's angle on the events' clock. A gap between samples ends a span.
 
         There is no ``second`` encoder: a lens is calibrated with one prism.
         """
         self.samples += len(t_us)
-        self._t, self._angle = np.concatenate([self._t, t_us]), np.concatenate([self._angle, angle])
+        self._t = np.concatenate([self._t, t_us])
+        self._angle = np.concatenate([self._angle, angle])
         if first := starts_of_runs(self._t, self._angle)[-1]:
             self._restart(first)
         self._advance()
@@ -79,16 +98,21 @@ class StillSpans:
                 f"{self._name}: no encoder samples have come; connect the encoder, or give the controller's --port"
             )
         if not self.turns:
-            raise AmiwarpError(f"{self._name}: {poses.too_few_turns(float(np.ptp(self._angle)) / TWO_PI)}")
+            raise AmiwarpError(
+                f"{self._name}: {poses.too_few_turns(float(np.ptp(self._angle)) / TWO_PI)}"
+            )
         self._end_span()
 
     def _restart(self, first: int) -> None:
         """Begin a new span with an encoder sample; use the present one, and drop the waiting events."""
         if self._t.size:
             self._end_span()
-        self._t, self._angle = self._t[first:], self._angle[first:]
-        self._waiting, self._held = list[Events](), 0
-        self._edges, self._span = list[int](), list[Events]()
+        self._t = self._t[first:]
+        self._angle = self._angle[first:]
+        self._waiting = list[Events]()
+        self._held = 0
+        self._edges = list[int]()
+        self._span = list[Events]()
         """Edges [us] and events of the turns of the present span."""
         self._before: NDArray[np.float64] | None = None
         self._used = False
@@ -106,49 +130,76 @@ class StillSpans:
             return None
         self._edges = self._edges or [int(self._t[0])]
         start = self._edges[-1]
-        turned = np.abs(self._angle - np.interp(start, self._t, self._angle)) * (self._t > start)
+        angle_at_start = np.interp(start, self._t, self._angle)
+        turned = np.abs(self._angle - angle_at_start) * (self._t > start)
         if turned[-1] < TWO_PI:
             return None
         k = int(np.argmax(turned >= TWO_PI))
-        edge = int(np.interp(TWO_PI, turned[k - 1 : k + 1], self._t[k - 1 : k + 1]))
-        return edge if self._last_us >= edge else None
+        around = slice(k - 1, k + 1)
+        edge = int(np.interp(TWO_PI, turned[around], self._t[around]))
+        if self._last_us < edge:
+            return None
+        return edge
 
     def _turn(self, start: int, edge: int) -> None:
         """Compare a turn with the one before: it continues the present span, or begins a new one."""
         events = Events.concatenate(self._waiting)
-        self._waiting = [events[int(np.searchsorted(events.t, edge)) :]]
-        self._held = held_bytes(self._waiting[0])
+        behind = events[int(np.searchsorted(events.t, edge)) :]
+        self._waiting = [behind]
+        self._held = held_bytes(behind)
         turn = _between(events, start, edge)
         self.turns += 1
-        if np.diff(turn.t, prepend=start, append=edge).max() > (edge - start) / ANGLE_RANGES:
+        longest_us = np.diff(turn.t, prepend=start, append=edge).max()
+        if longest_us > (edge - start) / ANGLE_RANGES:
             # a board shows events at every angle: some were lost on the way
             self._end_span()
-            self._edges, self._span, self._used, self._before = [edge], [], False, None
+            self._edges = [edge]
+            self._span = []
+            self._used = False
+            self._before = None
             return
-        counts = poses.counts_of(turn, Encoder(self._t, self._angle), self._size)
+        encoder = Encoder(self._t, self._angle)
+        counts = poses.counts_of(turn, encoder, self._size)
         if self._before is None or poses.repetition(self._before, counts) < poses.LEAST_REPETITION:
             self._end_span()
-            self._edges, self._span, self._used = [start], [], False
+            self._edges = [start]
+            self._span = []
+            self._used = False
         self._before = counts
-        self._edges, self._span = [*self._edges, edge], [*self._span, turn]
+        self._edges = [*self._edges, edge]
+        self._span = [*self._span, turn]
         if len(self._span) >= SETTLED_TURNS:
             self._end_span()
         kept = max(int(np.searchsorted(self._t, self._edges[0])) - 1, 0)
-        self._t, self._angle = self._t[kept:], self._angle[kept:]
+        self._t = self._t[kept:]
+        self._angle = self._angle[kept:]
 
     def _end_span(self) -> None:
         """Use the present span if it was not used yet and has two turns."""
-        edges, span = self._edges, self._span
+        edges = self._edges
+        span = self._span
         if len(span) >= 2 and not self._used:
             self._used = True
-            first, last = poses.used_part(edges[0], edges[-1], (edges[-1] - edges[0]) / len(span))
+            turn_us = (edges[-1] - edges[0]) / len(span)
+            first, last = poses.used_part(edges[0], edges[-1], turn_us)
             part = _between(Events.concatenate(span), first, last)
-            events = Events(part.x.copy(), part.y.copy(), part.t.copy(), part.p.copy())  # without the rest of the span
-            low, high = max(int(np.searchsorted(self._t, first)) - 1, 0), int(np.searchsorted(self._t, last)) + 1
-            encoder = Encoder(self._t[low:high].copy(), self._angle[low:high].copy())
-            self._found(Recording(MemoryEvents(events, *self._size), None, encoder, self._prism, name=self._name))
+            # Without the rest of the span
+            events = Events(part.x.copy(), part.y.copy(), part.t.copy(), part.p.copy())
+            low = max(int(np.searchsorted(self._t, first)) - 1, 0)
+            high = int(np.searchsorted(self._t, last)) + 1
+            t = self._t[low:high].copy()
+            angle = self._angle[low:high].copy()
+            recording = Recording(
+                events=MemoryEvents(events, *self._size),
+                camera=None,
+                encoder=Encoder(t, angle),
+                prism=self._prism,
+                name=self._name,
+            )
+            self._found(recording)
         if self._used:
-            self._edges, self._span = edges[-1:], []
+            self._edges = edges[-1:]
+            self._span = []
 
 
 def _between(events: Events, start: int, stop: int) -> Events:
@@ -159,16 +210,26 @@ def _between(events: Events, start: int, stop: int) -> Events:
 class LiveLens:
     """Poses of a board that a stream has shown so far, until they are enough for a lens calibration."""
 
-    def __init__(self, board: Board, camera: Camera, device: Any, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        board: Board,
+        camera: Camera,
+        device: Any,
+        say: Callable[[str], None],
+    ) -> None:
         """Start with a rough ``camera``. ``say`` is called with what each pose shows, and what is missing."""
         opencv()  # at once, not after the first pose
-        self._board, self._camera, self._device, self._say = board, camera, device, say
+        self._board = board
+        self._camera = camera
+        self._device = device
+        self._say = say
         self.enough = False
         """Whether the poses suffice for a good calibration."""
         self.poses = list[poses.Pose]()
         """Poses that count."""
         self._spans = 0
-        self._seen, self._tilts = list[Corners](), list[float]()
+        self._seen = list[Corners]()
+        self._tilts = list[float]()
         self._left_out = dict[str, str]()
         self._model: ExactModel | None = None
 
@@ -181,7 +242,8 @@ class LiveLens:
         try:
             corners = self._find(pose)
         except AmiwarpError as error:
-            self._left_out[pose.name] = reason = str(error).removeprefix(f"{recording.name}: ")
+            reason = str(error).removeprefix(f"{recording.name}: ")
+            self._left_out[pose.name] = reason
             self._say(f"{pose.name}: {reason}")
             return
         for earlier, before in zip(self.poses, self._seen, strict=True):
@@ -190,20 +252,30 @@ class LiveLens:
                 return
         self.poses.append(pose)
         self._seen.append(corners)
-        self._tilts.append(tilt_of(first_pose(self._camera, self._board, corners)))
+        placed = first_pose(self._camera, self._board, corners)
+        self._tilts.append(tilt_of(placed))
         self._tell(pose.name)
 
     def calibrate(self, progress: Progress) -> LensCalibration:
         """Calibrate from the poses. Raises :class:`AmiwarpError` as :func:`~amiwarp.calibrate_lens` does."""
         if not self._spans:
             raise AmiwarpError(poses.MOVES)
-        return LensWork(self._board, self._camera, self.poses, self._device, progress, self._left_out).run()
+        work = LensWork(
+            self._board,
+            self._camera,
+            self.poses,
+            self._device,
+            progress,
+            self._left_out,
+        )
+        return work.run()
 
     def _find(self, pose: poses.Pose) -> Corners:
         """Return the board's corners in a pose. Raises :class:`AmiwarpError` with the reason if it is not seen."""
         work = LensWork(self._board, self._camera, [pose], self._device, silent)
         for model in self._models(work):
-            picture = work.pictures(model, [pose.name], 0, turns=0.5)[pose.name]
+            pictures = work.pictures(model, [pose.name], 0, turns=0.5)
+            picture = pictures[pose.name]
             corners = self._board.find(picture)
             if corners is not None:
                 if self._board.has_another(picture, corners):
@@ -219,14 +291,17 @@ class LiveLens:
         if len(self.poses) >= 2:
             return
         [(_, search)] = work.searches(work.poses, ("apex", "phase"), {})
-        search.run()
-        yield ExactModel.from_values(self._camera, as_wedge(search.full_space.prism), search.best)
+        found = search.run()
+        yield ExactModel.from_values(self._camera, as_wedge(found.full_space.prism), found.best)
 
     def _tell(self, name: str) -> None:
         """Say what the latest pose shows, where in the image corners were so far, and what is missing."""
-        count, tilt = len(self.poses), math.degrees(self._tilts[-1])
+        count = len(self.poses)
+        tilt = math.degrees(self._tilts[-1])
         counted = f"{count} of {GOOD_POSES} poses" if count < GOOD_POSES else f"{count} poses"
-        self._say(f"{name}: board seen, tilt {tilt:.0f} deg; {counted}, corners in the nine parts of the image:")
+        self._say(
+            f"{name}: board seen, tilt {tilt:.0f} deg; {counted}, corners in the nine parts of the image:"
+        )
         coverage = coverage_of(self._seen, self._camera.width, self._camera.height)
         for row in coverage:
             self._say("".join(f"{corners:6d}" for corners in row))
@@ -245,6 +320,8 @@ class LiveLens:
 
 def _same(one: Corners, other: Corners) -> bool:
     """Return whether two poses show the same corners at nearly the same places."""
-    _, a, b = np.intersect1d(one.ids, other.ids, return_indices=True)
-    away = np.linalg.norm(one.xy[a] - other.xy[b], axis=1)
-    return len(a) == max(len(one.ids), len(other.ids)) and bool((away < SAME_PX).all())
+    _, of_one, of_other = np.intersect1d(one.ids, other.ids, return_indices=True)
+    if len(of_one) != max(len(one.ids), len(other.ids)):
+        return False
+    away = np.linalg.norm(one.xy[of_one] - other.xy[of_other], axis=1)
+    return bool((away < SAME_PX).all())

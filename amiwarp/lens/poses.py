@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.first_guess import ANGLE_RANGES, CELL
-from amiwarp.errors import AmiwarpError
+from amiwarp.calib.camera_rates import ANGLE_RANGES
+from amiwarp.calib.first_guess import CELL
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.tasks import in_order
 
-LEAST_TURNS, MOST_TURNS = 1.5, 3.0
+Vector = NDArray[np.float64]
+
+LEAST_TURNS = 1.5
+MOST_TURNS = 3.0
 """Shortest still span, and the longest part of one that is used, from its middle [turns]."""
 LEAST_REPETITION = 0.75
 """Smallest correlation of the events of two successive turns while nothing moves. A still board's was 0.96 to 0.98,
-that of a board that moved by 1.8 px in a turn 0.82, and by 3.7 px 0.52."""
+a board that moved by 1.8 px in a turn had 0.82, and by 3.7 px 0.52."""
 WITHOUT_PRISM = "because without it a still board gives no events"
 MOVES = (
     "no turn of the prism repeats the one before: hold the board and the camera still for two turns; without a prism, "
@@ -36,7 +41,7 @@ class Pose:
     """Span of a recording in which the board stands still."""
 
     name: str
-    """Name for messages: that of the recording, with the time of the span if the recording has several."""
+    """Name for messages: the recording's name, with the time of the span if the recording has several."""
     recording: Recording
     """The events of the span, at most three turns, in memory."""
 
@@ -47,25 +52,35 @@ def still_poses(recordings: Sequence[Recording]) -> tuple[list[Pose], dict[str, 
     Raises :class:`AmiwarpError`, with the reason of the first recording, if none has any.
     """
     recordings = _named_apart(recordings)
-    spans, reasons = list[tuple[Recording, tuple[int, int]]](), dict[str, str]()
-    for recording, found in zip(recordings, in_order(partial(_spans_of, one) for one in recordings), strict=True):
+    spans: list[tuple[Recording, tuple[int, int]]] = []
+    reasons: dict[str, str] = {}
+    jobs = (partial(_spans_of, recording) for recording in recordings)
+    for recording, found in zip(recordings, in_order(jobs), strict=True):
         if isinstance(found, AmiwarpError):
             reasons[recording.name] = str(found)
         else:
             spans += [(recording, span) for span in found]
     if not spans:
-        raise AmiwarpError(f"{recordings[0].name}: {reasons[recordings[0].name]}")
+        first = recordings[0].name
+        raise AmiwarpError(f"{first}: {reasons[first]}")
     if len(spans) > MOST_POSES:
-        spans = [spans[k] for k in np.linspace(0, len(spans) - 1, MOST_POSES).round().astype(int)]
-    several = {recording.name for recording in recordings if sum(one is recording for one, _ in spans) > 1}
-    return [_pose(recording, *span, several=recording.name in several) for recording, span in spans], reasons
+        chosen = np.linspace(0, len(spans) - 1, MOST_POSES).round().astype(int)
+        spans = [spans[k] for k in chosen]
+
+    count = Counter(recording.name for recording, _ in spans)
+    poses = []
+    for recording, (start, stop) in spans:
+        several = count[recording.name] > 1
+        poses.append(_pose(recording, start, stop, several=several))
+    return poses, reasons
 
 
 def _named_apart(recordings: Sequence[Recording]) -> list[Recording]:
     """Return the recordings with names of which no two are equal, because poses are known by them."""
     found: dict[str, Recording] = {}
     for recording in recordings:
-        name, count = recording.name, 1
+        name = recording.name
+        count = 1
         while name in found:
             count += 1
             name = f"{recording.name} ({count})"
@@ -74,10 +89,15 @@ def _named_apart(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def _pose(recording: Recording, start: int, stop: int, *, several: bool) -> Pose:
-    first = recording.events.t_first
-    where = f", {(start - first) * 1e-6:.2f} to {(stop - first) * 1e-6:.2f} s" if several else ""
-    events = MemoryEvents(recording.events.between(start, stop), *recording.events.size)
-    return Pose(f"{recording.name}{where}", replace(recording, events=events))
+    """Return a still span of a recording as a pose; with its times in the name if there are several."""
+    source = recording.events
+    name = recording.name
+    if several:
+        start_s = (start - source.t_first) * 1e-6
+        stop_s = (stop - source.t_first) * 1e-6
+        name += f", {start_s:.2f} to {stop_s:.2f} s"
+    events = MemoryEvents(source.between(start, stop), *source.size)
+    return Pose(name, replace(recording, events=events))
 
 
 def _spans_of(recording: Recording) -> list[tuple[int, int]] | AmiwarpError:
@@ -89,25 +109,36 @@ def _spans_of(recording: Recording) -> list[tuple[int, int]] | AmiwarpError:
 
 
 def _found_spans(recording: Recording) -> list[tuple[int, int]]:
-    encoder, source = recording.encoder, recording.events
+    encoder = recording.encoder
+    source = recording.events
     if encoder is None:
-        raise AmiwarpError(f"has no encoder; record the angle of a turning prism, {WITHOUT_PRISM}")
+        raise AmiwarpError(
+            f"has no encoder; record the angle of a turning prism, {WITHOUT_PRISM}",
+            ErrorCode.CONTENT_MISSING,
+        )
     if not len(source):
-        raise AmiwarpError("has no events; give a recording with events")
-    first, last = max(source.t_first, encoder.coverage[0]), min(source.t_last, encoder.coverage[1])
+        raise AmiwarpError("has no events; give a recording with events", ErrorCode.CONTENT_MISSING)
+    first_covered, last_covered = encoder.coverage
+    first = max(source.t_first, first_covered)
+    last = min(source.t_last, last_covered)
     turns = abs(encoder.rpm) * (last - first) / 60e6
     if turns < LEAST_TURNS:
         raise AmiwarpError(too_few_turns(turns))
     turn = (last - first) / turns
     if turns < 2.0:
-        return [(first, last)]
-    edges = first + (np.arange(int(turns) + 1) * turn).astype(np.int64)
+        return [(first, last)]  # no two turns to compare
+    elapsed = np.arange(int(turns) + 1) * turn
+    edges = first + elapsed.astype(np.int64)
     edges[-1] = last
     still = _repetition(recording, encoder, edges) >= LEAST_REPETITION
-    found = [(int(edges[a]), int(edges[b])) for a, b in _runs(still)]
+    found = []
+    for first_edge, last_edge in _runs(still):
+        start = int(edges[first_edge])
+        stop = int(edges[last_edge])
+        found.append(used_part(start, stop, turn))
     if not found:
         raise AmiwarpError(MOVES)
-    return [used_part(a, b, turn) for a, b in found]
+    return found
 
 
 def too_few_turns(turns: float) -> str:
@@ -121,38 +152,49 @@ def too_few_turns(turns: float) -> str:
 def used_part(start: int, stop: int, turn: float) -> tuple[int, int]:
     """Return the part of a still span that is used: at most :data:`MOST_TURNS` turns, in its middle [us]."""
     half = int(0.5 * MOST_TURNS * turn)
-    return max(start, (start + stop) // 2 - half), min(stop, (start + stop) // 2 + half)
+    middle = (start + stop) // 2
+    return max(start, middle - half), min(stop, middle + half)
 
 
-def _repetition(recording: Recording, encoder: Encoder, edges: NDArray[np.int64]) -> NDArray[np.float64]:
+def _repetition(recording: Recording, encoder: Encoder, edges: NDArray[np.int64]) -> Vector:
     """Return the repetition of each turn after the first, shape (turns - 1,)."""
-    before: NDArray[Any] | None = None
-    out: list[float] = []
-    for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        counts = counts_of(recording.events.between(start, stop), encoder, recording.events.size)
+    source = recording.events
+    before: Vector | None = None
+    found: list[float] = []
+    for start, stop in pairwise(edges.tolist()):
+        turn = source.between(start, stop)
+        counts = counts_of(turn, encoder, source.size)
         if before is not None:
-            out.append(repetition(before, counts))
+            found.append(repetition(before, counts))
         before = counts
-    return np.array(out)
+    return np.array(found)
 
 
-def counts_of(turn: Events, encoder: Encoder, size: tuple[int, int]) -> NDArray[np.float64]:
+def counts_of(turn: Events, encoder: Encoder, size: tuple[int, int]) -> Vector:
     """Return the events of a turn, ON minus OFF, by cell of the image and range of prism angles, flattened."""
-    columns, rows = (-(-side // CELL) for side in size)
-    angle = np.floor(encoder.angle_at(turn.t) * (ANGLE_RANGES / math.tau)).astype(np.int64) % ANGLE_RANGES
-    cell = ((turn.y // CELL).astype(np.int64) * columns + turn.x // CELL) * ANGLE_RANGES + angle
-    return np.asarray(
-        np.bincount(cell, weights=2.0 * turn.p - 1.0, minlength=rows * columns * ANGLE_RANGES), np.float64
-    )
+    width, height = size
+    columns = math.ceil(width / CELL)
+    rows = math.ceil(height / CELL)
+    ranges = np.floor(encoder.angle_at(turn.t) * (ANGLE_RANGES / math.tau))
+    angle = ranges.astype(np.int64) % ANGLE_RANGES
+    row = (turn.y // CELL).astype(np.int64)
+    cell = row * columns + turn.x // CELL
+    signs = 2.0 * turn.p - 1.0
+    bins = rows * columns * ANGLE_RANGES
+    counts = np.bincount(cell * ANGLE_RANGES + angle, weights=signs, minlength=bins)
+    return np.asarray(counts, np.float64)
 
 
-def repetition(before: NDArray[np.float64], counts: NDArray[np.float64]) -> float:
-    """Return the correlation of the events of a turn with those of the turn before, see :data:`LEAST_REPETITION`."""
+def repetition(before: Vector, counts: Vector) -> float:
+    """Return the correlation of the events of a turn with the turn before, see :data:`LEAST_REPETITION`."""
     energy = math.sqrt(float(counts @ counts) * float(before @ before))
     return float(counts @ before) / max(energy, 1e-30)
 
 
 def _runs(still: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the first and last edge of each run of still turns: ``still[k]`` compares the turns k and k + 1."""
-    steps = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
-    return [(int(a), int(b) + 1) for a, b in steps.reshape(-1, 2)]
+    padded = np.pad(still, 1).astype(np.int8)
+    steps = np.flatnonzero(np.diff(padded))
+    begins = steps[0::2].tolist()
+    ends = steps[1::2].tolist()
+    return [(first, last + 1) for first, last in zip(begins, ends, strict=True)]

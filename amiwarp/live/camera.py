@@ -11,7 +11,8 @@ from amiwarp.live.stream.camera_settings import CameraSettings
 from amiwarp.live.stream.cameras import CAMERAS
 from amiwarp.live.stream.packets import Packet
 from amiwarp.live.stream.sources import open_source
-from amiwarp.validation import guarded, real
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import real
 
 
 class CameraPackets:
@@ -95,7 +96,9 @@ def open_camera(
     """
     kind, colon, _ = name.partition(":")
     if kind not in CAMERAS:
-        raise AmiwarpError(f"name is {name!r}; give a camera: {', '.join(f'{each}:' for each in CAMERAS)}")
+        raise AmiwarpError(
+            f"name is {name!r}; give a camera: {', '.join(f'{each}:' for each in CAMERAS)}"
+        )
     wait_s = real(wait_for_source_s, "wait_for_source_s", 0.0, 1e9, " s")
     text = "" if settings is None else str(settings)
     spec = ",".join(part for part in (name if colon else f"{name}:", text) if part)

@@ -3,28 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import queue
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from amiwarp.calib.result import Calibration
-from amiwarp.compensation.recordings import check_size
 from amiwarp.compensation.streams import Compensated
-from amiwarp.errors import AmiwarpError
-from amiwarp.live.link.link import Link
-from amiwarp.live.queues import BackgroundLoop, Policy
-from amiwarp.live.stream.packets import Source
-from amiwarp.live.stream.session import Session, encoder_count
-from amiwarp.live.stream.sources import open_source
-from amiwarp.validation import guarded, real
-
-MOST_PACKETS = 8
-"""Largest number of compensated packets that wait for the program, each of at most one batch of the compensator."""
-STEP_S = 0.1
-"""Time between two checks whether the iteration was ended [s]."""
+from amiwarp.live.items import LiveItems, closed_on_error, open_rig
+from amiwarp.live.queues import Policy
+from amiwarp.live.stream.session import Session
+from amiwarp.results.calibration import Calibration
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import real
 
 
 @contextlib.contextmanager
@@ -104,76 +93,30 @@ def compensate_live(
     """
     wait_us = round(1e3 * real(wait_ms, "wait_ms", 0.0, 1e6, " ms"))
     watch_s = real(watch_s, "watch_s", 0.0, 1e9, " s")
-    wait_s = real(wait_for_source_s, "wait_for_source_s", 0.0, 1e9, " s")
-    if counts_per_turn is not None and port is None:
-        raise AmiwarpError("counts_per_turn is given without port; give the controller's port, or leave it out")
     with contextlib.ExitStack() as resources:
-        link = None
-        if port is not None:
-            link = resources.enter_context(Link(None if port == "find" else port, counts_per_turn=counts_per_turn))
-        opened = open_source(os.fspath(source), pace=None if fast else 1.0, wait_s=wait_s, say=say)
-        try:
-            if not encoder_count(opened, link):
-                raise AmiwarpError(f"{opened.name}: contains no encoder samples; give the controller's port")
-            check_size(calibration, opened.size, opened.name)
-            packets = CompensatedPackets(opened)
+        opened, link = open_rig(
+            resources,
+            source,
+            calibration,
+            port=port,
+            counts_per_turn=counts_per_turn,
+            fast=fast,
+            wait_for_source_s=wait_for_source_s,
+            say=say,
+        )
+        packets: LiveItems[Compensated] = LiveItems(opened)
+        with closed_on_error(opened):
             session = Session(
-                opened, calibration, link=link, sinks=(packets.put,), watch_s=watch_s or None, wait_us=wait_us,
-                policy=policy, device=device, say=say,
-            )  # fmt: skip
-        except BaseException:
-            opened.close()
-            raise
+                opened,
+                calibration,
+                link=link,
+                sinks=(packets.put,),
+                watch_s=watch_s or None,
+                wait_us=wait_us,
+                policy=policy,
+                device=device,
+                say=say,
+            )
         packets.start(session)
         resources.enter_context(packets)
         yield packets
-
-
-class CompensatedPackets(BackgroundLoop):
-    """Iterator over the compensated packets of a session, which runs in a background thread."""
-
-    def __init__(self, source: Source) -> None:
-        self._source = source
-        self._stop = threading.Event()
-        self._packets: queue.Queue[Compensated | None] = queue.Queue(MOST_PACKETS)
-
-    def start(self, session: Session) -> None:
-        """Start the session, one of whose sinks is :meth:`put`."""
-        self._session = session
-        self._start_thread("amiwarp-live")
-
-    def put(self, packet: Compensated | None) -> None:
-        """Wait until there is room for a packet, and add it; None marks the end. Does nothing once closed."""
-        while not self._ended.is_set():
-            with contextlib.suppress(queue.Full):
-                self._packets.put(packet, timeout=STEP_S)
-                return
-
-    def close(self) -> None:
-        """End the session, drop the waiting packets, and wait for its threads. Raises its error, once."""
-        self._stop.set()
-        super().close()
-
-    def __iter__(self) -> Iterator[Compensated]:
-        return self
-
-    def __next__(self) -> Compensated:
-        while not self._ended.is_set():
-            with contextlib.suppress(queue.Empty):
-                packet = self._packets.get(timeout=STEP_S)
-                if packet is not None:
-                    return packet
-                self.close()
-        raise StopIteration
-
-    def _run(self) -> None:
-        try:
-            status = self._session.run(self._stop, lambda _: None)
-            problem = getattr(self._source, "problem", None)
-            if problem is not None:
-                raise AmiwarpError(
-                    f"{self._source.name}: the stream broke off: {problem}; the iterator gave the {status.events:,} "
-                    "events received until then"
-                )
-        finally:
-            self.put(None)

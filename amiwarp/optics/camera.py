@@ -1,113 +1,27 @@
-"""Camera: image size, pinhole intrinsics, lens distortion, and rotation."""
+"""Camera: image size, pinhole intrinsics and lens distortion."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import INT64, array, guarded, real, shown, vector, whole
+from amiwarp.optics.distortion import (
+    DISTORTIONS,
+    Distortion,
+    RadialTangential,
+    coefficients,
+    opencv_distortion,
+)
+from amiwarp.schema.calls import guarded
+from amiwarp.schema.records import build, fields_of
+from amiwarp.validation import INT64, array, one_of, real, shown, vector, whole
 
-# Models of lens distortion.
-
-LARGEST_COEFFICIENT = 1e6
-"""Largest accepted magnitude of a distortion coefficient. The coefficients of long lenses reach thousands."""
-
-
-@guarded
-@dataclass(frozen=True, slots=True)
-class RadialTangential:
-    """OpenCV's radial-tangential distortion, also with its rational model. The coefficients are in OpenCV's order.
-
-    The radial factor is (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶).
-
-    Examples
-    --------
-    >>> amiwarp.RadialTangential(k1=-0.3, k2=0.1)
-    RadialTangential(k1=-0.3, k2=0.1, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0)
-    """
-
-    k1: float = 0.0
-    """Radial coefficient of r²."""
-    k2: float = 0.0
-    """Radial coefficient of r⁴."""
-    p1: float = 0.0
-    """First tangential coefficient."""
-    p2: float = 0.0
-    """Second tangential coefficient."""
-    k3: float = 0.0
-    """Radial coefficient of r⁶."""
-    k4: float = 0.0
-    """Coefficient of r² in the denominator."""
-    k5: float = 0.0
-    """Coefficient of r⁴ in the denominator."""
-    k6: float = 0.0
-    """Coefficient of r⁶ in the denominator."""
-
-    def __post_init__(self) -> None:
-        _check_coefficients(self)
-
-
-@guarded
-@dataclass(frozen=True, slots=True)
-class Fisheye:
-    """OpenCV's fisheye (equidistant) distortion.
-
-    Examples
-    --------
-    >>> amiwarp.Fisheye(k1=0.02)
-    Fisheye(k1=0.02, k2=0.0, k3=0.0, k4=0.0)
-    """
-
-    k1: float = 0.0
-    """Coefficient of θ³, with θ the angle between the ray and the optical axis."""
-    k2: float = 0.0
-    """Coefficient of θ⁵."""
-    k3: float = 0.0
-    """Coefficient of θ⁷."""
-    k4: float = 0.0
-    """Coefficient of θ⁹."""
-
-    def __post_init__(self) -> None:
-        _check_coefficients(self)
-
-
-Distortion = RadialTangential | Fisheye
-
-DISTORTIONS: dict[str, type[RadialTangential] | type[Fisheye]] = {
-    "radial_tangential": RadialTangential,
-    "fisheye": Fisheye,
-}
-"""Distortion classes by their names in files and streams. The fields of a class are in the files' order."""
-COEFFICIENTS = {"radial_tangential": (5, 8), "fisheye": (4,)}
-"""Numbers of coefficients that files and streams hold for each distortion class."""
-
-RATIONAL = ("k4", "k5", "k6")
-"""Coefficients of :class:`RadialTangential` that files and arrays leave out if all are 0."""
-
-
-def coefficients(lens: Distortion) -> dict[str, float]:
-    """Return the coefficients of a lens by name, in the files' order."""
-    given = asdict(lens)
-    if isinstance(lens, RadialTangential) and not any(given[name] for name in RATIONAL):
-        return {name: value for name, value in given.items() if name not in RATIONAL}
-    return given
-
-
-def _check_coefficients(lens: Distortion) -> None:
-    for field in fields(lens):
-        what = f"camera distortion {field.name}"
-        value = real(getattr(lens, field.name), what, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
-        object.__setattr__(lens, field.name, value)
-
-
-OPENCV_COUNTS = (4, 5, 8, 12, 14)
-"""Numbers of coefficients that OpenCV's radial-tangential model can have."""
 LARGEST_SIZE = 65536
 """Largest width and height of a sensor [px], because columns and rows of events are uint16."""
 LEAST_FOCAL = 1e-3
@@ -116,10 +30,8 @@ LARGEST_FOCAL = 1e6
 """Largest focal length [px]: one microradian per pixel. Above it float32 cannot represent the displacement."""
 LEAST_FOV = 1e-9
 """Smallest accepted field of view [rad]. In practice :data:`LARGEST_FOCAL` sets the limit."""
-
 CAMERA_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
 """Names of the fields of :class:`Camera` without the distortion, in the order in which files and streams use them."""
-
 Vectors = TypeVar("Vectors")
 """Type of the rows of vectors given to a camera: NumPy array (n, 2) or (n, 3), or Warp array of vec2 or vec3. Results
 have the same type."""
@@ -161,13 +73,16 @@ class Camera:
     """Lens distortion, or None for a pinhole camera."""
 
     def __post_init__(self) -> None:
+        unit = " pixels"
         for name, focal in (("width", "fx"), ("height", "fy")):
-            size = whole(getattr(self, name), f"camera {name}", 1, LARGEST_SIZE, " pixels")
-            length = real(getattr(self, focal), f"camera {focal}", LEAST_FOCAL * size, LARGEST_FOCAL, " pixels")
+            size = whole(getattr(self, name), f"camera {name}", 1, LARGEST_SIZE, unit)
+            least = LEAST_FOCAL * size
+            length = real(getattr(self, focal), f"camera {focal}", least, LARGEST_FOCAL, unit)
             object.__setattr__(self, name, size)
             object.__setattr__(self, focal, length)
         for name in ("cx", "cy"):
-            value = real(getattr(self, name), f"camera {name}", -LARGEST_SIZE, LARGEST_SIZE, " pixels")
+            given = getattr(self, name)
+            value = real(given, f"camera {name}", -LARGEST_SIZE, LARGEST_SIZE, unit)
             object.__setattr__(self, name, value)
         if not isinstance(self.distortion, Distortion | None):
             raise AmiwarpError(
@@ -175,7 +90,13 @@ class Camera:
             )
 
     @classmethod
-    def from_fov(cls, width: int, height: int, fov: float, distortion: Distortion | None = None) -> Camera:
+    def from_fov(
+        cls,
+        width: int,
+        height: int,
+        fov: float,
+        distortion: Distortion | None = None,
+    ) -> Camera:
         """Create a camera with square pixels and a centred principal point from its field of view.
 
         Parameters
@@ -207,11 +128,24 @@ class Camera:
         hint = " rad, 0 .. 180 deg; is it given in degrees?"
         fov = real(fov, "camera field of view", LEAST_FOV, math.nextafter(math.pi, 0.0), hint)
         focal = width / (2.0 * math.tan(fov / 2.0))
-        return cls(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, distortion)
+        return cls(
+            width=width,
+            height=height,
+            fx=focal,
+            fy=focal,
+            cx=(width - 1) / 2.0,
+            cy=(height - 1) / 2.0,
+            distortion=distortion,
+        )
 
     @classmethod
     def from_opencv(
-        cls, K: ArrayLike, dist: ArrayLike | None, size: tuple[int, int], *, fisheye: bool = False
+        cls,
+        K: ArrayLike,
+        dist: ArrayLike | None,
+        size: tuple[int, int],
+        *,
+        fisheye: bool = False,
     ) -> Camera:
         """Create a camera from OpenCV's camera matrix and distortion coefficients.
 
@@ -226,7 +160,7 @@ class Camera:
         size : tuple of int
             Width and height of the image [px].
         fisheye : bool, default False
-            Whether the coefficients are those of ``cv2.fisheye``.
+            Whether the coefficients belong to ``cv2.fisheye``.
 
         Returns
         -------
@@ -248,14 +182,21 @@ class Camera:
         if matrix.shape != (3, 3):
             raise AmiwarpError(f"camera matrix K has shape {matrix.shape}; expected (3, 3)")
         if matrix[0, 1] != 0.0:
-            raise AmiwarpError(f"camera matrix K has a skew of {matrix[0, 1]:g} px; calibrate without skew")
+            raise AmiwarpError(
+                f"camera matrix K has a skew of {matrix[0, 1]:g} px; calibrate without skew"
+            )
         if matrix[1, 0] != 0.0 or matrix[2].tolist() != [0.0, 0.0, 1.0]:
             raise AmiwarpError(
                 f"camera matrix K is {shown(matrix.tolist())}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
             )
-        fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-        width, height = vector(size, 2, "size", lambda value, what: whole(value, what, 1, LARGEST_SIZE, " pixels"))
-        return cls(width, height, fx, fy, cx, cy, _opencv_distortion(dist, fisheye=fisheye))
+        (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+
+        def side(value: object, what: str) -> int:
+            return whole(value, what, 1, LARGEST_SIZE, " pixels")
+
+        width, height = vector(size, 2, "size", side)
+        distortion = opencv_distortion(dist, fisheye=fisheye)
+        return cls(width, height, fx, fy, cx, cy, distortion)
 
     def to_opencv(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return OpenCV's camera matrix and distortion coefficients.
@@ -266,7 +207,7 @@ class Camera:
             Camera matrix [px], shape (3, 3).
         dist : numpy.ndarray
             Coefficients k1 k2 p1 p2 k3, shape (5,), or with the rational k4 k5 k6, shape (8,), for the functions of
-            ``cv2``, zeros for a pinhole camera; or those of a :class:`Fisheye`, shape (4,), for ``cv2.fisheye``.
+            ``cv2``, zeros for a pinhole camera; or the four of a :class:`Fisheye`, shape (4,), for ``cv2.fisheye``.
 
         Examples
         --------
@@ -274,8 +215,14 @@ class Camera:
         >>> camera.to_opencv()[1]
         array([0.02, 0.  , 0.  , 0.  ])
         """
-        matrix = np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
-        return matrix, np.array([*coefficients(self.distortion or RadialTangential()).values()])
+        matrix = [
+            [self.fx, 0.0, self.cx],
+            [0.0, self.fy, self.cy],
+            [0.0, 0.0, 1.0],
+        ]
+        lens = self.distortion or RadialTangential()
+        numbers = list(coefficients(lens).values())
+        return np.array(matrix), np.array(numbers)
 
     @property
     def fov(self) -> float:
@@ -331,32 +278,15 @@ class Camera:
         return _run("rays_to_pixels", self, rays, (3, 2))
 
 
-def _opencv_distortion(dist: ArrayLike | None, *, fisheye: bool) -> Distortion | None:
-    """Return the lens of OpenCV's coefficients, or None if it does not distort."""
-    if dist is None:
-        return Fisheye() if fisheye else None
-    given = array(dist, "distortion coefficients").astype(np.float64)
-    if given.size != max(given.shape, default=0):
-        raise AmiwarpError(f"distortion coefficients have shape {given.shape}; expected (n,), (1, n) or (n, 1)")
-    k = given.ravel().tolist()
-    if fisheye:
-        if len(k) != 4:
-            raise AmiwarpError(f"a fisheye lens has {len(k)} distortion coefficients; expected k1 k2 k3 k4")
-        return Fisheye(*k)
-    if len(k) not in OPENCV_COUNTS:
-        raise AmiwarpError(f"the lens has {len(k)} distortion coefficients; expected 4, 5 or 8 in OpenCV's order")
-    if any(k[8:]):
-        raise AmiwarpError(
-            f"distortion coefficients {shown(k)} go beyond k6; calibrate without the thin-prism and tilt models"
-        )
-    return RadialTangential(*k[:8]) if any(k) else None
-
-
 def check_size(width: float, height: float, where: object) -> None:
     """Raise :class:`AmiwarpError` for a sensor size out of 1 .. :data:`LARGEST_SIZE` px; ``where`` names the source."""
-    width, height = (whole(size, f"{where}: size of the sensor", *INT64) for size in (width, height))
+    what = f"{where}: size of the sensor"
+    width = whole(width, what, *INT64)
+    height = whole(height, what, *INT64)
     if not (1 <= width <= LARGEST_SIZE and 1 <= height <= LARGEST_SIZE):
-        raise AmiwarpError(f"{where}: size {width}x{height}; expected 1 .. {LARGEST_SIZE} pixels each way")
+        raise AmiwarpError(
+            f"{where}: size {width}x{height}; expected 1 .. {LARGEST_SIZE} pixels each way"
+        )
 
 
 def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) -> Any:
@@ -366,33 +296,55 @@ def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) ->
     from amiwarp.kernels import camera as kernels
     from amiwarp.kernels.launch import launch
 
-    given, wanted = ({2: wp.vec2, 3: wp.vec3}[size] for size in sizes)
+    types = {2: wp.vec2, 3: wp.vec3}
+    given_size, wanted_size = sizes
+    given = types[given_size]
+    wanted = types[wanted_size]
     if isinstance(rows, wp.array):
         if rows.dtype is not given or rows.ndim != 1:
-            raise AmiwarpError(f"array has type {rows.dtype} and shape {rows.shape}; give vec{sizes[0]} of shape (n,)")
-        out = wp.empty(len(rows), dtype=wanted, device=rows.device)
-        params = kernels.camera_params(camera, str(rows.device))
-        launch(getattr(kernels, kernel_name), len(rows), [params, rows], [out], device=rows.device)
+            raise AmiwarpError(
+                f"array has type {rows.dtype} and shape {rows.shape}; give vec{given_size} of shape (n,)"
+            )
+        device = rows.device
+        out = wp.empty(len(rows), dtype=wanted, device=device)
+        params = kernels.camera_params(camera, str(device))
+        launch(getattr(kernels, kernel_name), len(rows), [params, rows], [out], device=device)
         return out
     rows = array(rows, "array")
-    if rows.ndim != 2 or rows.shape[1] != sizes[0]:
-        raise AmiwarpError(f"array has shape {rows.shape}; give (n, {sizes[0]})")
-    result = _run(kernel_name, camera, wp.array(rows.astype(np.float32), dtype=given, device="cpu"), sizes)
-    return result.numpy().astype(rows.dtype if np.issubdtype(rows.dtype, np.floating) else np.float32, copy=False)
-
-
-# Rotation of the camera itself during a time window, with an angular velocity that is constant or linear in time.
-
-Vector = tuple[float, float, float]
+    if rows.ndim != 2 or rows.shape[1] != given_size:
+        raise AmiwarpError(f"array has shape {rows.shape}; give (n, {given_size})")
+    on_device = wp.array(rows.astype(np.float32), dtype=given, device="cpu")
+    result = _run(kernel_name, camera, on_device, sizes)
+    dtype = rows.dtype if np.issubdtype(rows.dtype, np.floating) else np.float32
+    return result.numpy().astype(dtype, copy=False)
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     """Return a camera as a JSON object."""
     out = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
-    if camera.distortion is not None:
-        [kind] = (name for name, lens in DISTORTIONS.items() if isinstance(camera.distortion, lens))
-        out["distortion"] = {"kind": kind, **coefficients(camera.distortion)}
+    lens = camera.distortion
+    if lens is not None:
+        [kind] = [name for name, of_kind in DISTORTIONS.items() if isinstance(lens, of_kind)]
+        out["distortion"] = {"kind": kind, **coefficients(lens)}
     return out
+
+
+def camera_from_json(data: Any, where: str = "") -> Camera:
+    """Return a camera from a JSON object.
+
+    ``where`` is the object's name in messages. Raises :class:`AmiwarpError` naming the field.
+    """
+    given = fields_of(data, where, *CAMERA_NUMBERS, optional=("distortion",))
+    prefix = f"{where}." if where else ""
+    lens = given.get("distortion")
+    distortion = None
+    if lens is not None:
+        field = f"{prefix}distortion"
+        numbers = dict(lens) if isinstance(lens, dict) else fields_of(lens, field)
+        kind = one_of(numbers.pop("kind", None), DISTORTIONS, f"field {field}.kind")
+        distortion = build(DISTORTIONS[kind], numbers, field)
+    numbers_of_camera = {name: given[name] for name in CAMERA_NUMBERS}
+    return Camera(**numbers_of_camera, distortion=distortion)
 
 
 LENS = ("focal_length", "center_x", "center_y", "k1", "fy_over_fx")
@@ -403,12 +355,17 @@ first radial coefficient of distortion, and fy / fx."""
 def given_lens(camera: Camera) -> dict[str, float]:
     """Return the values of a camera's lens parameters (:data:`LENS`)."""
     lens = camera.distortion
-    values = (camera.fx, camera.cx, camera.cy, lens.k1 if lens else 0.0, camera.fy / camera.fx)
-    return dict(zip(LENS, values, strict=True))
+    return {
+        "focal_length": camera.fx,
+        "center_x": camera.cx,
+        "center_y": camera.cy,
+        "k1": lens.k1 if lens else 0.0,
+        "fy_over_fx": camera.fy / camera.fx,
+    }
 
 
 def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
-    """Return the camera with those of its lens parameters (:data:`LENS`) that ``values`` contain."""
+    """Return the camera with the lens parameters (:data:`LENS`) that ``values`` contain."""
     if values.keys().isdisjoint(LENS):
         return camera
     fx = values.get("focal_length", camera.fx)
@@ -416,141 +373,17 @@ def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
     lens = camera.distortion
     if "k1" in values:
         lens = replace(lens or RadialTangential(), k1=values["k1"])
-    cx, cy = values.get("center_x", camera.cx), values.get("center_y", camera.cy)
+    cx = values.get("center_x", camera.cx)
+    cy = values.get("center_y", camera.cy)
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=lens)
-
-
-@guarded
-@dataclass(frozen=True, slots=True)
-class CameraRotation:
-    """Angular velocity of the camera in its own frame, constant or linear in time, and growth of the image.
-
-    The angular velocity at time t is ``angular_velocity + angular_acceleration * (t - middle_us)``. Compensation
-    rotates every pixel back to the time ``middle_us``, and then undoes the growth of the image.
-
-    Notes
-    -----
-    The rotation vector is ωτ + ατ²/2, with τ the time since ``middle_us``. This is exact if the axis is constant.
-
-    Examples
-    --------
-    >>> pan = amiwarp.CameraRotation(angular_velocity=(0.0, 0.5, 0.0), middle_us=10_000)
-    >>> pan.moves
-    True
-    """
-
-    angular_velocity: Vector = (0.0, 0.0, 0.0)
-    """Angular velocity at ``middle_us`` [rad/s], about x, y and z."""
-    angular_acceleration: Vector = (0.0, 0.0, 0.0)
-    """Angular acceleration [rad/s²], about x, y and z."""
-    middle_us: int = 0
-    """Reference time of the rotation [us], usually the middle of the time window."""
-    growth: float = 0.0
-    """Speed of a forward motion, divided by the scene's depth [1/s]: the image grows about the principal point."""
-
-    def about(self, middle_us: int) -> CameraRotation:
-        """Return the same rotation, expressed about another reference time.
-
-        Parameters
-        ----------
-        middle_us : int
-            New reference time [us].
-
-        Returns
-        -------
-        CameraRotation
-            The rotation with the angular velocity at the new reference time.
-
-        Raises
-        ------
-        AmiwarpError
-            If a forward motion has reached the scene before the new reference time.
-        """
-        later = (middle_us - self.middle_us) * 1e-6
-        x, y, z = (r + c * later for r, c in zip(self.angular_velocity, self.angular_acceleration, strict=True))
-        left = 1.0 - self.growth * later
-        if left <= 0.0:
-            raise AmiwarpError(
-                f"middle_us is {middle_us}; with growth {self.growth:g} 1/s the camera reaches the scene "
-                f"{1.0 / self.growth:g} s after {self.middle_us} us; give a time before that, or no growth"
-            )
-        return CameraRotation((x, y, z), self.angular_acceleration, middle_us, self.growth / left)
-
-    @property
-    def moves(self) -> bool:
-        """Whether the camera moves at all."""
-        return any((*self.angular_velocity, *self.angular_acceleration, self.growth))
-
-    def rotation(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rotation vectors since the reference time.
-
-        Parameters
-        ----------
-        tau : numpy.ndarray
-            Time since the reference time [s], shape (n,).
-
-        Returns
-        -------
-        numpy.ndarray
-            Rotation vectors [rad], shape (n, 3).
-        """
-        if not (np.abs(tau) <= 1e9).all():
-            raise AmiwarpError(f"tau = {shown(tau)} is not within 1e9 s of the reference time; give seconds")
-        return np.outer(tau, self.angular_velocity) + np.outer(0.5 * tau**2, self.angular_acceleration)
-
-    def params(self) -> Any:
-        """Return the parameters for kernels.
-
-        Returns
-        -------
-        amiwarp.kernels.camera.CameraRotationParams
-            Angular velocity, acceleration and growth as a Warp struct.
-        """
-        import warp as wp
-
-        from amiwarp.kernels.camera import CameraRotationParams
-
-        p = CameraRotationParams()
-        p.velocity, p.acceleration = wp.vec3(*self.angular_velocity), wp.vec3(*self.angular_acceleration)
-        p.growth = self.growth
-        return p
-
-    def reach(self, camera: Camera, half_s: float) -> NDArray[np.float64]:
-        """Return the largest displacement of border pixels within ``half_s`` of the reference time.
-
-        Parameters
-        ----------
-        camera : Camera
-            The camera.
-        half_s : float
-            Half the length of the window [s].
-
-        Returns
-        -------
-        numpy.ndarray
-            Largest displacement along x and y [px], shape (2,). It is the image size if every border pixel leaves the
-            view.
-        """
-        half_s = real(half_s, "half_s", 0.0, 1e9, " s")
-        ends = np.array([-half_s, half_s])
-        rotations, sizes = self.rotation(ends), 1.0 - self.growth * ends
-        if not (rotations.any() or self.growth):
-            return np.zeros(2)
-        from scipy.spatial.transform import Rotation  # here, because a still camera does not need this slow import
-
-        xy = border(camera)
-        rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float32)), np.float64)
-        sizes = np.where(sizes > 0.0, sizes, np.nan)  # beyond the scene
-        turned = (Rotation.from_rotvec(r).apply(rays) * (s, s, 1.0) for r, s in zip(rotations, sizes, strict=True))
-        moved = [camera.rays_to_pixels(each.astype(np.float32)) for each in turned]
-        displacement = np.abs(np.concatenate([np.asarray(m) - xy for m in moved]))
-        visible = displacement[np.isfinite(displacement).all(axis=1)]
-        return visible.max(axis=0) if len(visible) else np.array([camera.width, camera.height], np.float64)
 
 
 def border(camera: Camera) -> NDArray[np.float64]:
     """Return pixels along the image's border [px], shape (n, 2)."""
-    x, y = np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9)
-    grid = np.stack([m.ravel() for m in np.meshgrid(x, y)], axis=1)
-    edge = np.isin(grid[:, 0], x[[0, -1]]) | np.isin(grid[:, 1], y[[0, -1]])
-    return np.asarray(grid[edge])
+    x = np.linspace(0, camera.width - 1, 9)
+    y = np.linspace(0, camera.height - 1, 9)
+    columns, rows = np.meshgrid(x, y)
+    grid = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    left_or_right = np.isin(grid[:, 0], x[[0, -1]])
+    top_or_bottom = np.isin(grid[:, 1], y[[0, -1]])
+    return np.asarray(grid[left_or_right | top_or_bottom])

@@ -1,6 +1,6 @@
 """The glass in front of the camera: a wedge prism, a pair of them or a plane-parallel plate, and a wedge's deflection.
 
-This is the glass only. Its motion is that of the encoder, :mod:`amiwarp.events.encoder`.
+This is the glass only. Its motion is measured by the encoder, :mod:`amiwarp.events.encoder`.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ import math
 from dataclasses import dataclass
 from typing import TypeAlias, overload
 
-from amiwarp.choices import Option
-from amiwarp.errors import AmiwarpError
-from amiwarp.validation import choice, guarded, instance, real, vector
+from amiwarp.errors import AmiwarpError, Option
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import choice, instance, real, vector
 
 LARGEST_APEX = math.radians(30.0)
 """Upper limit of the apex angle [rad]. Larger values are mistakes, such as angles in degrees."""
 LARGEST_INDEX = 4.0
-"""Upper limit of the refractive index, which is that of germanium."""
+"""Upper limit of the refractive index: the index of germanium."""
 LARGEST_THICKNESS = 0.2
 """Upper limit of a plate's thickness [m]. Larger values are mistakes, such as millimetres."""
 STEEPEST_TILT = math.radians(80.0)
@@ -24,7 +24,8 @@ STEEPEST_TILT = math.radians(80.0)
 LARGEST_PHASE = 1e6
 """Largest accepted magnitude of a phase [rad]. Up to this phase float64 resolves 1e-10 rad."""
 _BELOW_LARGEST_APEX = math.nextafter(LARGEST_APEX, 0.0)
-_ABOVE_ONE, _BELOW_LARGEST_INDEX = math.nextafter(1.0, 2.0), math.nextafter(LARGEST_INDEX, 0.0)
+_ABOVE_ONE = math.nextafter(1.0, 2.0)
+_BELOW_LARGEST_INDEX = math.nextafter(LARGEST_INDEX, 0.0)
 _BELOW_RIGHT_ANGLE = math.nextafter(math.pi / 2.0, 0.0)
 
 
@@ -59,17 +60,22 @@ class Prism:
     apex: float
     """Angle between the two faces [rad]. It differs from the deflection (see :attr:`deflection`)."""
     index: float = 1.5168
-    """Refractive index. The default is that of N-BK7 at the d line, 587.6 nm."""
+    """Refractive index. The default is the index of N-BK7 at the d line, 587.6 nm."""
     flat_side: FlatSide = FlatSide.SCENE
     """Side that the flat face points to."""
     second: Prism | None = None
     """Second prism of a pair (Risley pair), behind this one as seen from the camera; None for one prism."""
 
     def __post_init__(self) -> None:
-        if self.second is not None and instance(self.second, Prism, "prism second").second is not None:
+        if (
+            self.second is not None
+            and instance(self.second, Prism, "prism second").second is not None
+        ):
             raise AmiwarpError("the second prism has a second one itself; a pair has two prisms")
         hint = " rad, 0 .. 30 deg; is it given in degrees?"
-        object.__setattr__(self, "apex", real(self.apex, "prism apex", 0.0, _BELOW_LARGEST_APEX, hint))
+        object.__setattr__(
+            self, "apex", real(self.apex, "prism apex", 0.0, _BELOW_LARGEST_APEX, hint)
+        )
         object.__setattr__(self, "index", check_index(self.index, "prism index"))
         object.__setattr__(self, "flat_side", choice(FlatSide, self.flat_side, "prism flat_side"))
 
@@ -91,7 +97,7 @@ class UnsizedPrism:
     """
 
     index: float = 1.5168
-    """Refractive index. The default is that of N-BK7 at the d line, 587.6 nm."""
+    """Refractive index. The default is the index of N-BK7 at the d line, 587.6 nm."""
     flat_side: FlatSide = FlatSide.SCENE
     """Side that the flat face points to."""
 
@@ -139,11 +145,12 @@ class Plate:
     tilt: float
     """Angle between the normal of the faces and the rotation axis [rad]."""
     index: float = 1.5168
-    """Refractive index. The default is that of N-BK7 at the d line, 587.6 nm."""
+    """Refractive index. The default is the index of N-BK7 at the d line, 587.6 nm."""
 
     def __post_init__(self) -> None:
         hint = " m; is it given in millimetres?"
-        object.__setattr__(self, "thickness", real(self.thickness, "plate thickness", 0.0, LARGEST_THICKNESS, hint))
+        thickness = real(self.thickness, "plate thickness", 0.0, LARGEST_THICKNESS, hint)
+        object.__setattr__(self, "thickness", thickness)
         hint = " rad, 0 .. 80 deg; is it given in degrees?"
         object.__setattr__(self, "tilt", real(self.tilt, "plate tilt", 0.0, STEEPEST_TILT, hint))
         object.__setattr__(self, "index", check_index(self.index, "plate index"))
@@ -154,7 +161,8 @@ class Plate:
 
         That is t sin α (1 − cos α / √(n² − sin² α)) for thickness t, tilt α and index n.
         """
-        sine, cosine = math.sin(self.tilt), math.cos(self.tilt)
+        sine = math.sin(self.tilt)
+        cosine = math.cos(self.tilt)
         return self.thickness * sine * (1.0 - cosine / math.sqrt(self.index**2 - sine**2))
 
 
@@ -173,7 +181,9 @@ def as_wedge(glass: NominalPrism) -> Prism | UnsizedPrism: ...
 def as_wedge(glass: NominalPrism) -> Prism | UnsizedPrism:
     """Return the glass if it is a wedge prism; raise :class:`AmiwarpError` for a plate."""
     if isinstance(glass, Plate):
-        raise AmiwarpError("the glass is a plane-parallel plate, but this works with a wedge prism; give a prism")
+        raise AmiwarpError(
+            "the glass is a plane-parallel plate, but this works with a wedge prism; give a prism"
+        )
     return glass
 
 
@@ -209,19 +219,24 @@ def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSi
     >>> round(amiwarp.deflection_from_apex(0.02, 1.5168), 6)
     0.010337
     """
-    scene, index = choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE, check_index(index, "index")
+    scene = choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE
+    index = check_index(index, "index")
     # The ray starts at the camera. With the flat face to the scene it enters the tilted face and leaves the flat one.
-    sine = index * math.sin(apex - math.asin(math.sin(apex) / index) if scene else apex)
+    incidence = apex - math.asin(math.sin(apex) / index) if scene else apex
+    sine = index * math.sin(incidence)
     if not abs(sine) <= 1.0:
         raise AmiwarpError(
             f"an apex of {math.degrees(apex):.4g} deg with index {index:.4g} totally reflects the camera's axial ray; "
             "give a smaller apex or index"
         )
-    return math.asin(sine) - (0.0 if scene else apex)
+    direction = math.asin(sine)
+    return direction if scene else direction - apex
 
 
 @guarded
-def apex_from_deflection(deflection: float, index: float, flat_side: FlatSide = FlatSide.SCENE) -> float:
+def apex_from_deflection(
+    deflection: float, index: float, flat_side: FlatSide = FlatSide.SCENE
+) -> float:
     """Return the apex angle for a deflection of the camera's axial ray.
 
     Inverse of :func:`deflection_from_apex`.
@@ -247,7 +262,8 @@ def apex_from_deflection(deflection: float, index: float, flat_side: FlatSide = 
     """
     index = check_index(index, "index")
     if choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE:
-        return math.atan2(math.sin(deflection), math.sqrt(index**2 - math.sin(deflection) ** 2) - 1.0)
+        sine = math.sin(deflection)
+        return math.atan2(sine, math.sqrt(index**2 - sine**2) - 1.0)
     return math.atan2(math.sin(deflection), index - math.cos(deflection))
 
 

@@ -1,1 +1,5 @@
 """Figures, point clouds, and the colour palette that they share."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

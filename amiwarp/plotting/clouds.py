@@ -31,10 +31,12 @@ def draw_cloud(axes: Any, cloud: Cloud) -> None:
     """Draw a cloud on three-dimensional Matplotlib axes."""
     from matplotlib.colors import to_rgba_array
 
-    colours = to_rgba_array([OFF_COLOUR, ON_COLOUR])[cloud.on.astype(int)]  # a name for each point is slow
+    # Colours by their names would be slow.
+    colours = to_rgba_array([OFF_COLOUR, ON_COLOUR])[cloud.on.astype(int)]
     axes.scatter(*cloud.xyz.T, s=1.6, c=colours, linewidths=0, alpha=0.7, depthshade=False)
     axes.set_box_aspect(HALF, zoom=1.1)
-    axes.set(xlim=(-HALF[0], HALF[0]), ylim=(-HALF[1], HALF[1]), zlim=(-HALF[2], HALF[2]))
+    x, y, z = HALF
+    axes.set(xlim=(-x, x), ylim=(-y, y), zlim=(-z, z))
     axes.view_init(elev=22, azim=-45)
     axes.set(xlabel="x", ylabel="y", xticks=(), yticks=(), zticks=())
     axes.text2D(0.03, 0.9, "angle", transform=axes.transAxes)

@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.imaging.export import GAMMA, PERCENTILE, in_two_colours
 from amiwarp.imaging.palette import BLUE, OFF_COLOUR, ON_COLOUR, ORANGE, PINK, VERMILION
-from amiwarp.io.depth_map import DepthMap
+from amiwarp.results.depth_map import DepthMap
 
 SKY = (0.85, 0.92, 1.0)
-"""Colour of pixels that see the sky, in the pictures of depth and instances."""
+"""Colour of pixels that see the sky, whose depth is unknown, or that have hardly any events."""
 CAUSE_COLOURS = (BLUE, ORANGE, PINK, VERMILION)
 """Colour of each cause of events, in the order of the codes of :class:`amiwarp.Cause`."""
 GREY = "#808080"
-"""Colour of the sky, and of unknown causes."""
+"""Colour of unknown causes, and of points in the sky."""
 LIGHT_GREY = "#bbbbbb"
 """Colour of points without a value. No colour of a scale is like it."""
 DEPTH_MAP = "viridis_r"
@@ -36,7 +36,7 @@ class Scale:
     title: str
     """Name of the quantity."""
     unit: str
-    """Unit of the values; empty for numbers without unit."""
+    """Unit of the values; "1" for numbers without unit."""
     low: float
     """Value at the start of the colour bar. Lower values have the same colour."""
     high: float
@@ -67,7 +67,8 @@ class Scale:
         if self.colours == "polarity":
             return as_bytes(np.clip(in_two_colours(*places), 0.0, 1.0))
         known = ~np.isnan(places)
-        rgb = table_of(self.colours)[(255.0 * np.where(known, places, 0.0)).astype(np.uint8)]
+        entries = (255.0 * np.where(known, places, 0.0)).astype(np.uint8)
+        rgb = table_of(self.colours)[entries]
         return np.where(known[..., None], rgb, as_bytes(self.missing))
 
     @property
@@ -79,12 +80,15 @@ class Scale:
     def label(self) -> str:
         """Name and unit of the quantity, and what a colour means that is not on the bar."""
         label = f"{self.title} {self.unit}" if self.counts else f"{self.title} [{self.unit}]"
-        return f"{label}; blue: {self.missing_text}" if self.missing == SKY else label
+        if self.missing == SKY:
+            label += f"; blue: {self.missing_text}"
+        return label
 
     def ticks(self) -> tuple[tuple[float, str], ...]:
         """Return the marks of the colour bar: their places, 0 to 1, and their texts."""
         values = ticks(self.low, self.high, 4, whole=self.counts)
-        return tuple((float(place), f"{v:g}") for place, v in zip(self.places(values), values, strict=True))
+        places = self.places(values).tolist()
+        return tuple((place, f"{value:g}") for place, value in zip(places, values, strict=True))
 
 
 def as_bytes(rgb: ArrayLike) -> NDArray[np.uint8]:
@@ -101,13 +105,16 @@ def table_of(colours: str) -> NDArray[np.uint8]:
     from matplotlib import colormaps
     from matplotlib.colors import LinearSegmentedColormap
 
-    shares, (name, _, paper) = np.linspace(0.0, 1.0, 256), colours.partition(" on ")
+    name, _, paper = colours.partition(" on ")
     if name == "difference":
-        table = LinearSegmentedColormap.from_list(name, (OFF_COLOUR, "white", ON_COLOUR))(shares)[:, :3]
+        colour_map: Any = LinearSegmentedColormap.from_list(name, (OFF_COLOUR, "white", ON_COLOUR))
     else:
-        table = colormaps[name](shares)[:, :3]
-    if paper:
-        table = 1.0 - 0.8 * (1.0 - table) if paper == "dark" else 0.8 * table
+        colour_map = colormaps[name]
+    table = colour_map(np.linspace(0.0, 1.0, 256))[:, :3]
+    if paper == "dark":
+        table = 1.0 - 0.8 * (1.0 - table)
+    elif paper == "light":
+        table = 0.8 * table
     return as_bytes(table)
 
 
@@ -119,14 +126,18 @@ def ticks(low: float, high: float, most: int = 5, *, whole: bool = False) -> NDA
     from matplotlib.ticker import MaxNLocator
 
     steps = [1, 2, 3, 4.5, 6, 9, 10] if high == 360.0 else [1, 2, 2.5, 5, 10]
-    values = np.asarray(MaxNLocator(most, steps=steps, integer=whole).tick_values(low, high), np.float64)
+    locator = MaxNLocator(most, steps=steps, integer=whole)
+    values = np.asarray(locator.tick_values(low, high), np.float64)
     return values[(values >= low) & (values <= high)]
 
 
 def count_scale(images: Sequence[NDArray[np.float32]], colours: str = "gray") -> Scale:
     """Return one scale of counts for images."""
-    positive = [image[image > 0.0] for image in images]
-    top = max([1.0, *(float(np.percentile(each, PERCENTILE)) for each in positive if each.size)])
+    top = 1.0
+    for image in images:
+        positive = image[image > 0.0]
+        if positive.size:
+            top = max(top, float(np.percentile(positive, PERCENTILE)))
     return Scale("events", "per pixel", 0.0, math.ceil(top), colours, GAMMA)
 
 
@@ -134,7 +145,9 @@ def depth_image(depth: DepthMap) -> tuple[NDArray[np.float32], Scale]:
     """Return the depths of a map [m], shape ``(height, width)``, NaN where they are unknown, and their scale."""
     with np.errstate(divide="ignore"):
         metres = 1.0 / depth.inverse_depth
-    return metres, Scale("depth", "m", *depth_ends(metres), DEPTH_MAP, missing=SKY, missing_text="unknown")
+    low, high = depth_ends(metres)
+    scale = Scale("depth", "m", low, high, DEPTH_MAP, missing=SKY, missing_text="unknown")
+    return metres, scale
 
 
 def cause_colours(codes: NDArray[Any]) -> NDArray[np.float64]:
@@ -152,13 +165,18 @@ def depth_colours(depth: NDArray[Any], ends: tuple[float, float]) -> NDArray[np.
     """
     from matplotlib import colormaps, colors
 
-    rgb = colormaps[DEPTH_MAP](colors.LogNorm(*ends, clip=True)(depth))[:, :3]
-    return np.asarray(np.where(np.isfinite(depth)[:, None], rgb, colors.to_rgb(GREY)))
+    place = colors.LogNorm(*ends, clip=True)
+    rgb = colormaps[DEPTH_MAP](place(depth))[:, :3]
+    seen = np.isfinite(depth)[:, None]
+    return np.asarray(np.where(seen, rgb, colors.to_rgb(GREY)))
 
 
 def depth_ends(depth: NDArray[Any]) -> tuple[float, float]:
     """Return the lowest and the highest depth of the colour scale [m]."""
     seen = depth[np.isfinite(depth)]
-    low, high = np.percentile(seen, DEPTH_PERCENTILES).tolist() if len(seen) else (1.0, 10.0)
+    low = 1.0
+    high = 10.0
+    if len(seen):
+        low, high = np.percentile(seen, DEPTH_PERCENTILES).tolist()
     low = max(low, 1e-3)
     return low, max(high, 1.1 * low)

@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.result import Calibration
 from amiwarp.choices import Axis, Vote
-from amiwarp.compensation.recordings import check_size, compensate_events
+from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.regions import inside
 from amiwarp.imaging.residuals import residual
-from amiwarp.validation import choice, guarded, vector, whole
+from amiwarp.results.calibration import Calibration
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import choice, vector, whole
 
 if TYPE_CHECKING:
     import pyvista
@@ -27,8 +29,11 @@ AXIS_HEIGHT = 0.75
 """Length of the drawn third axis, as a multiple of the region's width."""
 
 TRUTHS = {
-    "cause": "stored_causes", "instance": "stored_instances", "depth_m": "stored_depths", "place_m": "stored_places",
-}  # fmt: skip
+    "cause": "stored_causes",
+    "instance": "stored_instances",
+    "depth_m": "stored_depths",
+    "place_m": "stored_places",
+}
 """Arrays of the clouds by name, and the ground truth that they hold."""
 
 
@@ -106,47 +111,78 @@ def event_clouds(
     """
     import pyvista
 
-    third, source = choice(Axis, axis, "axis"), recording.events
+    third = choice(Axis, axis, "axis")
+    source = recording.events
     check_size(calibration, source.size, recording.name)
     integer = partial(whole, low=-(2**62), high=2**62)
-    start, stop = vector((source.t_first, source.t_last + 1) if window is None else window, 2, "window", integer)
+    if window is None:
+        window = (source.t_first, source.t_last + 1)
+    start, stop = vector(window, 2, "window", integer)
     if stop <= start:
         raise AmiwarpError(f"window is {window}; give start and end [us], the end after the start")
     width, height = source.size
-    left, top, right, bottom = vector((0, 0, *source.size) if region is None else region, 4, "region", integer)
+    if region is None:
+        region = (0, 0, width, height)
+    left, top, right, bottom = vector(region, 4, "region", integer)
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):
-        raise AmiwarpError(f"region is {region}; give left, top, right and bottom in an image of {width}x{height} px")
+        raise AmiwarpError(
+            f"region is {region}; give left, top, right and bottom in an image of {width}x{height} px"
+        )
+
+    # The events of window and region, as far as the encoder covers them.
     encoder = calibration.encoder_for(recording.encoder, source.t_first, source.t_last)
-    known = max(start, encoder.coverage[0]), min(stop, encoder.coverage[1] + 1)
-    first, last = (source.find(t) for t in known)
+    begin, end = encoder.coverage
+    first = source.find(max(start, begin))
+    last = source.find(min(stop, end + 1))
     events = source.slice(first, last)
     chosen = np.flatnonzero(inside(events, (left, top, right, bottom)))
     if not len(chosen):
-        raise AmiwarpError(f"{recording.name}: no events in the window and the region; take another window")
-    xy, t_us = np.stack([events.x, events.y], axis=1).astype(np.float32), events.t - source.t_first
+        raise AmiwarpError(
+            f"{recording.name}: no events in the window and the region; take another window"
+        )
+
+    t_us = events.t - source.t_first
     theta = np.mod(encoder.angle_at(events.t), math.tau)
-    ends = (0.0, 360.0) if third is Axis.ANGLE else ((start - source.t_first) * 1e-3, (stop - source.t_first) * 1e-3)
-    box = Box(left, top, right, bottom, *ends)
+    if third is Axis.ANGLE:
+        low = 0.0
+        high = 360.0
+        along = np.degrees(theta)
+        unit = "theta [deg]"
+    else:
+        low = (start - source.t_first) * 1e-3
+        high = (stop - source.t_first) * 1e-3
+        along = t_us * 1e-3
+        unit = "t [ms]"
+    box = Box(left, top, right, bottom, low, high)
     arrays: dict[str, NDArray[Any]] = {
-        "t_us": t_us[chosen], "theta_rad": theta[chosen], "polarity": events.p[chosen], "index": first + chosen,
-    }  # fmt: skip
+        "t_us": t_us[chosen],
+        "theta_rad": theta[chosen],
+        "polarity": events.p[chosen],
+        "index": first + chosen,
+    }
     for name, attribute in TRUTHS.items():
-        if (store := getattr(recording.truth, attribute, None)) is not None:
+        store = getattr(recording.truth, attribute, None)
+        if store is not None:
             arrays[name] = store[first:last][chosen]
-    along, unit = (np.degrees(theta), "theta [deg]") if third is Axis.ANGLE else (t_us * 1e-3, "t [ms]")
+
+    # Places of the events, and the image from which their residuals are measured, before and after compensation.
     count = partial(iwe, events, width, height, vote=Vote.NEAREST, device=device)
+    recorded = np.stack([events.x, events.y], axis=1).astype(np.float32)
     moved = compensate_events(events, calibration.model, encoder, device=device)
-    found = (xy, count()), (moved, count(model=calibration.model, encoder=encoder))
+    moved_image = count(model=calibration.model, encoder=encoder)
+    part = (slice(top, bottom), slice(left, right))
     clouds = []
-    for place, image in found:
-        spread = residual(image, place[chosen], (slice(top, bottom), slice(left, right))).astype(np.float32)
+    for place, image in ((recorded, count()), (moved, moved_image)):
+        spread = residual(image, place[chosen], part).astype(np.float32)
         points = box.positions(place[chosen], along[chosen])
         valid = np.isfinite(points).all(axis=1)
-        clouds.append(cloud := pyvista.PolyData(points[valid]))
+        cloud = pyvista.PolyData(points[valid])
+        clouds.append(cloud)
         for name, values in (arrays | {"residual_px": spread}).items():
             cloud.point_data[name] = values[valid]
         cloud.field_data["axes"] = ["x [px]", "-y [px]", f"({unit} - z_start) * z_scale"]
-        cloud.field_data["z_scale"], cloud.field_data["z_start"] = [box.stretch], [box.low]
+        cloud.field_data["z_scale"] = [box.stretch]
+        cloud.field_data["z_start"] = [box.low]
         cloud.field_data["t_first_us"] = np.array([source.t_first], np.int64)
     return clouds[0], clouds[1]
 
@@ -181,4 +217,5 @@ class Box:
 
     def positions(self, xy: NDArray[Any], third: NDArray[Any]) -> NDArray[np.float32]:
         """Return points in the scene, shape ``(n, 3)``; y is negated, because the scene's y axis points up."""
-        return np.stack([xy[:, 0], -xy[:, 1], (third - self.low) * self.stretch], axis=1).astype(np.float32)
+        height = (third - self.low) * self.stretch
+        return np.stack([xy[:, 0], -xy[:, 1], height], axis=1).astype(np.float32)

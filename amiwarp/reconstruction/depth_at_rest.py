@@ -9,15 +9,16 @@ import numpy as np
 
 from amiwarp.brightness.depths import SMALLEST_PX, find_depths, orbit_px
 from amiwarp.calib.plate import LARGEST_INVERSE, check_still, costs_at_rest, inverse_depth_by_wedge
-from amiwarp.calib.result import Calibration
 from amiwarp.compensation.recordings import check_size
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.device_events import device_of
 from amiwarp.events.recording import Recording
-from amiwarp.io.depth_map import DepthMap
-from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, PlateModel
+from amiwarp.optics.models.plate import LARGEST_INVERSE_DEPTH, PlateModel
+from amiwarp.results.calibration import Calibration
+from amiwarp.results.depth_map import DepthMap
+from amiwarp.schema.calls import guarded
 from amiwarp.tasks import Progress
-from amiwarp.validation import guarded, real
+from amiwarp.validation import real
 
 LEAST_KNOWN = 1e-3
 """Smallest share of the pixels with events whose depth must be known. Single pixels are known by chance."""
@@ -47,7 +48,7 @@ def depth(
     nearest_m : float, optional
         Smallest depth that is tried [m], 0.05 or above.
     device : str or warp.Device, optional
-        Device to compute on, by default that of :class:`DeviceMemoryEvents`, else the CPU.
+        Device to compute on, by default the device of :class:`DeviceMemoryEvents`, else the CPU.
     progress : Progress, optional
         Called with the finished share.
 
@@ -60,8 +61,8 @@ def depth(
     Raises
     ------
     AmiwarpError
-        If the calibration is not that of a plate, the camera or the scene moves, the sensor sizes differ, or there are
-        too few events.
+        If the calibration does not belong to a plate, the camera or the scene moves, the sensor sizes differ, or there
+        are too few events.
 
     Notes
     -----
@@ -75,7 +76,8 @@ def depth(
     Traceback (most recent call last):
     amiwarp.errors.AmiwarpError: the calibration has the exact model, which moves near and far points alike: ...
     """
-    name, nearest = recording.name, real(nearest_m, "nearest_m", 1.0 / LARGEST_INVERSE_DEPTH, 100.0, " m")
+    name = recording.name
+    nearest = real(nearest_m, "nearest_m", 1.0 / LARGEST_INVERSE_DEPTH, 100.0, " m")
     model = calibration.model
     if not isinstance(model, PlateModel):
         raise AmiwarpError(
@@ -83,11 +85,13 @@ def depth(
             "determined; record through a rotating tilted plate"
         )
     if not len(recording.events):
-        raise AmiwarpError(f"{name}: has no events; give a recording with events")
+        raise AmiwarpError(
+            f"{name}: has no events; give a recording with events", ErrorCode.CONTENT_MISSING
+        )
     check_size(calibration, recording.events.size, name)
-    encoder = calibration.encoder_for(recording.encoder, recording.events.t_first, recording.events.t_last)
-    on = device_of(recording.events, device)
-    costs = costs_at_rest(recording, model, encoder, 1.0 / nearest, on)
+    events = recording.events
+    encoder = calibration.encoder_for(recording.encoder, events.t_first, events.t_last)
+    costs = costs_at_rest(recording, model, encoder, 1.0 / nearest, device_of(events, device))
 
     def report(share: float) -> None:
         if progress is not None:
@@ -95,8 +99,9 @@ def depth(
 
     found = find_depths(costs, model, 1.0 / nearest, report)
     check_still(found, name)
-    # faces at an angle along the tilt change all inverse depths alike, which no event shows
-    std = np.hypot(found.std, inverse_depth_by_wedge(model) * calibration.uncertainty.get("wedge_x", 0.0))
+    # Faces at an angle along the tilt change all inverse depths alike, which no event shows.
+    wedge_std = calibration.uncertainty.get("wedge_x", 0.0)
+    std = np.hypot(found.std, inverse_depth_by_wedge(model) * wedge_std)
     seen = found.count >= LEAST_PAIRS
     known = seen & (std < KNOWN_SHARE * found.inverse_depth)
     if known.sum() < max(1.0, LEAST_KNOWN * seen.sum()):
@@ -117,11 +122,14 @@ def orbit_limit_m(model: PlateModel) -> float:
 def _points(model: PlateModel, inverse: Any) -> Any:
     """Return the points that pixels see on the mean of a turn [m], shape (height, width, 3)."""
     y, x = np.mgrid[: model.camera.height, : model.camera.width]
-    xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         depths = 1.0 / np.nan_to_num(inverse.ravel().astype(np.float64), nan=1.0)
-        angles = [np.full(len(xy), k * math.tau / 8) for k in range(8)]
-        mean = np.mean([model.compensate_at(xy, theta, 1.0 / depths) for theta in angles], axis=0)
+        moved = []
+        for k in range(8):
+            theta = np.full(len(pixels), k * math.tau / 8)
+            moved.append(model.compensate_at(pixels, theta, 1.0 / depths))
+        mean = np.mean(moved, axis=0)
     rays = model.camera.pixels_to_rays(mean)
     points = rays / rays[:, 2:] * depths[:, None]
     points[~np.isfinite(inverse.ravel())] = np.nan

@@ -10,13 +10,28 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import NAMES, DeviceEvents, first_beyond, import_array, wait
-from amiwarp.imaging.tensors import Windows
-from amiwarp.kernels import event_keys, launch, pixels, prism_view
+from amiwarp.events.device_columns import first_beyond, import_array
+from amiwarp.events.device_events import NAMES, DeviceEvents, wait
+from amiwarp.imaging.windows import Windows
+from amiwarp.kernels import (
+    camera_keys,
+    camera_pixels,
+    event_selection,
+    launch,
+    loading,
+    pixels,
+    prism_view,
+    readout,
+)
+from amiwarp.kernels.camera_keys import CAMERA_LOW_BITS, CameraKeys
+from amiwarp.kernels.camera_pixels import Cameras
 from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.schema.calls import guarded
+from amiwarp.simulation.engine import LATEST_US, sensor_params
+from amiwarp.simulation.key_buffer import KeyBuffer, sort_keys
+from amiwarp.simulation.readout import bus_of, row_scan
 from amiwarp.simulation.sensor_model import SensorModel
-from amiwarp.simulation.simulator import LATEST_US, KeyBuffer, bus_of, row_scan, sensor_params, sort_keys
-from amiwarp.validation import TIME_LIMIT, array, guarded, instance, on_gpu, packed, whole
+from amiwarp.validation import TIME_LIMIT, array, instance, on_gpu, packed, whole
 
 MOST_CAMERAS = 1 << 16
 """Largest number of cameras of an :class:`EventSensor`."""
@@ -34,7 +49,7 @@ class EventSensor:
     """Event sensors of many cameras, whose images come from another program and stay on the device.
 
     :meth:`step` takes one image of each camera, and returns the events since the images before. Between two images, log
-    intensity is linear in time. The sensors are those of :func:`simulate`, with the same random numbers: a camera gives
+    intensity is linear in time. The sensors work as in :func:`simulate`, with the same random numbers: a camera gives
     the same events, bit for bit, as a simulation with its seed whose time steps end at its images.
 
     Parameters
@@ -46,7 +61,7 @@ class EventSensor:
     model : SensorModel, optional
         Pixels and readout of all cameras.
     seed : int or sequence of int, default 0
-        Seed of each camera, or the seed of the first camera, from which those of the others count up.
+        Seed of each camera, or the seed of the first camera, from which the seeds of the others count up.
     device : str or warp.Device, default "cpu"
         Device of the images and the events.
 
@@ -54,7 +69,7 @@ class EventSensor:
     ------
     AmiwarpError
         If a value is out of range, the seeds are not one for each camera, or all cameras have over 2**24 pixels. With
-        ``row_us``, the number of cameras and that of pixels of each count as the next power of two.
+        ``row_us``, the number of cameras and the number of pixels of each count as the next power of two.
 
     Examples
     --------
@@ -80,15 +95,17 @@ class EventSensor:
         device: Any = "cpu",
     ) -> None:
         n = whole(cameras, "cameras", 1, MOST_CAMERAS)
-        height, width = (
-            whole(value, name, 1, LARGEST_SIZE, " pixels") for name, value in (("height", height), ("width", width))
-        )
+        height = whole(height, "height", 1, LARGEST_SIZE, " pixels")
+        width = whole(width, "width", 1, LARGEST_SIZE, " pixels")
         self._shape = (n, height, width)
         self._pixels = height * width
         self._model = instance(SensorModel() if model is None else model, SensorModel, "model")
-        self._scan, self._bus = row_scan(self._model, width, height), bus_of(self._model)
+        self._scan = row_scan(self._model, width, height)
+        self._bus = bus_of(self._model)
         scans = int(self._scan.row_ps) > 0
-        count = 1 << ((n - 1).bit_length() + (self._pixels - 1).bit_length()) if scans else n * self._pixels
+        count = n * self._pixels
+        if scans:
+            count = 1 << ((n - 1).bit_length() + (self._pixels - 1).bit_length())
         if count > MOST_PIXELS:
             have = "with row_us count as" if scans else "have"
             raise AmiwarpError(
@@ -96,33 +113,46 @@ class EventSensor:
                 "give fewer cameras at a time"
             )
         self._device = wp.get_device(device)
-        self._cameras = pixels.Cameras()
+        self._cameras = Cameras()
         self._cameras.pixels = self._pixels
         self._cameras.seed = wp.array(_seeds(seed, n), dtype=int, device=self._device)
         self._starts = np.ones(n, np.uint8)
-        filtered = bool(self._model.cutoff_hz or (self._model.leak_hz and self._model.leak_jitter_fraction))
-        self._kernel = pixels.run_filtered_camera_pixels if filtered else pixels.run_camera_pixels
+        self._kernel = camera_pixels.run_camera_pixels
         self._state = [wp.empty(n * self._pixels, dtype=pixels.Pixel, device=self._device)]
+        leaks_unevenly = self._model.leak_hz and self._model.leak_jitter_fraction
+        filtered = bool(self._model.cutoff_hz or leaks_unevenly)
         if filtered:
+            self._kernel = camera_pixels.run_filtered_camera_pixels
             self._state.append(wp.empty(n * self._pixels, dtype=float, device=self._device))
         self._buffer = KeyBuffer(n * self._pixels, self._device, EVENTS_PER_PIXEL)
         self._nothing: wp.array = wp.empty(0, dtype=wp.int64, device=self._device)
         self._carry = self._nothing
         self._free = wp.zeros(n, dtype=wp.int64, device=self._device)
         self._layout = self._key_layout()
-        self._first_us = self._now_us = -1
+        self._first_us = -1
+        self._now_us = -1
 
     def _key_layout(self) -> Any:
         """Return the layout of the keys of events."""
-        bits_of_camera = (self._shape[0] - 1).bit_length()
-        layout = event_keys.CameraKeys()
-        layout.pixels, layout.width = self._pixels, self._shape[2]
-        layout.shift = int(pixels.LOW_BITS) + (self._shape[0] * self._pixels - 1).bit_length()
-        layout.pixel = int(event_keys.CAMERA_LOW_BITS) if int(self._scan.row_ps) else 1
-        layout.time = int(layout.pixel) + (self._pixels - 1).bit_length()
-        # the sign stays 0 in both kinds of keys; the part has two bits
-        layout.camera = int(layout.time) + min(63 - int(layout.shift), 61 - bits_of_camera - int(layout.time))
-        layout.part = int(layout.camera) + bits_of_camera
+        cameras, _, width = self._shape
+        bits_of_camera = (cameras - 1).bit_length()
+        bits_of_pixel = (self._pixels - 1).bit_length()
+        layout = CameraKeys()
+        layout.pixels = self._pixels
+        layout.width = width
+        # Keys as pixels generate them: the time begins behind the number among the pixels of all cameras.
+        shift = int(pixels.LOW_BITS) + (cameras * self._pixels - 1).bit_length()
+        layout.shift = shift
+        # Keys sorted by camera: pixel, time, camera and part, each from its lowest bit on.
+        pixel = int(CAMERA_LOW_BITS) if int(self._scan.row_ps) else 1
+        time = pixel + bits_of_pixel
+        # The sign stays 0 in both kinds of keys; the part has two bits.
+        bits_of_time = min(63 - shift, 61 - bits_of_camera - time)
+        camera = time + bits_of_time
+        layout.pixel = pixel
+        layout.time = time
+        layout.camera = camera
+        layout.part = camera + bits_of_camera
         return layout
 
     def step(self, images: Any, t_us: int) -> tuple[DeviceEvents, Windows]:
@@ -141,7 +171,7 @@ class EventSensor:
             The simulator's scale is ``log(luminance + 0.02)`` with white at 1; the bandwidth and the noise of the model
             depend on it, thresholds do not.
         t_us : int
-            Time of the images [us], after that of the images before.
+            Time of the images [us], after the time of the images before.
 
         Returns
         -------
@@ -166,7 +196,13 @@ class EventSensor:
         start = np.where(self._starts, t_us, t_us - length)
         self._starts[:] = 0
         wait(self._device)
-        return found, Windows(edges[:-1].copy(), edges[1:].copy(), start, np.full(len(start), t_us, np.int64))
+        windows = Windows(
+            start=edges[:-1].copy(),
+            stop=edges[1:].copy(),
+            t_start=start,
+            t_end=np.full(len(start), t_us, np.int64),
+        )
+        return found, windows
 
     def reset(self, which: Any = None) -> None:
         """Start cameras anew at their next images, with the same random numbers as at first.
@@ -190,17 +226,22 @@ class EventSensor:
         chosen = array(np.arange(n) if which is None else which, "which", "biu").reshape(-1)
         if chosen.dtype == bool:
             if len(chosen) != n:
-                raise AmiwarpError(f"which has {len(chosen)} truth values; expected one for each of {n} cameras")
+                raise AmiwarpError(
+                    f"which has {len(chosen)} truth values; expected one for each of {n} cameras"
+                )
             chosen = np.flatnonzero(chosen)
         if chosen.size and not 0 <= int(chosen.min()) <= int(chosen.max()) < n:
-            raise AmiwarpError(f"which holds cameras {chosen.min()} .. {chosen.max()}; expected 0 .. {n - 1}")
+            raise AmiwarpError(
+                f"which holds cameras {chosen.min()} .. {chosen.max()}; expected 0 .. {n - 1}"
+            )
         chosen = chosen.astype(np.int64)
         self._starts[chosen] = 1
         free = self._free.numpy()
         free[chosen] = 0
         self._free = wp.array(free, dtype=wp.int64, device=self._device)
         if self._starts.all():
-            self._carry, self._now_us = self._nothing, -1
+            self._carry = self._nothing
+            self._now_us = -1
 
     def _length(self, t_us: int) -> int:
         """Return the duration of the step to a time [us]; 0 for the first step."""
@@ -221,18 +262,25 @@ class EventSensor:
         what = f"float32 of shape {self._shape}, log intensities of all cameras"
         if on_gpu(images):
             levels = import_array(images, "images")
-            kind, where = wp.dtype_to_numpy(levels.dtype), levels.device
+            kind = wp.dtype_to_numpy(levels.dtype)
+            where = levels.device
         else:
             levels = packed(array(images, "images"))
-            kind, where = levels.dtype, self._device
+            kind = levels.dtype
+            where = self._device
         if self._shape[0] == 1 and levels.shape == self._shape[1:]:
             levels = levels.reshape(self._shape)
         if kind != np.float32 or levels.shape != self._shape:
-            raise AmiwarpError(f"images are {np.dtype(kind)} of shape {levels.shape}; expected {what}")
+            raise AmiwarpError(
+                f"images are {np.dtype(kind)} of shape {levels.shape}; expected {what}"
+            )
         if where != self._device:
-            raise AmiwarpError(f"images are on {where}, the sensor is on {self._device}; move the images")
+            raise AmiwarpError(
+                f"images are on {where}, the sensor is on {self._device}; move the images"
+            )
         if isinstance(levels, np.ndarray):
-            flat = levels.reshape(-1)  # an axis of one camera, added by [None], has a stride that Warp cannot reshape
+            # An axis of one camera, added by [None], has a stride that Warp cannot reshape
+            flat = levels.reshape(-1)
             levels = wp.array(flat, dtype=float, device=self._device, copy=not self._device.is_cpu)
         levels = levels.reshape((1, -1))
         place = first_beyond(levels[0], LARGEST_LEVEL)
@@ -247,57 +295,68 @@ class EventSensor:
     def _generate(self, levels: wp.array, t_us: int, length: int) -> wp.array:
         """Simulate the pixels over a step. Return the keys of events, with those carried over, unsorted."""
         steps = prism_view.Steps()
-        steps.count, steps.ticks = 1, length * int(pixels.TICKS)
+        steps.count = 1
+        steps.ticks = length * int(pixels.TICKS)
         steps.per_tick = 1.0 / max(int(steps.ticks), 1)
         steps.shift = self._layout.shift
         if length == 0:
-            self._first_us = self._bus.origin = t_us
+            self._first_us = t_us
+            self._bus.origin = t_us
         self._cameras.starts = wp.array(self._starts, dtype=wp.uint8, device=self._device)
         sensor = sensor_params(self._model, max(length, 1))
-        launch.load(self._kernel, self._device)
-        return self._buffer.run(self._kernel, [levels, self._cameras, steps, sensor], self._state, self._carry)
+        loading.load(self._kernel, self._device)
+        inputs = [levels, self._cameras, steps, sensor]
+        return self._buffer.run(self._kernel, inputs, self._state, self._carry)
 
     def _arrange(self, keys: wp.array, length: int) -> tuple[wp.array, NDArray[np.int64]]:
         """Return the keys of the events that are read out in this step, sorted by camera, and the cameras' ranges.
 
         ``keys``: twice the needed length. Later events are kept for the next step.
         """
-        n, total = self._shape[0], len(keys) // 2
+        n = self._shape[0]
+        total = len(keys) // 2
         self._layout.length = length
         if not total:  # Warp cannot slice an empty array
             return self._nothing, np.zeros(n + 1, np.int64)
         if int(self._scan.row_ps):
-            self._scan.origin, self._scan.shift = self._now_us - self._first_us, self._layout.shift
-            self._launch(event_keys.stamp_rows, total - len(self._carry), [self._scan, keys])
-        self._launch(event_keys.sort_by_camera, total, [self._layout, self._cameras.starts, keys])
+            self._scan.origin = self._now_us - self._first_us
+            self._scan.shift = self._layout.shift
+            self._launch(readout.stamp_rows, total - len(self._carry), [self._scan, keys])
+        self._launch(camera_keys.sort_by_camera, total, [self._layout, self._cameras.starts, keys])
         lowest = 0 if int(self._scan.row_ps) else int(self._layout.pixel)
         sort_keys(keys, total, lowest, int(self._layout.part) + 2)
         found = wp.empty(n + 2, dtype=int, device=self._device)
-        self._launch(event_keys.find_cameras, n + 2, [self._layout, keys, total, n], [found])
+        self._launch(camera_keys.find_cameras, n + 2, [self._layout, keys, total, n], [found])
         edges = found.numpy().astype(np.int64)
         now, later = edges[n:].tolist()
         self._carry = wp.clone(keys[now:later]) if now < later else self._nothing
-        self._launch(event_keys.carry_over, len(self._carry), [self._layout, self._carry])
+        self._launch(camera_keys.carry_over, len(self._carry), [self._layout, self._carry])
         return keys[:now] if now else self._nothing, edges[: n + 1]
 
-    def _read(self, keys: wp.array, edges: NDArray[np.int64]) -> tuple[DeviceEvents, NDArray[np.int64]]:
+    def _read(
+        self, keys: wp.array, edges: NDArray[np.int64]
+    ) -> tuple[DeviceEvents, NDArray[np.int64]]:
         """Return the events of sorted keys that the sensors read out, and the ranges of the cameras."""
         if int(self._scan.row_ps) and len(keys):
-            (keys,), edges = self._keep(event_keys.mark_first_of_pixel, [keys], [keys], edges)
+            (keys,), edges = self._keep(event_selection.mark_first_of_pixel, [keys], [keys], edges)
         n = len(keys)
-        columns = [
-            wp.empty(n, dtype=dtype, device=self._device) for dtype in (wp.uint16, wp.uint16, wp.int64, wp.uint8)
-        ]
-        self._launch(event_keys.unpack_cameras, n, [self._layout, keys, self._now_us], columns)
+        types = (wp.uint16, wp.uint16, wp.int64, wp.uint8)
+        columns = [wp.empty(n, dtype=dtype, device=self._device) for dtype in types]
+        self._launch(camera_keys.unpack_cameras, n, [self._layout, keys, self._now_us], columns)
         if int(self._bus.event_ps) and n:
             _, y, t, _ = columns
             first = wp.array(edges, dtype=int, device=self._device)
             stamp = wp.empty(n, dtype=wp.int64, device=self._device)
-            launch.load(event_keys.queue_events, self._device)
-            wp.launch(event_keys.queue_events, self._shape[0], [self._bus, t, y, first, self._free], [stamp],
-                      device=self._device)  # fmt: skip
+            loading.load(readout.queue_events, self._device)
+            wp.launch(
+                readout.queue_events,
+                self._shape[0],
+                [self._bus, t, y, first, self._free],
+                [stamp],
+                device=self._device,
+            )
             columns[NAMES.index("t")] = stamp
-            columns, edges = self._keep(event_keys.mark_transmitted, [stamp], columns, edges)
+            columns, edges = self._keep(event_selection.mark_transmitted, [stamp], columns, edges)
         return DeviceEvents(*columns), edges
 
     def _keep(
@@ -310,14 +369,19 @@ class EventSensor:
         ends = wp.empty_like(kept)
         wp.utils.array_scan(kept, ends, inclusive=True)
         index = wp.array(edges, dtype=int, device=self._device)
-        self._launch(event_keys.count_before, len(edges), [ends], [index])
+        self._launch(event_selection.count_before, len(edges), [ends], [index])
         edges = index.numpy().astype(np.int64)
-        out = [wp.empty(int(edges[-1]), dtype=values.dtype, device=self._device) for values in columns]
-        for values, to in zip(columns, out, strict=True):
-            self._launch(event_keys.keep_marked, n, [values, ends], [to])
-        return out, edges
+        total = int(edges[-1])
+        kept_columns = []
+        for values in columns:
+            kept_values = wp.empty(total, dtype=values.dtype, device=self._device)
+            self._launch(event_selection.keep_marked, n, [values, ends], [kept_values])
+            kept_columns.append(kept_values)
+        return kept_columns, edges
 
-    def _launch(self, kernel: Any, n: int, inputs: list[Any], outputs: Sequence[wp.array] = ()) -> None:
+    def _launch(
+        self, kernel: Any, n: int, inputs: list[Any], outputs: Sequence[wp.array] = ()
+    ) -> None:
         """Run a kernel whose last input is ``start: int`` over ``range(n)``."""
         launch.launch(kernel, n, inputs, outputs, device=self._device)
 

@@ -1,11 +1,7 @@
-"""Pictures and sequences of pictures: their files, pixel values as light, and the simulator's maps of log intensity."""
+"""Sequences of pictures with times: folders of pictures, arrays and videos."""
 
 from __future__ import annotations
 
-import csv
-import io
-import re
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -15,190 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import errors_name, input_path, open_input, register_reader
-from amiwarp.io.formats import video_library
+from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.io.inputs import input_path
+from amiwarp.io.output_formats import video_library
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import TIME_LIMIT, check_ascending, guarded, real, shown, vector, whole
-
-LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Weights of linear red, green and blue in the luminance (ITU-R BT.709)."""
-
-DARK = 0.02
-"""Intensity added to every picture before the logarithm, relative to white.
-
-It stands for stray light and dark current, and limits the contrast of shadows.
-"""
-
-MOST_PIXELS = 1 << 26
-"""Largest picture that is read [px]: 67 megapixels. A small file may unpack to a huge picture."""
-
-BAND = 1 << 24
-"""Number of pixel values that are converted to light at a time."""
-
-PICTURE_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "GIF")
-"""Formats of picture files that are read, by Pillow's names. Others are excluded because some of them run external
-programs."""
-
-LARGEST_MAP = 8192
-"""Largest number of texels along a side of a map; a wider scene is resampled more coarsely."""
-
-
-def read_picture(path: str | Path) -> NDArray[np.float32]:
-    """Return the linear luminance of a picture file, shape (height, width); white is 1.
-
-    Raises :class:`AmiwarpError` if the file cannot be read.
-    """
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about Pillow's own, larger limits, and about damage that it tolerates
-            with Image.open(input_path(path), formats=PICTURE_FORMATS) as image:
-                if image.width * image.height > MOST_PIXELS:
-                    raise ValueError(
-                        f"{image.width}x{image.height} is over {MOST_PIXELS} pixels; make the picture smaller"
-                    )
-                wide = image.mode.startswith(("I", "F"))
-                pixels = np.asarray(image if wide else image.convert("RGB"))
-    except AmiwarpError:
-        raise
-    except Exception as error:  # Pillow raises errors of many types for damaged files
-        what = " ".join(str(error).split()) or type(error).__name__
-        raise AmiwarpError(f"{path} cannot be read as a picture ({what}); give a JPEG, PNG, TIFF ...") from error
-    if pixels.dtype.kind == "i":  # Pillow returns 16-bit pictures as int32
-        if pixels.min() < 0 or pixels.max() > 0xFFFF:
-            raise AmiwarpError(
-                f"{path} has values from {pixels.min()} to {pixels.max()}; save it with 16 bits, 0 to 65535"
-            )
-        pixels = pixels.astype(np.uint16)
-    return linear_luminance(pixels, name=str(path))
-
-
-def linear_luminance(pixels: NDArray[Any], *, name: str = "picture") -> NDArray[np.float32]:
-    """Return the linear luminance of pixel values, shape (height, width) or (height, width, 3 or 4).
-
-    uint8 and uint16 values are sRGB-encoded, as in files. Floating values are linear intensities, with white at 1.
-    Raises :class:`AmiwarpError` for other shapes and types, and for values that are negative or not finite.
-    """
-    pixels = np.asarray(pixels)
-    pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
-    colours = pixels.shape[2] if pixels.ndim == 3 else 0
-    if pixels.ndim not in (2, 3) or colours not in (0, 1, 3, 4) or min(pixels.shape[:2]) < 2:
-        raise AmiwarpError(f"{name} has shape {pixels.shape}; expected (height, width) or (height, width, 3)")
-    if pixels.dtype in (np.uint8, np.uint16):
-        top = np.iinfo(pixels.dtype).max
-        table = srgb_to_linear(np.arange(top + 1, dtype=np.float32) / top)
-    elif pixels.dtype.kind == "f":
-        table = None
-    else:
-        raise AmiwarpError(f"{name} is of type {pixels.dtype}; expected uint8, uint16 (sRGB) or float (linear)")
-    light = np.empty(pixels.shape[:2], np.float32)
-    rows = max(1, BAND // pixels[0].size)
-    for start in range(0, len(pixels), rows):
-        part = pixels[start : start + rows]
-        values = part.astype(np.float32) if table is None else table[part]
-        if colours in (3, 4):
-            values = values[..., :3] @ np.array(LUMINANCE, np.float32)
-        light[start : start + rows] = values[..., 0] if colours == 1 else values
-    if not (np.isfinite(light).all() and light.min() >= 0.0):
-        raise AmiwarpError(f"{name} has intensities that are negative or not finite; expected 0 .. 1")
-    return light
-
-
-def srgb_to_linear(value: NDArray[Any]) -> NDArray[np.float32]:
-    """Convert sRGB values 0 .. 1 to linear intensity (IEC 61966-2-1)."""
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-@dataclass(frozen=True, slots=True)
-class Placement:
-    """Placement of a picture map on the picture plane, which is at z = 1 in front of the camera."""
-
-    width: int
-    """Number of texels of the map along x."""
-    height: int
-    """Number of texels of the map along y."""
-    box: tuple[float, float, float, float]
-    """Part of the picture that the map shows: left, top, right and bottom edge [picture px]."""
-    left: float
-    """Coordinate x of the map's left edge on the picture plane."""
-    top: float
-    """Coordinate y of the map's top edge on the picture plane."""
-    pitch: tuple[float, float]
-    """Texels per unit of the picture plane, along x and along y."""
-
-    def to_texel(self) -> NDArray[np.float64]:
-        """Return the matrix (3, 3) from coordinates on the picture plane to texel coordinates.
-
-        Texel centres have whole coordinates.
-        """
-        (px, py), left, top = self.pitch, self.left, self.top
-        return np.array([[px, 0.0, -left * px - 0.5], [0.0, py, -top * py - 0.5], [0.0, 0.0, 1.0]])
-
-
-def place_picture(
-    size: tuple[int, int],
-    view: tuple[float, float, float, float],
-    pitch: float,
-    *,
-    fov: float | None = None,
-) -> Placement:
-    """Place a picture so that it covers a rectangle of the picture plane.
-
-    ``size`` is the picture's (width, height); ``view`` is the rectangle (left, top, right, bottom) on the plane. The
-    picture's aspect ratio is kept, and parts that are never seen are cut off. With ``fov`` [rad], its horizontal
-    extent, the picture is centred on the optical axis instead, and mirrored at its edges if the view extends beyond.
-    ``pitch``: texels per unit of the plane.
-    """
-    width, height = size
-    left, top, right, bottom = view
-    if fov is None:
-        scale = max((right - left) / width, (bottom - top) / height)  # plane units per picture pixel
-        x0, y0 = (left + right - width * scale) / 2.0, (top + bottom - height * scale) / 2.0
-    else:
-        scale = 2.0 * np.tan(fov / 2.0) / width
-        x0, y0 = -width * scale / 2.0, -height * scale / 2.0
-    box = (
-        max((left - x0) / scale, 0.0),
-        max((top - y0) / scale, 0.0),
-        min((right - x0) / scale, float(width)),
-        min((bottom - y0) / scale, float(height)),
-    )
-    if box[2] - box[0] < 1.0 or box[3] - box[1] < 1.0:
-        box = (0.0, 0.0, float(width), float(height))  # only mirror images of the picture are seen
-    texels = [int(np.clip(round(n * scale * pitch), 2, LARGEST_MAP)) for n in (box[2] - box[0], box[3] - box[1])]
-    pitches = (texels[0] / ((box[2] - box[0]) * scale), texels[1] / ((box[3] - box[1]) * scale))
-    return Placement(texels[0], texels[1], box, x0 + box[0] * scale, y0 + box[1] * scale, pitches)
-
-
-def log_map(light: NDArray[np.float32], placement: Placement, blur: float) -> NDArray[np.float32]:
-    """Return the log intensity of a picture resampled to a map, shape (height, width).
-
-    Resampling is cubic, with a low-pass filter if the picture is finer than the map. A Gaussian blur of ``blur``
-    [texels] follows.
-    """
-    from PIL import Image
-    from scipy.ndimage import gaussian_filter
-
-    size = (placement.width, placement.height)
-    image = Image.fromarray(light).resize(size, Image.Resampling.BICUBIC, box=placement.box)
-    texels = np.maximum(np.asarray(image, np.float32), 0.0)  # cubic interpolation overshoots at edges
-    if blur > 0.0:
-        texels = gaussian_filter(texels, blur, mode="mirror", truncate=3.0)
-    return np.log(texels + np.float32(DARK))
-
-
-# Picture sequences with times: folders of pictures, arrays and videos.
-
-MOST_TABLE_BYTES, MOST_PICTURES = 64 << 20, 1_000_000
-"""Largest ``times.csv`` that is read [bytes], and largest number of pictures in it."""
-
-TIMES = "times.csv"
-"""Name of the file, in a folder of pictures, that lists their times; its columns are file and t_us."""
-
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
-"""File suffixes of pictures in a folder."""
+from amiwarp.schema.calls import guarded
+from amiwarp.simulation.picture_light import (
+    MOST_PIXELS,
+    linear_luminance,
+    read_picture,
+    srgb_to_linear,
+)
+from amiwarp.validation import TIME_LIMIT, check_ascending, real, vector, whole
 
 
 @guarded
@@ -227,14 +51,21 @@ class PictureFolder:
     def __post_init__(self) -> None:
         if len(self.files) < 2 or self.times_us.shape != (len(self.files),):
             given = f"{len(self.files)} files and times of shape {self.times_us.shape}"
-            raise AmiwarpError(f"pictures have {given}; give at least two files and a time for each")
+            raise AmiwarpError(
+                f"pictures have {given}; give at least two files and a time for each"
+            )
         if self.times_us.dtype != np.int64 or self.times_us[0] != 0:
             given = f"{self.times_us.dtype} times from {self.times_us[0]} on"
             raise AmiwarpError(f"pictures have {given}; give int64 times [us] that start at 0")
         check_ascending(self.times_us, "picture")
         if self.start_us is not None:
             whole(self.start_us, "start_us", -TIME_LIMIT, TIME_LIMIT, " us")
-        vector(self.size, 2, "size of the pictures", lambda size, what: whole(size, what, 1, LARGEST_SIZE))
+        vector(
+            self.size,
+            2,
+            "size of the pictures",
+            lambda size, what: whole(size, what, 1, LARGEST_SIZE),
+        )
 
     @property
     def interval_us(self) -> float:
@@ -267,7 +98,9 @@ class PictureFolder:
             if light.shape != self.size[::-1]:
                 given = f"{light.shape[1]}x{light.shape[0]}"
                 expected = f"{self.size[0]}x{self.size[1]}"
-                raise AmiwarpError(f"{file} has {given} pixels, the first picture {expected}; resize this picture")
+                raise AmiwarpError(
+                    f"{file} has {given} pixels, the first picture {expected}; resize this picture"
+                )
             yield t, light
 
 
@@ -293,7 +126,9 @@ class PictureStack:
 
     def __post_init__(self) -> None:
         if self.pictures.ndim not in (3, 4):
-            raise AmiwarpError(f"pictures have shape {self.pictures.shape}; give (n, height, width) or (..., 3)")
+            raise AmiwarpError(
+                f"pictures have shape {self.pictures.shape}; give (n, height, width) or (..., 3)"
+            )
         real(self.fps, "fps", 1e-6, 1e6, " pictures per second")
 
     @property
@@ -326,15 +161,16 @@ class PictureStack:
         """
         for i, picture in enumerate(self.pictures):
             name = f"{self.name}: picture {i}"
+            t = round(i * self.interval_us)
             if picture.dtype.kind != "f":
-                yield round(i * self.interval_us), linear_luminance(picture, name=name)
+                yield t, linear_luminance(picture, name=name)
                 continue
             if not (np.isfinite(picture).all() and picture.min() >= 0.0 and picture.max() <= 1.0):
-                raise AmiwarpError(f"{name} has values outside 0 .. 1; scale the values, or store them as uint8")
-            yield (
-                round(i * self.interval_us),
-                linear_luminance(srgb_to_linear(np.asarray(picture, np.float32)), name=name),
-            )
+                raise AmiwarpError(
+                    f"{name} has values outside 0 .. 1; scale the values, or store them as uint8"
+                )
+            light = srgb_to_linear(np.asarray(picture, np.float32))
+            yield t, linear_luminance(light, name=name)
 
 
 @guarded
@@ -364,7 +200,12 @@ class VideoFile:
         real(self.fps, "fps", 1e-6, 1e6, " pictures per second")
         real(self.stretch, "stretch", 0.0, 1e9)
         real(self.duration_us, "duration_us", 0.0, TIME_LIMIT, " us")
-        vector(self.size, 2, "size of the frames", lambda size, what: whole(size, what, 1, LARGEST_SIZE))
+        vector(
+            self.size,
+            2,
+            "size of the frames",
+            lambda size, what: whole(size, what, 1, LARGEST_SIZE),
+        )
 
     @property
     def interval_us(self) -> float:
@@ -390,8 +231,11 @@ class VideoFile:
         try:
             with av.open(str(input_path(self.path))) as container:
                 for i, frame in enumerate(container.decode(video=0)):
-                    stamp = Fraction(i) / Fraction(self.fps) if frame.pts is None else frame.pts * frame.time_base
-                    first = stamp if first is None else first
+                    stamp = Fraction(i) / Fraction(self.fps)  # for frames without a time stamp
+                    if frame.pts is not None:
+                        stamp = frame.pts * frame.time_base
+                    if first is None:
+                        first = stamp
                     t = round((stamp - first) * 1_000_000 * Fraction(self.stretch))
                     if frame.width * frame.height > MOST_PIXELS:
                         raise AmiwarpError(
@@ -400,123 +244,19 @@ class VideoFile:
                         )
                     if t > last:
                         last = t
-                        yield t, linear_luminance(frame.to_ndarray(format="rgb24"), name=f"{self.path}: frame {i}")
+                        pixels = frame.to_ndarray(format="rgb24")
+                        yield t, linear_luminance(pixels, name=f"{self.path}: frame {i}")
         except AmiwarpError:
             raise
         except Exception as error:  # damage shows in errors of many types
             raise AmiwarpError(
-                f"{self.path} is damaged after {last / 1e6:.3f} s ({error}); cut the video at that time"
+                f"{self.path} is damaged after {last / 1e6:.3f} s ({error}); cut the video at that time",
+                ErrorCode.FILE_DAMAGED,
             ) from error
         if last < 0:
-            raise AmiwarpError(f"{self.path} contains no frame that can be decoded; give another video")
+            raise AmiwarpError(
+                f"{self.path} contains no frame that can be decoded; give another video"
+            )
 
 
 Pictures = PictureFolder | PictureStack | VideoFile
-
-
-def open_pictures(path: str | Path, *, fps: float | None = None) -> Pictures:
-    """Open a video, a folder of pictures, or an .npy stack.
-
-    ``fps`` is required for a stack, and for a folder without ``times.csv`` (columns file, t_us). A video is played at
-    that rate instead of its own, as for a slow-motion film. Raises :class:`AmiwarpError` if the pictures cannot be
-    read.
-    """
-    path = Path(path)
-    if fps is not None:
-        fps = real(fps, "fps", 1e-6, 1e6)
-    if not path.exists():
-        raise AmiwarpError(f"{path} does not exist; give a video, a folder of pictures or an .npy stack")
-    if path.is_dir():
-        folder = _open_folder(path, fps)
-        register_reader(folder, path / TIMES, *folder.files)
-        return folder
-    opened = _open_stack(path, fps) if path.suffix == ".npy" else _open_video(path, fps)
-    register_reader(opened, path)
-    return opened
-
-
-def _open_folder(folder: Path, fps: float | None) -> PictureFolder:
-    """Open a folder of pictures, with times from ``times.csv`` or from ``fps``."""
-    table = folder / TIMES
-    if table.exists() and fps is None:
-        files, times = _read_times(table)
-    else:
-        files = sorted((f for f in folder.iterdir() if f.suffix.lower() in PICTURE_SUFFIXES), key=_natural)
-        if fps is None:
-            raise AmiwarpError(
-                f"{folder} has no times.csv (columns file, t_us); add this file, or give the pictures per second as fps"
-            )
-        times = np.rint(np.arange(len(files)) * (1e6 / fps)).astype(np.int64)
-    if len(files) < 2:
-        raise AmiwarpError(f"{folder} contains {len(files)} pictures; give at least 2")
-    height, width = read_picture(files[0]).shape
-    start_us = None if fps is not None else int(times[0])
-    with errors_name(table, lambda: "times"):
-        return PictureFolder(tuple(files), times - times[0], (width, height), start_us)
-
-
-def _natural(file: Path) -> list[tuple[int, int, str]]:
-    """Return a sort key by which picture 10 comes after picture 9."""
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", file.name) if part]
-
-
-def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
-    """Read the file names and times in ``times.csv``."""
-    with errors_name(table, lambda: "is not a table with the columns file, t_us"):
-        with open_input(table) as file:
-            text = file.read(MOST_TABLE_BYTES + 1)
-        if len(text) > MOST_TABLE_BYTES:
-            raise AmiwarpError(f"it is larger than {MOST_TABLE_BYTES >> 20} MiB")
-        rows = csv.DictReader(io.StringIO(text.decode("utf-8-sig"), newline=""))
-        files: list[Path] = []
-        times = []
-        for row in rows:
-            if len(files) == MOST_PICTURES:
-                raise AmiwarpError(f"it lists over {MOST_PICTURES} pictures; split the folder")
-            name, t = row.get("file"), row.get("t_us")
-            if not name or t is None:
-                raise AmiwarpError(f"line {rows.line_num} has no {'t_us' if name else 'file'}")
-            try:
-                files.append(table.parent / name)
-                times.append(round(float(t)))
-            except (ValueError, OverflowError) as error:
-                raise AmiwarpError(f"line {rows.line_num}: t_us is {shown(t)}; expected a finite number") from error
-            if abs(times[-1]) >= TIME_LIMIT:
-                raise AmiwarpError(f"line {rows.line_num}: t_us is {shown(t)}, beyond {TIME_LIMIT} us")
-        return files, np.array(times, np.int64)
-
-
-def _open_stack(path: Path, fps: float | None) -> PictureStack:
-    try:
-        pictures = np.load(input_path(path), mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # NumPy parses the header as Python: errors of many types
-        what = " ".join(str(error).split())
-        raise AmiwarpError(f"{path} cannot be read as an array ({what}); give a stack saved by numpy.save") from error
-    if pictures.ndim not in (3, 4) or len(pictures) < 2:
-        raise AmiwarpError(f"{path} has shape {pictures.shape}; expected (n, height, width), n at least 2")
-    if fps is None:
-        raise AmiwarpError(f"{path} contains no times; give the pictures per second as fps")
-    return PictureStack(pictures, fps, str(path))
-
-
-def _open_video(path: Path, fps: float | None) -> VideoFile:
-    av = video_library(path)
-    try:
-        with av.open(str(input_path(path))) as container:
-            if not container.streams.video:
-                raise AmiwarpError(f"{path} contains no video stream; give a video")
-            stream = container.streams.video[0]
-            native_fps = float(stream.average_rate or stream.guessed_rate or 0.0)
-            length = float(stream.duration * stream.time_base) if stream.duration else (container.duration or 0) * 1e-6
-            size = (stream.width, stream.height)
-    except AmiwarpError:
-        raise
-    except Exception as error:  # damage shows in errors of many types
-        raise AmiwarpError(f"{path} cannot be read as a video ({error}); give a file that FFmpeg can read") from error
-    if size[0] * size[1] > MOST_PIXELS:
-        raise AmiwarpError(f"{path}: is {size[0]}x{size[1]}, over {MOST_PIXELS} pixels; make it smaller")
-    if native_fps <= 0.0 or min(size) < 2:
-        raise AmiwarpError(f"{path} has no frame rate or no picture size; convert it to a common format")
-    stretch = native_fps / fps if fps else 1.0
-    with errors_name(path, lambda: "video header"):
-        return VideoFile(path, size, native_fps, length * 1e6 * stretch, stretch)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from amiwarp.validation import guarded, one_of, real
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import one_of, real
 
 
 @guarded
@@ -54,7 +55,7 @@ class SensorModel:
     hot_hz: float = 100.0
     """Additional rate of random events of a hot pixel [1/s]."""
     cutoff_hz: float | None = 0.0
-    """Bandwidth of the photoreceptor at white [Hz]; 0 or None for unlimited bandwidth.
+    """Bandwidth of the photoreceptor at white [Hz], proportional to the light; 0 or None for unlimited bandwidth.
 
     The photoreceptor is a first-order low-pass filter of the log intensity, with the time constant
     ``1 / (2 pi cutoff)``. Its cut-off frequency is proportional to the luminance plus 0.02, the stray light and dark
@@ -99,8 +100,12 @@ class SensorModel:
         for name, limit in limits.items():
             object.__setattr__(self, name, real(getattr(self, name), f"sensor {name}", 0.0, limit))
         for name, least, limit in (("cutoff_hz", 0.01, 1e7), ("bus_rate_mev_s", 1e-3, 1e5)):
-            object.__setattr__(self, name, _real_or_none(getattr(self, name), f"sensor {name}", least, limit))
-        object.__setattr__(self, "shot_noise_dark", real(self.shot_noise_dark, "sensor shot_noise_dark", 1.0, 1e3))
+            object.__setattr__(
+                self, name, _real_or_none(getattr(self, name), f"sensor {name}", least, limit)
+            )
+        object.__setattr__(
+            self, "shot_noise_dark", real(self.shot_noise_dark, "sensor shot_noise_dark", 1.0, 1e3)
+        )
         for name in ("contrast_on", "contrast_off"):
             value = real(getattr(self, name), f"sensor {name}", 0.01, 10.0, " (log intensity)")
             object.__setattr__(self, name, value)
@@ -145,7 +150,7 @@ class SensorModel:
         Contrast thresholds C are published as relative changes of light, (maximum - minimum) / minimum (Prophesee,
         "Event-based vision sensor characteristics"). The model uses ln(1 + C) for both polarities.
 
-        ``dvxplorer``: iniVation DVXplorer, 640x480, 9 um pixels. Its data are those of the manufacturer
+        ``dvxplorer``: iniVation DVXplorer, 640x480, 9 um pixels. Its data come from the manufacturer
         (docs.inivation.com, DVXplorer):
 
         - thresholds 13 %: at this contrast half of the pixels respond
@@ -195,21 +200,52 @@ def _real_or_none(value: float | None, what: str, least: float, limit: float) ->
 
 _PRESETS: dict[str, dict[str, float]] = {
     "dvxplorer": {
-        "contrast_on": math.log(1.13), "contrast_off": math.log(1.13), "mismatch": 0.32, "refractory_us": 200.0,
-        "latency_us": 200.0, "latency_jitter_us": 50.0, "leak_hz": 0.05, "shot_noise_hz": 0.5, "shot_noise_dark": 4.0,
-        "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 1000.0, "row_us": 0.4,
-        "bus_rate_mev_s": 165.0, "bus_queue": 16384.0,
+        "contrast_on": math.log(1.13),
+        "contrast_off": math.log(1.13),
+        "mismatch": 0.32,
+        "refractory_us": 200.0,
+        "latency_us": 200.0,
+        "latency_jitter_us": 50.0,
+        "leak_hz": 0.05,
+        "shot_noise_hz": 0.5,
+        "shot_noise_dark": 4.0,
+        "leak_jitter_fraction": 0.1,
+        "noise_rate_cov_decades": 0.1,
+        "cutoff_hz": 1000.0,
+        "row_us": 0.4,
+        "bus_rate_mev_s": 165.0,
+        "bus_queue": 16384.0,
     },
     "davis346": {
-        "contrast_on": math.log(1.143), "contrast_off": math.log(1.225), "mismatch": 0.15, "refractory_us": 500.0,
-        "latency_us": 20.0, "latency_jitter_us": 10.0, "leak_hz": 0.1, "shot_noise_hz": 1.0, "shot_noise_dark": 4.0,
-        "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 300.0, "bus_rate_mev_s": 12.0,
+        "contrast_on": math.log(1.143),
+        "contrast_off": math.log(1.225),
+        "mismatch": 0.15,
+        "refractory_us": 500.0,
+        "latency_us": 20.0,
+        "latency_jitter_us": 10.0,
+        "leak_hz": 0.1,
+        "shot_noise_hz": 1.0,
+        "shot_noise_dark": 4.0,
+        "leak_jitter_fraction": 0.1,
+        "noise_rate_cov_decades": 0.1,
+        "cutoff_hz": 300.0,
+        "bus_rate_mev_s": 12.0,
         "bus_queue": 4096.0,
     },
     "gen4": {
-        "contrast_on": math.log(1.25), "contrast_off": math.log(1.25), "mismatch": 0.03, "refractory_us": 100.0,
-        "latency_us": 100.0, "latency_jitter_us": 30.0, "leak_hz": 0.05, "shot_noise_hz": 0.5, "shot_noise_dark": 4.0,
-        "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 2000.0, "bus_rate_mev_s": 1066.0,
+        "contrast_on": math.log(1.25),
+        "contrast_off": math.log(1.25),
+        "mismatch": 0.03,
+        "refractory_us": 100.0,
+        "latency_us": 100.0,
+        "latency_jitter_us": 30.0,
+        "leak_hz": 0.05,
+        "shot_noise_hz": 0.5,
+        "shot_noise_dark": 4.0,
+        "leak_jitter_fraction": 0.1,
+        "noise_rate_cov_decades": 0.1,
+        "cutoff_hz": 2000.0,
+        "bus_rate_mev_s": 1066.0,
         "bus_queue": 65536.0,
     },
-}  # fmt: skip
+}

@@ -5,20 +5,15 @@ import functools
 import importlib.util
 import logging
 import os
-import platform
-import re
 import signal
 import sys
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from importlib import metadata
-from pathlib import Path
 from typing import Any, TypeVar
 
-from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError, optional_module
-from amiwarp.kernels import launch
+from amiwarp.kernels import quiet_start
 from amiwarp.studies.failures import failure_text
 from amiwarp.tasks import cpu_threads, no_garbage_collection
 from amiwarp.validation import whole
@@ -36,7 +31,11 @@ MOST_WORKERS = 4096
 WORKERS_PER_GPU = 4
 """Local workers that share a GPU by default: what they do on the CPU takes several times as long."""
 LOCAL_CONFIGURATION = {
-    "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1},
+    "distributed.nanny.pre-spawn-environ": {
+        "OMP_NUM_THREADS": 1,
+        "MKL_NUM_THREADS": 1,
+        "OPENBLAS_NUM_THREADS": 1,
+    },
     "distributed.worker.profile.enabled": False,
 }
 """Dask's configuration of local workers.
@@ -64,7 +63,9 @@ def single_worker() -> Iterator[Workers]:
 
 
 @contextlib.contextmanager
-def start_workers(command: str, extra: str, scheduler: str | None, count: int, device: str) -> Iterator[Workers]:
+def start_workers(
+    command: str, extra: str, scheduler: str | None, count: int, device: str
+) -> Iterator[Workers]:
     """Yield the workers of a scheduler, or ``count`` local processes without one; a single one is a thread.
 
     With the device :data:`ANY_GPU`, local workers share the GPUs evenly, and each sees one, as ``cuda:0``. A local
@@ -81,16 +82,26 @@ def start_workers(command: str, extra: str, scheduler: str | None, count: int, d
         where: Any = scheduler
         if scheduler is None:
             stack.enter_context(importlib.import_module("dask").config.set(LOCAL_CONFIGURATION))
-            where = stack.enter_context(distributed.LocalCluster(
-                n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0",
-                memory_limit=distributed.system.MEMORY_LIMIT // count,
-                silence_logs=logging.CRITICAL,  # a worker that dies is reported by the executor
-            ))  # fmt: skip
+            where = stack.enter_context(
+                distributed.LocalCluster(
+                    n_workers=count,
+                    threads_per_worker=1,
+                    dashboard_address="127.0.0.1:0",
+                    memory_limit=distributed.system.MEMORY_LIMIT // count,
+                    silence_logs=logging.CRITICAL,  # a worker that dies is reported by the executor
+                )
+            )
         try:
             client = stack.enter_context(distributed.Client(where, timeout=20))
         except (OSError, ValueError) as error:
-            raise AmiwarpError(f"--scheduler {scheduler}: no Dask scheduler answers at this address ({error}); "
-                               "start one with: dask scheduler") from error  # fmt: skip
+            if scheduler is None:
+                raise AmiwarpError(
+                    f"the workers on this machine do not start ({error}); give fewer of them"
+                ) from error
+            raise AmiwarpError(
+                f"--scheduler {scheduler}: no Dask scheduler answers at this address ({error}); "
+                "start one with: dask scheduler"
+            ) from error
         gpus = _visible_gpus() if scheduler is None and device == ANY_GPU else ()
         client.register_worker_callbacks(functools.partial(_prepare, gpus, scheduler is None))
         yield Workers(stack.enter_context(client.get_executor()), lambda: len(client.nthreads()))
@@ -99,7 +110,7 @@ def start_workers(command: str, extra: str, scheduler: str | None, count: int, d
 def _visible_gpus() -> tuple[str, ...]:
     """Return the GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
     given = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-    count = gpu_count(launch.start_quietly())
+    count = gpu_count(quiet_start.start_quietly())
     return tuple(given.split(",")[:count]) if given else tuple(map(str, range(count)))
 
 
@@ -111,12 +122,14 @@ def worker_count(workers: int | None, device: str, bytes_each: int = 0) -> int:
     if workers is not None:
         return whole(workers, "workers", 1, MOST_WORKERS)
     if device == ANY_GPU:
-        gpus = max(1, gpu_count(launch.start_quietly()))
+        gpus = max(1, gpu_count(quiet_start.start_quietly()))
         count = gpus * min(WORKERS_PER_GPU, max(1, cpu_threads() // gpus))
     else:
         count = cpu_threads() if device == "cpu" else 1
     if bytes_each and count > 1 and importlib.util.find_spec("distributed"):
-        count = max(1, min(count, importlib.import_module("distributed.system").MEMORY_LIMIT // bytes_each))
+        count = max(
+            1, min(count, importlib.import_module("distributed.system").MEMORY_LIMIT // bytes_each)
+        )
     return count
 
 
@@ -144,7 +157,7 @@ def _prepare(gpus: tuple[str, ...], local: bool, dask_worker: Any) -> None:
     # An earlier command may have prepared this worker already.
     if sys.version_info < (3, 12) and not hasattr(sys._current_frames, "__wrapped__"):
         sys._current_frames = _without_collection(sys._current_frames)
-    launch.start_quietly()
+    quiet_start.start_quietly()
 
 
 def _without_collection(function: Callable[[], Result]) -> Callable[[], Result]:
@@ -193,7 +206,9 @@ def failure_of(future: Future[Any]) -> str:
     Raises :class:`AmiwarpError` if the scheduler stopped or dropped the job, because no other job can run then.
     """
     if future.cancelled():
-        raise AmiwarpError("the scheduler stopped or dropped the work; run the same command again to continue")
+        raise AmiwarpError(
+            "the scheduler stopped or dropped the work; run the same command again to continue"
+        )
     error = future.exception()
     if error is None:
         return ""
@@ -202,32 +217,3 @@ def failure_of(future: Future[Any]) -> str:
     if type(error).__name__ == "KilledWorker":  # of Dask, which need not be installed
         return f"its worker died, out of memory or killed: {failure_text(error)}"
     return failure_text(error)
-
-
-# Description of the machine of a measurement: processor or GPU, and versions of the relevant packages.
-
-
-def processor() -> str:
-    """Return the name of this machine's CPU."""
-    info = Path("/proc/cpuinfo")
-    found = re.search(r"^model name\s*: (.*)$", info.read_text(encoding="utf-8"), re.M) if info.exists() else None
-    return (found.group(1) if found else platform.processor() or platform.machine()).strip()
-
-
-def machine(device: str) -> str:
-    """Return the name of the GPU; for ``cpu`` the name of the CPU, with the number of cores that may be used."""
-    import warp as wp  # here, because the command line imports this module at its start
-
-    there = wp.get_device(device)
-    return str(there.name) if there.is_cuda else f"{cpu_threads()} cores of {processor()}"
-
-
-def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Return the versions of amiwarp, of Python, and of those ``packages`` that are installed, by name."""
-    out = {"amiwarp": __version__, "python": platform.python_version()}
-    for name in packages:
-        try:
-            out[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return out

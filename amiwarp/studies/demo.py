@@ -1,112 +1,47 @@
 """Demo: a recording is simulated from a picture, calibrated, compensated and reconstructed."""
 
-import importlib
 import importlib.util
 import math
-import pkgutil
-import tempfile
 import time
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp import kernels
-from amiwarp.brightness.solver import SensorTiming
+from amiwarp.brightness.sensor_timing import SensorTiming
 from amiwarp.calib.calibration import calibrate
-from amiwarp.calib.calibration_events import thin
-from amiwarp.calib.model_choice import CIRCLES
-from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import PhotometricSettings
-from amiwarp.compensation.recordings import compensate, compensate_events
+from amiwarp.calib.thinning import thin
+from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.recordings import compensate
 from amiwarp.events.recording import Recording
 from amiwarp.imaging import metrics
-from amiwarp.imaging.sharpness import gaussian
 from amiwarp.io import open_recording
-from amiwarp.io.files import check_output
-from amiwarp.io.formats import make_folder
-from amiwarp.kernels.camera import PinholeParams, fill_rays
-from amiwarp.kernels.checksum import compute_checksums
-from amiwarp.kernels.compensation import compensate_blocks
-from amiwarp.kernels.conjugate_gradients import descend, link
-from amiwarp.kernels.equations import find_squares, sum_costs
-from amiwarp.kernels.equations_cpu import apply_normal, make_chains
-from amiwarp.kernels.event_keys import unpack
-from amiwarp.kernels.iwe import CPU_WIDTH, find_largest, read_sums, smooth, smooth_and_sum
-from amiwarp.kernels.known_nodes import find_large_regions, mark_known
-from amiwarp.kernels.launch import load_ahead, load_all, load_kernels
-from amiwarp.kernels.map_positions import find_places, place_blocks
-from amiwarp.kernels.multilevel import prolong_rows
-from amiwarp.kernels.pairs import mark_spans
-from amiwarp.kernels.pixel_votes import vote_event_blocks, vote_point_blocks
-from amiwarp.kernels.pixels import run_pixels_ahead, start_pixels
-from amiwarp.kernels.prism_view import see_without_prism
-from amiwarp.kernels.refraction import ExactParams, compensate_points
-from amiwarp.kernels.slow_pixels import find_time_constants
-from amiwarp.kernels.votes import turn_events
+from amiwarp.io.output_formats import make_folder
+from amiwarp.io.outputs import check_output
+from amiwarp.kernels.loading import load_ahead
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, ExactModel
+from amiwarp.optics.models.exact import ExactModel
 from amiwarp.optics.prism import Prism, as_wedge
-from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
-from amiwarp.reconstruction.picture import Picture, Reconstruction, save_picture
-from amiwarp.simulation.description import PrismMotion, Scene
+from amiwarp.plotting.demo_figure import EventViews, Grid, Reconstructed, draw_demo
+from amiwarp.reconstruction.picture import Picture
+from amiwarp.reconstruction.picture_files import save_picture
+from amiwarp.reconstruction.reconstruct import Reconstruction
+from amiwarp.results.calibration import Calibration
+from amiwarp.simulation.description import Scene
+from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.tasks import Progress, part, silent
+from amiwarp.studies.demo_kernels import EXACT_KERNELS, SIMULATION_KERNELS
+from amiwarp.tasks import Progress, silent
 
-# Kernels that the demo needs on a CPU, to be compiled before they are needed.
-#
-# Each is followed by the structs of its generic arguments. The other kernels of its module are compiled with it.
-
-EXACT_KERNELS = (
-    (turn_events,),
-    (vote_event_blocks, ExactParams, PinholeParams),
-    (read_sums,),
-    *((smooth_and_sum(len(gaussian(sigma))),) for sigma in (2.0, 1.0)),  # coarse and fine images of a calibration
-    (smooth(int(CPU_WIDTH)),),
-    (find_largest,),
-    (mark_spans,),
-    (find_places, ExactParams, PinholeParams),
-    (place_blocks, ExactParams),
-    (make_chains,),
-    (apply_normal,),
-    (descend,),
-    (sum_costs,),
-    (find_time_constants, ExactParams),
-    (find_squares,),
-    (compensate_blocks, ExactParams, PinholeParams),
-    (compute_checksums,),
-    (vote_point_blocks,),
-    (link,),
-    (prolong_rows,),
-    (mark_known,),
-    (find_large_regions,),
-)
-"""Kernels of calibration, compensation and reconstruction by the exact model, in the order of their use."""
-SIMULATION_KERNELS = (
-    (compensate_points, ExactParams),
-    (fill_rays,),
-    (see_without_prism,),
-    (run_pixels_ahead,),
-    (start_pixels,),
-    (unpack,),
-)
-"""Kernels of a simulation of the exact model, in the order of their use."""
-CHOICE_KERNELS = tuple((compensate_points, MODELS[name].STRUCT) for name in CIRCLES)
-"""Kernels of the choice among optical models, which the demo leaves out and ``calibrate`` makes by default."""
-
-
-# Demo: a recording is simulated from a picture, calibrated, compensated and reconstructed.
-#
-# The calibration starts without a guess of the phase.
-
-APEX, PHASE = math.radians(1.0), math.radians(126.0)
-"""True apex angle and true phase of the simulated prism [rad]."""
+APEX = math.radians(1.0)
+"""True apex angle of the simulated prism [rad]."""
+PHASE = math.radians(126.0)
+"""True phase of the simulated prism [rad]. The calibration starts without a guess of it."""
 NOMINAL_APEX = math.radians(1.2)
 """Nominal apex angle of the recording [rad]. It differs from the truth, so that no search box is centred on the truth.
 """
@@ -194,24 +129,38 @@ def run_demo(demo: Demo, progress: Progress | None = None) -> DemoResult:
         return _run(demo, files, aside, progress or silent)
 
 
-def _run(demo: Demo, files: dict[str, Path], aside: ThreadPoolExecutor, report: Progress) -> DemoResult:
+def _run(
+    demo: Demo, files: dict[str, Path], aside: ThreadPoolExecutor, report: Progress
+) -> DemoResult:
     """Run the demo. What only the figure and the comparison with the truth need is computed ``aside``."""
     began = time.perf_counter()
-    grid = aside.submit(Grid.make, demo.width, demo.height)  # loads Matplotlib
+    # Loads Matplotlib, too.
+    grid = aside.submit(Grid.make, demo.width, demo.height)
     simulated = simulation(demo)
     simulated.write(files["recording"], progress=report)
     simulated_s = time.perf_counter() - began
+
     recording = open_recording(files["recording"])
     found = calibrate(
-        recording, model=ExactModel.NAME, seed=demo.seed, device=demo.device, photometric=BRIEF, progress=report
+        recording,
+        model=ExactModel.NAME,
+        seed=demo.seed,
+        device=demo.device,
+        photometric=BRIEF,
+        progress=report,
     )
     found.save(files["calibration"])
-    compensated = compensate(recording, found, files["compensated"], device=demo.device, progress=report)
+
+    compensated = compensate(
+        recording, found, files["compensated"], device=demo.device, progress=report
+    )
     views = aside.submit(EventViews.of, recording, found, demo.device)
     accuracy = aside.submit(_accuracy, recording, found, demo.device)
+
     report("reconstructing", 0.0)
     picture = middle_turn(recording, found, demo.device)
     save_picture(picture, files["picture"], contrast=simulated.sensor.contrast_on)
+
     report("measuring and drawing", 0.0)
     original = simulated.log_view()
     quality = metrics.picture_quality(picture.log, original)
@@ -219,9 +168,14 @@ def _run(demo: Demo, files: dict[str, Path], aside: ThreadPoolExecutor, report: 
     report("measuring and drawing", 0.5)
     assert recording.truth is not None
     draw_demo(
-        files["figure"], grid.result(), found, views.result(), Reconstructed(picture, original, quality),
-        headline=headline(values), truth=(recording.truth.parameters["apex"], recording.truth.parameters["phase"]),
-    )  # fmt: skip
+        files["figure"],
+        grid.result(),
+        found,
+        views.result(),
+        Reconstructed(picture, original, quality),
+        headline=headline(values),
+        truth=(recording.truth.parameters["apex"], recording.truth.parameters["phase"]),
+    )
     return DemoResult(
         **values,
         picture_correlation=quality.correlation,
@@ -241,12 +195,13 @@ def _accuracy(recording: Recording, found: Calibration, device: Any) -> dict[str
     assert recording.truth is not None
     truth = metrics.truth_model(recording.camera, recording.truth, as_wedge(found.prism).flat_side)
     before, after, with_truth = blurs(recording, found, truth, device)
+    phase_error = math.remainder(found.parameters["phase"] - truth.phase, 2.0 * math.pi)
     return {
         "apex_deg": math.degrees(found.exact.parameters["apex"]),
         "apex_true_deg": math.degrees(truth.prism.apex),
         "sharpness_model_error_px": metrics.model_error(sharpest(found).model, truth).rms,
         "model_error_px": metrics.model_error(found.model, truth).rms,
-        "phase_error_deg": math.degrees(math.remainder(found.parameters["phase"] - truth.phase, 2.0 * math.pi)),
+        "phase_error_deg": math.degrees(phase_error),
         "blur_before_px": before,
         "blur_after_px": after,
         "blur_with_truth_px": with_truth,
@@ -260,14 +215,18 @@ def middle_turn(recording: Recording, found: Calibration, device: Any) -> Pictur
     """
     work = Reconstruction(recording, found, device=device)
     _, turn_us = work.span()
-    first, last = recording.events.t_first, recording.events.t_last
-    return work.window(max(first, (first + last - turn_us) // 2), turn_us)
+    first_us = recording.events.t_first
+    last_us = recording.events.t_last
+    start_us = max(first_us, (first_us + last_us - turn_us) // 2)
+    return work.window(start_us, turn_us)
 
 
 def sharpest(found: Calibration) -> Calibration:
     """Return the calibration after the first stage, which uses sharpness alone."""
     exact = found.exact
-    return exact if exact.photometric is None else replace(exact, parameters=exact.photometric.sharpness_parameters)
+    if exact.photometric is None:
+        return exact
+    return replace(exact, parameters=exact.photometric.sharpness_parameters)
 
 
 def _files(out: Path) -> dict[str, Path]:
@@ -308,16 +267,21 @@ def earth() -> Path:
     return Path(found.origin).parent / "examples" / "2k_earth_daymap.jpg"
 
 
-def blurs(recording: Recording, found: Calibration, truth: ExactModel, device: Any) -> tuple[float, float, float]:
+def blurs(
+    recording: Recording, found: Calibration, truth: ExactModel, device: Any
+) -> tuple[float, float, float]:
     """Return three standard deviations of events across edges [px].
 
     They are measured before compensation, after compensation as calibrated, and after compensation with the true model.
     """
     events = thin(recording, MEASURED)
-    encoder = found.encoder_for(recording.encoder, recording.events.t_first, recording.events.t_last)
+    encoder = found.encoder_for(
+        recording.encoder, recording.events.t_first, recording.events.t_last
+    )
     after: NDArray[np.float32] = compensate_events(events, found.model, encoder, device=device)
     ideal = compensate_events(events, truth, encoder, device=device)
     raw = np.stack([events.x, events.y], axis=1).astype(np.float32)
+
     size = recording.events.size
     before, compensated = metrics.edge_blurs(after, *size, [raw, after])
     return before, compensated, metrics.edge_blur(ideal, *size)
@@ -330,45 +294,3 @@ def headline(values: dict[str, Any]) -> str:
         f"true {values['apex_true_deg']:.3f}°, nominal {math.degrees(NOMINAL_APEX):.3f}°; "
         f"blur {values['blur_before_px']:.2f} px before, {values['blur_after_px']:.2f} px after"
     )
-
-
-# Kernels compiled in advance, for containers and continuous integration.
-
-
-@dataclass(frozen=True, slots=True)
-class WarmUp:
-    """Result of :func:`warm_up`."""
-
-    compiled: int
-    """Number of modules of kernels that were compiled. The others were in the cache."""
-    cached: int
-    """Number of compiled modules in the cache, those of other programs and versions included."""
-    cache: str
-    """Folder of the cache."""
-    seconds: float
-    """Time that it took [s]."""
-
-
-def warm_up(devices: Sequence[str], progress: Progress = silent) -> WarmUp:
-    """Compile the kernels of the ordinary commands into Warp's cache, unless they are there.
-
-    A demo of 120 × 90 px runs on each device, because its optical model and its filters decide which of the kernels
-    with variants it needs. Then all kernels without variants are compiled.
-    """
-    began, cache = time.perf_counter(), Path(wp.config.kernel_cache_dir)
-    before = _binaries(cache)
-    for module in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}."):
-        importlib.import_module(module.name)
-    for k, device in enumerate(devices):
-        share = part(progress, k / len(devices), (k + 1) / len(devices))
-        with tempfile.TemporaryDirectory(prefix="amiwarp-") as folder:
-            run_demo(Demo(Path(folder), width=120, height=90, duration_s=0.17, device=device), part(share, 0.0, 0.6))
-        load_kernels(CHOICE_KERNELS, device)
-        load_all(device, part(share, 0.6, 1.0))
-    after = _binaries(cache)
-    return WarmUp(len(after - before), len(after), str(cache), time.perf_counter() - began)
-
-
-def _binaries(cache: Path) -> set[Path]:
-    """Return the files of machine code in Warp's cache: object files for CPUs, PTX or CUBIN for GPUs."""
-    return {path for path in cache.glob("*/*") if path.suffix in (".o", ".ptx", ".cubin")}

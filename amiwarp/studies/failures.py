@@ -18,14 +18,12 @@ def failure_text(error: BaseException) -> str:
     an :class:`AmiwarpError`.
     """
     said = str(error) if isinstance(error, AmiwarpError) else f"{type(error).__name__}: {error}"
-    inside = [
-        (Path(frame.filename).resolve().relative_to(PACKAGE).as_posix(), frame.lineno, frame.name)
-        for frame in traceback.extract_tb(error.__traceback__)
-        if Path(frame.filename).resolve().is_relative_to(PACKAGE)
-    ]
-    if inside:
-        file, line, function = inside[-1]
-        said += f" (in {function}, {file}:{line})"
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        file = Path(frame.filename).resolve()
+        if file.is_relative_to(PACKAGE):
+            place = f"{file.relative_to(PACKAGE).as_posix()}:{frame.lineno}"
+            said += f" (in {frame.name}, {place})"
+            break
     return shortened(printable(" ".join(said.split())))
 
 

@@ -3,13 +3,15 @@
 import json
 from pathlib import Path
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import write_text
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.json_files import read_json
+from amiwarp.io.outputs import write_text
 
-FORMAT, VERSION = "amiwarp views", 1
+FORMAT = "amiwarp views"
+VERSION = 1
 """What the file says that it is."""
-LONGEST_NAME, MOST_VIEWS = 60, 200
+LONGEST_NAME = 60
+MOST_VIEWS = 200
 """Largest length of a name [characters], and largest number of bookmarks of a recording."""
 MOST_BYTES = 1 << 20
 """Largest size of a file [bytes]."""
@@ -35,13 +37,21 @@ class Bookmarks:
         Raises :class:`AmiwarpError` for a bad name, a name that exists, if there are too many bookmarks, and if the
         file cannot be written or is a foreign one, which is kept.
         """
-        views, name = self._read(), name.strip()
+        views = self._read()
+        name = name.strip()
         if not (name and name.isprintable() and len(name) <= LONGEST_NAME):
-            raise AmiwarpError(f"the name {name!r:.80} cannot be taken; give 1 to {LONGEST_NAME} letters or digits")
+            raise AmiwarpError(
+                f"the name {name!r:.80} cannot be taken; give 1 to {LONGEST_NAME} letters or digits"
+            )
         if name in views:
-            raise AmiwarpError(f"{self.path.name}: {name!r} exists; give another name, or delete it first")
+            raise AmiwarpError(
+                f"{self.path.name}: {name!r} exists; give another name, or delete it first",
+                ErrorCode.OUTPUT_EXISTS,
+            )
         if len(views) >= MOST_VIEWS:
-            raise AmiwarpError(f"{self.path.name}: holds {len(views)} views, which is the maximum; delete some first")
+            raise AmiwarpError(
+                f"{self.path.name}: holds {len(views)} views, which is the maximum; delete some first"
+            )
         self._write({**views, name: text})
 
     def delete(self, name: str) -> None:
@@ -71,7 +81,11 @@ class Bookmarks:
         data = read_json(self.path, "bookmarks", most_bytes=MOST_BYTES, noted=False)
         views = data.get("views")
         known = data.get("format") == FORMAT and data.get("version") == VERSION
-        if not (known and isinstance(views, dict) and all(isinstance(text, str) for text in views.values())):
+        if not (
+            known
+            and isinstance(views, dict)
+            and all(isinstance(text, str) for text in views.values())
+        ):
             raise AmiwarpError(
                 f"{self.path}: holds no bookmarks of amiwarp (format {FORMAT!r}, version {VERSION}); rename it to save "
                 "views of this recording"

@@ -18,11 +18,16 @@ def check_display(remedy: str) -> None:
             f"a window needs libX11 and libGL; on Debian run: apt-get install libx11-6 libgl1; or {remedy}"
         )
     x11 = CDLL(libraries[0])
-    x11.XOpenDisplay.restype, x11.XCloseDisplay.argtypes = c_void_p, [c_void_p]
+    x11.XOpenDisplay.restype = c_void_p
+    x11.XCloseDisplay.argtypes = [c_void_p]
     display = x11.XOpenDisplay(None)
     if display is None:
         given = os.environ.get("DISPLAY")
-        found = f"the display {given!r} cannot be opened" if given else "there is no display to open a window on"
+        found = (
+            f"the display {given!r} cannot be opened"
+            if given
+            else "there is no display to open a window on"
+        )
         raise AmiwarpError(f"{found}; {remedy}")
     x11.XCloseDisplay(display)
     os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkXOpenGLRenderWindow"

@@ -83,14 +83,20 @@ class SelectedEvents:
     def __post_init__(self) -> None:
         width, height = self.size
         left, top, right, bottom = self.reach
-        reach = max(left, 0), max(top, 0), min(right, width), min(bottom, height)
-        chosen = self.selection.event_filter(self.hot, None if self.selection.region is None else reach)
-        given = [name for name in PARTS if is_given(chosen, name)]
-        self._parts = {name: RunningFilter(EventFilter(**{name: getattr(chosen, name)}), self.size) for name in given}
-        self._counts = {name: [0, 0] for name in given}
+        reach: Region | None = None
+        if self.selection.region is not None:
+            reach = max(left, 0), max(top, 0), min(right, width), min(bottom, height)
+        chosen = self.selection.event_filter(self.hot, reach)
+        self._parts = {}
+        self._counts = {}
+        for name in PARTS:
+            if is_given(chosen, name):
+                alone = EventFilter(**{name: getattr(chosen, name)})
+                self._parts[name] = RunningFilter(alone, self.size)
+                self._counts[name] = [0, 0]
 
     def keep(self, events: Events) -> NDArray[np.bool_]:
-        """Return which of the events that follow those of the last call are kept, bool, shape ``(n,)``."""
+        """Return which events are kept, where the events follow the events of the last call, bool, shape ``(n,)``."""
         keep = np.ones(len(events), np.bool_)
         if self.times is not None:
             first, last = self.times
@@ -104,7 +110,7 @@ class SelectedEvents:
         return keep
 
     def _count(self, name: str, events: Events, kept: NDArray[np.bool_]) -> None:
-        """Count the events of the region before and after a part. Before that of the region, all events count."""
+        """Count the events of the region before and after a part. Before the part "region", all events count."""
         region = self.selection.region
         within = np.ones(len(events), np.bool_) if region is None else inside(events, region)
         before = len(events) if name == "region" else int(np.count_nonzero(within))
@@ -114,7 +120,9 @@ class SelectedEvents:
     @property
     def steps(self) -> tuple[FilterStep, ...]:
         """Numbers of events before and after each part so far, in the order in which the parts are applied."""
-        return tuple(FilterStep(NAMES[name], before, after) for name, (before, after) in self._counts.items())
+        return tuple(
+            FilterStep(NAMES[name], before, after) for name, (before, after) in self._counts.items()
+        )
 
 
 @dataclass(frozen=True)
@@ -139,10 +147,12 @@ def list_hot_pixels(events: Events, hot: NDArray[np.bool_]) -> tuple[HotPixel, .
     rows, columns = np.nonzero(hot)
     found = counts.reshape(hot.shape)[rows, columns]
     seconds = 1e-6 * float(events.t[-1] - events.t[0] + 1)
-    order = np.argsort(-found, kind="stable")
-    return tuple(
-        HotPixel(int(columns[k]), int(rows[k]), float(found[k] / seconds), float(found[k] / len(events))) for k in order
-    )
+    pixels = []
+    for k in np.argsort(-found, kind="stable"):
+        rate = float(found[k] / seconds)
+        share = float(found[k] / len(events))
+        pixels.append(HotPixel(int(columns[k]), int(rows[k]), rate, share))
+    return tuple(pixels)
 
 
 PREFIXES = ((1e6, "M"), (1e3, "k"), (1.0, ""))
@@ -151,7 +161,10 @@ PREFIXES = ((1e6, "M"), (1e3, "k"), (1.0, ""))
 
 def unit_of(rate: float) -> tuple[float, str]:
     """Return size and prefix of the unit in which a rate has at most three digits before the point."""
-    return next((each for each in PREFIXES if rate >= 0.9995 * each[0]), PREFIXES[-1])
+    for size, prefix in PREFIXES:
+        if rate >= 0.9995 * size:
+            return size, prefix
+    return PREFIXES[-1]
 
 
 def rate_text(events_per_s: float) -> str:
@@ -167,9 +180,11 @@ def step_rows(steps: tuple[FilterStep, ...], read_us: float) -> list[list[str]]:
     """
     rows = []
     for step in steps:
-        before, after = (1e6 * count / read_us for count in (step.before, step.after))
+        before = 1e6 * step.before / read_us
+        after = 1e6 * step.after / read_us
         size, prefix = unit_of(before)
         rates = f"{before / size:.3g} → {after / size:.3g} {prefix}ev/s"
         share = 100.0 * (1.0 - step.after / max(step.before, 1))
-        rows.append([step.name, rates, f"{step.before:,} → {step.after:,} events (−{share:.3g} %)"])
+        numbers = f"{step.before:,} → {step.after:,} events (−{share:.3g} %)"
+        rows.append([step.name, rates, numbers])
     return rows

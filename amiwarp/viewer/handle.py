@@ -13,18 +13,26 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from amiwarp.calib.result import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.depth_map import DepthMap
-from amiwarp.optics.models import alternatives
-from amiwarp.validation import choice, guarded, instance, one_of, real, vector, whole
-from amiwarp.viewer import jobs, layout
+from amiwarp.optics.models.registry import alternatives
+from amiwarp.results.calibration import Calibration
+from amiwarp.results.depth_map import DepthMap
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import choice, instance, one_of, real, vector, whole
+from amiwarp.viewer import first_phase, view_state
+from amiwarp.viewer.actions import Actions
+from amiwarp.viewer.address import LONGEST_NOISE_US, MOST_EVERY, RATE_LIMITS
 from amiwarp.viewer.display import check_display
-from amiwarp.viewer.drawing import ImageKind, Look, draw_picture
-from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector, Source, colours_on_offer, foreign_names
-from amiwarp.viewer.layout import Actions, ViewState
+from amiwarp.viewer.drawn_truth import colours_on_offer
+from amiwarp.viewer.images import ImageKind
+from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector
+from amiwarp.viewer.knobs import Source, foreign_names
+from amiwarp.viewer.look import Look
+from amiwarp.viewer.screenshot import draw_picture
+from amiwarp.viewer.sliders import LIMITS, UNITS
+from amiwarp.viewer.view_state import ViewState
 
 if TYPE_CHECKING:
     from PIL.Image import Image as PillowImage
@@ -45,7 +53,7 @@ PICTURE_PX = (1400, 620)
 def parameter_names(inspector: Inspector, model: str) -> list[str]:
     """Return the names of the parameters that a model of this recording has."""
     absent = {"rpm" if inspector.has_encoder else "clock_offset"} | foreign_names(model)
-    return [name for name in layout.LIMITS if name not in absent]
+    return [name for name in LIMITS if name not in absent]
 
 
 def values_of(inspector: Inspector, state: ViewState) -> dict[str, Any]:
@@ -53,11 +61,13 @@ def values_of(inspector: Inspector, state: ViewState) -> dict[str, Any]:
     knobs = state.knobs
     known = {name: knobs.value(name) for name in parameter_names(inspector, knobs.model)}
     return {
-        "model": knobs.model, **{name: value for name, value in known.items() if value is not None},
-        "start_us": inspector.recording.events.t_first + state.start_us, "length_us": state.length_us,
+        "model": knobs.model,
+        **{name: value for name, value in known.items() if value is not None},
+        "start_us": inspector.recording.events.t_first + state.start_us,
+        "length_us": state.length_us,
         **{name: getattr(state.selection, name) for name in SELECTION},
         **{name: getattr(state, name) for name in STYLE},
-    }  # fmt: skip
+    }
 
 
 def with_values(inspector: Inspector, state: ViewState, values: dict[str, Any]) -> ViewState:
@@ -65,16 +75,20 @@ def with_values(inspector: Inspector, state: ViewState, values: dict[str, Any]) 
 
     Raises :class:`AmiwarpError` for an unknown name, or a value that this recording cannot have.
     """
-    model = one_of(values.get("model", state.knobs.model), [*alternatives(state.knobs.model)], "model")
+    model = one_of(
+        values.get("model", state.knobs.model), [*alternatives(state.knobs.model)], "model"
+    )
     parameters = parameter_names(inspector, model)
     known = ["model", *parameters, *TIME, *SELECTION, *STYLE]
     for name in values:
         if name not in known:
-            raise AmiwarpError(f"{inspector.recording.name}: {name!r} is unknown; choose among {', '.join(known)}")
+            raise AmiwarpError(
+                f"{inspector.recording.name}: {name!r} is unknown; choose among {', '.join(known)}"
+            )
     knobs = {}
     for name in parameters:
         if name in values:
-            low, high = (end * layout.UNITS[name] for end in layout.LIMITS[name])
+            low, high = (end * UNITS[name] for end in LIMITS[name])
             knobs[name] = real(values[name], name, low, high)
     events = inspector.recording.events
     selection: dict[str, Any] = {}
@@ -84,7 +98,9 @@ def with_values(inspector: Inspector, state: ViewState, values: dict[str, Any]) 
         start_us = whole(values["start_us"], "start_us", events.t_first, events.t_last, clock)
         other["start_us"] = start_us - events.t_first
     if "length_us" in values:
-        other["length_us"] = whole(values["length_us"], "length_us", 1, events.t_last - events.t_first + 1)
+        other["length_us"] = whole(
+            values["length_us"], "length_us", 1, events.t_last - events.t_first + 1
+        )
     if "region" in values:
         selection["region"] = _region(values["region"], events.size)
     if "polarity" in values:
@@ -94,15 +110,19 @@ def with_values(inspector: Inspector, state: ViewState, values: dict[str, Any]) 
         selection["hide_hot"] = instance(values["hide_hot"], bool, "hide_hot")
     if "noise_us" in values:
         given = values["noise_us"]
-        selection["noise_us"] = None if given is None else whole(given, "noise_us", 1, layout.LONGEST_NOISE_US)
+        selection["noise_us"] = (
+            None if given is None else whole(given, "noise_us", 1, LONGEST_NOISE_US)
+        )
     if "refractory_us" in values:
-        selection["refractory_us"] = whole(values["refractory_us"], "refractory_us", 0, layout.LONGEST_NOISE_US)
+        selection["refractory_us"] = whole(
+            values["refractory_us"], "refractory_us", 0, LONGEST_NOISE_US
+        )
     if "most_per_s" in values:
-        selection["most_per_s"] = real(values["most_per_s"], "most_per_s", *layout.RATE_LIMITS)
+        selection["most_per_s"] = real(values["most_per_s"], "most_per_s", *RATE_LIMITS)
     if "every" in values:
-        selection["every"] = whole(values["every"], "every", 1, layout.MOST_EVERY)
+        selection["every"] = whole(values["every"], "every", 1, MOST_EVERY)
     if "decay_us" in values:
-        other["decay_us"] = whole(values["decay_us"], "decay_us", 1, layout.LONGEST_NOISE_US)
+        other["decay_us"] = whole(values["decay_us"], "decay_us", 1, LONGEST_NOISE_US)
     for name, kind in (("image", ImageKind), ("axis", Axis), ("view", View)):
         if name in values:
             other[name] = choice(kind, values[name], name)
@@ -113,12 +133,13 @@ def with_values(inspector: Inspector, state: ViewState, values: dict[str, Any]) 
         if name in values:
             other[name] = instance(values[name], bool, name)
     now = replace(state.knobs.with_values(knobs), model=model)
-    sources = tuple(
-        (name, source if name in ("camera", "prism") or now.value(name) == state.knobs.value(name) else Source.HAND)
-        for name, source in state.sources
-    )
+    sources = []
+    for name, source in state.sources:
+        if name not in ("camera", "prism") and now.value(name) != state.knobs.value(name):
+            source = Source.HAND
+        sources.append((name, source))
     selected = replace(state.selection, **selection)
-    return replace(state, knobs=now, sources=sources, selection=selected, **other)
+    return replace(state, knobs=now, sources=tuple(sources), selection=selected, **other)
 
 
 def _region(value: object, size: tuple[int, int]) -> tuple[int, int, int, int] | None:
@@ -132,7 +153,9 @@ def _region(value: object, size: tuple[int, int]) -> tuple[int, int, int, int] |
             f"region = {(left, top, right, bottom)} is no part of the image of {width}x{height} px; give left, top, "
             "right and bottom, right and bottom exclusive, or None for the whole image"
         )
-    return None if (left, top, right, bottom) == (0, 0, width, height) else (left, top, right, bottom)
+    return (
+        None if (left, top, right, bottom) == (0, 0, width, height) else (left, top, right, bottom)
+    )
 
 
 @guarded
@@ -163,7 +186,9 @@ class InspectorHandle:
         self._callbacks: list[Callable[[dict[str, Any]], object]] = []
         self._tabs: weakref.WeakSet[Panel] = weakref.WeakSet()
         self._window: Window | None = None
-        self._drawing = False  # whether the window handles its input, during which it cannot be asked to
+        self._drawing = (
+            False  # whether the window handles its input, during which it cannot be asked to
+        )
         self._serving: asyncio.Task[None] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._scheduled = 0  # changes that the tabs have not got yet
@@ -193,7 +218,7 @@ class InspectorHandle:
         """
         before = self._known()
         state = with_values(self._own, before, values)
-        layout.apply_state(self._own, state)
+        view_state.apply_state(self._own, state)
         self._state = state
         if self._loop is not None:
             self._scheduled += 1
@@ -279,9 +304,11 @@ class InspectorHandle:
 
         width, height = vector(size, 2, "size", partial(whole, low=100, high=8000))
         state = self._known()
-        layout.apply_state(self._own, state)
+        view_state.apply_state(self._own, state)
         look = Look(state.colour, state.axis, dark=dark, overlaid=state.overlaid)
-        return Image.fromarray(draw_picture(self._own, state.view, look, (width, height), state.against))
+        return Image.fromarray(
+            draw_picture(self._own, state.view, look, (width, height), state.against)
+        )
 
     def run(self) -> None:
         """Follow the user until the window is closed. A page in a notebook needs no call: this returns at once.
@@ -292,11 +319,13 @@ class InspectorHandle:
         """
         if self._window is None:
             return
-        window, self._drawing = self._window, True
+        window = self._window
+        self._drawing = True
         try:
             window.run()
         finally:
-            self._window, self._drawing = None, False
+            self._window = None
+            self._drawing = False
 
     def close(self) -> None:
         """Close the window, or stop serving the page. Values can be set and pictures made from then on, too.
@@ -324,9 +353,11 @@ class InspectorHandle:
             window = inspector.window or inspector.first_window()
             inspector.open(*window)
             if math.isfinite(inspector.turn_us):
-                jobs.estimate_phase(inspector)
-                inspector.open(*window, replace(inspector.selection, region=inspector.suggest_region()))
-            self._state = layout.current_state(inspector)
+                first_phase.estimate_phase(inspector)
+                inspector.open(
+                    *window, replace(inspector.selection, region=inspector.suggest_region())
+                )
+            self._state = view_state.current_state(inspector)
         return self._state
 
     def _attach_tab(self, panel: Panel) -> None:
@@ -360,22 +391,31 @@ class InspectorHandle:
         """Take what a tab or the window shows now."""
         if self._scheduled:  # it will be told another state at once
             return
-        before, self._state = self._state, state
+        before = self._state
+        self._state = state
         if before is not None:
             self._call_back(before, state)
 
     def _call_back(self, before: ViewState, now: ViewState) -> None:
         """Tell the callbacks which values have changed."""
-        old, new = (values_of(self._own, each) for each in (before, now))
-        changed = {name: value for name, value in new.items() if name not in old or old[name] != value}
-        for callback in [*self._callbacks] if changed else ():
+        old = values_of(self._own, before)
+        new = values_of(self._own, now)
+        changed = {
+            name: value for name, value in new.items() if name not in old or old[name] != value
+        }
+        if not changed:
+            return
+        for callback in list(self._callbacks):
             try:
                 callback(dict(changed))
             except Exception as error:
                 name = getattr(callback, "__name__", type(callback).__name__)
                 logging.getLogger(__name__).exception("the callback %s failed", name)
-                for each in (*self._tabs, *filter(None, [self._window])):
-                    each.say(f"the callback {name} failed: {type(error).__name__}: {error}")
+                text = f"the callback {name} failed: {type(error).__name__}: {error}"
+                for tab in self._tabs:
+                    tab.say(text)
+                if self._window is not None:
+                    self._window.say(text)
 
 
 @guarded
@@ -420,8 +460,8 @@ def view(
     ------
     AmiwarpError
         If a recording holds no events, the calibration, the recording beside or the depth map belongs to a camera of
-        another size, the depth map is given for another optic than a plate, or there is neither a notebook nor a
-        display.
+        another size, the depth map is given for another optic than a plate, there is neither a notebook nor a
+        display, or there is a notebook and the libraries of the page are missing (``pip install 'amiwarp[page]'``).
 
     Examples
     --------
@@ -440,16 +480,20 @@ def view(
         loop = asyncio.get_running_loop()
         from IPython.display import IFrame, display
     except (ImportError, RuntimeError):  # no IPython, or no running loop
-        check_display(f"{recording.name}: view shows a recording in a notebook or a window; or run: amiwarp view FILE "
-                      "--web")  # fmt: skip
+        check_display(
+            f"{recording.name}: view shows a recording in a notebook or a window; or run: amiwarp view FILE "
+            "--web"
+        )
         handle = InspectorHandle(make_inspector("cpu"))
         _open_window(handle, make_inspector(device, WINDOW_POINTS))
         return handle
 
-    from amiwarp.kernels.launch import start_quietly
-    from amiwarp.viewer.panel import LOCAL_HOST, serve_tabs
-    from amiwarp.viewer.serve import address
+    from amiwarp.kernels.quiet_start import start_quietly
+    from amiwarp.viewer.host_names import address
+    from amiwarp.viewer.serve import check_libraries
+    from amiwarp.viewer.serve_panel import LOCAL_HOST, serve_tabs
 
+    check_libraries()
     start_quietly()
     # The handle's own inspector, whose errors the cell shows before the page is served, is on the CPU: only one thread
     # may call a GPU, and that is a tab's.
@@ -459,19 +503,30 @@ def view(
     listening = socket.create_server((LOCAL_HOST, 0))
     token = secrets.token_urlsafe(16)
     serving = loop.create_task(
-        serve_tabs(make_inspector, host=LOCAL_HOST, token=token, listening=listening, opened=handle._attach_tab)
+        serve_tabs(
+            make_inspector,
+            host=LOCAL_HOST,
+            token=token,
+            listening=listening,
+            opened=handle._attach_tab,
+        )
     )
-    serving.add_done_callback(lambda _: listening.close())  # also if it ends before the server takes the socket
+    # Also if it ends before the server takes the socket
+    serving.add_done_callback(lambda _: listening.close())
     display(IFrame(address(LOCAL_HOST, listening.getsockname()[1], token), "100%", height))
-    handle._serving, handle._loop = serving, loop
+    handle._serving = serving
+    handle._loop = loop
     return handle
 
 
-def _open_window(handle: InspectorHandle, inspector: Inspector, *, off_screen: bool = False) -> None:
+def _open_window(
+    handle: InspectorHandle, inspector: Inspector, *, off_screen: bool = False
+) -> None:
     """Open a window that a handle drives. ``off_screen``: draw without a display, for tests."""
     from amiwarp.viewer.window import Window
 
-    handle._window = window = Window(inspector, off_screen=off_screen)
+    window = Window(inspector, off_screen=off_screen)
+    handle._window = window
     handle._state = window.state_now()
-    layout.apply_state(handle._own, handle._state)
+    view_state.apply_state(handle._own, handle._state)
     window.listener = handle._hear

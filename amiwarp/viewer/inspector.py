@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import enum
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from threading import Event, Lock
@@ -16,278 +15,61 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.calib.bad_pixels import strange_pixels, stretch
-from amiwarp.calib.parameters import best_model, nominal, optical_parameters
 from amiwarp.calib.plate import LARGEST_INVERSE
-from amiwarp.calib.result import Calibration, constant_speed, replaces
-from amiwarp.choices import Colour, Sharpness, Vote
-from amiwarp.compensation.recordings import at_depths, compensate_events
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder, check_prisms, turn_between
+from amiwarp.choices import Sharpness, Vote
+from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.recordings import at_depths
+from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_speed import turn_between
+from amiwarp.events.encoder_stream import check_prisms
 from amiwarp.events.recording import Events, Recording
-from amiwarp.events.truth import Cause, Truth
+from amiwarp.imaging.canvas import CanvasShape
 from amiwarp.imaging.filters import find_hot_pixels
-from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, iwe, upload_events
+from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.regions import Region, RegionSharpness, inside, suggest_region
-from amiwarp.io.depth_map import DepthMap
-from amiwarp.io.formats import EXTENSIONS
-from amiwarp.io.pixel_map import PixelMap
-from amiwarp.io.plain_files import holds_map
+from amiwarp.imaging.uploaded_events import UploadedEvents, upload_events
+from amiwarp.imaging.votes import Votes
 from amiwarp.io.spans import Span, read_span
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, PHASE, Model, PlateModel, RisleyModel, alternatives, build_model
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.models.pair import RisleyModel
+from amiwarp.optics.models.parameter import PHASE
+from amiwarp.optics.models.plate import PlateModel
+from amiwarp.optics.models.registry import MODELS, build_model
 from amiwarp.optics.prism import NominalPrism, Plate, Prism, as_wedge
-from amiwarp.reconstruction.picture import Picture, border_displacements
-from amiwarp.viewer.filters import FilterStep, HotPixel, SelectedEvents, Selection, list_hot_pixels
+from amiwarp.reconstruction.windows import border_displacements
+from amiwarp.results.calibration import Calibration, constant_speed, replaces
+from amiwarp.results.depth_map import DepthMap
+from amiwarp.results.parameters import best_model, nominal
+from amiwarp.viewer.drawn_truth import DrawnTruth
+from amiwarp.viewer.filters import HotPixel, SelectedEvents, Selection, list_hot_pixels
+from amiwarp.viewer.knobs import (
+    CURVE_HALF_WIDTH,
+    SLIDING,
+    WEDGE_SIZES,
+    Knobs,
+    Source,
+    foreign_names,
+    size_name,
+)
+from amiwarp.viewer.shown_window import DisplayedWindow, LoadedWindow
 
 
 def _in_pixels(span: Span, size: tuple[int, int]) -> Span:
     """Return the span with the pixels of its events, also if these were compensated and lie anywhere."""
-    e = span.events
-    if not np.issubdtype(e.x.dtype, np.floating):
+    events = span.events
+    if not np.issubdtype(events.x.dtype, np.floating):
         return span
-    x, y = (np.clip(np.rint(v), 0, n - 1).astype(np.uint16) for v, n in zip((e.x, e.y), size, strict=True))
-    places = np.stack([e.x, e.y], axis=1).astype(np.float32)
-    return replace(span, events=Events(x, y, e.t, e.p), places=places)
+    width, height = size
+    x = np.clip(np.rint(events.x), 0, width - 1).astype(np.uint16)
+    y = np.clip(np.rint(events.y), 0, height - 1).astype(np.uint16)
+    places = np.stack([events.x, events.y], axis=1).astype(np.float32)
+    return replace(span, events=Events(x, y, events.t, events.p), places=places)
 
 
-# Ground truth of the events that the inspector draws, read from the recording on first use.
-
-STORES = {Colour.CAUSE: "stored_causes", Colour.INSTANCE: "stored_instances", Colour.DEPTH: "stored_depths"}
-"""Attribute of :class:`amiwarp.Truth` that each colour choice based on ground truth shows."""
-
-
-def colours_on_offer(truth: Truth | None) -> list[Colour]:
-    """Return the colour choices that are possible for a recording with this ground truth."""
-    return [c for c in Colour if c not in STORES or getattr(truth, STORES[c], None) is not None]
-
-
-def truth_text(truth: Truth | None) -> str:
-    """Return a one-line summary of the content of a ground truth; empty without ground truth."""
-    if truth is None:
-        return ""
-    stores = {"point": truth.stored_points, **{c.value: getattr(truth, name) for c, name in STORES.items()},
-              "place": truth.stored_places}  # fmt: skip
-    per_event = ", ".join(name for name, store in stores.items() if store is not None)
-    parts = [f"per event: {per_event}"] if per_event else ["prism"] if truth.parameters else []
-    parts += [f"{len(truth.labels.instances)} instances"] if truth.labels is not None else []
-    parts += [f"{len(truth.frames.t):,} instants"] if truth.frames is not None else []
-    parts += [f"{len(truth.poses):,} poses"] if truth.poses is not None else []
-    return "; ".join(parts)
-
-
-@dataclass(frozen=True, eq=False)
-class DrawnTruth:
-    """Ground truth of the events that the inspector draws."""
-
-    truth: Truth | None
-    """Ground truth of the whole recording; None if the recording has none."""
-    span: Span
-    """Time span from which the drawn events are a selection."""
-    positions: NDArray[np.int64]
-    """Indices of the drawn events in ``span.events``, shape ``(n,)``."""
-    _read: dict[Colour, NDArray[Any]] = field(default_factory=dict)
-
-    def values(self, colour: Colour) -> NDArray[Any]:
-        """Return the values of the drawn events that a colour shows, shape ``(n,)``.
-
-        The values are codes of causes, instance numbers, or depths [m]. Raises :class:`AmiwarpError` if the recording
-        does not hold this ground truth.
-        """
-        if colour not in self._read:
-            store = getattr(self.truth, STORES[colour], None)
-            if store is None:
-                given = ", ".join(c.value for c in colours_on_offer(self.truth))
-                raise AmiwarpError(
-                    f"colour {colour.value!r} needs ground truth that the recording does not hold; choose among {given}"
-                )
-            self._read[colour] = self.span.rows(store)[self.positions]
-        return self._read[colour]
-
-    def name(self, colour: Colour, number: int) -> str:
-        """Return the name of the cause with the code ``number``, or of the instance with this number."""
-        if colour is Colour.CAUSE:
-            return list(Cause)[number].value.replace("_", " ") if number < len(Cause) else f"cause {number}"
-        labels = () if self.truth is None or self.truth.labels is None else self.truth.labels.instances
-        return "sky" if number == 0 else labels[number - 1] if number <= len(labels) else f"instance {number}"
-
-    def text(self, k: int) -> str:
-        """Return the known ground truth of the drawn event ``k`` as text: cause, instance and depth."""
-        known = [c for c in colours_on_offer(self.truth) if c in STORES]
-        return "; ".join(
-            f"depth {self.values(c)[k]:.3f} m" if c is Colour.DEPTH else f"{c.value} {self.name(c, self.values(c)[k])}"
-            for c in known
-        )
-
-
-# Parameters of the prism and selection of events under which the inspector shows a recording.
-
-
-class Source(enum.StrEnum):
-    """Where the value of a parameter comes from. The value of a member is the text that the page shows."""
-
-    ASSUMED = "assumed"
-    ESTIMATED = "estimated"
-    FILE = "from the file"
-    CALIBRATED = "calibrated"
-    HAND = "set by hand"
-    TRUTH = "known truth"
-
-
-@dataclass(frozen=True)
-class Knobs:
-    """Parameters of the prism that the page's sliders set."""
-
-    model: str = "exact"
-    """Name of the optical model."""
-    apex: float = 0.0
-    """Apex angle of the prism [rad]. Other optics have their size among :attr:`others`."""
-    phase: float = 0.0
-    """Phase θ_b of the prism [rad]."""
-    clock_offset: float = 0.0
-    """Offset between the clocks of encoder and camera, as in :class:`Encoder` [us]."""
-    rpm: float = 0.0
-    """Speed of the prism if the recording has no encoder [1/min]."""
-    focal_length: float | None = None
-    """Calibrated focal length [px]; None: that of the camera."""
-    others: tuple[tuple[str, float], ...] = ()
-    """Names and values of other parameters of optical models that are not 0, sorted by name."""
-
-    @classmethod
-    def given(cls, values: Mapping[str, float], **known: Any) -> Knobs:
-        """Return parameters with ``known`` fields, and the other parameters of optical models among the ``values``."""
-        return cls(**known).with_values({name: values[name] for name in OTHERS if name in values})
-
-    def value(self, name: str) -> float | None:
-        """Return the value of a parameter; None if it is not known and has no slider."""
-        if name not in OTHERS:
-            return getattr(self, name)
-        return dict(self.others).get(name, 0.0 if name in SLIDING else None)
-
-    def with_values(self, values: Mapping[str, float]) -> Knobs:
-        """Return the parameters with other values of some of them."""
-        others = dict(self.others) | {name: value for name, value in values.items() if name in OTHERS}
-        fields: dict[str, Any] = {name: value for name, value in values.items() if name not in OTHERS}
-        return replace(self, **fields, others=tuple(sorted((n, v) for n, v in others.items() if v)))
-
-    @property
-    def calibrated_only(self) -> dict[str, float]:
-        """Parameters by name that the page cannot change, and that a calibration or the known truth gave."""
-        found = {name: self.value(name) for name in (*(n for n in OTHERS if n not in SLIDING), "focal_length")}
-        return {name: value for name, value in found.items() if value is not None}
-
-
-def size_name(model: str) -> str:
-    """Return the name of the parameter that the slider of a model's size sets: for all models of wedges the apex."""
-    kind = MODELS[model]
-    return "apex" if kind.PRISM and kind.GLASS is Prism else kind.SIZE
-
-
-WEDGE_SIZES = {kind.SIZE for name, kind in MODELS.items() if size_name(name) == "apex"}
-"""Names of the sizes of models that the slider of the apex sets."""
-OTHERS = {name: p for name, p in optical_parameters().items() if name not in (*WEDGE_SIZES, PHASE.name)}
-"""Parameters of the optical models but for phase and sizes of wedges, by name."""
-SLIDING = {name: p for name, p in OTHERS.items() if p.label}
-"""Those among :data:`OTHERS` that have a slider."""
-
-
-def foreign_names(model: str) -> set[str]:
-    """Return the names among :data:`OTHERS` of parameters that no model of the same optic has."""
-    return OTHERS.keys() - {name for each in alternatives(model).values() for name in each.FREE}
-
-
-CURVE_HALF_WIDTH = {
-    "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "rpm": 6.0,
-    **{name: p.half_range for name, p in SLIDING.items()},
-}  # fmt: skip
-"""Half width of the range of each parameter over which its sharpness curve is drawn, in the parameter's unit."""
-
-
-# Time windows of the inspector: their selected events, and what the page shows of them.
-
-
-@dataclass(frozen=True, eq=False)
-class DrawnWindow:
-    """Selected events of a time window that are drawn as points."""
-
-    span: Span
-    """Time window, with all events that were read from it."""
-    region: Region
-    """Part of the image that is shown."""
-    selected: int
-    """Number of selected events, which are all in the images."""
-    events: Events
-    """Events that are drawn as points."""
-    truth: DrawnTruth
-    """Ground truth of these events."""
-    before: NDArray[np.float32]
-    """Pixels of the drawn events as recorded [px], shape ``(n, 2)``."""
-    steps: tuple[FilterStep, ...]
-    """Numbers of events before and after each part of the selection."""
-
-    @property
-    def read_us(self) -> float:
-        """Time of which events were read [us]; of a window with too many events, that of its runs."""
-        return max(1.0, self.span.length_us * len(self.span.events) / max(self.span.count, 1))
-
-
-@dataclass(frozen=True, eq=False)
-class LoadedWindow(DrawnWindow):
-    """Selected events of a window, in memory and on the device, and their image without compensation."""
-
-    counted: Events
-    """Events of the images: the selected events, and those near the region that compensation may move into it."""
-    angles: dict[float, tuple[UploadedEvents, NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
-    """Events on the device, prism angles [rad] and speeds [rad/us] of the drawn events, without the clock offset set on
-    the page, by the speed of a prism without encoder [1/min]; with an encoder, the only key is 0."""
-    wrapped: dict[tuple[float, float], NDArray[np.float64]] = field(default_factory=dict)
-    """Last prism angles of the drawn events, from 0 to 2π [rad], by speed and drift of the clock offset."""
-    unmoved: list[tuple[NDArray[np.float32], float]] = field(default_factory=list)
-    """Image of the events as recorded and its sharpness, once it is measured."""
-    chosen: list[Picture] = field(default_factory=list)
-    """Reconstructed picture for which the weight of the smoothness prior was chosen last."""
-
-
-@dataclass(frozen=True, eq=False)
-class DisplayedWindow(DrawnWindow):
-    """Time window shown with the current parameters: images of all events, and points of evenly spaced events."""
-
-    after: NDArray[np.float32]
-    """Compensated positions of the drawn events [px], shape ``(n, 2)``; NaN if the model has no solution."""
-    theta: NDArray[np.float64]
-    """Prism angles of the drawn events [rad], from 0 to 2π, shape ``(n,)``."""
-    image_before: NDArray[np.float32]
-    """Number of events at each pixel as recorded, shape ``(height, width)``."""
-    image_after: NDArray[np.float32]
-    """Number of compensated events at each pixel, shape ``(height, width)``."""
-    sharpness_before: float
-    """Sharpness of ``image_before`` in the region: 0 for events at random, whatever their number."""
-    sharpness_after: float
-    """Sharpness of ``image_after`` in the region."""
-    beside: DisplayedWindow | None = None
-    """The same time of another recording, whose events, as recorded, the first cloud and image show instead."""
-    is_beside: bool = False
-    """Whether this is another recording, of which less may be known."""
-    offset_us: int = 0
-    """Time of its first event after the first event of the recording whose time axis it shares [us]."""
-
-    @property
-    def first(self) -> DisplayedWindow:
-        """What the first cloud shows."""
-        return self.beside or self
-
-    def every(self, step: int) -> DisplayedWindow:
-        """Return the window with every ``step``-th point."""
-        if step == 1:
-            return self
-        read = {colour: values[::step] for colour, values in self.truth._read.items()}
-        truth = replace(self.truth, positions=self.truth.positions[::step], _read=read)
-        return replace(self, events=self.events[::step], truth=truth, before=self.before[::step],
-                       after=self.after[::step], theta=self.theta[::step])  # fmt: skip
-
-
-# Selected events of a time window, on the host and with their prism angles on the device.
-
-MOST_POINTS, WINDOW_POINTS = 100_000, 1_000_000
+MOST_POINTS = 100_000
+WINDOW_POINTS = 1_000_000
 """Largest number of points in each event cloud: of the page, and of the window or a browser with a graphics card."""
 CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
@@ -299,12 +81,32 @@ FOV_DEG = 60.0
 """Horizontal field of view that is assumed if the camera is unknown [deg]."""
 NO_ENCODER = "no encoder: set the prism's speed (rpm), or calibrate, to compensate its motion"
 NO_CAMERA = f"camera unknown: {FOV_DEG:g}° field of view assumed; set it, or give it with --fov-deg or --camera"
-CURVE_POINTS, ORBIT_POINTS = 25, 181
+CURVE_POINTS = 25
+ORBIT_POINTS = 181
 """Number of points of a sharpness curve, and of the drawn orbit of a scene point."""
 LARGEST_APEX = math.radians(3.0)
 """Apex angle up to which events that move into the region are in its images, if the nominal apex is smaller [rad]."""
 WINDOW_US = 100_000
 """Length of the first time window if the prism does not rotate [us]."""
+
+
+def _first_sources(recording: Recording) -> dict[str, Source]:
+    """Return where the values come from with which the inspector of a recording starts."""
+
+    def source_of(given: object) -> Source:
+        return Source.ASSUMED if given is None else Source.FILE
+
+    sources = {
+        "camera": source_of(recording.camera),
+        "prism": source_of(recording.prism),
+        "apex": source_of(getattr(recording.prism, "apex", None)),
+        **dict.fromkeys(("model", "phase", *SLIDING), Source.ASSUMED),
+    }
+    if recording.encoder is None:
+        sources["rpm"] = Source.ASSUMED
+    else:
+        sources["clock_offset"] = Source.FILE
+    return sources
 
 
 class Inspector:
@@ -330,35 +132,43 @@ class Inspector:
         """
         source = recording.events
         if not len(source):
-            raise AmiwarpError(f"{recording.name}: holds no events; give a recording with events")
-        path = None if calibration is None or recording.encoder is not None else calibration.path
-        if path is not None and path.covers(source.t_first, source.t_last):
-            recording = replace(recording, encoder=path)
+            raise AmiwarpError(
+                f"{recording.name}: holds no events; give a recording with events",
+                ErrorCode.CONTENT_MISSING,
+            )
+        if calibration is not None and recording.encoder is None:
+            # A calibration without encoder may have found the angles of this very recording.
+            path = calibration.path
+            if path is not None and path.covers(source.t_first, source.t_last):
+                recording = replace(recording, encoder=path)
         self._no_speed = recording.encoder is None and calibration is None
-        self.sources = {
-            "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
-            "prism": Source.ASSUMED if recording.prism is None else Source.FILE,
-            "apex": Source.ASSUMED if getattr(recording.prism, "apex", None) is None else Source.FILE,
-            **dict.fromkeys(("model", "phase", *SLIDING), Source.ASSUMED),
-            **({"rpm": Source.ASSUMED} if recording.encoder is None else {"clock_offset": Source.FILE}),
-        }
+        self.sources = _first_sources(recording)
         """Where the value of each parameter that the page shows, the camera, and the prism's index come from."""
         if recording.camera is None:
-            recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
-        self.recording, self.device, self.latest = recording, device, latest
+            recording = replace(
+                recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG))
+            )
+        self.recording = recording
+        self.device = device
+        self.latest = latest
         self.prism = nominal(recording.prism)
         """Nominal glass of the recording; a prism with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
         """Time at which the prism angle is 0 if there is no encoder [us]."""
-        best, ratio, second = self._best_model, None if recording.encoder is None else recording.encoder.ratio, {}
+        best = self._best_model
+        ratio = None if recording.encoder is None else recording.encoder.ratio
+        second = {}
         if ratio is not None:  # of a pair of prisms
-            second = {"second_apex": (as_wedge(self.prism).second or as_wedge(self.prism)).apex, "ratio": ratio}
+            wedge = as_wedge(self.prism)
+            second = {"second_apex": (wedge.second or wedge).apex, "ratio": ratio}
         self.knobs = Knobs.given(
-            second | self._typical_size(best), model=best, apex=self.nominal_apex,
+            second | self._typical_size(best),
+            model=best,
+            apex=self.nominal_apex,
             clock_offset=self._recorded_offset_us,
-        )  # fmt: skip
+        )
         self.window: tuple[int, int] | None = None
-        """Start and length of the time window [us]; None: that of :meth:`first_window`."""
+        """Start and length of the time window [us]; None: the window of :meth:`first_window`."""
         self.fixed_count: int | None = None
         """Number of events of each time window that is opened, from its start on; None: windows have their length."""
         self.path: Path | None = None
@@ -380,7 +190,8 @@ class Inspector:
         self._is_beside = False
         self._found: tuple[Knobs, Calibration] | None = None
         self._harmonics: tuple[float, ...] | None = None
-        self._mended: Encoder | None = None  # angles that a calibration found in place of those of the encoder
+        # Angles that a calibration found instead of the encoder's.
+        self._mended: Encoder | None = None
         self._window: LoadedWindow | None = None
         self._span: Span | None = None
         self._closing = Event()
@@ -393,11 +204,16 @@ class Inspector:
 
     def copy(self) -> Inspector:
         """Return an inspector that shows the same, with buffers of its own, for another thread."""
-        made, size = copy(self), self.recording.events.size
-        made.lock, made._votes, made.sources = Lock(), {}, dict(self.sources)
+        made = copy(self)
+        size = self.recording.events.size
+        made.lock = Lock()
+        made._votes = {}
+        made.sources = dict(self.sources)
         made._imager = RegionSharpness(size, self.device)
-        made._window = made._span = None
-        made.besides, made.beside = tuple(each.copy() for each in self.besides), None
+        made._window = None
+        made._span = None
+        made.besides = tuple(each.copy() for each in self.besides)
+        made.beside = None
         if self.beside is not None:
             made.beside = made.besides[self.besides.index(self.beside)]
         return made
@@ -430,8 +246,12 @@ class Inspector:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is missing to compensate the prism's motion, one sentence each."""
-        no_speed = self._no_speed and not self.knobs.rpm
-        return (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (self.sources["camera"] is Source.ASSUMED)
+        missing = []
+        if self._no_speed and not self.knobs.rpm:
+            missing.append(NO_ENCODER)
+        if self.sources["camera"] is Source.ASSUMED:
+            missing.append(NO_CAMERA)
+        return tuple(missing)
 
     @property
     def fov_deg(self) -> float:
@@ -441,18 +261,23 @@ class Inspector:
     def set_camera(self, fov_deg: float) -> None:
         """Set a camera with a horizontal field of view [deg], without distortion. The window is read again."""
         camera = Camera.from_fov(*self.recording.events.size, math.radians(fov_deg))
-        self.recording, self.sources["camera"] = replace(self.recording, camera=camera), Source.HAND
+        self.recording = replace(self.recording, camera=camera)
+        self.sources["camera"] = Source.HAND
         self._window = None
 
     def set_index(self, index: float) -> None:
         """Set the refractive index of the prism."""
-        self.prism, self.sources["prism"] = replace(self.prism, index=index), Source.HAND
+        self.prism = replace(self.prism, index=index)
+        self.sources["prism"] = Source.HAND
 
     @property
     def nominal_prism(self) -> NominalPrism | None:
         """Prism of the recording, or the one that was set by hand; None if neither is known."""
         given = self.recording.prism
-        if Source.HAND in (self.sources["prism"], None if given is not None else self.sources["apex"]):
+        by_hand = self.sources["prism"] is Source.HAND
+        if given is None:
+            by_hand = by_hand or self.sources["apex"] is Source.HAND
+        if by_hand:
             return replace(as_wedge(self.prism), apex=self.knobs.apex)
         return given
 
@@ -469,7 +294,8 @@ class Inspector:
     @property
     def has_optic(self) -> bool:
         """Whether anything says that the camera looks through an optic that moves: else it is a plain recording."""
-        known = any(source is not Source.ASSUMED for name, source in self.sources.items() if name != "camera")
+        of_optic = [source for name, source in self.sources.items() if name != "camera"]
+        known = any(source is not Source.ASSUMED for source in of_optic)
         return known or self.has_encoder or self.recording.prism is not None
 
     @property
@@ -496,10 +322,14 @@ class Inspector:
     @cached_property
     def _corrected(self) -> Encoder | None:
         """The recording's encoder without the errors that a calibration found in it; None if there is no encoder."""
-        encoder, harmonics = self.recording.encoder, self._harmonics
-        if encoder is not None and self._mended is not None:
+        encoder = self.recording.encoder
+        if encoder is None:
+            return None
+        if self._mended is not None:
             encoder = replace(self._mended, clock_offset_us=encoder.clock_offset_us)
-        return encoder if encoder is None or harmonics is None else encoder.with_harmonics(harmonics)
+        if self._harmonics is not None:
+            encoder = encoder.with_harmonics(self._harmonics)
+        return encoder
 
     @property
     def _best_model(self) -> str:
@@ -525,12 +355,16 @@ class Inspector:
         """
         table = at_depths(self.model, depth).depths
         assert table is not None
-        self.depth, self._depths, self._window = depth, table, None
+        self.depth = depth
+        self._depths = table
+        self._window = None
 
     @property
     def orbit_names(self) -> tuple[str, ...]:
         """Names of size and phase, as far as they have a slider: with a depth map, there is no size to set."""
-        return (*((size_name(self.knobs.model),) if self.depth is None else ()), PHASE.name)
+        if self.depth is not None:
+            return (PHASE.name,)
+        return (size_name(self.knobs.model), PHASE.name)
 
     @property
     def margin_px(self) -> int:
@@ -538,7 +372,8 @@ class Inspector:
         if not self.has_optic:
             return 0
         if isinstance(self.prism, Plate):
-            reach = self.prism.shift * (LARGEST_INVERSE if self.depth is None else float(self._depths.max()))
+            nearest = LARGEST_INVERSE if self.depth is None else float(self._depths.max())
+            reach = self.prism.shift * nearest
         else:
             largest = replace(self.prism, apex=max(LARGEST_APEX, 2.0 * self.prism.apex))
             reach = math.tan(abs(largest.deflection))
@@ -562,10 +397,13 @@ class Inspector:
     @cached_property
     def _searched(self) -> tuple[NDArray[np.bool_], tuple[HotPixel, ...]]:
         """Hot pixels as a mask and as a list, found in the middle of the recording."""
-        source, encoder = self.recording.events, self.encoder
+        source = self.recording.events
+        encoder = self.encoder
         events = stretch(source, encoder)
-        turns = math.isfinite(self.turn_us)
-        hot = strange_pixels(events, encoder, source.size)[0] if turns else find_hot_pixels(events, source.size)
+        if math.isfinite(self.turn_us):
+            hot, _ = strange_pixels(events, encoder, source.size)
+        else:
+            hot = find_hot_pixels(events, source.size)
         return hot, list_hot_pixels(events, hot)
 
     def first_window(self) -> tuple[int, int]:
@@ -576,8 +414,9 @@ class Inspector:
         """
         source = self.recording.events
         whole = source.t_last - source.t_first + 1
-        still = min(WINDOW_US, max(1, whole // 5))
-        length = min(round(self.turn_us) if math.isfinite(self.turn_us) else still, whole)
+        length = min(WINDOW_US, max(1, whole // 5))
+        if math.isfinite(self.turn_us):
+            length = min(round(self.turn_us), whole)
         return source.t_first + (whole - length) // 2, length
 
     def window_of(self, start_us: int, count: int) -> tuple[int, int]:
@@ -598,10 +437,11 @@ class Inspector:
         """Return the start of the window [us] that lies by a number of windows of equal count after the current one."""
         source = self.recording.events
         start_us, length_us = self.window or self.first_window()
+        count = self.fixed_count or 1
         if windows >= 0:
-            index = source.find(start_us + length_us) + (windows - 1) * (self.fixed_count or 1)
+            index = source.find(start_us + length_us) + (windows - 1) * count
         else:
-            index = source.find(start_us) + windows * (self.fixed_count or 1)
+            index = source.find(start_us) + windows * count
         index = min(max(index, 0), len(source) - 1)
         return int(source.slice(index, index + 1).t[0])
 
@@ -612,7 +452,9 @@ class Inspector:
         """
         if self.latest is not None:
             recording = self.latest()
-            self.recording = replace(self.recording, events=recording.events, encoder=recording.encoder)
+            self.recording = replace(
+                self.recording, events=recording.events, encoder=recording.encoder
+            )
             self._span = None
             self._forget_angles()
 
@@ -626,37 +468,53 @@ class Inspector:
 
     def accept(self, calibration: Calibration) -> None:
         """Set the parameters to a calibration. Raises :class:`AmiwarpError` if its camera has another size."""
-        size, given = self.recording.events.size, (calibration.camera.width, calibration.camera.height)
+        size = self.recording.events.size
+        given = (calibration.camera.width, calibration.camera.height)
         if given != size:
             raise AmiwarpError(
                 f"the calibration is of {given[0]}x{given[1]} pixels, the events are of {size[0]}x{size[1]}; "
                 "calibrate this recording"
             )
-        self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
+        self.prism = calibration.prism
+        self.recording = replace(self.recording, camera=calibration.camera)
         self._harmonics = calibration.harmonics
-        own, path = self.recording.encoder, calibration.path
-        self._mended = path if own is not None and path is not None and replaces(path, own) else None
+        own = self.recording.encoder
+        path = calibration.path
+        self._mended = None
+        if own is not None and path is not None and replaces(path, own):
+            self._mended = path
         self._forget_angles()
         self.set(self.knobs_of(calibration))
-        found, free = (
-            {"apex" if name in WEDGE_SIZES else name for name in names} & set(self.sources)
-            for names in (calibration.parameters, calibration.free)
-        )
-        self.sources |= dict.fromkeys(found, Source.FILE) | dict.fromkeys(("model", *free), Source.CALIBRATED)
+
+        self.sources |= dict.fromkeys(self._shown_names(calibration.parameters), Source.FILE)
+        free = self._shown_names(calibration.free)
+        self.sources |= dict.fromkeys(("model", *free), Source.CALIBRATED)
         self._found = self.knobs, calibration
+
+    def _shown_names(self, names: Iterable[str]) -> set[str]:
+        """Return which of a model's parameters the page shows, by its names: any size of a wedge is the apex."""
+        return {"apex" if name in WEDGE_SIZES else name for name in names} & set(self.sources)
 
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
-        p, prism = calibration.parameters, calibration.prism
-        kind, rpm = MODELS[calibration.model_name], p.get("rpm", 0.0)
+        values = calibration.parameters
+        kind = MODELS[calibration.model_name]
+        rpm = values.get("rpm", 0.0)
         if calibration.zero_us is not None:
-            p = kind.turned_values(p, rpm * math.tau / 60e6 * (self.zero_us - calibration.zero_us))
-        offset = p.get("clock_offset", self._recorded_offset_us)
-        apex = kind.apex_from_size(p[kind.SIZE], as_wedge(prism)) if kind.SIZE in WEDGE_SIZES else self.knobs.apex
+            turned = rpm * math.tau / 60e6 * (self.zero_us - calibration.zero_us)
+            values = kind.turned_values(values, turned)
+        apex = self.knobs.apex
+        if kind.SIZE in WEDGE_SIZES:
+            apex = kind.apex_from_size(values[kind.SIZE], as_wedge(calibration.prism))
         return Knobs.given(
-            p, model=kind.NAME, apex=apex, phase=p["phase"], clock_offset=offset, rpm=rpm,
-            focal_length=p.get("focal_length"),
-        )  # fmt: skip
+            values,
+            model=kind.NAME,
+            apex=apex,
+            phase=values["phase"],
+            clock_offset=values.get("clock_offset", self._recorded_offset_us),
+            rpm=rpm,
+            focal_length=values.get("focal_length"),
+        )
 
     @property
     def truth(self) -> Knobs | None:
@@ -664,18 +522,24 @@ class Inspector:
 
         None if the recording has no ground truth of its prism.
         """
-        p = {} if self.recording.truth is None else self.recording.truth.parameters
-        if not {"apex", "phase"} <= set(p):
+        values = {} if self.recording.truth is None else self.recording.truth.parameters
+        if "apex" not in values or "phase" not in values:
             return None
-        offset = p.get("clock_offset_us", self._recorded_offset_us)
         return Knobs.given(
-            p, model=self._best_model, apex=p["apex"], phase=p["phase"], clock_offset=offset, rpm=self.knobs.rpm
+            values,
+            model=self._best_model,
+            apex=values["apex"],
+            phase=values["phase"],
+            clock_offset=values.get("clock_offset_us", self._recorded_offset_us),
+            rpm=self.knobs.rpm,
         )
 
     def take_truth(self) -> None:
         """Set the parameters to the known truth. Raises :class:`AmiwarpError` if the recording has none."""
         if self.truth is None:
-            raise AmiwarpError(f"{self.recording.name}: holds no true parameters of its prism; simulate a recording")
+            raise AmiwarpError(
+                f"{self.recording.name}: holds no true parameters of its prism; simulate a recording"
+            )
         self.set(self.truth)
         known = set(self.sources) - {"camera", "prism", "rpm"} - foreign_names(self.truth.model)
         self.sources |= dict.fromkeys(known, Source.TRUTH)
@@ -684,20 +548,40 @@ class Inspector:
         """Return the accepted calibration if no parameter was changed since, else one of the current parameters."""
         if self._found is not None and self._found[0] == self.knobs:
             return self._found[1]
-        k, w, values = self.knobs, self.loaded, self._values(self.knobs)
-        kind = MODELS[k.model]
+        knobs = self.knobs
+        window = self.loaded
+        kind = MODELS[knobs.model]
+
+        values = self._values(knobs)
         others = [name for name in kind.FREE if name in SLIDING]
-        time = {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
-        kept = {name: values[name] for name in (kind.SIZE, *others, "phase", *k.calibrated_only)} | time
+        names = (kind.SIZE, *others, "phase", *knobs.calibrated_only)
+        parameters = {name: values[name] for name in names}
+        if self.has_encoder:
+            parameters["clock_offset"] = knobs.clock_offset
+        else:
+            parameters["rpm"] = knobs.rpm
+
         with self.lock:
-            before, after = (self._imager.measure(*self.warped(w, each), w.region)[0] for each in (None, k))
+            before, _ = self._imager.measure(*self.warped(window, None), window.region)
+            after, _ = self._imager.measure(*self.warped(window, knobs), window.region)
         return Calibration(
-            model_name=k.model, camera=self.camera, prism=nominal(self.prism, kind), parameters=kept, uncertainty={},
-            free=(), sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before, sharpness_after=after,
-            stages=(), events=len(w.counted), seconds=0.0, warnings=("set by hand in the inspector",),
-            zero_us=None if self.has_encoder else self.zero_us, harmonics=self._harmonics,
+            model_name=knobs.model,
+            camera=self.camera,
+            prism=nominal(self.prism, kind),
+            parameters=parameters,
+            uncertainty={},
+            free=(),
+            sharpness_name=Sharpness.VARIANCE.value,
+            sharpness_before=before,
+            sharpness_after=after,
+            stages=(),
+            events=len(window.counted),
+            seconds=0.0,
+            warnings=("set by hand in the inspector",),
+            zero_us=None if self.has_encoder else self.zero_us,
+            harmonics=self._harmonics,
             path=self._mended,
-        )  # fmt: skip
+        )
 
     def set(self, knobs: Knobs) -> None:
         """Set the parameters of the prism. Parameters that change count as set by hand.
@@ -722,7 +606,8 @@ class Inspector:
         if self.fixed_count is not None:
             start_us, length_us = self.window_of(start_us, self.fixed_count)
         self._window = self._load(start_us, max(1, length_us), chosen)
-        self.selection, self.window = chosen, (start_us, length_us)
+        self.selection = chosen
+        self.window = (start_us, length_us)
 
     @property
     def chosen(self) -> tuple[tuple[int, int] | None, Selection]:
@@ -733,8 +618,11 @@ class Inspector:
         """Return the region in which compensation gains most sharpness in the current time window."""
         loaded = self.loaded
         if self.selection.region is not None:
-            loaded = self._load(loaded.span.start_us, loaded.span.length_us, replace(self.selection, region=None))
-        (before, _), (after, _) = self._measured(loaded, None), self._measured(loaded, self.knobs)
+            loaded = self._load(
+                loaded.span.start_us, loaded.span.length_us, replace(self.selection, region=None)
+            )
+        before, _ = self._measured(loaded, None)
+        after, _ = self._measured(loaded, self.knobs)
         return suggest_region(before, after, margin=math.ceil(self.orbit_px))
 
     @property
@@ -749,7 +637,8 @@ class Inspector:
         prism's angles of this recording at these times, with the speed and the clock offset that are set for this one:
         :attr:`angles_lent` says so. Raises :class:`AmiwarpError` if it has no events, or another number of pixels.
         """
-        source, size = recording.events, self.recording.events.size
+        source = recording.events
+        size = self.recording.events.size
         if source.size != size:
             raise AmiwarpError(
                 f"{recording.name}: has {source.size[0]}x{source.size[1]} pixels, {self.recording.name} has "
@@ -759,9 +648,13 @@ class Inspector:
         lent = recording.encoder is None
         if recording.encoder is None and own is not None and len(source):
             shift = source.t_first - self.recording.events.t_first - offset_us
-            recording = replace(recording, encoder=Encoder(own.t + shift, own.angle, own.clock_offset_us))
+            recording = replace(
+                recording, encoder=Encoder(own.t + shift, own.angle, own.clock_offset_us)
+            )
         made = Inspector(recording, device=self.device, most_points=self.most_points)
-        made._is_beside, made.offset_us, made._angles_are_lent = True, offset_us, lent
+        made._is_beside = True
+        made.offset_us = offset_us
+        made._angles_are_lent = lent
         made.zero_us = source.t_first + self.zero_us - self.recording.events.t_first - offset_us
         self.besides = (*self.besides, made)
         self.beside = self.beside or made
@@ -781,9 +674,14 @@ class Inspector:
     def counts_beside(self, span: Span) -> list[int]:
         """Return how many events each recording on this time axis has in the time of a span, whatever is selected."""
         start_us = span.start_us - span.first_us
-        ends = [[each.time_of(t_us) for t_us in (start_us, start_us + span.length_us)] for each in self.besides]
-        sources = [each.recording.events for each in self.besides]
-        return [source.find(stop) - source.find(start) for source, (start, stop) in zip(sources, ends, strict=True)]
+        stop_us = start_us + span.length_us
+        counts = []
+        for other in self.besides:
+            source = other.recording.events
+            first = source.find(other.time_of(start_us))
+            stop = source.find(other.time_of(stop_us))
+            counts.append(stop - first)
+        return counts
 
     def _beside(
         self, span: Span, selection: Selection, image_after: NDArray[np.float32], lent: Knobs | None
@@ -795,16 +693,28 @@ class Inspector:
         """
         if lent is not None:
             self.knobs = replace(self.knobs, rpm=lent.rpm, clock_offset=lent.clock_offset)
-        window = self.time_of(span.start_us - span.first_us), span.length_us
-        if (window, selection) != (self.window, self.selection):
-            self.open(*window, selection)
-        w = self.loaded
-        image, sharpness = self._measured(w, None)
+        time = self.time_of(span.start_us - span.first_us), span.length_us
+        if (time, selection) != (self.window, self.selection):
+            self.open(*time, selection)
+        window = self.loaded
+        image, sharpness = self._measured(window, None)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.events, w.truth, w.before, w.steps, w.before,
-            self._wrapped(w, self.knobs), image, image_after, sharpness, sharpness, is_beside=True,
+            span=window.span,
+            region=window.region,
+            selected=window.selected,
+            events=window.events,
+            truth=window.truth,
+            before=window.before,
+            steps=window.steps,
+            after=window.before,
+            theta=self._wrapped(window, self.knobs),
+            image_before=image,
+            image_after=image_after,
+            sharpness_before=sharpness,
+            sharpness_after=sharpness,
+            is_beside=True,
             offset_us=self.offset_us,
-        )  # fmt: skip
+        )
 
     def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
         """Return the time window's images and points.
@@ -813,19 +723,34 @@ class Inspector:
         replace the recorded events as the first of the two clouds and images. Without them, the first ones show the
         recording beside, if there is one.
         """
-        w, knobs = self.loaded, knobs or self.knobs
-        xy = w.before if against is None else self._moved(w, against)
-        (image_after, sharpness_after), other = self._measured(w, knobs), None
+        window = self.loaded
+        knobs = knobs or self.knobs
+        before = window.before if against is None else self._moved(window, against)
+        image_after, sharpness_after = self._measured(window, knobs)
+        other = None
         if self.beside is not None and against is None:
             lent = knobs if self.angles_lent else None
-            other = self.beside._beside(w.span, self.selection, image_after, lent)
-            image, sharpness = other.image_before, other.sharpness_before
+            other = self.beside._beside(window.span, self.selection, image_after, lent)
+            image_before = other.image_before
+            sharpness_before = other.sharpness_before
         else:
-            image, sharpness = self._measured(w, against)
+            image_before, sharpness_before = self._measured(window, against)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.events, w.truth, xy, w.steps, self._moved(w, knobs),
-            self._wrapped(w, knobs), image, image_after, sharpness, sharpness_after, other,
-        )  # fmt: skip
+            span=window.span,
+            region=window.region,
+            selected=window.selected,
+            events=window.events,
+            truth=window.truth,
+            before=before,
+            steps=window.steps,
+            after=self._moved(window, knobs),
+            theta=self._wrapped(window, knobs),
+            image_before=image_before,
+            image_after=image_after,
+            sharpness_before=sharpness_before,
+            sharpness_after=sharpness_after,
+            beside=other,
+        )
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return values of a parameter around its current one, in its unit, and the sharpness at each of them."""
@@ -834,9 +759,13 @@ class Inspector:
 
     def curve_points(self, name: str) -> Iterator[tuple[float, float]]:
         """Yield the points of :meth:`curve` one after the other."""
-        knobs, half, sharpness = self.knobs, CURVE_HALF_WIDTH[name], self.sharpness_meter()
+        knobs = self.knobs
+        half = CURVE_HALF_WIDTH[name]
+        sharpness = self.sharpness_meter()
         values = (knobs.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
-        for value in values[values >= 0.0].tolist() if name == size_name(knobs.model) else values.tolist():
+        if name == size_name(knobs.model):
+            values = values[values >= 0.0]
+        for value in values.tolist():
             yield value, sharpness(knobs.with_values({name: value}))
 
     def sharpness_meter(self) -> Callable[[Knobs | None], float]:
@@ -845,14 +774,17 @@ class Inspector:
         Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and has buffers of
         its own, for one thread.
         """
-        w, imager = self.loaded, RegionSharpness(self.recording.events.size, self.device)
-        part = w.counted[:: max(1, -(-len(w.counted) // CURVE_EVENTS))]
-        undrawn = replace(w, counted=part, events=w.events[:0], angles={})
+        window = self.loaded
+        imager = RegionSharpness(self.recording.events.size, self.device)
+        step = max(1, -(-len(window.counted) // CURVE_EVENTS))  # rounded up
+        undrawn = replace(
+            window, counted=window.counted[::step], events=window.events[:0], angles={}
+        )
 
         def sharpness(knobs: Knobs | None) -> float:
             if self.closed:
                 raise AmiwarpError(f"{self.recording.name}: is closed")
-            return imager.measure(*self.warped(undrawn, knobs), w.region)[1]
+            return imager.measure(*self.warped(undrawn, knobs), window.region)[1]
 
         return sharpness
 
@@ -863,37 +795,52 @@ class Inspector:
         a pixel, over the logarithm of the interval [us]. Intervals between runs are not counted. Those under 1 us are
         in the first bin, those over 1 s in the last one.
         """
-        events, span, (left, top, right, bottom) = self.loaded.counted, self.loaded.span, self.loaded.region
-        events = events[inside(events, self.loaded.region)]
-        run = np.searchsorted(span.run_starts, events.t, side="right")
-        pixel = (run * (bottom - top) + events.y.astype(np.int64) - top) * (right - left) + events.x - left
+        window = self.loaded
+        left, top, right, bottom = window.region
+        width = right - left
+        height = bottom - top
+        area = width * height
+        events = window.counted[inside(window.counted, window.region)]
+
+        # Events of one pixel and one run of events come together, in the order of their times.
+        run = np.searchsorted(window.span.run_starts, events.t, side="right")
+        row = events.y.astype(np.int64) - top
+        pixel = (run * height + row) * width + events.x - left
         order = np.argsort(pixel, kind="stable")
-        steps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
-        counts, _ = np.histogram(np.clip(steps, 1, 999_999), INTERVALS_US)
-        n, area, known, decades = len(events), (right - left) * (bottom - top), bool(len(steps)), np.log10(INTERVALS_US)
-        pixels, read_us = len(np.unique(pixel % area)), self.loaded.read_us
-        median_us = float(np.median(steps)) if known else math.nan
+        same_pixel = np.diff(pixel[order]) == 0
+        intervals_us = np.diff(events.t[order])[same_pixel]
+
+        known = bool(len(intervals_us))
+        counts, _ = np.histogram(np.clip(intervals_us, 1, 999_999), INTERVALS_US)
+        decades = np.log10(INTERVALS_US)
+        median_us = float(np.median(intervals_us)) if known else math.nan
+        pixels = len(np.unique(pixel % area))
         rows = [
-            ("rate", f"{n / read_us * 1e6:,.0f} events/s"), ("events per pixel", f"{n / area:.3g}"),
-            ("ON", f"{100.0 * events.p.mean():.1f} %"), ("pixels with events", f"{100.0 * pixels / area:.1f} %"),
+            ("rate", f"{len(events) / window.read_us * 1e6:,.0f} events/s"),
+            ("events per pixel", f"{len(events) / area:.3g}"),
+            ("ON", f"{100.0 * events.p.mean():.1f} %"),
+            ("pixels with events", f"{100.0 * pixels / area:.1f} %"),
             ("median interval of a pixel", f"{median_us:,.0f} µs" if known else "–"),
-        ]  # fmt: skip
+        ]
         return {
-            "rows": [list(row) for row in rows], "x": (0.5 * (decades[1:] + decades[:-1])).tolist() if known else [],
+            "rows": [list(row) for row in rows],
+            "x": (0.5 * (decades[1:] + decades[:-1])).tolist() if known else [],
             "y": (100.0 * counts / max(1, counts.sum())).tolist(),
             "median": math.log10(max(median_us, 1.0)) if known else None,
-        }  # fmt: skip
+        }
 
     def orbit(self, x: float, y: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Return the orbit of the scene point that would appear at (x, y) [px] without the prism.
 
         Returns prism angles over one turn [rad], shape ``(n,)``, and pixels, shape ``(n, 2)``.
         """
-        theta, model = np.linspace(0.0, math.tau, ORBIT_POINTS), self.model
+        theta = np.linspace(0.0, math.tau, ORBIT_POINTS)
+        model = self.model
         point = np.broadcast_to(np.array([[x, y]], np.float32), (len(theta), 2))
         if isinstance(model, PlateModel) and model.depths is not None:  # the point has one depth
-            at = np.clip(np.rint(np.nan_to_num([y, x])).astype(int), 0, np.array(model.depths.shape) - 1)
-            model = replace(model, depths=None, inverse_depth=float(model.depths[*at]))
+            last = np.array(model.depths.shape) - 1
+            row, column = np.clip(np.rint(np.nan_to_num([y, x])).astype(int), 0, last)
+            model = replace(model, depths=None, inverse_depth=float(model.depths[row, column]))
         return theta, model.deflect_points(point, theta.astype(np.float32))
 
     @property
@@ -914,23 +861,33 @@ class Inspector:
 
         A prism that does not rotate gets apex 0 and no cylinder power, so that nothing is compensated.
         """
-        turns, more = bool(self.has_encoder or knobs.rpm), knobs.calibrated_only
-        others = {name: (knobs.value(name) if turns else None) or 0.0 for name in SLIDING}
-        kind, values = MODELS[knobs.model], {**more, **others, "phase": knobs.phase}
+        turns = bool(self.has_encoder or knobs.rpm)
+        calibrated = knobs.calibrated_only
+        sliding = dict.fromkeys(SLIDING, 0.0)
+        if turns:
+            sliding = {name: knobs.value(name) or 0.0 for name in SLIDING}
+        values = {**calibrated, **sliding, "phase": knobs.phase}
+
+        kind = MODELS[knobs.model]
         if kind.SIZE in WEDGE_SIZES:
-            wedge = replace(as_wedge(self.prism), index=more.get("index", self.prism.index))
+            wedge = replace(as_wedge(self.prism), index=calibrated.get("index", self.prism.index))
             values[kind.SIZE] = kind.size_from_apex(knobs.apex if turns else 0.0, wedge)
         return values
 
     def model_of(
-        self, knobs: Knobs, camera: Camera | None = None, part: tuple[slice, slice] = (slice(None), slice(None))
+        self,
+        knobs: Knobs,
+        camera: Camera | None = None,
+        part: tuple[slice, slice] = (slice(None), slice(None)),
     ) -> Model:
         """Return the optical model with given parameters.
 
         ``camera``: another camera than the recording's, which sees these rows and columns of its pixels.
         """
         model = build_model(knobs.model, camera or self.camera, self.prism, self._values(knobs))
-        if self.depth is None or not isinstance(model, PlateModel) or not model.inverse_depth:  # of 0, nothing moves
+        if self.depth is None or not isinstance(model, PlateModel):
+            return model
+        if not model.inverse_depth:  # nothing moves
             return model
         return model.with_depths(self._depths[part])
 
@@ -939,170 +896,172 @@ class Inspector:
         encoder = self._encoder(knobs.rpm)
         return encoder.with_clock_offset(knobs.clock_offset) if self.has_encoder else encoder
 
-    def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
+    def warped(
+        self, window: LoadedWindow, knobs: Knobs | None
+    ) -> tuple[Model, UploadedEvents, float]:
         """Return the model, the events on the device and their drift [us], to vote the events of a window.
 
         ``knobs``: the parameters; None for the events as recorded.
         """
-        given = knobs or replace(self.knobs, model=self._best_model, apex=0.0, others=())  # which move no event
-        return self.model_of(given), self._angles(w, given)[0], self._drift_us(given)
+        if knobs is None:  # parameters that move no event
+            knobs = replace(self.knobs, model=self._best_model, apex=0.0, others=())
+        uploaded, _, _ = self._angles(window, knobs)
+        return self.model_of(knobs), uploaded, self._drift_us(knobs)
 
     def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
         """Read and select the events of a time window. The events of the last one are not read again."""
-        if self._span is None or (self._span.start_us, self._span.length_us) != (start_us, length_us):
+        span = self._span
+        if span is None or (span.start_us, span.length_us) != (start_us, length_us):
             span = read_span(self.recording.events, start_us, length_us, most_events=MOST_EVENTS)
-            self._span = _in_pixels(span, self.recording.events.size) if self._is_beside else span
-        return self.select(self._span, selection)
+            if self._is_beside:
+                span = _in_pixels(span, self.recording.events.size)
+            self._span = span
+        return self.select(span, selection)
 
     def select(self, span: Span, selection: Selection) -> LoadedWindow:
         """Select the events of a time window. Raises :class:`AmiwarpError` if no event meets the selection."""
         recording = self.recording
         region = selection.region or (0, 0, *recording.events.size)
+
+        # Events in the region and near it: compensation may move these into it.
         running = self.selected_events(selection)
         keep = running.keep(span.events)
         if span.places is not None:  # compensated events outside of the image have no pixel
             half = np.array(recording.events.size) / 2.0
             keep &= (np.abs(span.places + 0.5 - half) <= half).all(axis=1)
         near = None if keep.all() else np.flatnonzero(keep)  # None stands for all
-        events = span.events if near is None else span.events[near]
-        within = np.flatnonzero(inside(events, region)) if selection.region else None
-        n = len(events) if within is None else len(within)
-        if not n:
-            what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
-            raise AmiwarpError(f"{what} from {span.start_ms:.3f} ms on for {span.length_us * 1e-3:.3f} ms; "
-                               "take another window")  # fmt: skip
-        thin = np.arange(min(n, self.most_points)) * n // min(n, self.most_points)
-        thin = thin if within is None else within[thin]
-        drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
-        xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
-        xy = xy if span.places is None else span.places[truth.positions]
-        return LoadedWindow(span, region, n, drawn, truth, xy, running.steps, events)
+        counted = span.events if near is None else span.events[near]
+
+        within = np.flatnonzero(inside(counted, region)) if selection.region else None
+        selected = len(counted) if within is None else len(within)
+        if not selected:
+            what = "no events"
+            if len(span.events):
+                what = f"{span.count:,} events, none of them selected,"
+            raise AmiwarpError(
+                f"{what} from {span.start_ms:.3f} ms on for {span.length_us * 1e-3:.3f} ms; "
+                "take another window"
+            )
+
+        # The drawn ones are evenly spaced among the selected ones.
+        points = min(selected, self.most_points)
+        thin = np.arange(points) * selected // points
+        if within is not None:
+            thin = within[thin]
+        drawn = counted[thin]
+        truth = DrawnTruth(recording.truth, span, thin if near is None else near[thin])
+        if span.places is None:
+            before = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
+        else:
+            before = span.places[truth.positions]
+        return LoadedWindow(
+            span, region, selected, drawn, truth, before, running.steps, counted=counted
+        )
 
     def selected_events(self, selection: Selection) -> SelectedEvents:
         """Return a selection that can run over the events of a window.
 
         It also keeps the events near the region, which compensation may move into it.
         """
-        m = self.margin_px
-        left, top, right, bottom = selection.region or (0, 0, *self.recording.events.size)
-        return SelectedEvents(
-            selection,
-            self.recording.events.size,
-            (left - m, top - m, right + m, bottom + m),
-            self.hot if selection.hide_hot else None,
-            None if self.recording.encoder is None else self.recording.encoder.coverage,
-        )
+        size = self.recording.events.size
+        margin = self.margin_px
+        left, top, right, bottom = selection.region or (0, 0, *size)
+        with_margin = (left - margin, top - margin, right + margin, bottom + margin)
+        hidden = self.hot if selection.hide_hot else None
+        encoder = self.recording.encoder
+        coverage = None if encoder is None else encoder.coverage
+        return SelectedEvents(selection, size, with_margin, hidden, coverage)
 
     def _drift_us(self, knobs: Knobs) -> float:
-        """Return how far the clock offset is from that of the recording's own encoder [us]."""
+        """Return how far the clock offset is from the offset of the recording's own encoder [us]."""
         return knobs.clock_offset - self._recorded_offset_us
 
-    def _angles(self, w: LoadedWindow, knobs: Knobs) -> tuple[UploadedEvents, NDArray[np.float64], NDArray[np.float64]]:
-        """Return the prism angles of a window; those of the two last speeds are kept."""
+    def _angles(
+        self, window: LoadedWindow, knobs: Knobs
+    ) -> tuple[UploadedEvents, NDArray[np.float64], NDArray[np.float64]]:
+        """Return the prism angles of a window; the angles of the two last speeds are kept."""
         rpm = 0.0 if self.has_encoder else knobs.rpm
-        if rpm not in w.angles:
-            encoder, t = self._encoder(rpm), w.events.t
-            for old in list(w.angles)[:-1]:
-                del w.angles[old]
+        if rpm not in window.angles:
+            encoder = self._encoder(rpm)
+            t = window.events.t
+            for old in list(window.angles)[:-1]:
+                del window.angles[old]
             # with the slope, the clock offset of the encoder can be changed afterwards
-            slope = encoder.speed_at(w.counted.t) * 1e-6 if self.has_encoder else None
-            uploaded = upload_events(w.counted, encoder, self.device, slope=slope)
-            w.angles[rpm] = uploaded, encoder.angle_at(t), encoder.speed_at(t) * 1e-6
-        return w.angles[rpm]
+            slope = encoder.speed_at(window.counted.t) * 1e-6 if self.has_encoder else None
+            uploaded = upload_events(window.counted, encoder, self.device, slope=slope)
+            window.angles[rpm] = uploaded, encoder.angle_at(t), encoder.speed_at(t) * 1e-6
+        return window.angles[rpm]
 
-    def _theta(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
+    def _theta(self, window: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
         """Return the prism angles of the drawn events [rad], shape ``(n,)``."""
-        _, theta, speed = self._angles(w, knobs)
+        _, theta, speed = self._angles(window, knobs)
         return theta + speed * self._drift_us(knobs)
 
-    def _wrapped(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
+    def _wrapped(self, window: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
         """Return the prism angles of the drawn events, from 0 to 2π [rad], shape ``(n,)``."""
-        key = 0.0 if self.has_encoder else knobs.rpm, self._drift_us(knobs)
-        if key not in w.wrapped:
-            w.wrapped.clear()
-            w.wrapped[key] = np.mod(self._theta(w, knobs), math.tau)
-        return w.wrapped[key]
+        rpm = 0.0 if self.has_encoder else knobs.rpm
+        key = rpm, self._drift_us(knobs)
+        if key not in window.wrapped:
+            window.wrapped.clear()
+            window.wrapped[key] = np.mod(self._theta(window, knobs), math.tau)
+        return window.wrapped[key]
 
-    def _moved(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
+    def _moved(self, window: LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
         """Return the compensated positions of the drawn events [px], shape ``(n, 2)``."""
-        encoder, (first, last) = self.encoder_of(knobs), w.events.t[[0, -1]].tolist()
-        if encoder.covers(first, last) and w.events.x.dtype == np.uint16:  # several times as fast
-            return np.asarray(compensate_events(w.events, self.model_of(knobs), encoder, device=self.device))
-        theta = self._theta(w, knobs).astype(np.float32)
-        return np.asarray(self.model_of(knobs).compensate_points(w.before, theta), np.float32)
+        events = window.events
+        model = self.model_of(knobs)
+        encoder = self.encoder_of(knobs)
+        first_us, last_us = events.t[[0, -1]].tolist()
+        if encoder.covers(first_us, last_us) and events.x.dtype == np.uint16:
+            # several times as fast
+            return np.asarray(compensate_events(events, model, encoder, device=self.device))
+        theta = self._theta(window, knobs).astype(np.float32)
+        return np.asarray(model.compensate_points(window.before, theta), np.float32)
 
-    def at_pixels(self, w: LoadedWindow, knobs: Knobs | None) -> Events:
+    def at_pixels(self, window: LoadedWindow, knobs: Knobs | None) -> Events:
         """Return a window's events at the pixels in which they lie with given parameters; None: as recorded."""
+        events = window.counted
         if knobs is None:
-            return w.counted
-        e = w.counted
-        recorded = np.stack([e.x, e.y], axis=1).astype(np.float32)
-        moved = self._moved(replace(w, events=e, before=recorded, angles={}), knobs)
+            return events
+        recorded = np.stack([events.x, events.y], axis=1).astype(np.float32)
+        moved = self._moved(replace(window, events=events, before=recorded, angles={}), knobs)
         half = np.array(self.recording.events.size) / 2.0
         seen = (np.abs(moved + 0.5 - half) < half).all(axis=1)  # False for NaN
         x, y = np.rint(moved[seen]).astype(np.uint16).T
-        return Events(x, y, e.t[seen], e.p[seen])
+        return Events(x, y, events.t[seen], events.p[seen])
 
-    def counts(self, w: LoadedWindow, knobs: Knobs | None, *, per_polarity: bool = False) -> NDArray[np.float32]:
+    def counts(
+        self, window: LoadedWindow, knobs: Knobs | None, *, per_polarity: bool = False
+    ) -> NDArray[np.float32]:
         """Return the number of a window's events at each pixel, shape ``(height, width)``, or two such images.
 
         Compensated events count at the pixel in which they lie; ``knobs`` None counts the events as recorded.
         """
         size = self.recording.events.size
         if knobs is None:
-            return iwe(w.counted, *size, per_polarity=per_polarity, vote=Vote.NEAREST)
+            return iwe(window.counted, *size, per_polarity=per_polarity, vote=Vote.NEAREST)
         with self.lock:
             if per_polarity not in self._votes:
                 canvas = CanvasShape(*size, per_polarity=per_polarity, vote=Vote.NEAREST)
                 self._votes[per_polarity] = Votes(canvas, self.device)
             votes = self._votes[per_polarity]
-            model, events, drift_us = self.warped(w, knobs)
+            model, events, drift_us = self.warped(window, knobs)
             votes.add_events(model, events, drift=drift_us)
             image = votes.take()
         return image if per_polarity else image[0]
 
-    def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[NDArray[np.float32], float]:
+    def _measured(
+        self, window: LoadedWindow, knobs: Knobs | None
+    ) -> tuple[NDArray[np.float32], float]:
         """Return the image of a window with these parameters, and its sharpness.
 
         If ``knobs`` is None, it shows the events as recorded, and is measured only once.
         """
-        if knobs is None and w.unmoved:
-            return w.unmoved[0]
+        if knobs is None and window.unmoved:
+            return window.unmoved[0]
         with self.lock:
-            _, sharpness = self._imager.measure(*self.warped(w, knobs), w.region)
-        found = self.counts(w, knobs), sharpness
+            _, sharpness = self._imager.measure(*self.warped(window, knobs), window.region)
+        found = self.counts(window, knobs), sharpness
         if knobs is None:
-            w.unmoved.append(found)
+            window.unmoved.append(found)
         return found
-
-
-# Recordings that a page can open: the files in one folder.
-
-SUFFIXES = {*EXTENSIONS, ".aedat", ".aedat2", ".bag", ".bin", ".csv", ".dat", ".es"}
-"""Suffixes of files that may be recordings."""
-MOST_FILES = 200
-"""Largest number of files that are listed."""
-
-
-class Library:
-    """Files in a folder that a page may open. The page names a file, never a folder."""
-
-    def __init__(self, folder: Path, open_file: Callable[[Path], Inspector]) -> None:
-        self.folder, self._open_file = folder.resolve(), open_file
-
-    def files(self) -> list[list[str]]:
-        """Return names and sizes of the files, in the order of their names."""
-        found = sorted(
-            path for path in self.folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
-            and path.is_file() and path.resolve().parent == self.folder  # also if it is a link
-            and not holds_map(path, (DepthMap, PixelMap))
-        )  # fmt: skip
-        return [[path.name, f"{path.stat().st_size / 1e6:,.1f} MB"] for path in found[:MOST_FILES]]
-
-    def open(self, name: str) -> Inspector:
-        """Open a file of the folder. Raises :class:`AmiwarpError` for any other name, or if it is no recording."""
-        if name not in [file for file, _ in self.files()]:
-            raise AmiwarpError(f"{name!r}: is no recording in {self.folder}; choose one from the list")
-        made = self._open_file(self.folder / name)
-        made.path = self.folder / name
-        return made

@@ -1,4 +1,4 @@
-"""Page of the inspector: passes input from the browser to the inspector, and results back; the page in a browser."""
+"""Page of the inspector: passes input from the browser to the inspector, and results back."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import logging
 import math
-import secrets
 import tempfile
 import traceback
 import weakref
@@ -24,16 +23,38 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import iwe
 from amiwarp.io.event_rates import EventRates
-from amiwarp.live.stream.session import LiveSource
 from amiwarp.plotting.colours import Scale, count_scale
 from amiwarp.tasks import Progress
-from amiwarp.viewer import drawing, jobs, layout
+from amiwarp.viewer import (
+    calibration_job,
+    captions,
+    clouds_film,
+    cost_surface,
+    downloads,
+    first_phase,
+    images,
+    layout,
+    orbit_lines,
+    page_state,
+    sliders,
+    view_state,
+)
+from amiwarp.viewer.actions import Actions
+from amiwarp.viewer.address import MOST_COUNT, decode_state, encode_state
 from amiwarp.viewer.bookmarks import Bookmarks
-from amiwarp.viewer.drawing import ImageKind, Look
 from amiwarp.viewer.filters import Selection, step_rows
-from amiwarp.viewer.inspector import WINDOW_POINTS, DisplayedWindow, Inspector, Knobs, Library
-from amiwarp.viewer.jobs import JobCancelled, JobProgress
-from amiwarp.viewer.serve import finite, serve, use_page
+from amiwarp.viewer.images import SLOW_KINDS, ImageKind, ShownImages
+from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector
+from amiwarp.viewer.job_progress import JobCancelled, JobProgress
+from amiwarp.viewer.knobs import Knobs
+from amiwarp.viewer.library import Library
+from amiwarp.viewer.look import Look
+from amiwarp.viewer.page_files import use_page
+from amiwarp.viewer.page_messages import finite
+from amiwarp.viewer.shown_window import DisplayedWindow
+from amiwarp.viewer.sliders import FIELD_LIMITS, GIVEN, SLIDERS, UNITS
+from amiwarp.viewer.view_state import History, ViewState
+from amiwarp.viewer.watched_stream import WatchedStream
 
 STEP_S = 0.2
 """Duration of counting events after which the timeline shows what is counted [s]."""
@@ -49,12 +70,14 @@ QUICK = {
 }
 SLOW = ("curve", "picture", "statistics")
 """Updates that are made at once, with the parts of the page that wait for them, and updates that take longer."""
-PLAY_S, FOLLOW_S, RATES_S = 0.05, 0.1, 1.0
+PLAY_S = 0.05
+FOLLOW_S = 0.1
+RATES_S = 1.0
 """Shortest interval between two pictures while a recording is played, and while a live stream is followed, and between
 two counts of a live stream's events for the timeline [s]."""
 
 
-class Panel(layout.Actions):
+class Panel(Actions):
     """Panel that connects the page of one browser tab with its inspector. Call :meth:`close` when the tab is closed.
 
     The page may call the methods in :data:`amiwarp.viewer.layout.CALLS`. The server checks their arguments by their
@@ -65,10 +88,15 @@ class Panel(layout.Actions):
 
     def __init__(self, server: Any, inspector: Inspector, library: Library | None = None) -> None:
         """Build the page on a new trame server. ``library``: other recordings that the page may open."""
-        self.server, self.state, self.inspector, self._library = server, server.state, inspector, library
+        self.server = server
+        self.state = server.state
+        self.inspector = inspector
+        self._library = library
         self.buffers_lock = asyncio.Lock()
         """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
-        self.device_lock: Any = _CUDA_LOCK if "cuda" in str(inspector.device) else contextlib.nullcontext()
+        self.device_lock: Any = contextlib.nullcontext()
+        if "cuda" in str(inspector.device):
+            self.device_lock = _CUDA_LOCK
         self._quick_requests: set[str] = set()
         self._slow_requests: set[str] = set()
         self._doing: set[str] = set()
@@ -82,14 +110,18 @@ class Panel(layout.Actions):
         """Window as the page shows it; None before the first update."""
         self.plays = False
         """Whether the playback runs; after a stop it runs until it notices the stop."""
-        self._picked, self._card = -1, False
+        self._picked = -1
+        self._card = False
         self._held = False
         """Whether a change lasts, such as a drag: meanwhile the brightness of images does not follow it."""
         self._scales: tuple[Scale, Scale] | None = None
         self._scales_of: ImageKind | None = None
         self._surface_about: Knobs | None = None  # parameters in the middle of the map of sharpness
-        self._made_for: dict[str, Any] = {}  # window and selection of which the slow parts of the page are, by name
-        self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
+        # Window and selection of which the slow parts of the page are, by name.
+        self._made_for: dict[str, Any] = {}
+        # Successive changes of one name are undone together, until a release.
+        self._change = ""
+        self._drags = 0
         self._rates: list[EventRates] = []  # of the recording, and of those on its time axis
         self._rates_first_us = 0
         self._progress = JobProgress(self._show_progress)  # of the latest calibration or film
@@ -101,23 +133,34 @@ class Panel(layout.Actions):
 
     def start(self, inspector: Inspector) -> None:
         """Show an inspector from its first state."""
-        self.inspector, self.shown, self.b, self.found, self._picked = inspector, None, None, None, -1
-        self.history, self.steps = None, ()
+        self.inspector = inspector
+        self.shown = None
+        self.b = None
+        self.found = None
+        self._picked = -1
+        self.history = None
+        self.steps = ()
         self._made_for.clear()
         self.use_card(self._card)
         inspector.renew()  # a live stream may have gone on since the inspector was made
-        files = [] if self._library is None else self._library.files()
-        folder = "" if self._library is None else str(self._library.folder)
+        files: list[list[str]] = []
+        folder = ""
+        if self._library is not None:
+            files = self._library.files()
+            folder = str(self._library.folder)
         self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder})
-        self._wanted: dict[str, Any] = {}  # values that were set on the page, and that the inspector has not taken yet
+        # Values that were set on the page, and that the inspector has not taken yet.
+        self._wanted: dict[str, Any] = {}
         self.time_window = inspector.window or inspector.first_window()
         self.start_job(self._count_events())
-        self.request("window", *(["suggestion"] if self.compensates else []))
+        self.request("window")
+        if self.compensates:
+            self.request("suggestion")
         self.released()
         self.request_slow("preparation")
         if inspector.latest is not None:
             self.play()
-        if isinstance(inspector.latest, LiveSource):
+        if isinstance(inspector.latest, WatchedStream):
             self.start_job(self._watch(inspector.latest))
         self.bookmarks = None if inspector.path is None else Bookmarks(inspector.path)
         self._list_views()
@@ -149,7 +192,9 @@ class Panel(layout.Actions):
 
     @look.setter
     def look(self, look: Look) -> None:
-        self.state.update({"colour": look.colour.value, "axis": look.axis.value, "overlaid": look.overlaid})
+        self.state.update(
+            {"colour": look.colour.value, "axis": look.axis.value, "overlaid": look.overlaid}
+        )
 
     @property
     def view(self) -> View:
@@ -183,12 +228,17 @@ class Panel(layout.Actions):
     @property
     def time_window(self) -> tuple[int, int]:
         """Start and length of the time window that the page shows, on the events' clock [us]."""
-        return self._clock_us(float(self.state.start_ms)), max(1, round(float(self.state.length_ms) * 1e3))
+        start_us = self._clock_us(float(self.state.start_ms))
+        length_us = round(float(self.state.length_ms) * 1e3)
+        return start_us, max(1, length_us)
 
     @time_window.setter
     def time_window(self, window: tuple[int, int]) -> None:
-        start_us, length_us = window[0] - self.inspector.recording.events.t_first, window[1]
-        self.state.update({"start_ms": round(start_us * 1e-3, 3), "length_ms": round(length_us * 1e-3, 3)})
+        start_us, length_us = window
+        start_us -= self.inspector.recording.events.t_first
+        self.state.update(
+            {"start_ms": round(start_us * 1e-3, 3), "length_ms": round(length_us * 1e-3, 3)}
+        )
 
     def request(self, *what: str, change: str = "") -> None:
         """Request quick updates: "newest" (of a live stream), "window", "knobs", "look", "suggestion" or "state".
@@ -216,13 +266,15 @@ class Panel(layout.Actions):
 
     def start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run a job until it ends or the browser tab is closed."""
-        self._jobs.add(task := asyncio.get_running_loop().create_task(work))
+        task = asyncio.get_running_loop().create_task(work)
+        self._jobs.add(task)
         task.add_done_callback(self._ended)
         return task
 
     async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
         """Call ``work`` in one of the browser tab's threads, and return its result."""
-        return await asyncio.get_running_loop().run_in_executor(self._threads, partial(work, *args, **options))
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._threads, partial(work, *args, **options))
 
     def say(self, text: str, severity: str = "info") -> None:
         """Show a message."""
@@ -243,30 +295,39 @@ class Panel(layout.Actions):
 
     def _show_pending(self) -> None:
         """Show which parts of the page wait for an update."""
-        quick = self._quick_requests | self._doing
-        parts = {part for what in quick for part in QUICK.get(what, ())} | (self._slow_requests | self._doing) & {*SLOW}
+        parts = (self._slow_requests | self._doing) & {*SLOW}
+        for what in self._quick_requests | self._doing:
+            parts.update(QUICK.get(what, ()))
         self.state.updating = sorted(parts)
 
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._jobs.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
+        error = None if task.cancelled() else task.exception()
+        if error is not None:
             logging.getLogger(__name__).error("the page's work failed", exc_info=error)
             text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
             self.say(text, "error")
 
     async def _update(self) -> None:
         while self._quick_requests:
-            while (page := self.server.protocol) is not None and page.network_monitor.pending > MOST_IN_FLIGHT:
+            while self._page_lags():
                 await asyncio.sleep(WAIT_S)
-            todo, self._quick_requests = self._quick_requests, set()
+            todo = self._quick_requests
+            self._quick_requests = set()
             async with self._done(todo), self.device_lock, self.buffers_lock:
                 await self.make(todo)
             await asyncio.sleep(0)
 
+    def _page_lags(self) -> bool:
+        """Return whether the page does not keep up with the messages."""
+        page = self.server.protocol
+        return page is not None and page.network_monitor.pending > MOST_IN_FLIGHT
+
     async def _update_slowly(self) -> None:
         while self._slow_requests:
             await self.until_drawn()
-            name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
+            # In alphabetical order: the curve first, the preparation last
+            name = min(self._slow_requests)
             self._slow_requests.discard(name)
             async with self._done({name}), self.device_lock:
                 with self.errors_shown(name):
@@ -310,30 +371,34 @@ class Panel(layout.Actions):
 
     def choose(self, name: str) -> None:
         """Select the parameter over which the sharpness curve is drawn."""
-        if name in layout.SLIDERS and name != self.state.knob:
+        if name in SLIDERS and name != self.state.knob:
             self.state.knob = name
             self.request_slow("curve")
 
     def typed(self, name: str, text: str) -> None:
         """Set the value that a user typed into a number field."""
-        if name not in (*layout.FIELD_LIMITS, *layout.FILTER_FIELDS, "start_ms", "length_ms", "turns", "events"):
+        times = ("start_ms", "length_ms", "turns", "events")
+        if name not in (*FIELD_LIMITS, *layout.FILTER_FIELDS, *times):
             return
         try:
             value = finite(text)
         except ValueError:
             self.say(f"{text!r} is not a number; give a number such as 1.5", "error")
             return
-        if name in layout.FIELD_LIMITS:
+        if name in FIELD_LIMITS:
             self.slide(name, value)
         elif name in layout.FILTER_FIELDS:
             self._set_filter(name, value)
         elif name == "events":
-            self.state.fixed_count = min(max(1, round(value)), layout.MOST_COUNT)
+            self.state.fixed_count = min(max(1, round(value)), MOST_COUNT)
             self.request("window")
         else:
-            length = name == "turns"
-            self.state["length_ms" if length else name] = round(value * float(self.state.turn_ms if length else 1.0), 4)
-            self.state.fixed_count = self.state.fixed_count if name == "start_ms" else 0
+            if name == "turns":
+                self.state.length_ms = round(value * float(self.state.turn_ms), 4)
+            else:
+                self.state[name] = round(value, 4)
+            if name != "start_ms":  # the window has this length now, not a number of events
+                self.state.fixed_count = 0
             self.request("window")
         self.released()
 
@@ -341,7 +406,9 @@ class Panel(layout.Actions):
         """Set a field of a filter, or the decay time of images."""
         label, unit, (low, high) = layout.FILTER_FIELDS[name]
         if not low <= value <= high:
-            self.say(f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error")
+            self.say(
+                f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error"
+            )
             return
         self.state[name] = round(value) if name == "every" else value
         self.request("knobs" if name == "decay_ms" else "window")
@@ -365,20 +432,25 @@ class Panel(layout.Actions):
     async def _list_hot(self) -> None:
         with self.errors_shown("hot pixels"):
             found = await self.in_thread(lambda: self.inspector.hot_pixels)
-            rows = [[each.x, each.y, f"{each.rate:,.0f}", f"{100.0 * each.share:.3g}"] for each in found]
+            rows = [
+                [each.x, each.y, f"{each.rate:,.0f}", f"{100.0 * each.share:.3g}"] for each in found
+            ]
             with self.state:
                 self.state.hot_rows = rows
 
     def slide(self, name: str, value: float) -> None:
         """Set a parameter of the prism or the camera, in the unit of its slider or field."""
-        if name not in layout.FIELD_LIMITS:
+        if name not in FIELD_LIMITS:
             return
-        (low, high), (label, unit, *_) = layout.FIELD_LIMITS[name], {**layout.SLIDERS, **layout.GIVEN}[name]
+        low, high = FIELD_LIMITS[name]
+        label, unit, _ = SLIDERS[name] if name in SLIDERS else GIVEN[name]
         if not low <= value <= high:
-            self.say(f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error")
+            self.say(
+                f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error"
+            )
             return
         self._wanted[name] = round(value, 4)
-        if name in layout.SLIDERS:
+        if name in SLIDERS:
             self.state.knob = name
         self.show_knobs()
         self.request("knobs", change=name)
@@ -442,12 +514,12 @@ class Panel(layout.Actions):
     def _list_views(self) -> None:
         """Show the names of the bookmarks."""
         names: list[str] = []
+        file = ""
         if self.bookmarks is not None:
+            file = self.bookmarks.path.name
             with self.errors_shown("bookmarks"):
                 names = self.bookmarks.names()
-        self.state.update({
-            "views": names, "views_file": "" if self.bookmarks is None else self.bookmarks.path.name,
-        })  # fmt: skip
+        self.state.update({"views": names, "views_file": file})
 
     def choose_beside(self, k: int) -> None:
         """Show the recording with the number ``k`` of those that are on the same time axis."""
@@ -459,8 +531,11 @@ class Panel(layout.Actions):
 
     def draw(self, left: float, top: float, right: float, bottom: float) -> None:
         """Show a region of the image [px] that was drawn or typed."""
-        sides, limits = (left, top, right, bottom), 2 * self.state.size
-        region = [min(max(round(each), 0), limit) for each, limit in zip(sides, limits, strict=True)]
+        sides = (left, top, right, bottom)
+        limits = 2 * self.state.size
+        region = [
+            min(max(round(each), 0), limit) for each, limit in zip(sides, limits, strict=True)
+        ]
         whole = region == [0, 0, *self.state.size]
         self.state.update({"region_wanted": region, "region_kind": "whole" if whole else "drawn"})
         self.request("window")
@@ -480,7 +555,8 @@ class Panel(layout.Actions):
 
     def resize_window(self, start_ms: float, end_ms: float) -> None:
         """Set the ends of the time window [ms]."""
-        start, end = max(0.0, float(start_ms)), min(float(end_ms), float(self.state.whole_ms))
+        start = max(0.0, float(start_ms))
+        end = min(float(end_ms), float(self.state.whole_ms))
         if end > start:
             self.state.fixed_count = 0
             self.time_window = self._clock_us(start), max(1, round(1e3 * (end - start)))
@@ -488,7 +564,8 @@ class Panel(layout.Actions):
 
     def zoom_timeline(self, start_ms: float, end_ms: float) -> None:
         """Show another part of the time on the timeline [ms]."""
-        start, end = max(0.0, float(start_ms)), min(float(end_ms), float(self.state.whole_ms))
+        start = max(0.0, float(start_ms))
+        end = min(float(end_ms), float(self.state.whole_ms))
         if end - start > 1e-2:
             self.state.rate_span = [start, end]
             self._show_rates()
@@ -503,11 +580,14 @@ class Panel(layout.Actions):
             self.start_job(work).add_done_callback(lambda _: setattr(self, "plays", False))
 
     async def _run(self) -> None:
-        state, loop, elapsed_s = self.state, asyncio.get_running_loop(), PLAY_S
+        state = self.state
+        loop = asyncio.get_running_loop()
+        elapsed_s = PLAY_S
         while state.playing:
             start_s = loop.time()
             with state:
-                state.playing = self.advance(1e6 * elapsed_s * float(state.speed), loop=bool(state.loop))
+                shown_us = 1e6 * elapsed_s * float(state.speed)
+                state.playing = self.advance(shown_us, loop=bool(state.loop))
             await self.until_drawn()
             await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
             elapsed_s = loop.time() - start_s
@@ -516,7 +596,8 @@ class Panel(layout.Actions):
     async def _follow(self) -> None:
         """Show the current events of a live stream, again and again."""
         await self.until_drawn()  # with the suggested region
-        loop, counted_s = asyncio.get_running_loop(), -math.inf
+        loop = asyncio.get_running_loop()
+        counted_s = -math.inf
         while self.state.playing:
             start_s = loop.time()
             if start_s >= counted_s + RATES_S:
@@ -529,20 +610,23 @@ class Panel(layout.Actions):
 
     def record(self) -> None:
         """Save a live stream from now on to a new file in the current folder of the server, or finish the file."""
-        if isinstance(self.inspector.latest, LiveSource):
+        if isinstance(self.inspector.latest, WatchedStream):
             self.start_job(self._record(self.inspector.latest))
 
-    async def _record(self, source: LiveSource) -> None:
+    async def _record(self, source: WatchedStream) -> None:
         with self.errors_shown("recording"):
             if source.is_recording:
                 self.say(f"saved {await self.in_thread(source.stop_recording)}", "success")
             else:
-                path = jobs.unused_path(f"{jobs.file_stem(self.inspector.recording.name)}.h5")
-                await self.in_thread(source.record, path.resolve())
-                self.say(f"recording to {path.resolve()} until you press stop, or the stream or the command ends")
+                stem = downloads.file_stem(self.inspector.recording.name)
+                path = downloads.unused_path(f"{stem}.h5").resolve()
+                await self.in_thread(source.record, path)
+                self.say(
+                    f"recording to {path} until you press stop, or the stream or the command ends"
+                )
         self.state.flush()
 
-    async def _watch(self, source: LiveSource) -> None:
+    async def _watch(self, source: WatchedStream) -> None:
         """Show the figures of a live stream, also while it is not followed, until the page is closed."""
         while True:
             with self.state as state:
@@ -556,7 +640,8 @@ class Panel(layout.Actions):
     async def _count_events(self) -> None:
         """Count the recording's events in the background, for the timeline."""
         inspectors = (self.inspector, *self.inspector.besides)
-        rates = self._rates = [EventRates(each.recording.events) for each in inspectors]
+        rates = [EventRates(each.recording.events) for each in inspectors]
+        self._rates = rates
         self._rates_first_us = self.inspector.recording.events.t_first
         for each in rates:
             finished = False
@@ -571,13 +656,14 @@ class Panel(layout.Actions):
         start_us, end_us = (round(1e3 * each) for each in self.state.rate_span)
         own, *others = self._rates
         _, rates = own.curve(first_us + start_us, first_us + end_us, layout.BINS)
-        off, on, share = *map(drawing.float_bytes, rates), own.share
+        off, on = map(page_state.float_bytes, rates)
         rows = []
         for each, counted in zip(self.inspector.besides, others, strict=True):
             _, rates = counted.curve(each.time_of(start_us), each.time_of(end_us), layout.BINS)
-            rows.append({"name": drawing.beside_text(each), "on": drawing.float_bytes(rates[1]),
-                         "off": drawing.float_bytes(rates[0])})  # fmt: skip
-        note = "" if share >= 1.0 else f"counting events: {100.0 * share:.0f} %"
+            off_beside, on_beside = map(page_state.float_bytes, rates)
+            name = captions.beside_text(each)
+            rows.append({"name": name, "on": on_beside, "off": off_beside})
+        note = "" if own.share >= 1.0 else f"counting events: {100.0 * own.share:.0f} %"
         self.state.update({"rate_on": on, "rate_off": off, "rate_note": note, "rate_rows": rows})
 
     # Parameters of the prism, and those to compare with
@@ -598,17 +684,24 @@ class Panel(layout.Actions):
     def show_b(self, knobs: Knobs | None) -> None:
         """Show parameters on the left as B; None for the recorded events."""
         self.b = knobs
-        orbit = "" if knobs is None else layout.orbit_text(knobs.model, knobs.value, knobs.phase)
-        text, against = ("", "recorded") if knobs is None else (f"{knobs.model}, {orbit}", "B")
-        self.state.update({"has_b": knobs is not None, "b_text": text, "against": against})
+        if knobs is None:
+            self.state.update({"has_b": False, "b_text": "", "against": "recorded"})
+        else:
+            orbit = sliders.orbit_text(knobs.model, knobs.value, knobs.phase)
+            text = f"{knobs.model}, {orbit}"
+            self.state.update({"has_b": True, "b_text": text, "against": "B"})
         self.request("knobs")
 
     def set_knobs(self) -> None:
         """Give the inspector the values that were set on the page."""
-        inspector, wanted, self._wanted = self.inspector, self._wanted, {}
-        layout.set_given(inspector, wanted.pop("fov_deg", None), wanted.pop("prism_index", None))
+        inspector = self.inspector
+        wanted = self._wanted
+        self._wanted = {}
+        view_state.set_given(
+            inspector, wanted.pop("fov_deg", None), wanted.pop("prism_index", None)
+        )
         model = wanted.pop("model", inspector.knobs.model)
-        values = {name: value * layout.UNITS[name] for name, value in wanted.items()}
+        values = {name: value * UNITS[name] for name, value in wanted.items()}
         inspector.set(replace(inspector.knobs.with_values(values), model=model))
 
     def show_knobs(self) -> None:
@@ -629,14 +722,20 @@ class Panel(layout.Actions):
         return self._comparable().get(self.state.against)
 
     def _comparable(self) -> dict[str, Knobs | None]:
-        """Return what the left cloud can show now, by the names in :data:`amiwarp.viewer.drawing.AGAINST`."""
-        found = None if self.found is None else self.inspector.knobs_of(self.found)
-        known = {"B": self.b, "found": found, "truth": self.inspector.truth}
-        return {"recorded": None, **{name: knobs for name, knobs in known.items() if knobs is not None}}
+        """Return what the left cloud can show now, by the names in :data:`amiwarp.viewer.captions.AGAINST`."""
+        comparable: dict[str, Knobs | None] = {"recorded": None}
+        if self.b is not None:
+            comparable["B"] = self.b
+        if self.found is not None:
+            comparable["found"] = self.inspector.knobs_of(self.found)
+        truth = self.inspector.truth
+        if truth is not None:
+            comparable["truth"] = truth
+        return comparable
 
     def _against_choices(self) -> list[list[str]]:
         """Return names and titles of what the left cloud can show now."""
-        return [[name, drawing.against_title(self.inspector, name)] for name in self._comparable()]
+        return [[name, captions.against_title(self.inspector, name)] for name in self._comparable()]
 
     # Calibration
 
@@ -644,7 +743,15 @@ class Panel(layout.Actions):
         """Start a calibration, or cancel the running one."""
         if not self.state.busy:
             self.found = None
-            self.state.update({"busy": "calibrating", "calibrating": True, "progress": 0, "found": "", "surface": None})
+            self.state.update(
+                {
+                    "busy": "calibrating",
+                    "calibrating": True,
+                    "progress": 0,
+                    "found": "",
+                    "surface": None,
+                }
+            )
             self._progress = JobProgress(self._show_progress)
             self.start_job(self._calibrate(self._progress))
         elif self.state.calibrating:
@@ -653,20 +760,23 @@ class Panel(layout.Actions):
 
     async def _calibrate(self, progress: JobProgress) -> None:
         """Calibrate in a thread, and show the result with a map of sharpness about it."""
-        inspector, state = self.inspector, self.state
+        inspector = self.inspector
+        state = self.state
         try:
-            find = partial(jobs.find_calibration, whole=state.scope != layout.SCOPES[0])
+            find = partial(calibration_job.find_calibration, whole=state.scope != layout.SCOPES[0])
             async with self.device_lock:
                 found = await self.in_thread(_guarded, find, weakref.ref(inspector), progress)
             if isinstance(found, str):
-                text, severity = ("calibration cancelled", "info") if progress.cancelled else (found, "error")
-                self.say(text, severity)
+                if progress.cancelled:
+                    self.say("calibration cancelled", "info")
+                else:
+                    self.say(found, "error")
                 return
             self.found, text = found
             with state:
                 state.update({"found": text, "against_choices": self._against_choices()})
             async with self.device_lock:
-                draw = partial(jobs.cost_surface, found=self.found)
+                draw = partial(cost_surface.cost_surface, found=self.found)
                 self._surface_about = inspector.knobs
                 surface = await self.in_thread(_guarded, draw, weakref.ref(inspector), progress)
             if not isinstance(surface, str) and self.inspector is inspector:
@@ -692,40 +802,65 @@ class Panel(layout.Actions):
 
     def export(self, what: str) -> None:
         """Give the browser a file; ``what`` is a name in :data:`amiwarp.viewer.layout.EXPORTS`."""
-        s = self.state
-        if what in ("picture", "image") and self.shown is not None:
-            words = drawing.caption(self.inspector, self.shown).split("; ")
-            self.server.js_call("page", what, jobs.download_name(self.inspector.recording.name, what), words)
-        elif what in layout.EXPORTS and what not in ("picture", "image") and not (what in layout.FILMS and s.busy):
-            self.start_job(self._film(what) if what in layout.FILMS else self._write(what))
+        if what not in layout.EXPORTS:
+            return
+        if what in ("picture", "image"):  # the browser draws them
+            if self.shown is not None:
+                name = downloads.download_name(self.inspector.recording.name, what)
+                words = captions.caption(self.inspector, self.shown).split("; ")
+                self.server.js_call("page", what, name, words)
+        elif what in layout.FILMS:
+            if not self.state.busy:
+                self.start_job(self._film(what))
+        else:
+            self.start_job(self._write(what))
 
     async def _write(self, what: str) -> None:
         from amiwarp.viewer.publish import Page, save_figure
 
         inspector = self.inspector
-        figure = partial(save_figure, inspector, page=Page(), view=self.view, look=self.look, against=self.against)
+        figure = partial(
+            save_figure,
+            inspector,
+            page=Page(),
+            view=self.view,
+            look=self.look,
+            against=self.against,
+        )
         write: dict[str, Callable[[Path], object]] = {
             **dict.fromkeys(("pdf", "svg"), figure),
             "values": lambda path: save_values(path, self._pair().after),
-            **dict.fromkeys(("csv", "npz"), partial(jobs.write_table, inspector)),
-            "events": partial(jobs.write_events, inspector, compensated=False),
-            "compensated": partial(jobs.write_events, inspector, compensated=True),
+            **dict.fromkeys(("csv", "npz"), partial(downloads.write_table, inspector)),
+            "events": partial(downloads.write_events, inspector, compensated=False),
+            "compensated": partial(downloads.write_events, inspector, compensated=True),
             "calibration": lambda path: inspector.as_calibration().save(path),
-            "vtp": partial(jobs.write_cloud, inspector, axis=self.look.axis, compensated=False),
-            "vtp_after": partial(jobs.write_cloud, inspector, axis=self.look.axis, compensated=True),
-        }  # fmt: skip
+            "vtp": partial(
+                downloads.write_cloud, inspector, axis=self.look.axis, compensated=False
+            ),
+            "vtp_after": partial(
+                downloads.write_cloud, inspector, axis=self.look.axis, compensated=True
+            ),
+        }
         async with self.device_lock, self.buffers_lock:
             await self._download(what, write[what])
 
     async def _film(self, what: str) -> None:
         s = self.state
         look = self.look.for_clouds([title for _, title in s.titles])
-        self._progress = progress = JobProgress(self._show_progress)
+        progress = JobProgress(self._show_progress)
+        self._progress = progress
         film = partial(
-            jobs.write_film, inspector=self.inspector.copy(), look=look, view=self.view, progress=progress, what=what,
-            against=self.against, with_orbit=bool(s.orbit_shown), speed=float(s.speed),
+            clouds_film.write_film,
+            inspector=self.inspector.copy(),
+            look=look,
+            view=self.view,
+            progress=progress,
+            what=what,
+            against=self.against,
+            with_orbit=bool(s.orbit_shown),
+            speed=float(s.speed),
             ended=lambda: progress.ended,
-        )  # fmt: skip
+        )
         self._show_progress(f"making the {layout.EXPORTS[what][0]}", 0.0)
         try:
             with contextlib.suppress(JobCancelled):
@@ -737,14 +872,17 @@ class Panel(layout.Actions):
 
     async def _download(self, what: str, write: Callable[[Path], object]) -> None:
         """Write a file in a thread, and give it to the browser."""
-        name = jobs.download_name(self.inspector.recording.name, what)
+        name = downloads.download_name(self.inspector.recording.name, what)
         with self.errors_shown("export"):
             path = Path(self._folder.name) / name
             path.unlink(missing_ok=True)
             await self.in_thread(write, path)
-            about = path.stat()  # with its time, as a browser keeps what it has loaded from an address
-            self.server.js_call("page", "download", name, f"{self.server.name}/{name}?{about.st_mtime_ns}")
-            self.say(f"{name}: {about.st_size / 1e3:,.0f} kB, in the browser's downloads", "success")
+            about = path.stat()
+            # With its time, as a browser keeps what it has loaded from an address.
+            address = f"{self.server.name}/{name}?{about.st_mtime_ns}"
+            self.server.js_call("page", "download", name, address)
+            size = f"{about.st_size / 1e3:,.0f} kB"
+            self.say(f"{name}: {size}, in the browser's downloads", "success")
         self.state.flush()
 
     # Undo, redo, reset, and the state in the page's address
@@ -752,38 +890,57 @@ class Panel(layout.Actions):
     def restore(self, address: str) -> None:
         """Show the state that an address describes."""
 
-        def described(history: layout.History) -> layout.ViewState:
+        def described(history: History) -> ViewState:
             size = self.inspector.recording.events.size
-            state, wrong = layout.decode_state(address, history.first, size=size, duration_us=self.whole_us)
+            state, wrong = decode_state(
+                address, history.first, size=size, duration_us=self.whole_us
+            )
             if wrong:
                 self.say("; ".join(wrong), "error")
             return state
 
         self.travel(described)
 
-    def remember(self, change: str) -> layout.History:
+    def remember(self, change: str) -> History:
         """Add what the page shows now to the history, and to its address."""
-        h = super().remember(change)
-        address = layout.encode_state(h.state, h.first)
-        self.state.update({"can_undo": h.can_undo, "can_redo": h.can_redo, "address": address})
-        return h
+        history = super().remember(change)
+        self.state.update(
+            {
+                "can_undo": history.can_undo,
+                "can_redo": history.can_redo,
+                "address": encode_state(history.state, history.first),
+            }
+        )
+        return history
 
     async def _apply_steps(self) -> None:
         """Show the requested state. Raises :class:`AmiwarpError` if it selects no events."""
         wanted = self.travelled()
         if wanted is None:
             return
-        await self.in_thread(layout.apply_state, self.inspector, wanted)
-        s, selection = self.state, wanted.selection
+        await self.in_thread(view_state.apply_state, self.inspector, wanted)
+        s = self.state
+        selection = wanted.selection
         region = list(selection.region or (0, 0, *s.size))
-        kind = s.region_kind if region == s.region_wanted else "whole" if selection.region is None else "drawn"
+        kind = s.region_kind
+        if region != s.region_wanted:
+            kind = "whole" if selection.region is None else "drawn"
         self.time_window = self.inspector.window or self.time_window
-        s.update({
-            **layout.filter_state(selection), "region_wanted": region, "region_kind": kind, "kind": wanted.image.value,
-            "fixed_count": wanted.fixed_count or 0, "decay_ms": wanted.decay_us * 1e-3, "same_scale": wanted.same_scale,
-            "difference": wanted.difference,
-        })  # fmt: skip
-        self.look = replace(self.look, colour=wanted.colour, axis=wanted.axis, overlaid=wanted.overlaid)
+        s.update(
+            {
+                **layout.filter_state(selection),
+                "region_wanted": region,
+                "region_kind": kind,
+                "kind": wanted.image.value,
+                "fixed_count": wanted.fixed_count or 0,
+                "decay_ms": wanted.decay_us * 1e-3,
+                "same_scale": wanted.same_scale,
+                "difference": wanted.difference,
+            }
+        )
+        self.look = replace(
+            self.look, colour=wanted.colour, axis=wanted.axis, overlaid=wanted.overlaid
+        )
         if wanted.view is not self.view:
             self.view = wanted.view
         if wanted.against != self.against:
@@ -800,14 +957,16 @@ class Panel(layout.Actions):
                 state.update(layout.source_state(self.inspector))
                 self.time_window = self.newest_window()
             todo = {*todo, "window"}
-        if self.shown is not None and "state" in todo and len(todo) > 1:  # what came before an undo can be redone
+        if self.shown is not None and "state" in todo and len(todo) > 1:
+            # What came before an undo can be redone.
             await self.make(todo - {"state"})
             todo = {"state"}
         if todo & {"window", "suggestion"}:
             with self.errors_shown("window"):
                 try:
                     await self._open(suggest="suggestion" in todo)
-                except AmiwarpError:  # show again what is still open; playback goes on through a time without events
+                except AmiwarpError:
+                    # Show again what is still open; playback goes on through a time without events.
                     if self.inspector.window is not None and not state.playing:
                         self.time_window = self.inspector.window
                         state.region_wanted = list(self.inspector.loaded.region)
@@ -831,14 +990,18 @@ class Panel(layout.Actions):
             if self.compensates != bool(state.turn_ms):  # the speed of a prism was set, or set to 0
                 state.axis = (Axis.ANGLE if self.compensates else Axis.TIME).value
                 self.request("look")
-            mark = layout.knob_values(self.inspector)[state.knob]
+            mark = sliders.knob_values(self.inspector)[state.knob]
             self._show_old()
             if state.surface:  # the parameters may have moved on its map
-                marks = jobs.surface_marks(
-                    self.inspector, state.surface["names"], self._surface_about or self.inspector.knobs, self.found
+                marks = cost_surface.surface_marks(
+                    self.inspector,
+                    state.surface["names"],
+                    self._surface_about or self.inspector.knobs,
+                    self.found,
                 )
                 state.surface = {**state.surface, "marks": marks}
-            state.optic = bool(state.optic or self.inspector.has_optic)  # a live stream may have got its encoder
+            # A live stream may have got its encoder
+            state.optic = bool(state.optic or self.inspector.has_optic)
             state.update({**values, "turn_ms": layout.turn_ms(self.inspector), "curve_mark": mark})
             if not state.playing:
                 self.remember("" if todo & {"suggestion", "state"} else self._change)
@@ -847,7 +1010,9 @@ class Panel(layout.Actions):
     def _show_old(self) -> None:
         """Show which slow parts of the page are still of another window or selection."""
         chosen = self.inspector.chosen
-        self.state.old = sorted(name for name, made_for in self._made_for.items() if made_for != chosen)
+        self.state.old = sorted(
+            name for name, made_for in self._made_for.items() if made_for != chosen
+        )
 
     async def make_slow(self, name: str) -> None:
         """Make a slow update: "curve", "picture", "statistics", or "preparation" of the first picture."""
@@ -860,21 +1025,24 @@ class Panel(layout.Actions):
 
     async def _make_slow(self, name: str, inspector: Inspector) -> None:
         if name == "preparation":
-            await self.in_thread(drawing.prepare, inspector)
+            await self.in_thread(images.prepare, inspector)
         elif name == "statistics":
             self.state.statistics = await self.in_thread(inspector.statistics)
         elif name == "curve":
             await self._curve(inspector)
-        elif self.image is ImageKind.LOG_INTENSITY and self.shown is not None:
+        elif self.image in SLOW_KINDS and self.shown is not None:
             self.state.update(await self.in_thread(self._images, self.shown, inspector))
 
     async def _open(self, *, suggest: bool) -> None:
         """Read the window and the selection that the page shows."""
-        s, inspector, in_thread = self.state, self.inspector, self.in_thread
+        s = self.state
+        inspector = self.inspector
+        in_thread = self.in_thread
         if not float(s.length_ms) > 0.0:
             raise AmiwarpError(f"a window of {s.length_ms:g} ms; give a length above 0")
         start_us, length_us = self.time_window
-        length_us, known_count = min(length_us, self.whole_us), inspector.fixed_count
+        length_us = min(length_us, self.whole_us)
+        known_count = inspector.fixed_count
         inspector.fixed_count = int(s.fixed_count) or None
         try:
             await in_thread(inspector.open, start_us, length_us, self._selection())
@@ -883,9 +1051,10 @@ class Panel(layout.Actions):
             s.fixed_count = known_count or 0
             raise
         if inspector.fixed_count is not None and inspector.window is not None:
-            self.time_window = start_us, length_us = inspector.window
+            start_us, length_us = inspector.window
+            self.time_window = inspector.window
         if suggest:
-            await in_thread(jobs.estimate_phase, inspector)
+            await in_thread(first_phase.estimate_phase, inspector)
             region = await in_thread(inspector.suggest_region)
             s.update({"region_wanted": list(region), "region_kind": "suggested"})
             await in_thread(inspector.open, start_us, length_us, self._selection())
@@ -894,7 +1063,8 @@ class Panel(layout.Actions):
     def _selection(self) -> Selection:
         """Return the conditions for events that the page shows."""
         s = self.state
-        region, whole = tuple(s.region_wanted), (0, 0, *s.size)
+        region = tuple(s.region_wanted)
+        whole = (0, 0, *s.size)
         return Selection(
             polarity={"both": None, "ON": 1, "OFF": 0}[s.polarity],
             region=None if region == whole else region,
@@ -907,32 +1077,45 @@ class Panel(layout.Actions):
 
     def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
         """Return what is to be shown, and the state variables that show it."""
-        s, before, against = self.state, self.shown, self.against
+        s = self.state
+        before = self.shown
+        against = self.against
         shown = self.inspector.show(against=against)
-        values = drawing.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
-        values["image_slow"] = self.image is ImageKind.LOG_INTENSITY
+        values = page_state.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
+        values["image_slow"] = self.image in SLOW_KINDS
         if not values["image_slow"]:
             values |= self._images(shown)
-        found = drawing.shown_lines(self.inspector, shown, self.look.axis, against, self._picked)
-        lines = found if found and s.orbit_shown else (np.zeros(0),) * 2
-        values["orbit"], values["column"] = map(drawing.float_bytes, lines)
+        lines = orbit_lines.shown_lines(
+            self.inspector, shown, self.look.axis, against, self._picked
+        )
+        if not lines or not s.orbit_shown:
+            lines = (np.zeros(0), np.zeros(0))
+        values["orbit"], values["column"] = map(page_state.float_bytes, lines)
         if before is None or shown.span is not before.span:
-            counts = iwe(shown.span.events, *self.inspector.recording.events.size, vote=Vote.NEAREST)
-            values["overview"] = drawing.picture_state(counts, count_scale([counts]))
+            size = self.inspector.recording.events.size
+            counts = iwe(shown.span.events, *size, vote=Vote.NEAREST)
+            values["overview"] = page_state.picture_state(counts, count_scale([counts]))
             values["beside_counts"] = self.inspector.counts_beside(shown.span)
         left = "recorded" if against is None else s.against
-        titles = drawing.cloud_titles(self.inspector, left, Axis(s.axis))
+        titles = captions.cloud_titles(self.inspector, left, Axis(s.axis))
+        picked_text = ""
+        if self._picked >= 0:
+            picked_text = captions.event_text(shown, self._picked, compensated=self.compensates)
         return shown, {
-            **values, "titles": [list(each) for each in enumerate(titles)], "events": drawing.chosen_text(shown),
-            "steps": step_rows(shown.steps, shown.read_us), "beside_rows": drawing.beside_rows(self.inspector, shown),
-            "drawn": drawing.drawn_text(shown), "count": shown.span.count,
-            "sharpness": drawing.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
-            "picked_text": "" if self._picked < 0 else drawing.event_text(
-                shown, self._picked, compensated=self.compensates
-            ),
+            **values,
+            "titles": [list(each) for each in enumerate(titles)],
+            "events": captions.chosen_text(shown),
+            "steps": step_rows(shown.steps, shown.read_us),
+            "beside_rows": captions.beside_rows(self.inspector, shown),
+            "drawn": captions.drawn_text(shown),
+            "count": shown.span.count,
+            "sharpness": captions.sharpness_text(shown, compensated=self.compensates),
+            "picked": self._picked,
+            "picked_text": picked_text,
             "after_title": self._after_title(shown),
-            "against_title": drawing.against_title(self.inspector, left), "against_choices": self._against_choices(),
-        }  # fmt: skip
+            "against_title": captions.against_title(self.inspector, left),
+            "against_choices": self._against_choices(),
+        }
 
     def _after_title(self, shown: DisplayedWindow) -> str:
         """Return the title of the second image."""
@@ -943,7 +1126,9 @@ class Panel(layout.Actions):
             return "region" if shown.beside is None else f"{name}, as recorded"
         if shown.beside is not None:
             return f"{name}, compensated"
-        return "difference" if self.state.difference and self.image is ImageKind.COUNT else "compensated"
+        if self.state.difference and self.image is ImageKind.COUNT:
+            return "difference"
+        return "compensated"
 
     def _images(self, shown: DisplayedWindow, inspector: Inspector | None = None) -> dict[str, Any]:
         """Return the state variables of the images of the region, or why there are none."""
@@ -951,17 +1136,24 @@ class Panel(layout.Actions):
             pair = self._pair(shown, inspector)
         except AmiwarpError as error:
             return {"before": None, "after": None, "image_note": str(error)}
-        scales = pair.scale, pair.after_scale or pair.scale
-        self._scales, self._scales_of = scales, self.image
-        before, after = (
-            None if image is None else drawing.picture_state(image, scale)
-            for image, scale in zip((pair.before, pair.after), scales, strict=True)
-        )
-        first, second = map(drawing.scale_state, scales)
-        return {"before": before, "after": after, "image_scale": first, "after_scale": second, "image_note": pair.note}
+        after_scale = pair.after_scale or pair.scale
+        self._scales = pair.scale, after_scale
+        self._scales_of = self.image
+        before = None
+        if pair.before is not None:
+            before = page_state.picture_state(pair.before, pair.scale)
+        return {
+            "before": before,
+            "after": page_state.picture_state(pair.after, after_scale),
+            "image_scale": page_state.scale_state(pair.scale),
+            "after_scale": page_state.scale_state(after_scale),
+            "image_note": pair.note,
+        }
 
-    def _pair(self, shown: DisplayedWindow | None = None, inspector: Inspector | None = None) -> drawing.ShownImages:
-        return drawing.make_images(
+    def _pair(
+        self, shown: DisplayedWindow | None = None, inspector: Inspector | None = None
+    ) -> ShownImages:
+        return images.make_images(
             inspector or self.inspector,
             self.image,
             against=self.against,
@@ -973,25 +1165,38 @@ class Panel(layout.Actions):
         )
 
     async def _curve(self, inspector: Inspector) -> None:
-        s, name = self.state, self.state.knob
-        find = partial(jobs.calibrated_events, inspector)
-        s.calibrate_on = [(await self.in_thread(find, whole=whole))[1] for whole in (False, True)]
+        s = self.state
+        name = self.state.knob
+        find = partial(calibration_job.calibrated_events, inspector)
+        _, of_selection = await self.in_thread(find, whole=False)
+        _, of_whole = await self.in_thread(find, whole=True)
+        s.calibrate_on = [of_selection, of_whole]
         if not self.compensates:
             return
         values, scores = await self.in_thread(inspector.curve, name)
-        x: list[float] = (values / layout.UNITS[name]).tolist()
+        x: list[float] = (values / UNITS[name]).tolist()
         if not x:
             return
-        label, unit, *_ = layout.SLIDERS[name]
+        label, unit, *_ = SLIDERS[name]
         best = int(np.argmax(scores))
-        peak = f"{'at the edge ' if best in (0, len(x) - 1) else ''}{x[best]:.4g}"
-        now = layout.knob_values(self.inspector)[name]
-        s.curve = {"name": label, "title": f"{label} ({unit})", "text": f"peak {peak}, now {now:.4g}", "x": x,
-                   "y": scores.tolist(), "truth": layout.truths(self.inspector)[name]}  # fmt: skip
+        peak = f"{x[best]:.4g}"
+        if best in (0, len(x) - 1):
+            peak = f"at the edge {peak}"
+        now = sliders.knob_values(self.inspector)[name]
+        s.curve = {
+            "name": label,
+            "title": f"{label} ({unit})",
+            "text": f"peak {peak}, now {now:.4g}",
+            "x": x,
+            "y": scores.tolist(),
+            "truth": sliders.truths(self.inspector)[name],
+        }
         s.curve_mark = now
 
 
-def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progress: Progress) -> Any:
+def _guarded(
+    call: Callable[..., Any], inspector: weakref.ref[Inspector], progress: Progress
+) -> Any:
     """Return the result of a call, or the text of its error; None if the inspector is gone.
 
     NLopt keeps the last error, and its traceback would keep all local variables of this call and its callers alive.
@@ -1004,45 +1209,3 @@ def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progre
         return str(error)
     finally:
         known = None
-
-
-# The page in a browser.
-
-LOCAL_HOST = "127.0.0.1"
-"""Address of this machine that only this machine can reach."""
-
-
-def serve_panel(
-    make_inspector: Callable[[], Inspector],
-    library: Library | None = None,
-    *,
-    host: str = LOCAL_HOST,
-    port: int = 0,
-    ready: Callable[[str], None],
-) -> None:
-    """Serve the inspector's page until interrupted; each browser tab gets its own inspector.
-
-    ``library``: other recordings that the page may open. ``ready`` is called with the page's address as soon as it can
-    be opened.
-    Raises :class:`AmiwarpError` if the host or the port cannot be used.
-    """
-    with contextlib.suppress(KeyboardInterrupt):
-        token = secrets.token_urlsafe(16)
-        asyncio.run(serve_tabs(make_inspector, library, host=host, port=port, token=token, ready=ready))
-
-
-async def serve_tabs(
-    make_inspector: Callable[[], Inspector],
-    library: Library | None = None,
-    *,
-    opened: Callable[[Panel], None] = lambda panel: None,
-    **options: Any,
-) -> None:
-    """Serve the page, as :func:`serve_panel` does. ``opened`` is called with the panel of each tab that opens."""
-
-    def build(server: Any) -> Callable[[], None]:
-        panel = Panel(server, make_inspector(), library)
-        opened(panel)
-        return panel.close
-
-    await serve(build, settable=layout.SETTABLE, **options)

@@ -15,33 +15,45 @@ from amiwarp.choices import Axis, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.imaging.regions import inside
-from amiwarp.io.files import NewFile, check_output, scratch_folder
-from amiwarp.io.formats import check_ending
+from amiwarp.io.output_formats import check_ending
+from amiwarp.io.outputs import NewFile, check_output
+from amiwarp.io.unfinished import scratch_folder
 from amiwarp.plotting.colours import Scale, table_of
 from amiwarp.plotting.figures import blank
 from amiwarp.plotting.meshes import AXIS_HEIGHT, Box, event_clouds
-from amiwarp.viewer import drawing, layout
-from amiwarp.viewer.drawing import CAMERA_DIRECTIONS, Look
-from amiwarp.viewer.inspector import DisplayedWindow, Inspector, Knobs
+from amiwarp.viewer import captions, cloud_colours, sliders
+from amiwarp.viewer.images import ImageKind, make_images
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.knobs import Knobs
+from amiwarp.viewer.look import CAMERA_DIRECTIONS, ORBIT_COLOUR, Look
+from amiwarp.viewer.page_state import LEGEND_ROWS
+from amiwarp.viewer.shown_window import DisplayedWindow
+from amiwarp.viewer.sliders import SLIDERS, UNITS
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 """Endings of figures."""
-SIZE_MM, DPI = (180.0, 130.0), 300
+SIZE_MM = (180.0, 130.0)
+DPI = 300
 """Default width and height of a figure [mm], and default resolution of what is drawn as pixels in it [1/inch]."""
 MM_PER_INCH = 25.4
 MOST_POINTS = 150_000
 """Largest number of points in each cloud of a figure."""
-TEXT_PT, TITLE_PT = 6.5, 7.5
+TEXT_PT = 6.5
+TITLE_PT = 7.5
 """Sizes of text and titles [pt]."""
 POINT_AREA = 0.35
 """Area of a point of a cloud [pt²]."""
-CLOUD_LETTERS, IMAGE_LETTERS = 44, 20
+CLOUD_LETTERS = 44
+IMAGE_LETTERS = 20
 """Largest length of a line of the title of a cloud and of an image [characters]."""
 LETTERS_PER_MM = 0.8
 """Letters of the caption that fit on a line, per width of the figure."""
 RATE_BINS = 100
 """Number of bins of the rates over a time window."""
-NOW, TRUTH = "#c8501e", drawing.ORBIT_COLOUR
+FLAT_AXES = {View.XY: (0, 1), View.X_AXIS: (0, 2), View.Y_AXIS: (1, 2)}
+"""Which of a cloud's axes each flat view shows, across and upwards."""
+NOW = "#c8501e"
+TRUTH = ORBIT_COLOUR
 """Colours of the lines that mark the current and the true value of a parameter."""
 
 
@@ -55,12 +67,18 @@ class Page:
 
     @classmethod
     def of_pixels(cls, width: int, height: int, dpi: int) -> Page:
-        """Return the page that has so many pixels."""
+        """Return the page with this number of pixels."""
         return cls(width * MM_PER_INCH / dpi, height * MM_PER_INCH / dpi, dpi)
 
 
 def save_figure(
-    inspector: Inspector, path: Path, page: Page, *, view: View, look: Look, against: Knobs | None = None
+    inspector: Inspector,
+    path: Path,
+    page: Page,
+    *,
+    view: View,
+    look: Look,
+    against: Knobs | None = None,
 ) -> int:
     """Write a figure as PNG, SVG or PDF, and return the number of points in each cloud.
 
@@ -73,18 +91,25 @@ def save_figure(
     ending = check_ending(path, "figures are written", FIGURE_ENDINGS)
     check_output(path)
     shown = inspector.show(against=against)
-    stride = max(1, -(-len(shown.events) // MOST_POINTS))
+    stride = max(1, -(-len(shown.events) // MOST_POINTS))  # rounded up
     compensates = math.isfinite(inspector.turn_us)
-    titles = drawing.cloud_titles(inspector, "recorded" if against is None else "B", look.axis)
-    with mpl.rc_context({"font.size": TEXT_PT, "axes.titlesize": TITLE_PT, "pdf.fonttype": 42, "svg.hashsalt": "a"}):
+    titles = captions.cloud_titles(inspector, "recorded" if against is None else "B", look.axis)
+    style = {
+        "font.size": TEXT_PT,
+        "axes.titlesize": TITLE_PT,
+        "pdf.fonttype": 42,
+        "svg.hashsalt": "a",
+    }
+    with mpl.rc_context(style):
         figure = blank((page.width_mm / MM_PER_INCH, page.height_mm / MM_PER_INCH), dpi=page.dpi)
         figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.03)
         clouds, charts, foot = figure.subfigures(3, 1, height_ratios=(1.3, 1.0, 0.25))
         pair = [(shown.first.before, shown.first), (shown.after, shown)][-len(titles) :]
         axes = []
         for k, (title, (xy, window)) in enumerate(zip(titles, pair, strict=True)):
-            place = 1, len(titles), k + 1
-            after = window is shown and k == len(titles) - 1
+            place = (1, len(titles), k + 1)
+            is_last = k == len(titles) - 1
+            after = window is shown and is_last
             ax = _draw_cloud(clouds, place, xy, window, look, view, stride=stride, after=after)
             ax.set_title(textwrap.fill(title, CLOUD_LETTERS))
             axes.append(ax)
@@ -109,38 +134,49 @@ def _draw_cloud(
     after: bool,
 ) -> Any:
     """Draw a cloud, in three dimensions or flat along an axis, and return its axes."""
-    rgb = drawing.colours_of(window, look, after=after)[::stride] / 255.0
-    third, ends = drawing.third_axis(window, look.axis)[::stride], drawing.axis_range(window, look.axis)
+    rgb = cloud_colours.colours_of(window, look, after=after)[::stride] / 255.0
+    third = cloud_colours.third_axis(window, look.axis)[::stride]
     xy = xy[::stride]
     left, top, right, bottom = window.region
-    x, y = (left - 0.5, right - 0.5), (bottom - 0.5, top - 0.5)  # y points down
-    third_name = "θ [°]" if look.axis is Axis.ANGLE else "t [ms]"
-    low, high = (x[0], y[1]), (x[1], y[0])
-    within = ((xy >= low) & (xy <= high)).all(axis=1)  # not NaN, either: where the model has no solution
-    points = [values[within] for values in (xy[:, 0], xy[:, 1], third)]
+    low = (left - 0.5, top - 0.5)
+    high = (right - 0.5, bottom - 0.5)
+    # Not NaN, either: where the model has no solution
+    within = ((xy >= low) & (xy <= high)).all(axis=1)
+    points = [xy[within, 0], xy[within, 1], third[within]]
     dots = {"s": POINT_AREA, "c": rgb[within], "linewidths": 0.0, "rasterized": True}
-    if view is View.FREE:
-        ax = figure.add_subplot(*place, projection="3d", computed_zorder=False)
-        away = CAMERA_DIRECTIONS[view][0]
-        ax.view_init(elev=math.degrees(math.atan2(away[2], math.hypot(*away[:2]))),
-                     azim=math.degrees(math.atan2(away[1], away[0])))  # fmt: skip
-        ax.scatter(*points, depthshade=False, **dots)
-        ax.set(xlim=x, ylim=y, zlim=ends, xlabel="x [px]", ylabel="y [px]", zlabel=third_name)
-        ax.set_box_aspect((np.ptp(x), np.ptp(y), AXIS_HEIGHT * np.ptp(x)), zoom=1.15)
-        ax.locator_params(axis="x", nbins=5)
-        ax.locator_params(axis="y", nbins=4)
-        ax.tick_params(pad=-2)
-        ax.xaxis.labelpad = ax.yaxis.labelpad = ax.zaxis.labelpad = -6
-        if look.axis is Axis.ANGLE:
-            ax.set_zticks((0, 90, 180, 270, 360))
-    else:
+
+    names = ["x [px]", "y [px]", "θ [°]" if look.axis is Axis.ANGLE else "t [ms]"]
+    limits = [
+        (left - 0.5, right - 0.5),
+        (bottom - 0.5, top - 0.5),  # y points down
+        cloud_colours.axis_range(window, look.axis),
+    ]
+    if view is not View.FREE:
         ax = figure.add_subplot(*place)
-        across, up = {View.XY: (0, 1), View.X_AXIS: (0, 2), View.Y_AXIS: (1, 2)}[view]
-        names = "x [px]", "y [px]", third_name
+        across, up = FLAT_AXES[view]
         ax.scatter(points[across], points[up], **dots)
-        ax.set(xlim=(x, y, ends)[across], ylim=(x, y, ends)[up], xlabel=names[across], ylabel=names[up])
+        ax.set(xlim=limits[across], ylim=limits[up], xlabel=names[across], ylabel=names[up])
         if view is View.XY:
             ax.set_aspect("equal")
+        return ax
+
+    ax = figure.add_subplot(*place, projection="3d", computed_zorder=False)
+    (away_x, away_y, away_z), _ = CAMERA_DIRECTIONS[view]
+    elevation = math.degrees(math.atan2(away_z, math.hypot(away_x, away_y)))
+    azimuth = math.degrees(math.atan2(away_y, away_x))
+    ax.view_init(elev=elevation, azim=azimuth)
+    ax.scatter(*points, depthshade=False, **dots)
+    ax.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
+    ax.set(xlabel=names[0], ylabel=names[1], zlabel=names[2])
+    width = right - left
+    ax.set_box_aspect((width, bottom - top, AXIS_HEIGHT * width), zoom=1.15)
+    ax.locator_params(axis="x", nbins=5)
+    ax.locator_params(axis="y", nbins=4)
+    ax.tick_params(pad=-2)
+    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+        axis.labelpad = -6
+    if look.axis is Axis.ANGLE:
+        ax.set_zticks((0, 90, 180, 270, 360))
     return ax
 
 
@@ -154,7 +190,7 @@ def _draw_charts(
     compensates: bool,
 ) -> None:
     """Draw the images with one scale, or of two recordings each with its own, and the sharpness over two parameters."""
-    pair = drawing.make_images(inspector, drawing.ImageKind.COUNT, against=against, shown=shown)
+    pair = make_images(inspector, ImageKind.COUNT, against=against, shown=shown)
     images = [pair.before, pair.after][-len(titles) :]
     names = [*inspector.orbit_names] if compensates else []
     axes = figure.subplots(1, len(images) + max(1, len(names)))
@@ -170,41 +206,59 @@ def _draw_charts(
         _draw_curve(ax, inspector, name)
     if not names:
         _draw_rates(axes[-1], inspector)
-    figure.legend(*axes[-1].get_legend_handles_labels(), loc="outside lower right", ncols=2, frameon=False)
+    handles, labels = axes[-1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower right", ncols=2, frameon=False)
 
 
 def _draw_curve(ax: Any, inspector: Inspector, name: str) -> None:
     """Draw the sharpness over a parameter, with its shown and its true value."""
     values, sharpness = inspector.curve(name)
-    label, unit, *_ = layout.SLIDERS[name]
-    ax.plot(values / layout.UNITS[name], sharpness, color="#333333", linewidth=0.9)
-    for knobs, colour, style, text in ((inspector.knobs, NOW, "-", "shown"), (inspector.truth, TRUTH, "--", "truth")):
-        value = None if knobs is None else knobs.value(name) or 0.0
-        if value is not None and values[0] <= value <= values[-1]:
-            ax.axvline(value / layout.UNITS[name], color=colour, linewidth=0.9, label=text, linestyle=style)
+    label, unit, *_ = SLIDERS[name]
+    ax.plot(values / UNITS[name], sharpness, color="#333333", linewidth=0.9)
+    for knobs, colour, style, text in (
+        (inspector.knobs, NOW, "-", "shown"),
+        (inspector.truth, TRUTH, "--", "truth"),
+    ):
+        if knobs is None:
+            continue
+        value = knobs.value(name) or 0.0
+        if values[0] <= value <= values[-1]:
+            shown = value / UNITS[name]
+            ax.axvline(shown, color=colour, linewidth=0.9, label=text, linestyle=style)
     ax.set(title="sharpness", xlabel=f"{label} [{unit}]" if unit else label, box_aspect=0.8)
     ax.locator_params(axis="x", nbins=4)
 
 
 def _draw_rates(ax: Any, inspector: Inspector) -> None:
     """Draw the rates of the selected ON and OFF events of the region over the time window."""
-    window, region = inspector.loaded, inspector.loaded.region
-    events, span = window.counted[inside(window.counted, region)], window.span
+    window = inspector.loaded
+    region = inspector.loaded.region
+    events = window.counted[inside(window.counted, region)]
+    span = window.span
     edges = np.linspace(span.start_us, span.start_us + span.length_us, RATE_BINS + 1)
     read = len(span.events) / span.count  # of a full window, a part is read
     per_s = RATE_BINS / (span.length_us * 1e-6 * read)
     for polarity, colour, text in ((1, ON_COLOUR, "ON"), (0, OFF_COLOUR, "OFF")):
         counts, _ = np.histogram(events.t[events.p == polarity], edges)
-        ax.stairs(counts * per_s * 1e-6, (edges - span.first_us) * 1e-3, color=colour, linewidth=0.8, label=text)
-    ax.set(title="events of the region", xlabel="t [ms]", ylabel="rate [Mev/s]", ylim=(0.0, None), box_aspect=0.6)
+        rates = counts * per_s * 1e-6
+        ax.stairs(rates, (edges - span.first_us) * 1e-3, color=colour, linewidth=0.8, label=text)
+    ax.set(
+        title="events of the region",
+        xlabel="t [ms]",
+        ylabel="rate [Mev/s]",
+        ylim=(0.0, None),
+        box_aspect=0.6,
+    )
 
 
 def _mapped(scale: Scale) -> dict[str, Any]:
     """Return how Matplotlib maps values to the colours of a scale."""
     from matplotlib.colors import ListedColormap, PowerNorm
 
-    return {"cmap": ListedColormap(table_of(scale.colours) / 255.0),
-            "norm": PowerNorm(scale.gamma, scale.low, scale.high, clip=True)}  # fmt: skip
+    return {
+        "cmap": ListedColormap(table_of(scale.colours) / 255.0),
+        "norm": PowerNorm(scale.gamma, scale.low, scale.high, clip=True),
+    }
 
 
 def _explain_colours(figure: Any, axes: list[Any], shown: DisplayedWindow, look: Look) -> None:
@@ -212,28 +266,43 @@ def _explain_colours(figure: Any, axes: list[Any], shown: DisplayedWindow, look:
     from matplotlib.cm import ScalarMappable
     from matplotlib.lines import Line2D
 
-    bar = drawing.scale_of(shown, look.colour, dark=False)
+    bar = cloud_colours.scale_of(shown, look.colour, dark=False)
     if bar is not None:
-        figure.colorbar(ScalarMappable(**_mapped(bar)), ax=axes, location="bottom", label=bar.label, shrink=0.4,
-                        aspect=40)  # fmt: skip
+        figure.colorbar(
+            ScalarMappable(**_mapped(bar)),
+            ax=axes,
+            location="bottom",
+            label=bar.label,
+            shrink=0.4,
+            aspect=40,
+        )
     rows = (
-        *drawing.legend_of(shown.truth, look.colour, drawing.LEGEND_ROWS),
-        *drawing.unknown_rows(shown, look.colour),
+        *cloud_colours.legend_of(shown.truth, look.colour, LEGEND_ROWS),
+        *cloud_colours.unknown_rows(shown, look.colour),
     )
-    marks = [Line2D([], [], marker="s", linestyle="", markersize=4, color=colour or "none", label=text)
-             for colour, text in rows]  # fmt: skip
+    square: dict[str, Any] = {"marker": "s", "linestyle": "", "markersize": 4}
+    marks = [Line2D([], [], color=colour or "none", label=text, **square) for colour, text in rows]
     if marks:
-        figure.legend(handles=marks, loc="outside lower center", ncols=5, frameon=False, handletextpad=0.2)
+        figure.legend(
+            handles=marks, loc="outside lower center", ncols=5, frameon=False, handletextpad=0.2
+        )
 
 
 def _draw_foot(
-    figure: Any, inspector: Inspector, shown: DisplayedWindow, stride: int, page: Page, *, compensates: bool
+    figure: Any,
+    inspector: Inspector,
+    shown: DisplayedWindow,
+    stride: int,
+    page: Page,
+    *,
+    compensates: bool,
 ) -> None:
     """Draw the caption: recording, time, region, numbers, sharpness and parameters."""
-    words = [drawing.caption(inspector, shown, stride)]
+    words = [captions.caption(inspector, shown, stride)]
     if compensates:
-        knobs, source = inspector.knobs, inspector.sources["phase"].value
-        words.append(f"model {knobs.model}: {layout.orbit_text(knobs.model, knobs.value, knobs.phase)} ({source})")
+        knobs = inspector.knobs
+        orbit = sliders.orbit_text(knobs.model, knobs.value, knobs.phase)
+        words.append(f"model {knobs.model}: {orbit} ({inspector.sources['phase'].value})")
     wide = round(page.width_mm * LETTERS_PER_MM)
     lines = [line for text in words for line in textwrap.wrap(text, wide)]
     figure.text(0.01, 0.04, "\n".join(lines), va="bottom", ha="left", fontsize=TEXT_PT)
@@ -242,7 +311,7 @@ def _draw_foot(
 def save_clouds(inspector: Inspector, path: Path) -> int:
     """Write both clouds of the window to one VTP file, and return the number of points of each.
 
-    The arrays are those of :func:`amiwarp.event_clouds`, and ``compensated``: 0 for the events as recorded, 1 for the
+    It has the arrays of :func:`amiwarp.event_clouds`, and ``compensated``: 0 for the events as recorded, 1 for the
     compensated ones. Without a prism that turns, there is one cloud over the time. Raises :class:`AmiwarpError` if
     the file exists, or for a depth map, which the file could not name.
     """
@@ -251,28 +320,37 @@ def save_clouds(inspector: Inspector, path: Path) -> int:
     check_ending(path, "clouds are written", [".vtp"])
     check_output(path)
     if inspector.depth is not None:
-        raise AmiwarpError("a .vtp holds clouds that a calibration explains, without a depth map; leave --depth out")
+        raise AmiwarpError(
+            "a .vtp holds clouds that a calibration explains, without a depth map; leave --depth out"
+        )
     shown = inspector.show()
-    start, stop = shown.span.start_us, shown.span.start_us + shown.span.length_us
+    start = shown.span.start_us
+    stop = shown.span.start_us + shown.span.length_us
     if math.isfinite(inspector.turn_us):
         pair = event_clouds(
-            inspector.recording, inspector.as_calibration(), window=(start, stop), region=shown.region,
+            inspector.recording,
+            inspector.as_calibration(),
+            window=(start, stop),
+            region=shown.region,
             device=inspector.device,
-        )  # fmt: skip
+        )
         whole = pyvista.PolyData(np.concatenate([cloud.points for cloud in pair]))
         for name in pair[0].point_data:
             whole.point_data[name] = np.concatenate([cloud.point_data[name] for cloud in pair])
-        whole.point_data["compensated"] = np.repeat(np.arange(2, dtype=np.uint8), [cloud.n_points for cloud in pair])
+        counts = [cloud.n_points for cloud in pair]
+        whole.point_data["compensated"] = np.repeat(np.arange(2, dtype=np.uint8), counts)
         for name in pair[0].field_data:
             whole.field_data[name] = pair[0].field_data[name]
         count = pair[0].n_points
     else:
-        box = Box(*shown.region, *drawing.axis_range(shown, Axis.TIME))
+        box = Box(*shown.region, *cloud_colours.axis_range(shown, Axis.TIME))
         t_us = shown.events.t - inspector.recording.events.t_first
         whole = pyvista.PolyData(box.positions(shown.before, t_us * 1e-3))
-        whole.point_data["t_us"], whole.point_data["polarity"] = t_us, shown.events.p
+        whole.point_data["t_us"] = t_us
+        whole.point_data["polarity"] = shown.events.p
         whole.field_data["axes"] = ["x [px]", "-y [px]", "(t [ms] - z_start) * z_scale"]
-        whole.field_data["z_scale"], whole.field_data["z_start"] = [box.stretch], [box.low]
+        whole.field_data["z_scale"] = [box.stretch]
+        whole.field_data["z_start"] = [box.low]
         count = whole.n_points
     with scratch_folder(path.resolve().parent) as folder, NewFile(path) as new:
         whole.save(folder / "clouds.vtp")  # VTK wants this ending

@@ -41,8 +41,10 @@ def text_width(text: str, font_px: int) -> float:
 
 def fitting_font(text: str, width_px: float, font_px: int) -> int:
     """Return the largest size of the font up to a given one with which a line of text is at most so wide [px]."""
-    sizes = range(font_px, SMALLEST_PX, -1)
-    return next((size for size in sizes if text_width(text, size) <= width_px), SMALLEST_PX)
+    for size in range(font_px, SMALLEST_PX, -1):
+        if text_width(text, size) <= width_px:
+            return size
+    return SMALLEST_PX
 
 
 def wrapped(text: str, width_px: float, font_px: int) -> list[str]:

@@ -10,12 +10,15 @@ from typing import Any
 from amiwarp.choices import Axis, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.live.stream.session import LiveSource
 from amiwarp.tasks import interrupts_later, no_garbage_collection
-from amiwarp.viewer import drawing, jobs, layout
+from amiwarp.viewer import captions, depth_view, first_phase, orbit_lines, view_state
 from amiwarp.viewer.bookmarks import Bookmarks
-from amiwarp.viewer.drawing import Look, Scene
 from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.job_progress import PROGRESS_S, JobCancelled
+from amiwarp.viewer.look import Look
+from amiwarp.viewer.scene import Scene
+from amiwarp.viewer.view_state import ViewState
+from amiwarp.viewer.watched_stream import WatchedStream
 from amiwarp.viewer.window_actions import FINE, SPEED
 from amiwarp.viewer.window_contents import WindowContents
 from amiwarp.viewer.window_layout import LARGEST, Places, first_size, places
@@ -30,9 +33,12 @@ DRAWING_SHARE = 0.2
 """Largest share of the time of a calibration in which the window draws."""
 REST_S = 0.3
 """Time without a change after which all points are drawn, and the sharpness curves computed [s]."""
-IDLE_S, FOLLOW_S = 0.005, 0.25
+IDLE_S = 0.005
+FOLLOW_S = 0.25
 """Interval between two looks for input, and between two pictures of a live stream [s]."""
-COUNT_S, TELL_S, COUNTED_S = 0.02, 0.2, 1.0
+COUNT_S = 0.02
+TELL_S = 0.2
+COUNTED_S = 1.0
 """Time for which events are counted for the timeline between two looks for input, and shortest intervals between two
 drawings of what is counted, and between two counts of a live stream [s]."""
 
@@ -45,9 +51,14 @@ class Window(WindowContents):
     """
 
     def __init__(
-        self, inspector: Inspector, *, look: Look | None = None, view: View = View.FREE,
-        size: tuple[int, int] | None = None, off_screen: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        inspector: Inspector,
+        *,
+        look: Look | None = None,
+        view: View = View.FREE,
+        size: tuple[int, int] | None = None,
+        off_screen: bool = False,
+    ) -> None:
         """Open the window. ``size``: in pixels; by default, the largest that fits the screen.
 
         ``off_screen``: draw without a display, for tests. Raises :class:`AmiwarpError` if there is no display, or no
@@ -57,12 +68,14 @@ class Window(WindowContents):
         self.plotter = self.scene.plotter
         if size is None and not off_screen:
             self.plotter.window_size = first_size(tuple(self.plotter.render_window.GetScreenSize()))
-        self.inspector, self.view = inspector, view
+        self.inspector = inspector
+        self.view = view
         self.bookmarks = None if inspector.path is None else Bookmarks(inspector.path)
         self.look = look or Look(axis=Axis.ANGLE if self.compensates else Axis.TIME)
         self.first_dark = self.look.dark
-        self.statistics_shown = not self.compensates  # in place of the charts of the sharpness
-        self.knob, self.message = inspector.orbit_names[0], ""
+        self.statistics_shown = not self.compensates  # instead of the charts of the sharpness
+        self.knob = inspector.orbit_names[0]
+        self.message = ""
         self.sheets = Sheets(list(self.plotter.renderers)[-RENDERERS:], self)
         self.mouse = Mouse(self)
         self._prepare()
@@ -75,8 +88,12 @@ class Window(WindowContents):
         self._interrupts: list[int] = []
         self._progress_due_s = 0.0
         self._built: tuple[Any, ...] = ()
-        self._exposed, self._sheets_old = True, False
-        self._changed_s = self._counted_s = self._told_s = 0.0
+        self._exposed = True
+        self._sheets_old = False
+        # When something has changed, and the events of a live stream and the counted ones were shown, last.
+        self._changed_s = 0.0
+        self._counted_s = 0.0
+        self._told_s = 0.0
         self._coarse = 1
         self._slow: Iterator[None] = iter(())
         self._listen()
@@ -122,28 +139,20 @@ class Window(WindowContents):
         if self.scene.stride > 1:
             self._draw_at(1)
             return True
-        return self._sheets_old or next(self._slow, self) is not self or self._count_events()
+        if self._sheets_old:  # drawn in the next turn
+            return True
+        ended = object()
+        if next(self._slow, ended) is not ended:
+            return True
+        return self._count_events()
 
     def update(self) -> None:
         """Compute what was requested, and give it to VTK."""
-        wanted, self._wanted = self._wanted, set()
+        wanted = self._wanted
+        self._wanted = set()
         inspector = self.inspector
         try:
-            if wanted & {"window", "suggestion"}:
-                inspector.open(*self.time_window)
-            if "state" in wanted:
-                if not self.plays:
-                    self.remember("")  # what came before an undo can be redone
-                if (state := self.travelled()) is not None:
-                    self.show_state(state)
-            if "suggestion" in wanted:
-                jobs.estimate_phase(inspector)
-                inspector.open(*self.time_window, replace(inspector.selection, region=inspector.suggest_region()))
-            if wanted - {"look"}:
-                before = getattr(self, "shown", None)
-                self.shown, self._shown_knobs = inspector.show(against=self.b), inspector.knobs
-                self._picked = self._picked if before is not None and before.events is self.shown.events else -1
-                self.message = ""
+            self._compute(wanted)
         except AmiwarpError as error:
             if not hasattr(self, "shown"):
                 raise
@@ -159,6 +168,29 @@ class Window(WindowContents):
             self.remember(self._change)
         self.announce()
 
+    def _compute(self, wanted: set[str]) -> None:
+        """Read, set and compute what was requested. Raises :class:`AmiwarpError` if there are no such events."""
+        inspector = self.inspector
+        if wanted & {"window", "suggestion"}:
+            inspector.open(*self.time_window)
+        if "state" in wanted:
+            if not self.plays:
+                self.remember("")  # what came before an undo can be redone
+            state = self.travelled()
+            if state is not None:
+                self.show_state(state)
+        if "suggestion" in wanted:
+            first_phase.estimate_phase(inspector)
+            suggested = replace(inspector.selection, region=inspector.suggest_region())
+            inspector.open(*self.time_window, suggested)
+        if wanted - {"look"}:
+            before = getattr(self, "shown", None)
+            self.shown = inspector.show(against=self.b)
+            self._shown_knobs = inspector.knobs
+            if before is None or before.events is not self.shown.events:
+                self._picked = -1  # the picked event is gone
+            self.message = ""
+
     def request(self, *what: str, change: str = "") -> None:
         """Request an update: "window", "suggestion", "knobs", "state" or "look"."""
         self._wanted.update(what)
@@ -166,12 +198,18 @@ class Window(WindowContents):
         if set(what) - {"look"}:
             self._slow = self._slow_steps()
 
-    def show_state(self, state: layout.ViewState) -> None:
+    def show_state(self, state: ViewState) -> None:
         """Show what a state describes. Raises :class:`AmiwarpError`, and changes nothing, if it selects no events."""
-        layout.apply_state(self.inspector, state)
-        self.b, self.view, self.image = state.against, state.view, state.image
-        self.difference, self.decay_us, self.same_scale = state.difference, state.decay_us, state.same_scale
-        self.look = replace(self.look, axis=state.axis, colour=state.colour, overlaid=state.overlaid)
+        view_state.apply_state(self.inspector, state)
+        self.b = state.against
+        self.view = state.view
+        self.image = state.image
+        self.difference = state.difference
+        self.decay_us = state.decay_us
+        self.same_scale = state.same_scale
+        self.look = replace(
+            self.look, axis=state.axis, colour=state.colour, overlaid=state.overlaid
+        )
         self.scene.look_from(self.view, self._look)
 
     # Time
@@ -190,7 +228,7 @@ class Window(WindowContents):
         if now - self._played_s < FOLLOW_S:
             return
         self._played_s = now
-        if isinstance(latest, LiveSource):
+        if isinstance(latest, WatchedStream):
             rows, note = latest.figures()
             self._stream = [*(f"{name}: {text}" for name, text, _ in rows), note]
         if self.plays:
@@ -210,21 +248,25 @@ class Window(WindowContents):
         """Count events for the timeline for a short time; return whether some were left."""
         if self._rates.share >= 1.0:
             return False
-        finished, now = self._rates.fill(COUNT_S), time.perf_counter()
+        finished = self._rates.fill(COUNT_S)
+        now = time.perf_counter()
         if finished or now - self._told_s > TELL_S:
-            self._told_s, self._sheets_old = now, True
+            self._told_s = now
+            self._sheets_old = True
         return True
 
     def _show_progress(self, what: str, share: float) -> None:
         """Show how far a calibration is, and handle the input meanwhile."""
-        if not self._progress or self._interrupts or self.closed or self.plotter.iren.interactor.GetDone():
-            raise jobs.JobCancelled
-        if (now := time.perf_counter()) >= self._progress_due_s:
+        cancelled = not self._progress or self._interrupts
+        if cancelled or self.closed or self.plotter.iren.interactor.GetDone():
+            raise JobCancelled
+        now = time.perf_counter()
+        if now >= self._progress_due_s:
             self.message = f"{what}: {100.0 * min(share, 1.0):.0f} % ({self._progress})"
             self.request("look")
             self.turn()
             after = time.perf_counter()
-            self._progress_due_s = after + max(jobs.PROGRESS_S, (after - now) / DRAWING_SHARE)
+            self._progress_due_s = after + max(PROGRESS_S, (after - now) / DRAWING_SHARE)
 
     # Drawing
 
@@ -246,7 +288,9 @@ class Window(WindowContents):
         self.time_window = self.inspector.window or self.inspector.first_window()
         self.plays = self.inspector.latest is not None
         self._count_anew()
-        self.request("window", *(["suggestion"] if self.compensates else []))
+        self.request("window")
+        if self.compensates:
+            self.request("suggestion")
         self.update()
         if self.inspector.bookmark:
             self.open_view(self.inspector.bookmark)
@@ -258,13 +302,15 @@ class Window(WindowContents):
 
     def _draw_at(self, stride: int) -> None:
         """Draw every ``stride``-th point. If only the camera has moved, only the clouds are drawn."""
-        changed, everything = self.scene.stride != stride, bool(self._wanted) or self._exposed
+        changed = self.scene.stride != stride
+        everything = bool(self._wanted) or self._exposed
         self.scene.stride = stride
         if self._wanted:
             self.update()
         elif changed:
             self._show_clouds()
-        self.mouse.turned = self._exposed = False
+        self.mouse.turned = False
+        self._exposed = False
         start = time.perf_counter()
         flat = self.sheets.flat
         self._render([each for each in self.plotter.renderers if everything or each not in flat])
@@ -295,29 +341,35 @@ class Window(WindowContents):
         """Lay the parts of the window out, and give sliders and texts to them."""
         fields = self._fields()
         names = [slider.name for slider in fields if slider.name not in FINE]
-        self.knob = self.knob if self.knob in names or not names else names[0]
+        if names and self.knob not in names:
+            self.knob = names[0]
         self.sheets.set_sliders(fields, self.knob)
-        built, self._built = self._built, (self._curve_names(), self.statistics_shown)
+        built = self._built
+        self._built = (self._curve_names(), self.statistics_shown)
         if built != self._built:
             self.sheets.set_charts(self._curve_names())
             self._slow = self._slow_steps()
-        size = tuple(self.plotter.render_window.GetSize())
-        self.places = places((size[0], size[1]), compensates=self.compensates, statistics=self.statistics_shown)
-        self.scene.place(self.places.clouds.shares(self.places.size), self.places.font_px, self._look)
+        width, height = self.plotter.render_window.GetSize()
+        self.places = places(
+            (width, height), compensates=self.compensates, statistics=self.statistics_shown
+        )
+        clouds = self.places.clouds.shares(self.places.size)
+        self.scene.place(clouds, self.places.font_px, self._look)
         self._set_texts()
 
     def _show(self) -> None:
         """Give what is to be shown to VTK."""
         self._show_clouds()
         if self.compensates:
-            orbit, column = drawing.orbit_lines(self.inspector, self.shown, self._picked)
-            self.sheets.show_orbit(orbit[:, 2], orbit[:, :2] - column[:, :2])  # of the scene point by the prism
+            orbit, column = orbit_lines.orbit_lines(self.inspector, self.shown, self._picked)
+            # Of the scene point by the prism
+            self.sheets.show_orbit(orbit[:, 2], orbit[:, :2] - column[:, :2])
         for name in self._curve_names():
             self._show_curve(name)
         self._show_timeline()
         if self.depth_shown and self.inspector.depth is not None and not self._depth_drawn:
             first = len(self.plotter.renderers) - RENDERERS + 3
-            drawing.draw_depth(self.plotter, first, self.inspector.depth, self.places.font_px)
+            depth_view.draw_depth(self.plotter, first, self.inspector.depth, self.places.font_px)
             self._depth_drawn = True
         self._show_sheets()
 
@@ -332,5 +384,7 @@ class Window(WindowContents):
 
     def _show_clouds(self) -> None:
         look = self._look
-        lines = drawing.shown_lines(self.inspector, self.shown, look.axis, self.b, self._picked)
-        self.scene.show(self.shown, look, lines, drawing.caption(self.inspector, self.shown, self.scene.stride))
+        lines = orbit_lines.shown_lines(self.inspector, self.shown, look.axis, self.b, self._picked)
+        self.scene.show(
+            self.shown, look, lines, captions.caption(self.inspector, self.shown, self.scene.stride)
+        )

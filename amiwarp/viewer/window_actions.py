@@ -1,7 +1,6 @@
 """What keys, sliders and the mouse do in the window."""
 
 import contextlib
-import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,11 +12,17 @@ from amiwarp.choices import Axis, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.regions import Region
-from amiwarp.optics.models import alternatives
-from amiwarp.viewer import drawing, jobs, layout
-from amiwarp.viewer.drawing import ImageKind, Look, Scene
+from amiwarp.optics.models.registry import alternatives
+from amiwarp.viewer import calibration_job, captions, clouds_film, downloads, sliders
+from amiwarp.viewer.actions import Actions
+from amiwarp.viewer.drawn_truth import colours_on_offer
 from amiwarp.viewer.filters import HotPixel
-from amiwarp.viewer.inspector import DisplayedWindow, colours_on_offer
+from amiwarp.viewer.images import DECAY_US, SLOW_KINDS, ImageKind
+from amiwarp.viewer.job_progress import JobCancelled
+from amiwarp.viewer.look import Look
+from amiwarp.viewer.scene import Scene
+from amiwarp.viewer.shown_window import DisplayedWindow
+from amiwarp.viewer.sliders import SLIDERS, UNITS
 from amiwarp.viewer.window_controls import Slider
 from amiwarp.viewer.window_keys import KEYS, OF_OPTICS, X_KEYS
 from amiwarp.viewer.window_sheets import Sheets
@@ -36,13 +41,14 @@ DECAY_ENDS = (10, 10_000_000)
 """Shortest and longest decay time [us]."""
 
 
-class WindowActions(layout.Actions):
+class WindowActions(Actions):
     """Actions of the window. They only change what is wanted; the window then computes and draws it."""
 
     keys = KEYS
     image = ImageKind.COUNT
-    decay_us = drawing.DECAY_US
-    same_scale = difference = False
+    decay_us = DECAY_US
+    same_scale = False
+    difference = False
     scene: Scene
     sheets: Sheets
     shown: DisplayedWindow
@@ -53,7 +59,12 @@ class WindowActions(layout.Actions):
     """Parameter that the arrow keys move, and over which the first curve is."""
     message: str
     """Text that is shown in the column."""
-    plays = loop = closed = help_shown = statistics_shown = depth_shown = False
+    plays = False
+    loop = False
+    closed = False
+    help_shown = False
+    statistics_shown = False
+    depth_shown = False
     optic_shown = False
     """Whether a recording shows the controls of a prism though nothing says that there is one."""
     update: Callable[[], None]
@@ -89,7 +100,7 @@ class WindowActions(layout.Actions):
             self.resize_window(start_us, start_us + round(value * 1e3))
         elif name in self.sliders:
             self.knob = name
-            knobs = self.inspector.knobs.with_values({name: value * layout.UNITS[name]})
+            knobs = self.inspector.knobs.with_values({name: value * UNITS[name]})
             if knobs != self.inspector.knobs:
                 self.inspector.set(knobs)
                 self.request("knobs", change=name)
@@ -124,22 +135,28 @@ class WindowActions(layout.Actions):
         """Move the chosen parameter by steps of its slider."""
         if self.knob not in self.sliders:
             return
-        value = layout.knob_values(self.inspector)[self.knob]
-        self.slide(self.knob, value + steps * layout.SLIDERS[self.knob][2][2])
+        value = sliders.knob_values(self.inspector)[self.knob]
+        _, _, (_, _, step) = SLIDERS[self.knob]
+        self.slide(self.knob, value + steps * step)
 
     def choose_next(self, what: str) -> None:
         """Choose the next "knob" (parameter for the keys and the curve), "model", "colour", "polarity" or "image"."""
-        inspector, knobs = self.inspector, self.inspector.knobs
+        inspector = self.inspector
+        knobs = self.inspector.knobs
         if what == "knob":
-            self.knob = _following([name for name in self.sliders if name not in FINE] or [self.knob], self.knob)
+            names = [name for name in self.sliders if name not in FINE]
+            self.knob = _following(names or [self.knob], self.knob)
             self.request("look")
         elif what == "model":
-            inspector.set(replace(knobs, model=_following(list(alternatives(knobs.model)), knobs.model)))
+            model = _following(list(alternatives(knobs.model)), knobs.model)
+            inspector.set(replace(knobs, model=model))
             self.request("knobs")
         elif what == "colour":
-            self.restyle(colour=_following(colours_on_offer(inspector.recording.truth), self.look.colour))
+            colours = colours_on_offer(inspector.recording.truth)
+            self.restyle(colour=_following(colours, self.look.colour))
         elif what == "image":
-            self.image, self.difference = _following(self._image_kinds(), (self.image, self.difference))
+            shown = self.image, self.difference
+            self.image, self.difference = _following(self._image_kinds(), shown)
             self.request("knobs")
         else:
             self._select(polarity=_following([None, 1, 0], inspector.selection.polarity))
@@ -156,7 +173,7 @@ class WindowActions(layout.Actions):
             self._select(noise_us=NOISE_US if selection.noise_us is None else None)
 
     def scale_count(self, factor: float) -> None:
-        """Show a time window with so many times as many events; it keeps their number when it moves."""
+        """Show a time window with a multiple of the events; it keeps their number when it moves."""
         source = self.inspector.recording.events
         self.inspector.fixed_count = min(max(1, round(self.shown.span.count * factor)), len(source))
         self.request("window")
@@ -164,7 +181,8 @@ class WindowActions(layout.Actions):
     def scale_decay(self, factor: float) -> None:
         """Show the decaying time surface with another decay time."""
         low, high = DECAY_ENDS
-        self.image, self.difference = ImageKind.DECAY, False
+        self.image = ImageKind.DECAY
+        self.difference = False
         self.decay_us = min(max(round(self.decay_us * factor), low), high)
         self.request("knobs")
 
@@ -181,7 +199,9 @@ class WindowActions(layout.Actions):
             self.say("there is no depth map; start with --depth FILE")
             return
         setattr(self, name, not getattr(self, name))
-        self.message = f"play {'in a loop' if self.loop else 'once'}" if name == "loop" else ""
+        self.message = ""
+        if name == "loop":
+            self.message = "play in a loop" if self.loop else "play once"
         self._slow = self._slow_steps()
         self.request("look")
 
@@ -194,16 +214,20 @@ class WindowActions(layout.Actions):
 
     def look_from(self, view: str) -> None:
         """Set the direction from which the clouds are seen, and fit them into the window."""
-        self.view, self.depth_shown = View(view), False
+        self.view = View(view)
+        self.depth_shown = False
         self.scene.look_from(self.view, self._look)
         self.request("look")
 
     def pick(self, place: tuple[int, int]) -> None:
         """Describe the event that is drawn at a place, and show its orbit. ``place``: pixels from left and bottom."""
-        if not self.depth_shown:
-            self._picked = self.scene.event_at(place, self.shown, self._look)
-            compensated = self.compensates
-            self.say("" if self._picked < 0 else drawing.event_text(self.shown, self._picked, compensated=compensated))
+        if self.depth_shown:
+            return
+        self._picked = self.scene.event_at(place, self.shown, self._look)
+        text = ""
+        if self._picked >= 0:
+            text = captions.event_text(self.shown, self._picked, compensated=self.compensates)
+        self.say(text)
 
     def reset(self) -> None:
         """Show the first state again, also light or dark, which the history does not hold."""
@@ -227,7 +251,9 @@ class WindowActions(layout.Actions):
         now = time.perf_counter()
         if now - self._ended_s < STOP_S:
             return
-        was, self.plays, self._played_s = self.plays, not self.plays and self.can_play(), now
+        was = self.plays
+        self.plays = not self.plays and self.can_play()
+        self._played_s = now
         if was:
             self.say("stopped")
         elif self.plays:
@@ -239,7 +265,9 @@ class WindowActions(layout.Actions):
             self._progress = ""
             return
         with self._job("calibration", "c cancels it"):
-            self.found, text = jobs.find_calibration(self.inspector, progress=self._show_progress)
+            self.found, text = calibration_job.find_calibration(
+                self.inspector, progress=self._show_progress
+            )
             self.message = f"{text}. Press a to accept"
 
     def film(self) -> None:
@@ -249,7 +277,7 @@ class WindowActions(layout.Actions):
             return
         with self._job("film", "f ends it, c cancels it"):
             path = self._new_name("film")
-            jobs.write_film(
+            clouds_film.write_film(
                 path,
                 self.inspector,
                 self._look,
@@ -269,7 +297,7 @@ class WindowActions(layout.Actions):
         with self.errors_shown("window"):
             try:
                 yield
-            except jobs.JobCancelled:
+            except JobCancelled:
                 self.message = f"{what} cancelled"
         self._progress = ""
         self.request("look")
@@ -286,7 +314,8 @@ class WindowActions(layout.Actions):
 
     def choose_next_beside(self) -> None:
         """Show the next of the recordings that are on the same time axis."""
-        others, now = self.inspector.besides, self.inspector.beside
+        others = self.inspector.besides
+        now = self.inspector.beside
         if now is None:
             self.say("there is no other recording; start with --beside FILE")
             return
@@ -295,12 +324,17 @@ class WindowActions(layout.Actions):
     def save_next_view(self) -> None:
         """Save what is shown as a bookmark, under the first free number."""
         names = self._views()
-        if names is not None:
-            self.save_view(next(name for k in itertools.count(1) if (name := f"view {k}") not in names))
+        if names is None:
+            return
+        number = 1
+        while f"view {number}" in names:
+            number += 1
+        self.save_view(f"view {number}")
 
     def open_view(self, name: str) -> None:
         """Show a bookmark, and its name or what is wrong with it."""
-        self.message, self._view_name = f"bookmark {name}", name
+        self.message = f"bookmark {name}"
+        self._view_name = name
         super().open_view(name)
         told = self.message
         self.update()
@@ -326,12 +360,12 @@ class WindowActions(layout.Actions):
             return None
 
     def _new_name(self, what: str) -> Path:
-        return jobs.unused_path(jobs.download_name(self.inspector.recording.name, what))
+        return downloads.unused_path(downloads.download_name(self.inspector.recording.name, what))
 
     @property
     def _look(self) -> Look:
         against = "recorded" if self.b is None else "B"
-        return self.look.for_clouds(drawing.cloud_titles(self.inspector, against))
+        return self.look.for_clouds(captions.cloud_titles(self.inspector, against))
 
     def say(self, text: str) -> None:
         """Show a message."""
@@ -351,10 +385,14 @@ class WindowActions(layout.Actions):
 
     def _image_kinds(self) -> list[tuple[ImageKind, bool]]:
         """Return the kinds of images on offer, and whether the second one is their difference."""
-        left_out = {ImageKind.DEPTH} if self.inspector.depth is None else set()
-        left_out |= set() if self.compensates else {ImageKind.LOG_INTENSITY}
-        kinds = [(kind, False) for kind in ImageKind if kind not in left_out]
-        return [*kinds, (ImageKind.COUNT, True)] if len(self._look.titles) > 1 else kinds
+        kinds = [(kind, False) for kind in ImageKind]
+        if self.inspector.depth is None:
+            kinds.remove((ImageKind.DEPTH, False))
+        if not self.compensates:
+            kinds = [(kind, False) for kind, _ in kinds if kind not in SLOW_KINDS]
+        if len(self._look.titles) > 1:
+            kinds.append((ImageKind.COUNT, True))
+        return kinds
 
     @property
     def _image_name(self) -> str:
@@ -365,7 +403,9 @@ def _hot_text(hot: Sequence[HotPixel]) -> str:
     """Return how many hot pixels there are, and the places and rates of the busiest ones."""
     if not hot:
         return "no hot pixels found"
-    busiest = "; ".join(f"x {each.x}, y {each.y}: {each.rate:,.0f} events/s" for each in hot[:NAMED_HOT])
+    busiest = "; ".join(
+        f"x {each.x}, y {each.y}: {each.rate:,.0f} events/s" for each in hot[:NAMED_HOT]
+    )
     most = "with the highest rates: " if len(hot) > NAMED_HOT else ""
     return f"{len(hot):,} hot pixel{'s' if len(hot) > 1 else ''} hidden; {most}{busiest}"
 

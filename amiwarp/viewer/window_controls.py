@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from amiwarp.viewer.drawing import ORBIT_COLOUR
+from amiwarp.viewer.look import ORBIT_COLOUR
 from amiwarp.viewer.texts import LINE, fitting_font, wrapped
 from amiwarp.viewer.window_layout import NOWHERE, SLIDER_EM, Rect
 from amiwarp.viewer.window_paper import OVER, Paper
@@ -66,14 +66,17 @@ class Controls:
         self.sliders = {}
         for new in sliders:
             slider = known.get(new.name, new)
-            slider.value, slider.least, slider.most = new.value, new.least, new.most
-            slider.step, slider.title = new.step, new.title
+            slider.value = new.value
+            slider.least = new.least
+            slider.most = new.most
+            slider.step = new.step
+            slider.title = new.title
             self.sliders[new.name] = slider
         self.chosen = chosen
 
     def press(self, place: tuple[int, int]) -> bool:
         """Take the slider under the mouse. Its handle jumps to the mouse unless the mouse is on it."""
-        self._dragged = next((slider for slider in self.sliders.values() if slider.place.holds(place)), None)
+        self._dragged = self._under(place)
         if self._dragged is None:
             return False
         self._offset = place[0] - self._dragged.column()
@@ -93,38 +96,68 @@ class Controls:
 
     def wheel(self, place: tuple[int, int], steps: int) -> bool:
         """Move the slider under the mouse by steps; return whether there is one."""
+        slider = self._under(place)
+        if slider is None:
+            return False
+        value = slider.value + steps * slider.step
+        self._slide(slider.name, min(max(value, slider.least), slider.most))
+        return True
+
+    def _under(self, place: tuple[int, int]) -> Slider | None:
+        """Return the slider at a place of the window."""
         for slider in self.sliders.values():
             if slider.place.holds(place):
-                value = slider.value + steps * slider.step
-                self._slide(slider.name, min(max(value, slider.least), slider.most))
-                return True
-        return False
+                return slider
+        return None
 
     def draw(self, paper: Paper, rect: Rect) -> None:
         """Draw the column."""
-        em, line = paper.font_px, LINE * paper.font_px
+        em = paper.font_px
+        line = LINE * paper.font_px
         inner = rect.inset(em, em, em, em)
-        top = inner.low + SLIDER_EM * em * len(self.sliders)
+
+        # Sliders at the bottom, and rows above them
+        top_of_sliders = inner.low + SLIDER_EM * em * len(self.sliders)
         for k, slider in enumerate(self.sliders.values()):
-            self._draw_slider(paper, slider, inner, top - k * SLIDER_EM * em)
-        rows = [part for row in self.rows for part in wrapped(row, inner.width, em)]
+            self._draw_slider(paper, slider, inner, top_of_sliders - k * SLIDER_EM * em)
+        rows = []
+        for row in self.rows:
+            rows += wrapped(row, inner.width, em)
         for k, row in enumerate(rows):
-            paper.text(row, inner.left, top + (len(rows) - k) * line, up="top")
-        most = max(0, int((inner.top - top) / line) - len(rows))
-        self.lines = [part for text in self.texts for part in wrapped(text, inner.width, em)]
-        shown = self.lines if len(self.lines) <= most else [*self.lines[: most - 1], "…"]
+            paper.text(row, inner.left, top_of_sliders + (len(rows) - k) * line, up="top")
+
+        # Texts at the top, cut off where they would meet the rows
+        self.lines = []
+        for text in self.texts:
+            self.lines += wrapped(text, inner.width, em)
+        most = max(0, int((inner.top - top_of_sliders) / line) - len(rows))
+        shown = self.lines
+        if len(shown) > most:
+            shown = [*shown[: most - 1], "…"]
         for k, words in enumerate(shown):
             paper.text(words, inner.left, inner.top - k * line, up="top")
 
     def _draw_slider(self, paper: Paper, slider: Slider, inner: Rect, top: float) -> None:
         em = paper.font_px
-        wide, high = (share * em for share in HANDLE_EM)
+        wide_em, high_em = HANDLE_EM
+        wide = wide_em * em
+        high = high_em * em
         ink = ORBIT_COLOUR if slider.name == self.chosen else ""
         size = fitting_font(slider.title, inner.width, em)
         paper.text(slider.title, inner.left, top, colour=ink, up="top", font_px=size)
+
+        half_wide = 0.5 * wide
+        half_high = 0.5 * high
         middle = top - 2.3 * em
-        slider.track = Rect(inner.left + 0.5 * wide, middle - 1, inner.right - 0.5 * wide, middle + 1)
-        slider.place = Rect(inner.left - 0.5 * em, middle - high, inner.right + 0.5 * em, middle + high)
-        paper.line([(slider.track.left, middle), (slider.track.right, middle)], ink, 2.0)
+        left = inner.left + half_wide
+        right = inner.right - half_wide
+        slider.track = Rect(left, middle - 1, right, middle + 1)
+        paper.line([(left, middle), (right, middle)], ink, 2.0)
+
+        # The mouse takes the slider around its line, too.
+        around = 0.5 * em
+        slider.place = Rect(inner.left - around, middle - high, inner.right + around, middle + high)
+
         x = slider.column()
-        paper.area(Rect(x - 0.5 * wide, middle - 0.5 * high, x + 0.5 * wide, middle + 0.5 * high), ink, layer=OVER)
+        handle = Rect(x - half_wide, middle - half_high, x + half_wide, middle + half_high)
+        paper.area(handle, ink, layer=OVER)

@@ -11,22 +11,34 @@ from numpy.typing import NDArray
 
 from amiwarp.imaging.regions import Region
 from amiwarp.plotting.colours import Scale
-from amiwarp.viewer.drawing import ORBIT_COLOUR, ShownImages, polarity_square
+from amiwarp.viewer.images import ShownImages
+from amiwarp.viewer.look import ORBIT_COLOUR
+from amiwarp.viewer.page_state import polarity_square
 from amiwarp.viewer.texts import LINE, fitting_font, text_width
 from amiwarp.viewer.window_layout import Rect
 from amiwarp.viewer.window_paper import LINES, Paper
 
-BAR_EM, LABEL_EM = 1.0, 1.0
+BAR_EM = 1.0
+LABEL_EM = 1.0
 """Width of a colour bar, and of its label, which is written upwards, in sizes of the font."""
 LEAST_REGION_PX = 4
 """Smallest width and height of a drawn region [px of the sensor]."""
 
 
-def thinned(values: NDArray[np.float32], step: int) -> NDArray[np.float32]:
-    """Return the largest values in squares of ``step`` pixels of an image, shape ``(..., height, width)``."""
-    for axis in (-2, -1) if step > 1 else ():
-        values = np.fmax.reduceat(values, range(0, values.shape[axis], step), axis=axis)
-    return values
+def thinned(values: NDArray[np.float32], step: int, *, signed: bool = False) -> NDArray[np.float32]:
+    """Return the largest values in squares of ``step`` pixels of an image, shape ``(..., height, width)``.
+
+    ``signed``: the values farthest from 0, of a difference.
+    """
+    if step == 1:
+        return values
+    height, width = values.shape[-2:]
+    rows = np.fmax.reduceat(values, range(0, height, step), axis=-2)
+    largest = np.fmax.reduceat(rows, range(0, width, step), axis=-1)
+    if not signed:
+        return largest
+    smallest = -thinned(-values, step)
+    return np.where(-smallest > largest, smallest, largest)
 
 
 def value_text(value: NDArray[np.float32], scale: Scale) -> str:
@@ -58,8 +70,13 @@ class Panel:
 
 def panels_of(images: ShownImages, titles: tuple[str, ...], region: Region) -> list[Panel]:
     """Return the images of a region, from the second one backwards as many as there are titles."""
-    both = (images.before, images.scale), (images.after, images.after_scale or images.scale)
-    return [Panel(title, *each, region) for title, each in zip(titles, both[-len(titles) :], strict=True)]
+    after_scale = images.after_scale or images.scale
+    both = [(images.before, images.scale), (images.after, after_scale)]
+    shown = both[-len(titles) :]
+    panels = []
+    for title, (values, scale) in zip(titles, shown, strict=True):
+        panels.append(Panel(title, values, scale, region))
+    return panels
 
 
 class ImageRow:
@@ -67,7 +84,8 @@ class ImageRow:
 
     def __init__(self, choose: Callable[[Region], None], changed: Callable[[], None]) -> None:
         """``choose``: shows a region that was drawn; ``changed``: draws the images again."""
-        self._choose, self._changed = choose, changed
+        self._choose = choose
+        self._changed = changed
         self.panels: list[Panel] = []
         self.note = ""
         """What limits the images, or why there are none."""
@@ -92,7 +110,8 @@ class ImageRow:
 
     def _pixel(self, k: int, place: tuple[int, int]) -> tuple[int, int]:
         """Return the pixel of an image at a place, or the next one if the place is outside."""
-        frame, (left, top, right, bottom) = self.frames[k], self.panels[k].region
+        frame = self.frames[k]
+        left, top, right, bottom = self.panels[k].region
         x = left + math.floor((place[0] - frame.left) / frame.width * (right - left))
         y = top + math.floor((frame.top - place[1]) / frame.height * (bottom - top))
         return min(max(x, left), right - 1), min(max(y, top), bottom - 1)
@@ -102,15 +121,17 @@ class ImageRow:
         found = self.pixel_at(place)
         if found is None:
             return False
-        self._mouse, (self._drawn_on, self._start) = place, found
+        self._mouse = place
+        self._drawn_on, self._start = found
         self._end = self._start
         return True
 
     def drag(self, place: tuple[int, int]) -> None:
         """Follow the mouse with the other corner of the region."""
         self._mouse = place
-        if self._start is None or self._drawn_on >= len(self.frames):  # the images have changed meanwhile
+        if self._drawn_on >= len(self.frames):  # the images have changed meanwhile
             self._start = None
+        if self._start is None:
             return
         self._end = self._pixel(self._drawn_on, place)
         self._changed()
@@ -119,7 +140,8 @@ class ImageRow:
         """Show the drawn region, unless it is too small."""
         if self._start is None:
             return
-        (left, top, right, bottom), self._start = self._drawn_region(), None
+        left, top, right, bottom = self._drawn_region()
+        self._start = None
         if min(right - left, bottom - top) >= LEAST_REGION_PX:
             self._choose((left, top, right, bottom))
         self._changed()
@@ -133,56 +155,82 @@ class ImageRow:
 
     def _drawn_region(self) -> Region:
         assert self._start is not None
-        (x0, x1), (y0, y1) = (sorted(pair) for pair in zip(self._start, self._end, strict=True))
-        return x0, y0, x1 + 1, y1 + 1
+        left, right = sorted((self._start[0], self._end[0]))
+        top, bottom = sorted((self._start[1], self._end[1]))
+        return left, top, right + 1, bottom + 1
 
     def hover(self, place: tuple[int, int]) -> bool:
         """Describe the pixel under the mouse; return whether the description has changed."""
-        before, self._mouse = self._under, place
+        before = self._under
+        self._mouse = place
         self._read()
         return self._under != before
 
     def _read(self) -> None:
         """Describe the pixel that is under the mouse now: the images may have changed since it moved."""
-        self._under, found = "", self.pixel_at(self._mouse)
-        if found is not None:
-            k, (x, y) = found
-            left, top, *_ = self.panels[k].region
-            same = [each for each in self.panels if each.region == self.panels[k].region]
-            values = [(each.values[..., y - top, x - left], each.scale) for each in same if each.values is not None]
-            self._under = f"x {x}, y {y} px: {' → '.join(value_text(*each) for each in values)}"
+        self._under = ""
+        found = self.pixel_at(self._mouse)
+        if found is None:
+            return
+        k, (x, y) = found
+        region = self.panels[k].region
+        left, top, *_ = region
+        texts = []
+        for panel in self.panels:
+            if panel.region == region and panel.values is not None:
+                value = panel.values[..., y - top, x - left]
+                texts.append(value_text(value, panel.scale))
+        self._under = f"x {x}, y {y} px: {' → '.join(texts)}"
 
     def draw(self, paper: Paper, rect: Rect) -> None:
         """Draw the images into a part of the window."""
-        em, line = paper.font_px, LINE * paper.font_px
+        em = paper.font_px
+        line = LINE * paper.font_px
         self.frames = []
-        x, low = rect.left + em, rect.low + 1.3 * line
-        high, wide = rect.height - 2.6 * line, self._width_of_each(rect, em)
+        left = rect.left + em
+        wide = self._width_of_each(rect, em)
         for k, panel in enumerate(self.panels):
-            left, top, right, bottom = panel.region
-            share = min(wide / (right - left), high / (bottom - top))
-            width, height = (max(1, math.floor(share * n)) for n in (right - left, bottom - top))
-            bottom_px = math.floor(rect.top - 1.3 * line - height)
-            frame = Rect(math.floor(x), bottom_px, math.floor(x) + width, bottom_px + height)
-            low = max(rect.low + 1.1 * line, min(low, bottom_px) if k else bottom_px)
+            frame = self._frame_of(panel, rect, left, wide, line)
             self.frames.append(frame)
             paper.text(panel.title, frame.left, rect.top, up="top")
             if panel.values is None:
                 paper.text("needs compensated events", frame.left, frame.top - em, up="top")
             else:
-                paper.picture(self._rgb(k, panel, width), frame)
+                paper.picture(self._rgb(k, panel, frame.width), frame)
             paper.frame(Rect(frame.left - 1, frame.low - 1, frame.right + 1, frame.top + 1))
-            x = frame.right + em
+            left = frame.right + em
             if self._has_bar(k):
-                self._draw_bar(paper, Rect(x, frame.low, x + BAR_EM * em, frame.top), panel.scale)
-                x += BAR_EM * em + self._bar_space(panel.scale, em)
+                bar = Rect(left, frame.low, left + BAR_EM * em, frame.top)
+                self._draw_bar(paper, bar, panel.scale)
+                left += BAR_EM * em + self._bar_space(panel.scale, em)
                 label = bar_label(panel.scale)
                 size = fitting_font(label, frame.height, em)
-                paper.text(label, x - LABEL_EM * em, frame.low, font_px=size, upwards=True)
+                paper.text(label, left - LABEL_EM * em, frame.low, font_px=size, upwards=True)
         self._draw_regions(paper)
+
+        # Below the images: what is drawn or under the mouse, or a note
         self._read()
         words = self._region_text() or self._under or self.note
-        paper.text(words, rect.left + em, low - 0.4 * em, up="top")
+        lowest = min((frame.low for frame in self.frames), default=rect.low + 1.3 * line)
+        below = max(rect.low + 1.1 * line, lowest)
+        paper.text(words, rect.left + em, below - 0.4 * em, up="top")
+
+    @staticmethod
+    def _frame_of(panel: Panel, rect: Rect, left: float, wide: float, line: float) -> Rect:
+        """Return the place of an image, as large as the room for it allows, below a line for its title.
+
+        ``left``: where it begins; ``wide``: width that there is for it; ``line``: height of a line of text [px].
+        """
+        region_left, region_top, region_right, region_bottom = panel.region
+        columns = region_right - region_left
+        rows = region_bottom - region_top
+        high = rect.height - 2.6 * line
+        scale = min(wide / columns, high / rows)
+        width = max(1, math.floor(scale * columns))
+        height = max(1, math.floor(scale * rows))
+        left_px = math.floor(left)
+        low_px = math.floor(rect.top - 1.3 * line - height)
+        return Rect(left_px, low_px, left_px + width, low_px + height)
 
     def _has_bar(self, k: int) -> bool:
         """Return whether an image has a colour bar of its own: the last one of each scale."""
@@ -199,18 +247,23 @@ class ImageRow:
         """Return the colours of an image, with about as many pixels as its place in the window."""
         assert panel.values is not None
         step = max(1, math.floor(panel.values.shape[-1] / width))
-        known = self._drawn.get(k)
-        if known is None or known[0] is not panel.values or known[1:3] != (panel.scale, step):
-            self._drawn[k] = panel.values, panel.scale, step, panel.scale.rgb(thinned(panel.values, step))
-        return self._drawn[k][3]
+        if k in self._drawn:
+            values, scale, known_step, rgb = self._drawn[k]
+            if values is panel.values and (scale, known_step) == (panel.scale, step):
+                return rgb
+        rgb = panel.scale.rgb(
+            thinned(panel.values, step, signed=panel.scale.colours == "difference")
+        )
+        self._drawn[k] = (panel.values, panel.scale, step, rgb)
+        return rgb
 
     def _bar_space(self, scale: Scale, em: int) -> float:
         """Return the width of the numbers and the label of a colour bar, and of the gaps beside them [px]."""
-        return (
-            (1.4 + LABEL_EM) * em
-            + max((text_width(text, em) for _, text in scale.ticks()), default=0.0)
-            + (3.5 * em if scale.colours == "polarity" else 0.0)
-        )
+        numbers = max((text_width(text, em) for _, text in scale.ticks()), default=0.0)
+        space = (1.4 + LABEL_EM) * em + numbers
+        if scale.colours == "polarity":  # the square is wider than a bar
+            space += 3.5 * em
+        return space
 
     def _draw_bar(self, paper: Paper, bar: Rect, scale: Scale) -> None:
         """Draw a colour bar with its numbers; for two polarities a square, OFF to the right and ON upwards."""
@@ -220,11 +273,9 @@ class ImageRow:
             square = Rect(bar.left, bar.top - 3.0 * em, bar.left + 3.0 * em, bar.top)
             paper.picture(self._bar_rgb(scale, both), square)
             paper.frame(square)
-            for text, x, y, across, up in (
-                (f"{scale.high:g} ON", square.right + 0.3 * em, square.top, "left", "top"),
-                (f"{scale.high:g} OFF", square.left, square.low - 0.2 * em, "left", "top"),
-            ):
-                paper.text(text, x, y, across=across, up=up)
+            most = f"{scale.high:g}"
+            paper.text(f"{most} ON", square.right + 0.3 * em, square.top, across="left", up="top")
+            paper.text(f"{most} OFF", square.left, square.low - 0.2 * em, across="left", up="top")
             return
         shares = np.linspace(1.0, 0.0, 128)[:, None] ** (1.0 / scale.gamma)
         paper.picture(self._bar_rgb(scale, scale.low + shares * (scale.high - scale.low)), bar)
@@ -237,7 +288,8 @@ class ImageRow:
     def _bar_rgb(self, scale: Scale, values: NDArray[np.floating]) -> NDArray[np.uint8]:
         """Return the colours of a bar, which stay the same array while the scale does."""
         if scale not in self._bars:
-            self._bars = dict([*self._bars.items()][-1:]) | {scale: scale.rgb(values)}
+            last = list(self._bars.items())[-1:]  # there are two scales at most
+            self._bars = dict(last) | {scale: scale.rgb(values)}
         return self._bars[scale]
 
     def _draw_regions(self, paper: Paper) -> None:
@@ -245,11 +297,9 @@ class ImageRow:
         for frame, panel in zip(self.frames, self.panels, strict=True):
             if panel.region != self.region:
                 paper.frame(self._on_image(frame, panel.region, self.region), ORBIT_COLOUR, 2.0)
-            if (
-                self._start is not None
-                and self._drawn_on < len(self.panels)
-                and panel.region == self.panels[self._drawn_on].region
-            ):
+            if self._start is None or self._drawn_on >= len(self.panels):
+                continue
+            if panel.region == self.panels[self._drawn_on].region:
                 drawn = self._on_image(frame, panel.region, self._drawn_region())
                 paper.area(drawn, ORBIT_COLOUR, 0.3, LINES)
                 paper.frame(drawn, ORBIT_COLOUR, 2.0)
@@ -257,11 +307,13 @@ class ImageRow:
     @staticmethod
     def _on_image(frame: Rect, shown: Region, region: Region) -> Rect:
         """Return where a region is on the image of another one."""
-        left, top, right, bottom = shown
-        across, up = frame.width / (right - left), frame.height / (bottom - top)
+        shown_left, shown_top, shown_right, shown_bottom = shown
+        left, top, right, bottom = region
+        across = frame.width / (shown_right - shown_left)
+        up = frame.height / (shown_bottom - shown_top)
         return Rect(
-            frame.left + (region[0] - left) * across,
-            frame.top - (region[3] - top) * up,
-            frame.left + (region[2] - left) * across,
-            frame.top - (region[1] - top) * up,
+            frame.left + (left - shown_left) * across,
+            frame.top - (bottom - shown_top) * up,
+            frame.left + (right - shown_left) * across,
+            frame.top - (top - shown_top) * up,
         )

@@ -25,7 +25,11 @@ MORE_KEYS = (
     ("Tab", ("choose_next", "knob"), "choose the next parameter for these keys and the curve"),
     ("m", ("choose_next", "model"), "next optical model"),
     ("v", ("take_truth",), "take the known true parameters of a simulation"),
-    ("5", ("toggle", "depth_shown"), "the depth map (--depth) as an image and as points, or the clouds"),
+    (
+        "5",
+        ("toggle", "depth_shown"),
+        "the depth map (--depth) as an image and as points, or the clouds",
+    ),
     ("6", ("choose_next", "image"), "next kind of images"),
     ("k", ("choose_next", "colour"), "next quantity shown by colour"),
     ("n", ("choose_next", "polarity"), "ON, OFF or both"),
@@ -48,7 +52,10 @@ MORE_KEYS = (
 """Keys that only the window has, as :data:`amiwarp.viewer.layout.KEYS`."""
 WINDOW_WORDS = {"p": "save a picture of the window"}
 """Help of keys that do something else in the window than on the page."""
-KEYS = tuple((key, action, WINDOW_WORDS.get(key, words)) for key, action, words in layout.KEYS) + MORE_KEYS
+KEYS = (
+    tuple((key, action, WINDOW_WORDS.get(key, words)) for key, action, words in layout.KEYS)
+    + MORE_KEYS
+)
 """All keys of the window."""
 OF_OPTICS = {"t", "o", "b", "c", "a", "s", "Up", "Down", "Tab", "m", "v", "e"}
 """Keys that act on a prism or on compensated events."""
@@ -76,5 +83,9 @@ def help_rows(*, optic: bool, depth: bool) -> list[tuple[str, str]]:
     ``optic``: whether there are controls of a prism; ``depth``: whether there is a depth map.
     """
     left_out = (OF_PLAIN if optic else OF_OPTICS) | (set() if depth else {"5"})
-    rows = [(key, words if optic else PLAIN_WORDS.get(key, words)) for key, _, words in KEYS if key not in left_out]
+    rows = [
+        (key, words if optic else PLAIN_WORDS.get(key, words))
+        for key, _, words in KEYS
+        if key not in left_out
+    ]
     return [*rows, *MOUSE]

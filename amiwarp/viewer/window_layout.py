@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-LARGEST, FRAME_PX = (1500, 950), (0, 70)
+LARGEST = (1500, 950)
+FRAME_PX = (0, 70)
 """Largest size of the window at the start, and what the desktop needs of the screen for title and panel [px]."""
-FONT_PX, FONT_ENDS = 12, (10, 30)
+FONT_PX = 12
+FONT_ENDS = (10, 30)
 """Size of the texts in a window of :data:`LARGEST`, and their smallest and largest size [px]."""
-COLUMN_SHARE, COLUMN_EM = 0.2, 19
+COLUMN_SHARE = 0.2
+COLUMN_EM = 19
 """Width of the column with the sliders: share of the window, and smallest number of sizes of the font."""
-STRIP_SHARE, STRIP_EM = 0.29, 14
+STRIP_SHARE = 0.29
+STRIP_EM = 14
 """Height of images and charts: share of the window, and smallest number of sizes of the font."""
-TIMELINE_EM, SIDE_EM, SLIDER_EM = 6.5, 22, 3.9
+TIMELINE_EM = 6.5
+SIDE_EM = 22
+SLIDER_EM = 3.9
 """Height of the timeline, width of the statistics, and distance of the sliders, in sizes of the font."""
 CHARTS_SHARE = 0.42
 """Width of the charts, as a share of what is right of the column."""
@@ -74,12 +80,16 @@ class Places:
     charts: Rect
     timeline: Rect
     side: Rect
-    """Statistics: right of the clouds, or in place of the charts that a recording without a prism does not have."""
+    """Statistics: right of the clouds, or instead of the charts that a recording without a prism does not have."""
 
 
 def first_size(screen: tuple[int, int]) -> tuple[int, int]:
     """Return the size of the window at the start, for a screen of a size [px]: the largest that fits."""
-    width, height = (min(most, each - frame) for most, each, frame in zip(LARGEST, screen, FRAME_PX, strict=True))
+    screen_width, screen_height = screen
+    largest_width, largest_height = LARGEST
+    frame_width, frame_height = FRAME_PX
+    width = min(largest_width, screen_width - frame_width)
+    height = min(largest_height, screen_height - frame_height)
     return width, height
 
 

@@ -11,14 +11,15 @@ CLICK_PX = 3.0
 NO_CLICK = (-99, -99)
 """Place of a press that cannot become a click."""
 FIRST = 10.0
-"""Priority of the observers, so that they come before those of VTK."""
+"""Priority of the observers, so that they come before VTK's."""
 
 
 class Mouse:
     """Follows the mouse over a window. What is not for one of its parts goes on to VTK."""
 
     def __init__(self, window: Any) -> None:
-        self._window, self._sheets = window, window.sheets
+        self._window = window
+        self._sheets = window.sheets
         self.turned = False
         """Whether the camera may have moved since the last picture."""
         self.pressed = False
@@ -45,7 +46,9 @@ class Mouse:
         # from a press on the clouds until the release, VTK's style takes all events before others see them
         style = window.plotter.iren.style
         style.AddObserver("InteractionEvent", lambda *_: setattr(self, "turned", True))
-        style.AddObserver("EndInteractionEvent", lambda *_: self._release(self._interactor.GetEventPosition()))
+        style.AddObserver(
+            "EndInteractionEvent", lambda *_: self._release(self._interactor.GetEventPosition())
+        )
 
     def _follow(self, event: str, follow: Callable[[tuple[int, int]], bool]) -> None:
         """Call a method with the place of the mouse at an event. If it returns True, VTK does not get the event."""
@@ -62,10 +65,14 @@ class Mouse:
     def _on_clouds(self, place: tuple[int, int]) -> bool:
         """Return whether a place is on clouds or the depth map, and not on the help over them."""
         shown = [*self._window.scene.views, *self._sheets.depth]
-        return not self._on_help(place) and any(each.GetDraw() and each.IsInViewport(*place) for each in shown)
+        return not self._on_help(place) and any(
+            each.GetDraw() and each.IsInViewport(*place) for each in shown
+        )
 
     def _press(self, place: tuple[int, int]) -> bool:
-        self.pressed, self._from, sheets = True, place, self._sheets
+        self.pressed = True
+        self._from = place
+        sheets = self._sheets
         self.turns = self._on_clouds(place)
         if self.turns or self._on_help(place):
             return not self.turns
@@ -78,7 +85,8 @@ class Mouse:
         return True
 
     def _press_other(self, place: tuple[int, int]) -> bool:
-        self.pressed = self.turns = self._on_clouds(place)
+        self.turns = self._on_clouds(place)
+        self.pressed = self.turns
         self._from = NO_CLICK
         return not self.turns
 
@@ -91,7 +99,11 @@ class Mouse:
         return self._held is not None
 
     def _release(self, place: tuple[int, int]) -> bool:
-        held, turned, self._held, self.turns, self.pressed = self._held, self.turns, None, False, False
+        held = self._held
+        turned = self.turns
+        self._held = None
+        self.turns = False
+        self.pressed = False
         self.drags += 1
         if held is not None:
             held.release()

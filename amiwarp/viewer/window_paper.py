@@ -30,19 +30,26 @@ class Paper:
 
     def __init__(self, renderer: Any) -> None:
         self.renderer = renderer
-        self._actors: dict[int, list[Any]] = {layer: [] for layer in (UNDER, PICTURES, LINES, OVER, TEXTS)}
+        self._actors: dict[int, list[Any]] = {
+            layer: [] for layer in (UNDER, PICTURES, LINES, OVER, TEXTS)
+        }
         self._used = dict.fromkeys(self._actors, 0)
         self._rect = NOWHERE
-        self.font_px, self.ink = 12, "black"
+        self.font_px = 12
+        self.ink = "black"
         self._grown = False
         self._pictures: dict[Any, NDArray[np.uint8]] = {}
 
-    def clear(self, rect: Rect, size: tuple[int, int], font_px: int, colours: tuple[str, str]) -> None:
+    def clear(
+        self, rect: Rect, size: tuple[int, int], font_px: int, colours: tuple[str, str]
+    ) -> None:
         """Begin a new drawing in a part of a window of a size [px]. ``colours``: of the paper and of the ink."""
-        self._rect, self.font_px, self.ink = rect, font_px, colours[1]
+        self._rect = rect
+        self.font_px = font_px
+        background, self.ink = colours
         self.renderer.SetDraw(True)
         self.renderer.SetViewport(*rect.shares(size))
-        self.renderer.set_background(colours[0])
+        self.renderer.set_background(background)
         self._used = dict.fromkeys(self._used, 0)
 
     def hide(self) -> None:
@@ -57,9 +64,10 @@ class Paper:
                 actor.SetVisibility(k < self._used[layer])
         if self._grown:  # VTK draws the actors in the order in which they were added
             self._grown = False
-            for actor in (actor for actors in self._actors.values() for actor in actors):
-                self.renderer.RemoveViewProp(actor)
-                self.renderer.AddViewProp(actor)
+            for actors in self._actors.values():
+                for actor in actors:
+                    self.renderer.RemoveViewProp(actor)
+                    self.renderer.AddViewProp(actor)
 
     def text(
         self,
@@ -88,14 +96,18 @@ class Paper:
         actor.SetPosition(round(x - self._rect.left), round(y - self._rect.low))
 
     def line(
-        self, points: NDArray[np.floating] | Sequence[tuple[float, float]], colour: str = "", width: float = 1.0
+        self,
+        points: NDArray[np.floating] | Sequence[tuple[float, float]],
+        colour: str = "",
+        width: float = 1.0,
     ) -> None:
         """Draw a line through points, shape ``(n, 2)``. It has gaps where they are NaN."""
         xy = np.asarray(points, np.float64).reshape(-1, 2)
         known = np.isfinite(xy[:, 0]) & np.isfinite(xy[:, 1])
         first = np.flatnonzero(known[:-1] & known[1:])
         pairs = np.stack([first, first + 1], axis=1)
-        self._draw(LINES, _mesh(self._here(np.where(known[:, None], xy, 0.0)), pairs, areas=False), colour, width)
+        here = self._here(np.where(known[:, None], xy, 0.0))
+        self._draw(LINES, _mesh(here, pairs, areas=False), colour, width)
 
     def area(self, rect: Rect, colour: str = "", opacity: float = 1.0, layer: int = UNDER) -> None:
         """Fill a rectangle."""
@@ -119,9 +131,8 @@ class Paper:
             actor.GetTexture().SetInputDataObject(image)
             self._pictures[actor] = rgb
         mesh = _mesh(self._here(_corners(rect)), QUAD, areas=True)
-        mesh.GetPointData().SetTCoords(
-            pyvista.convert_array(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32), deep=True)
-        )
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+        mesh.GetPointData().SetTCoords(pyvista.convert_array(corners, deep=True))
         actor.GetMapper().SetInputData(mesh)
 
     def _draw(self, layer: int, mesh: Any, colour: str, width: float, opacity: float = 1.0) -> None:
@@ -139,7 +150,8 @@ class Paper:
 
     def _next(self, layer: int, make: Any) -> Any:
         """Return an actor of a layer that is not used yet in this drawing."""
-        actors, k = self._actors[layer], self._used[layer]
+        actors = self._actors[layer]
+        k = self._used[layer]
         if k == len(actors):
             actors.append(make())
             self._grown = True
@@ -154,7 +166,9 @@ def _mesh(points: NDArray[np.float32], cells: NDArray[np.int64], *, areas: bool)
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 
     vtk: Any = numpy_support  # which has no types
-    mesh, places, numbers = vtkPolyData(), vtkPoints(), vtkCellArray()
+    mesh = vtkPolyData()
+    places = vtkPoints()
+    numbers = vtkCellArray()
     places.SetData(vtk.numpy_to_vtk(points, deep=True))
     count, length = cells.shape
     numbers.SetData(
@@ -190,7 +204,8 @@ def _rgb(colour: str) -> tuple[float, float, float]:
 def _text_actor() -> Any:
     from vtkmodules.vtkRenderingCore import vtkTextActor, vtkTextProperty
 
-    actor, prop = vtkTextActor(), vtkTextProperty()
+    actor = vtkTextActor()
+    prop = vtkTextProperty()
     prop.SetFontFamily(VTK_FONT_FILE)
     prop.SetFontFile(str(font()))
     actor.SetTextProperty(prop)
@@ -209,7 +224,8 @@ def _mesh_actor() -> Any:
 def _picture_actor() -> Any:
     from vtkmodules.vtkRenderingCore import vtkPolyDataMapper2D, vtkTexture, vtkTexturedActor2D
 
-    actor, texture = vtkTexturedActor2D(), vtkTexture()
+    actor = vtkTexturedActor2D()
+    texture = vtkTexture()
     texture.InterpolateOff()
     texture.SetColorModeToDirectScalars()
     actor.SetTexture(texture)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.plotting.colours import ticks
 from amiwarp.viewer.axes import tick_texts
-from amiwarp.viewer.drawing import ORBIT_COLOUR
 from amiwarp.viewer.filters import unit_of
+from amiwarp.viewer.look import ORBIT_COLOUR
 from amiwarp.viewer.texts import text_width
 from amiwarp.viewer.window_layout import NOWHERE, Rect
 from amiwarp.viewer.window_paper import Paper
@@ -34,7 +34,8 @@ class Timeline:
 
     def __init__(self, move: Callable[[int], None], resize: Callable[[int, int], None]) -> None:
         """``move``: sets the start of the time window; ``resize``: sets its start and its end."""
-        self._move, self._resize = move, resize
+        self._move = move
+        self._resize = resize
         self.span = 0.0, 1.0
         """Start and end of the shown time [us]."""
         self.whole_us = 1
@@ -46,7 +47,8 @@ class Timeline:
         self.rect = NOWHERE
         self._inner = NOWHERE
         self._dragged = ""
-        self._from = 0.0  # time at which the mouse pressed, and what it moves, then
+        # Time at which the mouse was pressed, and the ends of what it moves, as they were then.
+        self._from = 0.0
         self._held: tuple[float, float] = (0.0, 0.0)
 
     def time_at(self, x: float) -> float:
@@ -74,34 +76,48 @@ class Timeline:
         """Take the mouse if it is on the timeline."""
         if not self.rect.holds(place):
             return False
+        x, _ = place
         start, length = self.window
-        self._from, self._held = self.time_at(place[0]), (float(start), float(start + length))
-        first, last = self.column_of(start), self.column_of(start + length)
-        near = [abs(place[0] - each) < GRIP_PX for each in (first, last)]
+        self._from = self.time_at(x)
         if shift:
-            self._dragged, self._held = "time", self.span
-        elif any(near) and last - first > 3.0 * GRIP_PX:
-            self._dragged = "start" if near[0] else "end"
+            self._dragged = "time"
+            self._held = self.span
+            return True
+
+        self._held = (float(start), float(start + length))
+        first = self.column_of(start)
+        last = self.column_of(start + length)
+        near_start = abs(x - first) < GRIP_PX
+        near_end = abs(x - last) < GRIP_PX
+        has_room_between = last - first > 3.0 * GRIP_PX
+        if near_start and has_room_between:
+            self._dragged = "start"
+        elif near_end and has_room_between:
+            self._dragged = "end"
         else:
             self._dragged = "window"
-            if not first - GRIP_PX <= place[0] <= last + GRIP_PX:  # a click moves its middle there
-                self._held = self._from - 0.5 * length, self._from + 0.5 * length
+            is_on_window = first - GRIP_PX <= x <= last + GRIP_PX
+            if not is_on_window:  # a click moves its middle there
+                self._held = (self._from - 0.5 * length, self._from + 0.5 * length)
                 self._move(round(self._held[0]))
         return True
 
     def drag(self, place: tuple[int, int]) -> None:
         """Follow the mouse."""
         low, high = self._held
+        time = self.time_at(place[0])
         if self._dragged == "time":
-            self._show(self.span[0] + self._from - self.time_at(place[0]), high - low)
+            self._show(self.span[0] + self._from - time, high - low)
             return
-        moved = self.time_at(place[0]) - self._from
+        moved = time - self._from
         if self._dragged == "window":
             self._move(round(low + moved))
         elif self._dragged == "start":
-            self._resize(round(min(max(low + moved, 0.0), high - 1.0)), round(high))
+            start = min(max(low + moved, 0.0), high - 1.0)
+            self._resize(round(start), round(high))
         elif self._dragged == "end":
-            self._resize(round(low), round(max(min(high + moved, self.whole_us), low + 1.0)))
+            end = max(min(high + moved, self.whole_us), low + 1.0)
+            self._resize(round(low), round(end))
 
     def release(self) -> None:
         """Leave the time window."""
@@ -111,9 +127,11 @@ class Timeline:
         """Zoom about the mouse; return whether it is on the timeline."""
         if not self.rect.holds(place):
             return False
-        (low, high), at = self.span, self.time_at(place[0])
+        low, high = self.span
+        time = self.time_at(place[0])
         length = min(max((high - low) * ZOOM**-steps, LEAST_US), float(self.whole_us))
-        self._show(at - (at - low) * length / (high - low), length)
+        # The time under the mouse stays there.
+        self._show(time - (time - low) * length / (high - low), length)
         return True
 
     def _show(self, start: float, length: float) -> None:
@@ -123,47 +141,63 @@ class Timeline:
     def draw(self, paper: Paper, rect: Rect) -> None:
         """Draw the timeline into a part of the window."""
         em = paper.font_px
+        inner = rect.inset(NUMBERS_EM * em, 1.7 * em, 1.5 * em, 0.5 * em)
         self.rect = rect
-        self._inner = inner = rect.inset(NUMBERS_EM * em, 1.7 * em, 1.5 * em, 0.5 * em)
-        start, length = self.window
-        first, last = (min(max(self.column_of(t), inner.left), inner.right) for t in (start, start + length))
-        if self.span[0] < start + length and start < self.span[1]:
-            paper.area(Rect(first, inner.low, max(last, first + 2.0), inner.top), ORBIT_COLOUR, 0.25)
-        for time in (start, start + length):
-            if self.span[0] <= time <= self.span[1]:
-                at = self.column_of(time)
-                paper.line([(at, inner.low), (at, inner.top)], ORBIT_COLOUR, 2.0)
+        self._inner = inner
+        self._draw_window(paper, inner)
         known = self.rates[np.isfinite(self.rates)]
-        top = float(known.max()) if len(known) else 0.0
-        for rates, colour in zip(self.rates, (OFF_COLOUR, ON_COLOUR), strict=True):
-            columns = (
-                inner.left
-                + (np.repeat(self.edges, 2)[1:-1] - self.span[0]) / (self.span[1] - self.span[0]) * inner.width
-            )
-            heights = inner.low + np.repeat(rates, 2) / (top or 1.0) * 0.95 * inner.height
-            paper.line(np.column_stack([columns, heights]), colour, 1.5)
+        most = float(known.max()) if len(known) else 0.0
+        self._draw_rates(paper, inner, most)
+
         paper.line([(inner.left, inner.top), (inner.left, inner.low), (inner.right, inner.low)])
-        for text, at, side in (
-            (_short(top), inner.top, "top"),
-            ("events/s", inner.low + 0.5 * inner.height, "middle"),
-            ("0", inner.low, "bottom"),
-        ):
-            paper.text(text, inner.left - 0.5 * em, at, across="right", up=side)
+        middle = inner.low + 0.5 * inner.height
+        right = inner.left - 0.5 * em
+        paper.text(_short(most), right, inner.top, across="right", up="top")
+        paper.text("events/s", right, middle, across="right", up="middle")
+        paper.text("0", right, inner.low, across="right", up="bottom")
         self._draw_times(paper, inner)
         if self.note:
             paper.text(self.note, inner.right, inner.top, across="right", up="top")
 
+    def _draw_window(self, paper: Paper, inner: Rect) -> None:
+        """Draw the time window, and its ends where they are shown."""
+        low, high = self.span
+        start, length = self.window
+        stop = start + length
+        if low < stop and start < high:
+            first = min(max(self.column_of(start), inner.left), inner.right)
+            last = min(max(self.column_of(stop), inner.left), inner.right)
+            area = Rect(first, inner.low, max(last, first + 2.0), inner.top)
+            paper.area(area, ORBIT_COLOUR, 0.25)
+        for time in (start, stop):
+            if low <= time <= high:
+                column = self.column_of(time)
+                paper.line([(column, inner.low), (column, inner.top)], ORBIT_COLOUR, 2.0)
+
+    def _draw_rates(self, paper: Paper, inner: Rect, most: float) -> None:
+        """Draw the rates as stairs. ``most``: the highest of them [1/s]."""
+        low, high = self.span
+        times = np.repeat(self.edges, 2)[1:-1]
+        columns = inner.left + (times - low) / (high - low) * inner.width
+        for rates, colour in zip(self.rates, (OFF_COLOUR, ON_COLOUR), strict=True):
+            rows = inner.low + np.repeat(rates, 2) / (most or 1.0) * 0.95 * inner.height
+            paper.line(np.column_stack([columns, rows]), colour, 1.5)
+
     def _draw_times(self, paper: Paper, inner: Rect) -> None:
-        em, (low, high) = paper.font_px, self.span
+        """Draw the numbers of the time axis; the last one has the unit."""
+        em = paper.font_px
+        low, high = self.span
         unit, scale = ("s", 1e-6) if high - low >= SECONDS_US else ("ms", 1e-3)
-        values = ticks(low * scale, high * scale, int(min(max(inner.width / (8.0 * em), 2), 12)))
+        most = int(min(max(inner.width / (8.0 * em), 2), 12))
+        values = ticks(low * scale, high * scale, most)
         texts = tick_texts(values.tolist())
-        for k, (text, value) in enumerate(zip(texts, values, strict=True)):
-            at = self.column_of(value / scale)
-            paper.line([(at, inner.low), (at, inner.low - 0.3 * em)])
-            text = f"{text} {unit}" if k == len(texts) - 1 else text
-            at = min(at, inner.right - 0.5 * text_width(text, em) + em)
-            paper.text(text, at, inner.low - 0.4 * em, across="center", up="top")
+        if texts:
+            texts[-1] = f"{texts[-1]} {unit}"
+        for text, value in zip(texts, values, strict=True):
+            column = self.column_of(value / scale)
+            paper.line([(column, inner.low), (column, inner.low - 0.3 * em)])
+            middle = min(column, inner.right - 0.5 * text_width(text, em) + em)
+            paper.text(text, middle, inner.low - 0.4 * em, across="center", up="top")
 
 
 def _short(rate: float) -> str:

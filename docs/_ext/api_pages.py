@@ -1,6 +1,6 @@
 """Write the pages of the Python reference: one per room of the package, one per public name.
 
-The names are those of ``amiwarp.__all__``. The imports of the package's front door tell in which room each one lives.
+The names come from ``amiwarp.PUBLIC_NAMES``. The imports of the front door tell in which room each one lives.
 The pages are written before Sphinx reads its sources, to ``reference/api``, which is not under version control.
 """
 
@@ -46,7 +46,7 @@ def homes() -> dict[str, str]:
         if isinstance(node, ast.ImportFrom):
             module = f"amiwarp.{node.module}" if node.level else str(node.module)
             found.update({alias.asname or alias.name: module for alias in node.names})
-    names = [name for name in amiwarp.__all__ if not name.startswith("_")]
+    names = [name for name in amiwarp.PUBLIC_NAMES if not name.startswith("_")]
     missing = [name for name in names if name not in found]
     if missing:
         raise ExtensionError(f"no import in amiwarp's front door for {', '.join(missing)}")
@@ -66,7 +66,10 @@ def rooms(order: list[str]) -> dict[str, list[str]]:
     for name, module in sorted(homes().items(), key=lambda item: item[0].lower()):
         out.setdefault(room_of(module), []).append(name)
     known = {room: i for i, room in enumerate(order)}
-    return {room: out[room] for room in sorted(out, key=lambda r: (r == COMMON, known.get(r, len(order)), r))}
+    return {
+        room: out[room]
+        for room in sorted(out, key=lambda r: (r == COMMON, known.get(r, len(order)), r))
+    }
 
 
 def alias(name: str) -> tuple[str, str]:
@@ -127,7 +130,11 @@ def name_page(name: str) -> str:
 
 def room_page(room: str, names: list[str]) -> str:
     """Return the page of one room: what it is for, and a table of its names."""
-    about = COMMON_ABOUT if room == COMMON else first_sentence(importlib.import_module(f"amiwarp.{room}").__doc__ or "")
+    about = (
+        COMMON_ABOUT
+        if room == COMMON
+        else first_sentence(importlib.import_module(f"amiwarp.{room}").__doc__ or "")
+    )
     rows = "".join(f"   * - :py:obj:`~amiwarp.{name}`\n     - {summary(name)}\n" for name in names)
     table = f".. list-table::\n   :class: names\n   :widths: 25 75\n\n{rows}\n"
     toctree = ".. toctree::\n   :hidden:\n\n" + "".join(f"   {page_of(name)}\n" for name in names)
@@ -155,7 +162,9 @@ def write(app: Sphinx, config: Any) -> None:
     write_pages(Path(app.srcdir) / "reference" / "api", pages)
 
 
-def link_by_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, contnode: Any) -> nodes.reference | None:
+def link_by_name(
+    app: Sphinx, env: BuildEnvironment, node: pending_xref, contnode: Any
+) -> nodes.reference | None:
     """Link ``amiwarp.room.module.Name`` and ``Name`` to the public ``amiwarp.Name``, its members included."""
     if node.get("refdomain") != "py":
         return None
@@ -176,12 +185,16 @@ class AttributeText:
     def __init__(self) -> None:
         self.kept: dict[str, list[str]] = {}
 
-    def keep(self, app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    def keep(
+        self, app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]
+    ) -> None:
         """Store the text, before Napoleon."""
         if what in ("attribute", "data", "property"):
             self.kept[name] = list(lines)
 
-    def restore(self, app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    def restore(
+        self, app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]
+    ) -> None:
         """Put the text back, after Napoleon."""
         lines[:] = self.kept.pop(name, lines)
 

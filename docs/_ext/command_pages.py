@@ -58,7 +58,9 @@ def parameter(one: Any, ctx: Any) -> str:
 def usage(command: Any, ctx: Any) -> str:
     """Return the line that shows how the command is called."""
     arguments = [one for one in command.params if one.param_type_name == "argument"]
-    pieces = [argument_name(one) if one.required else f"[{argument_name(one)}]" for one in arguments]
+    pieces = [
+        argument_name(one) if one.required else f"[{argument_name(one)}]" for one in arguments
+    ]
     return " ".join([ctx.command_path, *pieces, "[OPTIONS]"])
 
 
@@ -66,7 +68,10 @@ def command_page(name: str, command: Any, parent: Any) -> str:
     """Return the page of one command."""
     ctx = typer.Context(command, parent=parent, info_name=name)
     example = plain(command.epilog).removeprefix("Example:").strip()
-    out = heading(ctx.command_path) + f".. program:: {ctx.command_path}\n\n{paragraphs(plain(command.help))}\n\n"
+    out = (
+        heading(ctx.command_path)
+        + f".. program:: {ctx.command_path}\n\n{paragraphs(plain(command.help))}\n\n"
+    )
     out += f".. code-block:: sh\n   :caption: Example\n\n   {example}\n\n"
     out += f".. code-block:: text\n   :caption: Usage\n\n   {usage(command, ctx)}\n\n"
     panels: dict[str, list[Any]] = {}
@@ -75,7 +80,9 @@ def command_page(name: str, command: Any, parent: Any) -> str:
             continue
         default = "Arguments" if one.param_type_name == "argument" else "Options"
         panels.setdefault(one.rich_help_panel or default, []).append(one)
-    for panel in sorted(panels, key=lambda p: {"Arguments": 0, "Options": 1, "Common": 3}.get(p, 2)):
+    for panel in sorted(
+        panels, key=lambda p: {"Arguments": 0, "Options": 1, "Common": 3}.get(p, 2)
+    ):
         out += heading(panel, "-") + "".join(parameter(one, ctx) for one in panels[panel])
     return out
 
@@ -90,7 +97,13 @@ def write(app: Sphinx, config: Any) -> None:
     )
     table = f".. list-table::\n   :class: names\n   :widths: 30 70\n\n{rows}\n"
     toctree = ".. toctree::\n   :hidden:\n\n" + "".join(f"   {name}\n" for name in group.commands)
-    pages = {"index.rst": heading("Command line") + f"{paragraphs(plain(group.help))}\n\n" + INDEX + table + toctree}
+    pages = {
+        "index.rst": heading("Command line")
+        + f"{paragraphs(plain(group.help))}\n\n"
+        + INDEX
+        + table
+        + toctree
+    }
     for name, command in group.commands.items():
         pages[f"{name}.rst"] = command_page(name, command, parent)
     write_pages(Path(app.srcdir) / "reference" / "command-line", pages)

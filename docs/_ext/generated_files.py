@@ -14,7 +14,9 @@ def heading(text: str, line: str = "=") -> str:
 def escape(text: str) -> str:
     """Return ``text`` with the markup characters of reStructuredText escaped."""
     marked = re.sub(r"([\\*`|_])", r"\\\1", text)
-    return re.sub(r":(?=\S)", r"\\:", marked)  # otherwise text that looks like an address becomes a link
+    return re.sub(
+        r":(?=\S)", r"\\:", marked
+    )  # otherwise text that looks like an address becomes a link
 
 
 def write_page(path: Path, text: str) -> None:

@@ -36,7 +36,9 @@ def check(app: Sphinx, exception: Exception | None) -> None:
     if exception is None and app.builder.format == "html":
         found = remote_resources(Path(app.outdir))
         if found:
-            raise ExtensionError("the pages load resources from the network: " + "; ".join(found[:10]))
+            raise ExtensionError(
+                "the pages load resources from the network: " + "; ".join(found[:10])
+            )
 
 
 def inline(self: Any, node: nodes.math) -> None:

@@ -47,11 +47,18 @@ from typing import Any
 import plain_installation
 
 ROOT = REPOSITORY = Path(__file__).resolve().parents[2]
-PAGES = ("README.md", "docs/getting-started/*.md", "docs/how-to/*.md", "docs/explanation/*.md", "docs/reference/*.md")
+PAGES = (
+    "README.md",
+    "docs/getting-started/*.md",
+    "docs/how-to/*.md",
+    "docs/explanation/*.md",
+    "docs/reference/*.md",
+)
 GUIDES = ("docs/getting-started/", "docs/how-to/")
 """Folders of pages that one reader follows in one folder."""
 BLOCK = re.compile(
-    r"^( *)```(sh|python|output)([^\n]*)\n(.*?)^\1```$|^ *<!-- (given|twin)( [^:\n]*)?:(.*?)-->", re.M | re.S
+    r"^( *)```(sh|python|output)([^\n]*)\n(.*?)^\1```$|^ *<!-- (given|twin)( [^:\n]*)?:(.*?)-->",
+    re.M | re.S,
 )
 NUMBER = re.compile(r"(?<![\w.])[-+−]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?", re.I)
 NOT_RUN = "# not tested: "
@@ -79,7 +86,9 @@ def blocks(page: str) -> list[Block]:
     for match in BLOCK.finditer(page):
         line = page.count("\n", 0, match.start()) + 1
         if match[5]:
-            out.append(Block(match[5], (match[6] or "").strip(), textwrap.dedent(match[7]).strip(), line))
+            out.append(
+                Block(match[5], (match[6] or "").strip(), textwrap.dedent(match[7]).strip(), line)
+            )
         else:
             out.append(Block(match[2], match[3].strip(), textwrap.dedent(match[4]), line))
     return out
@@ -98,7 +107,11 @@ def lacking(block: Block, twin: Block) -> list[str]:
     """Return the commands, options and names of a block that its twin neither has nor says to do without."""
     text = re.sub(r"(?<!\S)# .*", "", block.text)
     have = {*NAMED.findall(twin.text), *twin.info.removeprefix("without").replace(",", " ").split()}
-    return [name for name in dict.fromkeys(NAMED.findall(text)) if name not in have and name.split()[-1] not in have]
+    return [
+        name
+        for name in dict.fromkeys(NAMED.findall(text))
+        if name not in have and name.split()[-1] not in have
+    ]
 
 
 def with_twins(found: list[Block]) -> Iterator[tuple[Block, Block | None]]:
@@ -118,7 +131,9 @@ def close(shown: str, printed: str, spread: str) -> bool:
     if spread == "any":
         return True
     one, other = (float(text.replace(",", "").replace("−", "-")) for text in (shown, printed))
-    allowed = float(spread.rstrip("%")) * (max(abs(one), abs(other)) / 100 if spread.endswith("%") else 1)
+    allowed = float(spread.rstrip("%")) * (
+        max(abs(one), abs(other)) / 100 if spread.endswith("%") else 1
+    )
     return math.isclose(one, other, rel_tol=0, abs_tol=allowed * (1 + 1e-9))
 
 
@@ -142,7 +157,9 @@ def difference(shown: str, printed: str, info: str = "") -> str | None:
         for first in range(start, len(words) - len(wanted) + 1):
             rest = [*wanted[1:], ""]
             pairs = zip(wanted, words[first:], rest, strict=False)
-            equal = next((k for k, pair in enumerate(pairs) if not same_word(*pair, allowed)), len(wanted))
+            equal = next(
+                (k for k, pair in enumerate(pairs) if not same_word(*pair, allowed)), len(wanted)
+            )
             if equal > best:
                 best, at = equal, first
         if best < len(wanted):
@@ -185,7 +202,12 @@ def python(code: str, names: dict[str, Any]) -> str:
     """Run Python code that shares the names of the code before it, and return what it prints."""
     printed = io.StringIO()
     name = f"<page {len(linecache.cache)}>"
-    linecache.cache[name] = len(code), None, code.splitlines(keepends=True), name  # PyTorch reads it
+    linecache.cache[name] = (
+        len(code),
+        None,
+        code.splitlines(keepends=True),
+        name,
+    )  # PyTorch reads it
     program = compile(code, name, "exec")
     try:
         with contextlib.redirect_stdout(printed):
@@ -213,13 +235,19 @@ def problems(text: str, folder: Path) -> Iterator[tuple[int, str]]:
         if block.kind == "given":
             continue
         if block.kind == "output":
-            found = "no block before it was run" if printed is None else difference(block.text, printed, block.info)
+            found = (
+                "no block before it was run"
+                if printed is None
+                else difference(block.text, printed, block.info)
+            )
             if found:
                 yield block.line, found
             continue
         printed = None
         run = block if twin is None else twin
-        if run.text.startswith(NOT_RUN) or (run is block and block.kind == "sh" and INSTALLATION.search(block.text)):
+        if run.text.startswith(NOT_RUN) or (
+            run is block and block.kind == "sh" and INSTALLATION.search(block.text)
+        ):
             continue
         try:
             printed = python(run.text, names) if block.kind == "python" else shell(run.text, folder)
@@ -229,7 +257,10 @@ def problems(text: str, folder: Path) -> Iterator[tuple[int, str]]:
             yield run.line, f"takes longer than {LIMIT_S:g} s"
         for need in plain_installation.noted():
             if not plain_installation.named(text, need):
-                yield run.line, f"needs {need}, which a plain installation lacks and the page does not name"
+                yield (
+                    run.line,
+                    f"needs {need}, which a plain installation lacks and the page does not name",
+                )
 
 
 def written(folder: Path) -> set[str]:
@@ -240,7 +271,13 @@ def written(folder: Path) -> set[str]:
 def environment(page: Path | None = None) -> dict[str, str]:
     """Return the variables for the commands of a page."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    return {**os.environ, "PATH": path, "MPLBACKEND": "agg", "REPOSITORY": str(REPOSITORY), "PAGE": str(page)}
+    return {
+        **os.environ,
+        "PATH": path,
+        "MPLBACKEND": "agg",
+        "REPOSITORY": str(REPOSITORY),
+        "PAGE": str(page),
+    }
 
 
 def run_page(page: Path, given: Path, plain: Path) -> dict[str, Any]:
@@ -275,16 +312,24 @@ def run_pages(pages: list[Path]) -> dict[Path, list[tuple[int, str]]]:
     """Run pages, two at a time, and return the problems of each: line and text."""
     givens = {page: next(iter(given_commands(page)), "") for page in pages}
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(2) as pool:
-        folders = {command: Path(name) / str(k) for k, command in enumerate(dict.fromkeys(givens.values()))}
+        folders = {
+            command: Path(name) / str(k) for k, command in enumerate(dict.fromkeys(givens.values()))
+        }
         for folder in folders.values():
             folder.mkdir()
         plain = Path(name) / "plain"
         plain_installation.prepare(plain)
         first_pages = {command: page for page, command in reversed(givens.items())}
-        made = pool.map(lambda command: shell(command, folders[command], environment(first_pages[command])), folders)
+        made = pool.map(
+            lambda command: shell(command, folders[command], environment(first_pages[command])),
+            folders,
+        )
         list(made)
         results = list(pool.map(lambda page: run_page(page, folders[givens[page]], plain), pages))
-    out = {page: [tuple(found) for found in result["problems"]] for page, result in zip(pages, results, strict=True)}
+    out = {
+        page: [tuple(found) for found in result["problems"]]
+        for page, result in zip(pages, results, strict=True)
+    }
     owner: dict[str, Path] = {}
     for page, result in zip(pages, results, strict=True):
         if not page.relative_to(ROOT).as_posix().startswith(GUIDES):

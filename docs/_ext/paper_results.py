@@ -1,7 +1,8 @@
 """Make the tables and figures of the page on the paper's results from the reports of ``amiwarp evaluate``.
 
 The reports are ``benchmarks/results/evaluate/*.json``, each a ``report.json``. What is made from them is not under
-version control: ``docs/explanation/paper-results/``, with the text ``content.md`` that the page includes.
+version control: ``docs/reference/paper-results/``, with the text ``content.md``, which
+``benchmarks/results/paper_results.md`` includes.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from typing import Any
 from generated_files import write_page
 from sphinx.application import Sphinx
 
+from amiwarp.studies.evaluate.charts import draw, save
 from amiwarp.studies.evaluate.claims import PAPER
-from amiwarp.studies.evaluate.evaluation import draw, pivoted, save
-from amiwarp.studies.evaluate.study import Chart, ChartKind, Table
+from amiwarp.studies.evaluate.report import pivoted
+from amiwarp.studies.evaluate.results import Chart, ChartKind, Table
 
 FOLDER = "paper-results"
 """Name of the folder of the figures and of the text."""
@@ -28,7 +30,9 @@ def table_of(data: dict[str, Any]) -> Table:
     """Return a table from its JSON form."""
     chart = data["chart"]
     if chart is not None:
-        chart = Chart(**{**chart, "panels": tuple(chart["panels"]), "kind": ChartKind(chart["kind"])})
+        chart = Chart(
+            **{**chart, "panels": tuple(chart["panels"]), "kind": ChartKind(chart["kind"])}
+        )
     rows = [tuple(row) for row in data["rows"]]
     return Table(data["name"], data["title"], tuple(data["columns"]), rows, data["caption"], chart)
 
@@ -36,7 +40,12 @@ def table_of(data: dict[str, Any]) -> Table:
 def markdown_table(headings: list[str], rows: list[list[str]]) -> str:
     """Return a table in Markdown."""
     lines = [headings, ["---"] * len(headings), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n\n"
+    return (
+        "\n".join(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+        )
+        + "\n\n"
+    )
 
 
 def verdicts(reports: dict[str, Any]) -> str:
@@ -48,7 +57,9 @@ def verdicts(reports: dict[str, Any]) -> str:
         for claim in section["claims"]:
             cells = (cell for report in reports.values() for cell in judged(report, claim))
             number = "*Robustness:* " if claim["number"] is None else f"{claim['number']}. "
-            rows.append([f"{number}{claim['text']} *Rule: {claim['rule']}.*", claim["paper"], *cells])
+            rows.append(
+                [f"{number}{claim['text']} *Rule: {claim['rule']}.*", claim["paper"], *cells]
+            )
         names = [cell for name in reports for cell in (f"here ({name})", "verdict")]
         text += f"### {section['title']}\n\n" + markdown_table(["claim", "paper", *names], rows)
     return text
@@ -60,7 +71,12 @@ def overview(reports: dict[str, Any]) -> str:
     for number, paper in PAPER.items():
         verdicts = []
         for report in reports.values():
-            found = [c["verdict"] for s in report["evaluations"] for c in s["claims"] if c["number"] == number]
+            found = [
+                c["verdict"]
+                for s in report["evaluations"]
+                for c in s["claims"]
+                if c["number"] == number
+            ]
             counts = (f"{found.count(verdict)} {verdict}" for verdict in dict.fromkeys(found))
             verdicts.append(", ".join(counts) or "–")
         rows.append([str(number), paper.text, paper.value, *verdicts, paper.elsewhere])
@@ -97,7 +113,7 @@ def sections(report: dict[str, Any], folder: Path) -> Iterator[str]:
             figure = draw(table)
             if figure is not None:
                 save(figure, folder / f"{table.name}.png")
-                yield f"![{table.title}]({FOLDER}/{table.name}.png)\n\n*{table.title}. {table.caption}*\n\n"
+                yield f"![{table.title}](../{FOLDER}/{table.name}.png)\n\n*{table.title}. {table.caption}*\n\n"
             elif len(table.rows) <= LONGEST:
                 yield f"*{table.title}. {table.caption}*\n\n" + markdown_table(*pivoted(table))
 
@@ -108,10 +124,14 @@ def content(reports: dict[str, Any], folder: Path) -> str:
         return "No report lies in `benchmarks/results/evaluate`.\n"
     runs = "".join(run_of(name, report) for name, report in reports.items())
     first = next(iter(reports))
-    judging = {name: report for name, report in reports.items() if any(s["claims"] for s in report["evaluations"])}
+    judging = {
+        name: report
+        for name, report in reports.items()
+        if any(s["claims"] for s in report["evaluations"])
+    }
     return (
         f"## The claims, and verdicts on them\n\n{overview(judging)}{verdicts(judging) if judging else ''}"
-        f"## Reports\n\n{runs}\nFigures and tables below are those of the run {first}.\n\n"
+        f"## Reports\n\n{runs}\nFigures and tables below come from the run {first}.\n\n"
         + "".join(sections(reports[first], folder))
     )
 
@@ -119,12 +139,14 @@ def content(reports: dict[str, Any], folder: Path) -> str:
 def make(app: Sphinx) -> None:
     """Write the text and the figures."""
     source = Path(app.srcdir)
-    folder = source / "explanation" / FOLDER
+    folder = source / "reference" / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.png"):
         old.unlink()
     files = (source.parent / "benchmarks" / "results" / "evaluate").glob("*.json")
-    files = sorted(files, key=lambda path: -path.stat().st_size)  # the one with most recordings first
+    files = sorted(
+        files, key=lambda path: -path.stat().st_size
+    )  # the one with most recordings first
     reports = {path.stem: json.loads(path.read_text()) for path in files}
     write_page(folder / "content.md", content(reports, folder))
 

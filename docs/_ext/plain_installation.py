@@ -35,7 +35,7 @@ MISSING = re.compile(r"ModuleNotFoundError: No module named '([^'.]+)")
 
 @cache
 def extras() -> dict[str, list[str]]:
-    """Return the requirements of each extra in pyproject.toml; those of a plain installation are at the key ''."""
+    """Return the requirements of each extra in pyproject.toml; the plain installation's are at the key ''."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     return {"": project["dependencies"], **project["optional-dependencies"]}
 
@@ -60,7 +60,9 @@ def installed_by(extra: str = "") -> frozenset[str]:
         seen.add((name, wanted))
         for text in _requirements(name, wanted):
             one = Requirement(text)
-            if one.marker is None or any(one.marker.evaluate({"extra": key}) for key in ("", *wanted)):
+            if one.marker is None or any(
+                one.marker.evaluate({"extra": key}) for key in ("", *wanted)
+            ):
                 todo.append(one)
     return frozenset(name for name, _ in seen)
 
@@ -83,7 +85,10 @@ def hidden_names() -> dict[str, Any]:
     plain = installed_by() | INSTALLERS
     modules: dict[str, str] = {}
     programs: dict[str, str] = {}
-    distributions, kept = set(), {entry.name for entry in ROOT.iterdir()}  # folders that programs of the pages import
+    distributions, kept = (
+        set(),
+        {entry.name for entry in ROOT.iterdir()},
+    )  # folders that programs of the pages import
     for one in importlib.metadata.distributions():
         name = canonical(one.name)
         if name in plain:
@@ -91,7 +96,9 @@ def hidden_names() -> dict[str, Any]:
             continue
         distributions.add(name)
         modules.update(dict.fromkeys(modules_of(one), name))
-        programs.update({entry.name: name for entry in one.entry_points.select(group="console_scripts")})
+        programs.update(
+            {entry.name: name for entry in one.entry_points.select(group="console_scripts")}
+        )
     modules = {module: name for module, name in modules.items() if module not in kept}
     return {
         "distributions": sorted(distributions),
@@ -125,12 +132,22 @@ def prepare(folder: Path) -> None:
 def environment(variables: dict[str, str], folder: Path, needs: Path) -> dict[str, str]:
     """Return environment variables with which programs hide packages, and note in the file ``needs`` what they need."""
     path = os.pathsep.join([str(folder / "bin"), variables["PATH"]])
-    return {**variables, FOLDER: str(folder), NEEDS: str(needs), "PATH": path, "PYTHONPATH": _plain_path(True)}
+    return {
+        **variables,
+        FOLDER: str(folder),
+        NEEDS: str(needs),
+        "PATH": path,
+        "PYTHONPATH": _plain_path(True),
+    }
 
 
 def _plain_path(plain: bool) -> str:
     """Return the value of PYTHONPATH with which packages are hidden, or shown."""
-    others = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path not in ("", str(SITE))]
+    others = [
+        path
+        for path in os.environ.get("PYTHONPATH", "").split(os.pathsep)
+        if path not in ("", str(SITE))
+    ]
     return os.pathsep.join([str(SITE), *others] if plain else others)
 
 
@@ -152,7 +169,11 @@ def need_of(error: str, *, command: bool) -> str | None:
     if extra:
         return f"[{extra[1]}]"
     files = re.findall(r'^ *File "([^"]+)"', error, re.M)
-    return names()["modules"].get(module[1]) if module and not (files and of_amiwarp(files[-1])) else None
+    return (
+        names()["modules"].get(module[1])
+        if module and not (files and of_amiwarp(files[-1]))
+        else None
+    )
 
 
 def of_amiwarp(file: str) -> bool:
@@ -162,11 +183,17 @@ def of_amiwarp(file: str) -> bool:
 
 def named(page: str, need: str) -> bool:
     """Return whether a page's text names the extra or the distribution that a command needs."""
-    found = {extra for group in re.findall(r"(?:amiwarp|\.)\[([a-z,]+)\]", page) for extra in group.split(",")}
+    found = {
+        extra
+        for group in re.findall(r"(?:amiwarp|\.)\[([a-z,]+)\]", page)
+        for extra in group.split(",")
+    }
     if need.startswith("["):
         return need[1:-1] in found
     words = {
-        canonical(word) for line in re.findall(r"pip install ([^`\n]+)", page) for word in re.findall(r"[\w-]+", line)
+        canonical(word)
+        for line in re.findall(r"pip install ([^`\n]+)", page)
+        for word in re.findall(r"[\w-]+", line)
     }
     return need in words or any(need in names()["extras"].get(extra, []) for extra in found)
 
@@ -207,7 +234,9 @@ def everything_shown() -> Iterator[None]:
         _set_aside.update({name: sys.modules.pop(name) for name in found})
 
 
-def run(command: list[str], variables: dict[str, str], **streams: Any) -> subprocess.CompletedProcess[str]:
+def run(
+    command: list[str], variables: dict[str, str], **streams: Any
+) -> subprocess.CompletedProcess[str]:
     """Run a program, and pass the first signal that is to end this one on to it, in a group of its own."""
     pending: list[int] = []
 
@@ -217,7 +246,9 @@ def run(command: list[str], variables: dict[str, str], **streams: Any) -> subpro
         pending.append(number)
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: None)  # caught, so that the program does not inherit an ignored signal
+        signal.signal(
+            number, lambda *_: None
+        )  # caught, so that the program does not inherit an ignored signal
     child = subprocess.Popen(command, env=variables, text=True, start_new_session=True, **streams)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, send)
@@ -228,14 +259,20 @@ def run(command: list[str], variables: dict[str, str], **streams: Any) -> subpro
 def main(command: list[str]) -> int:
     """Run a program as in a plain installation, and again with all packages if it says that it needs one."""
     program = Path(command[0]).name
-    shown = {**os.environ, "PATH": os.environ["PATH"].partition(os.pathsep)[2], "PYTHONPATH": _plain_path(False)}
+    shown = {
+        **os.environ,
+        "PATH": os.environ["PATH"].partition(os.pathsep)[2],
+        "PYTHONPATH": _plain_path(False),
+    }
     plain = {**os.environ, "PYTHONPATH": _plain_path(True)}
     if program in names()["programs"]:
         note(names()["programs"][program])
         return run(command, shown).returncode
     known, job = Path(os.environ[NEEDS] + ".known"), " ".join([program, *command[1:2]])
     if program == "amiwarp" and known.exists() and job in known.read_text().splitlines():
-        return run(command, shown).returncode  # a command that has named its extra on this page saves the time
+        return run(
+            command, shown
+        ).returncode  # a command that has named its extra on this page saves the time
     code = run(command, plain).returncode
     if code == 1:
         again = run(command, plain, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)

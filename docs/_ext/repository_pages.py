@@ -2,7 +2,7 @@
 
 Each entry of ``repository_pages`` is a page and the file that it shows; ``*`` stands for any name. The pages are
 copied before Sphinx reads its sources and are not under version control. A file that is not Markdown is shown as code.
-Links in Markdown are those of the repository, which lead somewhere in a plain checkout: on the site a link to a file
+Links in Markdown are made for the repository, and lead somewhere in a plain checkout: on the site a link to a file
 that is shown leads to its page, and a link to a folder becomes plain text.
 """
 
@@ -15,7 +15,9 @@ from pathlib import Path
 from generated_files import write_page
 from sphinx.application import Sphinx
 
-LINK = re.compile(r"(?<!!)\[((?:[^\[\]]|!\[[^\]]*\]\([^)]*\))*)\]\(([^)\s]+)\)|(!\[[^\]]*\])\(([^)\s]+)\)")
+LINK = re.compile(
+    r"(?<!!)\[((?:[^\[\]]|!\[[^\]]*\]\([^)]*\))*)\]\(([^)\s]+)\)|(!\[[^\]]*\])\(([^)\s]+)\)"
+)
 """A link with its text, or a picture."""
 
 
@@ -32,12 +34,17 @@ def page_text(docs: Path, page: str, path: Path) -> str:
     """Return the text of ``page``, which shows the file ``path``."""
     if path.suffix == ".md":
         return path.read_text()
-    language, shown = path.suffix.removeprefix(".").replace("py", "python"), os.path.relpath(path, (docs / page).parent)
+    language, shown = (
+        path.suffix.removeprefix(".").replace("py", "python"),
+        os.path.relpath(path, (docs / page).parent),
+    )
     name = path.relative_to(docs.parent).as_posix()
     return f"---\norphan: true\n---\n\n# {name}\n\n```{{literalinclude}} {shown}\n:language: {language}\n```\n"
 
 
-def rewrite(text: str, page: str, docs: Path, shown: dict[str, Path], aliases: dict[str, str]) -> str:
+def rewrite(
+    text: str, page: str, docs: Path, shown: dict[str, Path], aliases: dict[str, str]
+) -> str:
     """Return the Markdown of ``page`` with links that lead to the right pages of the site."""
     pages = {path: name for name, path in shown.items()}
     pages.update({(docs.parent / path).resolve(): name for path, name in aliases.items()})
@@ -57,7 +64,11 @@ def rewrite(text: str, page: str, docs: Path, shown: dict[str, Path], aliases: d
     def link(match: re.Match[str]) -> str:
         if match[3]:
             return f"{match[3]}({target(match[4])})"
-        folder = "://" not in match[2] and (base / match[2].partition("#")[0]).is_dir() and not match[2].startswith("#")
+        folder = (
+            "://" not in match[2]
+            and (base / match[2].partition("#")[0]).is_dir()
+            and not match[2].startswith("#")
+        )
         return match[1] if folder else f"[{match[1]}]({target(match[2])})"
 
     return LINK.sub(link, text)

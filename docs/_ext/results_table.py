@@ -63,12 +63,16 @@ class Column:
         """Read ``heading | [summary] field | [*factor] [format]``."""
         parts = [part.strip() for part in line.split("|")]
         if len(parts) not in (2, 3):
-            raise ResultsError(f"column {line!r}: expected 'heading | field' or 'heading | field | format'")
+            raise ResultsError(
+                f"column {line!r}: expected 'heading | field' or 'heading | field | format'"
+            )
         first, _, rest = parts[1].partition(" ")
         summary, field = (first, rest.strip()) if first in SUMMARIES else ("", parts[1])
         match = re.fullmatch(r"(?:\*(\S+))?\s*(\S*)", parts[2] if len(parts) == 3 else "")
         if match is None:
-            raise ResultsError(f"column {line!r}: expected '*factor format', as '*1e-6 .3g', after the second |")
+            raise ResultsError(
+                f"column {line!r}: expected '*factor format', as '*1e-6 .3g', after the second |"
+            )
         return cls(parts[0], summary, field, float(match[1] or 1.0), match[2])
 
     def text(self, rows: list[Row]) -> tuple[str, bool]:
@@ -97,7 +101,7 @@ def value(row: Any, path: str) -> Any:
 
 
 def rows_at(data: Any, path: str) -> Iterator[Row]:
-    """Yield the rows at ``path``: those of a list, or a single one."""
+    """Yield the rows at ``path``: the rows of a list, or a single one."""
     key, _, rest = path.partition(".")
     if key == "*":
         for name, below in data.items():
@@ -158,7 +162,9 @@ class ResultsTable(SphinxDirective):
     def table(self, data: Any) -> nodes.table:
         """Return the table of ``data``."""
         columns = [Column.parse(line) for line in self.content if line.strip()]
-        rows = select(list(rows_at(data, self.options.get("rows", ""))), self.options.get("where", ""))
+        rows = select(
+            list(rows_at(data, self.options.get("rows", ""))), self.options.get("where", "")
+        )
         if "sort" in self.options:
             field = self.options["sort"].strip()
             rows.sort(key=lambda row: value(row, field.lstrip("-")), reverse=field.startswith("-"))
@@ -169,7 +175,9 @@ class ResultsTable(SphinxDirective):
         body = nodes.tgroup(cols=len(columns))
         body += [nodes.colspec(colwidth=1) for _ in columns]
         body += nodes.thead("", self.row([self.entry(column.heading, False) for column in columns]))
-        cells = [[self.entry(*column.text(same)) for column in columns] for same in group(rows, fields)]
+        cells = [
+            [self.entry(*column.text(same)) for column in columns] for same in group(rows, fields)
+        ]
         body += nodes.tbody("", *map(self.row, cells))
         out += body
         return out
@@ -177,7 +185,9 @@ class ResultsTable(SphinxDirective):
     def entry(self, text: str, number: bool) -> nodes.entry:
         """Return a cell."""
         children = [nodes.Text(text)] if number else self.parse_inline(text)[0]
-        return nodes.entry("", nodes.paragraph("", "", *children), classes=["number"] if number else [])
+        return nodes.entry(
+            "", nodes.paragraph("", "", *children), classes=["number"] if number else []
+        )
 
     def row(self, cells: list[nodes.entry]) -> nodes.row:
         """Return a row of cells."""

@@ -8,5 +8,10 @@ def reset(gallery_conf: dict[str, Any], fname: str) -> None:
     import matplotlib
 
     matplotlib.rcParams.update(
-        {"figure.figsize": (8.0, 3.6), "figure.constrained_layout.use": True, "font.size": 9.5, "image.cmap": "gray"}
+        {
+            "figure.figsize": (8.0, 3.6),
+            "figure.constrained_layout.use": True,
+            "font.size": 9.5,
+            "image.cmap": "gray",
+        }
     )

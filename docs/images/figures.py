@@ -3,7 +3,7 @@
     python docs/images/figures.py DEMO [NAME ...]
 
 ``DEMO`` is the folder of ``amiwarp demo --size 160x120 --duration 0.5``; for the pictures of the inspector, of
-``amiwarp demo --size 320x240``. Without names, all pictures are drawn, but those of the inspector.
+``amiwarp demo --size 320x240``. Without names, all pictures are drawn, except the inspector's.
 """
 
 import math
@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from pyvista.examples import mapfile
 
 import amiwarp
-from amiwarp.plotting.figures import draw_calibration
+from amiwarp.plotting.calibration_figure import draw_calibration
 
 ON, OFF = "#e0761b", "#3c8fd0"
 
@@ -39,7 +39,10 @@ def panels(titles: list[str], height: float = 2.4) -> tuple[Figure, list[plt.Axe
 
 def optics(demo: Path) -> Figure:
     """Draw the orbits of points over the image, and the error of one circle for all."""
-    camera, prism = amiwarp.Camera.from_fov(640, 480, math.radians(60)), amiwarp.Prism(math.radians(1.82), index=1.55)
+    camera, prism = (
+        amiwarp.Camera.from_fov(640, 480, math.radians(60)),
+        amiwarp.Prism(math.radians(1.82), index=1.55),
+    )
     exact, circle = amiwarp.ExactModel(camera, prism), amiwarp.CircleModel.from_prism(camera, prism)
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.0, 3.1), layout="constrained")
     theta = np.linspace(0, 2 * np.pi, 65)
@@ -52,8 +55,10 @@ def optics(demo: Path) -> Figure:
             left.plot(*(point + 2 * shift).T, color="#999999", linewidth=1)
             left.plot(*(point + 2 * moved).T, color=ON, linewidth=1.3)
     left.set(xlim=(-40, 680), ylim=(520, -40), aspect="equal", xlabel="x [px]", ylabel="y [px]")
-    left.set_title("orbits, twice as large; grey: that of the middle", fontsize=10)
-    grid = np.stack(np.meshgrid(np.linspace(0, 639, 65), np.linspace(0, 479, 49)), axis=-1).reshape(-1, 2)
+    left.set_title("orbits, twice as large; grey: the middle's", fontsize=10)
+    grid = np.stack(np.meshgrid(np.linspace(0, 639, 65), np.linspace(0, 479, 49)), axis=-1).reshape(
+        -1, 2
+    )
     turns = [np.full(len(grid), angle) for angle in theta[:-1:4]]
     error = [circle.compensate_points(grid, t) - exact.compensate_points(grid, t) for t in turns]
     rms = np.sqrt(np.mean(np.sum(np.square(error), axis=-1), axis=0)).reshape(49, 65)
@@ -83,16 +88,23 @@ def noise(demo: Path) -> Figure:
     events = recording.events.between(100_000, 150_000)
     marked = amiwarp.find_background_activity(events, recording.events.size, window_us=5000)
     figure, axes = panels(["events of 50 ms", "kept", "marked as noise"])
-    for ax, some, most in zip(axes, (events, events[~marked], events[marked]), (12, 12, 2), strict=True):
+    for ax, some, most in zip(
+        axes, (events, events[~marked], events[marked]), (12, 12, 2), strict=True
+    ):
         ax.imshow(amiwarp.iwe(some, *recording.events.size), cmap="gray", vmin=0, vmax=most)
     return figure
 
 
 def pixels(demo: Path) -> Figure:
     """Draw the ON threshold of every pixel, as the guide's commands find it."""
-    camera, prism = amiwarp.Camera.from_fov(160, 120, math.radians(60)), amiwarp.Prism(math.radians(1))
+    camera, prism = (
+        amiwarp.Camera.from_fov(160, 120, math.radians(60)),
+        amiwarp.Prism(math.radians(1)),
+    )
     sensor = amiwarp.SensorModel(mismatch=0.1)
-    recording = amiwarp.simulate(demo / "picture.png", camera, prism, duration_s=1.0, motion=720.0, sensor=sensor)
+    recording = amiwarp.simulate(
+        demo / "picture.png", camera, prism, duration_s=1.0, motion=720.0, sensor=sensor
+    )
     found = amiwarp.pixel_thresholds(recording, amiwarp.calibrate(recording))
     figure, axes = panels(["picture", "ON threshold", "its standard deviation"])
     axes[0].imshow(plt.imread(demo / "picture.png"), cmap="gray")
@@ -115,7 +127,9 @@ def no_encoder(demo: Path) -> Figure:
             "compensate plain.h5 plain_compensated.h5 --calibration plain.json --iwe plain.png",
             "reconstruct plain.h5 plain_picture.png --calibration plain.json --turns 1",
         ):
-            subprocess.run([sys.executable, "-m", "amiwarp", *command.split()], cwd=folder, check=True)
+            subprocess.run(
+                [sys.executable, "-m", "amiwarp", *command.split()], cwd=folder, check=True
+            )
         figure, axes = panels(["as recorded", "compensated", "reconstructed"])
         axes[0].imshow(amiwarp.iwe(whole.events.between(100_000, 183_333), 160, 120), cmap="gray")
         axes[1].imshow(plt.imread(f"{folder}/plain.png"), cmap="gray")

@@ -41,7 +41,9 @@ def quantised(picture: Path, out: Path) -> None:
     indexed(np.asarray(rgb)).save(out, optimize=True)
     colours = 128
     while out.stat().st_size > MOST_BYTES and colours > 8:
-        rgb.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(out, optimize=True)
+        rgb.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+            out, optimize=True
+        )
         colours //= 2
     print(f"{out.name}: {out.stat().st_size / 1e3:.0f} kB")
 
@@ -55,7 +57,10 @@ def shown(out: Path, *commands: str, view: str) -> None:
 
 def wedge(demo: Path, out: Path) -> None:
     """A rotating wedge with encoder."""
-    shown(out, view=f"{demo}/recording.h5 --calibration {demo}/calibration.json --region 145,85,225,145")
+    shown(
+        out,
+        view=f"{demo}/recording.h5 --calibration {demo}/calibration.json --region 145,85,225,145",
+    )
 
 
 def without_encoder(demo: Path, out: Path) -> None:
@@ -78,7 +83,10 @@ def plain(demo: Path, out: Path) -> None:
 
 def prophesee(demo: Path, out: Path) -> None:
     """Words of a Prophesee sensor (EVT 3.0)."""
-    shown(out, view=f"{data()}/rosbag/ros2_evt3_640x480_trig10Hz.db3 --window 0.2:1.2 --view x-y --colour density")
+    shown(
+        out,
+        view=f"{data()}/rosbag/ros2_evt3_640x480_trig10Hz.db3 --window 0.2:1.2 --view x-y --colour density",
+    )
 
 
 def mirror(demo: Path, out: Path) -> None:
@@ -146,7 +154,9 @@ def calibration_by_hand(demo: Path, out: Path) -> None:
     palette = pictures[len(pictures) // 2].quantize(FILM_COLOURS, Image.Quantize.MAXCOVERAGE)
     frames = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
     durations = [FRAME_MS] * (len(frames) - 1) + [LAST_MS]
-    frames[0].save(out, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+    frames[0].save(
+        out, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True
+    )
     print(f"{out.name}: {out.stat().st_size / 1e3:.0f} kB, {len(frames)} pictures")
     assert out.stat().st_size <= MOST_FILM_BYTES
 
@@ -166,7 +176,9 @@ def page_pictures(recording: Path) -> Iterator[Image.Image]:
         assert server.stdout is not None
         url = server.stdout.readline().split(": ")[1].strip()
         size = dict(zip(("width", "height"), FILM_SIZE, strict=True))
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+        )
         page = browser.new_page(viewport=size)
         page.goto(url)
         page.wait_for_selector("#field-phase")

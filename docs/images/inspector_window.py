@@ -23,7 +23,9 @@ def main(demo: str) -> None:
     recording = amiwarp.open_recording(f"{demo}/recording.h5")
     calibration = amiwarp.Calibration.load(f"{demo}/calibration.json")
     window.REST_S = 0.0
-    shown = window.Window(Inspector(recording, calibration, most_points=WINDOW_POINTS), size=SIZE, off_screen=True)
+    shown = window.Window(
+        Inspector(recording, calibration, most_points=WINDOW_POINTS), size=SIZE, off_screen=True
+    )
     while shown.turn():
         pass
     picture = Image.fromarray(shown.scene.picture()).quantize(128, dither=Image.Dither.NONE)

@@ -48,7 +48,9 @@ def dots(x: np.ndarray, y: np.ndarray, p: np.ndarray) -> str:
     """Return events as dots, ON orange and OFF blue."""
     out = ""
     for polarity, colour in ((1, ON), (0, OFF)):
-        points = "".join(f"M{a:.0f} {b:.0f}h0" for a, b in zip(x[p == polarity], y[p == polarity], strict=True))
+        points = "".join(
+            f"M{a:.0f} {b:.0f}h0" for a, b in zip(x[p == polarity], y[p == polarity], strict=True)
+        )
         out += f'<path d="{points}" stroke="{colour}" stroke-width="2.2" stroke-linecap="round" fill="none"/>\n'
     return out
 
@@ -57,10 +59,15 @@ def main() -> None:
     """Simulate the events and write the three files."""
     picture = Image.new("L", (8 * WIDTH, 8 * HEIGHT), 60)
     ImageDraw.Draw(picture).polygon([(8 * WIDTH * a, 8 * HEIGHT * b) for a, b in CORNERS], fill=200)
-    camera, prism = amiwarp.Camera.from_fov(WIDTH, HEIGHT, math.radians(20)), amiwarp.Prism(math.radians(1.6))
+    camera, prism = (
+        amiwarp.Camera.from_fov(WIDTH, HEIGHT, math.radians(20)),
+        amiwarp.Prism(math.radians(1.6)),
+    )
     with tempfile.TemporaryDirectory() as folder:
         picture.save(f"{folder}/scene.png")
-        recording = amiwarp.simulate(f"{folder}/scene.png", camera, prism, duration_s=0.2, motion=720.0, seed=1)
+        recording = amiwarp.simulate(
+            f"{folder}/scene.png", camera, prism, duration_s=0.2, motion=720.0, seed=1
+        )
     events = recording.events.between(80_000, 80_000 + 83_333)
     model = amiwarp.ExactModel(camera, prism)
     rest = amiwarp.compensate_events(events, model, recording.encoder)
@@ -77,10 +84,17 @@ def main() -> None:
             events.x,
             events.y,
         ),
-        "compensated": ("The same events after compensation: the edges are thin", rest[:, 0], rest[:, 1]),
+        "compensated": (
+            "The same events after compensation: the edges are thin",
+            rest[:, 0],
+            rest[:, 1],
+        ),
     }
     for name, (title, x, y) in panels.items():
-        places = [((values + 0.5 + shift) * SCALE)[keep] for values, shift in zip((x, y), spread, strict=True)]
+        places = [
+            ((values + 0.5 + shift) * SCALE)[keep]
+            for values, shift in zip((x, y), spread, strict=True)
+        ]
         (HERE / f"prism_{name}.svg").write_text(
             svg(title, dots(*places, events.p[keep]) + (path if name == "recorded" else ""))
         )

@@ -36,7 +36,7 @@ LETTERS = {
     "Z": ("111", "001", "010", "100", "111"),
 }
 CLASSES = tuple(LETTERS)
-EACH, TRAIN = 26, 18  # scenes of each letter, and those of them for training
+EACH, TRAIN = 26, 18  # scenes of each letter, and how many of them for training
 camera = amiwarp.Camera.from_fov(SIDE, SIDE, math.radians(24.0))
 sensor = amiwarp.SensorModel.preset("davis346")
 rng = np.random.default_rng(5)
@@ -118,7 +118,7 @@ other = {
 # With ``model`` and ``encoder``, :func:`amiwarp.polarity_histogram` moves each
 # event back to its position without the wedge, and shares it among the four pixels
 # nearest to it. A raw image shows a letter as if drawn with a ring, whose size is
-# that of the wedge's circle.
+# the size of the wedge's circle.
 
 rows = (
     ("plain camera", inputs["plain camera"][first_test:]),

@@ -16,6 +16,7 @@
 #define UNDERVOLTAGE_MS 20u /* the mean needs some 16 ms more */
 #define OVERVOLTAGE_MS 5u
 #define SUPPLY_SHIFT 4 /* the mean is that of 2^4 samples */
+#define FIRST_SAMPLES 16
 #define LEAST_CHANGE_PER_S 4 /* a change of the speed takes a quarter of a second, else it overshoots */
 
 static int32_t size_of(int32_t x) { return x == INT32_MIN ? INT32_MAX : x < 0 ? -x : x; }
@@ -242,9 +243,23 @@ static struct stamp latched(const struct controller *c, struct stamp pulse) {
     return pulse;
 }
 
+/* The prism may turn at the start, as after a reset. The tracker begins with the mean speed of the first samples: from rest it
+   would take 50 ms to find the speed, and a command would brake the prism with full voltage until the guard stops the motor. */
+static void measure_speed(struct controller *c, int32_t count) {
+    if (c->first_samples < FIRST_SAMPLES) {
+        if (!c->first_samples++) c->first_count = count;
+        return;
+    }
+    if (!c->tracking) {
+        int32_t moved = step_of(c->last.count, c->first_count);
+        tracker_begin(&c->tracker, c->last.count, moved, FIRST_SAMPLES - 1, c->settings.counts_per_turn);
+        c->tracking = true;
+    }
+    c->speed = tracker_step(&c->tracker, count);
+}
+
 static void take_sample(struct controller *c, struct stamp at) {
-    if (!c->sampled) tracker_begin(&c->tracker, at.count, c->settings.counts_per_turn);
-    c->speed = tracker_step(&c->tracker, at.count);
+    measure_speed(c, at.count);
     if (has_absolute_angle(&c->settings)) pass_zero(c, at);
     if (c->settings.encoder == MAGNETIC && size_of(c->speed) > RPM(1)) c->backwards = c->speed < 0;
     if (!c->sampled) c->last_index = at;
@@ -295,7 +310,7 @@ static uint8_t stop(struct controller *c) {
 /* Use other counts per turn, while the prism rests. */
 static void begin_counts(struct controller *c) {
     uint32_t per_turn = c->settings.counts_per_turn;
-    tracker_begin(&c->tracker, c->last.count, per_turn);
+    tracker_begin(&c->tracker, c->last.count, 0, 1, per_turn);
     guard_begin(&c->guard, c->last.count, per_turn);
     c->indexed = c->index_known = false;
     c->last_index = c->last;
@@ -393,8 +408,16 @@ static void send_answer(struct controller *c, uint16_t sequence, uint8_t refused
     send(c, ANSWER_TYPE, answer, sizeof answer);
 }
 
-static void execute(struct controller *c, uint32_t size, uint32_t now) {
-    const uint8_t *packet = c->decoder.packet, *payload = packet + HEADER_BYTES;
+/* Keep a command to the motor until the speed of the prism is known. A later one replaces it, as a stop must not be refused. */
+static void hold(struct controller *c, const uint8_t *packet, uint32_t size) {
+    if (c->held) send_answer(c, get16(c->held_packet + 2), REFUSED_NOT_POSSIBLE_NOW);
+    for (uint32_t k = 0; k < HEADER_BYTES + size; k++) c->held_packet[k] = packet[k];
+    c->held_size = (uint8_t)size;
+    c->held = true;
+}
+
+static void execute(struct controller *c, const uint8_t *packet, uint32_t size, uint32_t now) {
+    const uint8_t *payload = packet + HEADER_BYTES;
     uint8_t refused = REFUSED_UNKNOWN_COMMAND, type = packet[1];
     uint16_t sequence = get16(packet + 2);
     c->heard = now;
@@ -403,8 +426,13 @@ static void execute(struct controller *c, uint32_t size, uint32_t now) {
         send_two(c, PONG_TYPE, get32(payload + PING_NUMBER), now);
         return;
     }
-    if (type == SET_SPEED_TYPE && size == SET_SPEED_BYTES) refused = set_speed(c, payload);
-    else if (type == STOP_TYPE && size == STOP_BYTES) refused = stop(c);
+    bool turn = type == SET_SPEED_TYPE && size == SET_SPEED_BYTES, rest = type == STOP_TYPE && size == STOP_BYTES;
+    if ((turn || rest) && !c->tracking) {
+        hold(c, packet, size);
+        return;
+    }
+    if (turn) refused = set_speed(c, payload);
+    else if (rest) refused = stop(c);
     else if (type == SET_COUNTS_TYPE && size == SET_COUNTS_BYTES) refused = set_counts(c, payload);
     else if (type == ASK_TYPE && size == ASK_BYTES) refused = tell(c, payload, now);
     else if (type == SET_SETTING_TYPE && size == SET_SETTING_BYTES) refused = set_setting(c, payload);
@@ -464,11 +492,15 @@ void controller_poll(struct controller *c, uint32_t now) {
         c->interval_used = false;
         draw_interval(c);
     }
+    if (c->tracking && c->held) {
+        c->held = false;
+        execute(c, c->held_packet, c->held_size, now);
+    }
     while (WAITING(c->rx)) {
         uint8_t byte = *FIRST(c->rx, RX_BYTES);
         DROP(c->rx);
         int size = frame_decode(&c->decoder, byte);
-        if (size >= 0) execute(c, (uint32_t)size, now);
+        if (size >= 0) execute(c, c->decoder.packet, (uint32_t)size, now);
     }
     for (;;) { /* samples and pulses in the order of their times; a pulse after a sample of the same time */
         bool sample = WAITING(c->samples), index = WAITING(c->index), sync = WAITING(c->sync);

@@ -101,7 +101,10 @@ struct controller {
     uint8_t batched, state, sent_state, still;
     int32_t speed, over_speed;
     uint8_t odd_seen;
-    bool indexed, sampled, told, commanded;
+    uint8_t first_samples;   /* their number, until there are enough to measure the speed */
+    int32_t first_count;
+    uint8_t held_packet[HEADER_BYTES + SET_SPEED_BYTES], held_size; /* a command that waits for that speed */
+    bool held, indexed, sampled, tracking, told, commanded;
 };
 
 void controller_begin(struct controller *c, const struct settings *built, uint32_t now);

@@ -4,6 +4,7 @@
 #define BETA 5  /* in 1/512: (1 - z)^2 */
 #define CREEP RPM(10) /* below this speed a stopping motor is released */
 #define BEHIND(reference) (RPM(100) + ((reference) >> 4)) /* the reference waits for a speed that is further behind */
+#define MOST_COUNTS 16383 /* of the tracker, per tick */
 #define TRACKER_SHIFT 4 /* the tracker's speed comes 2^4 ticks late in a ramp: ALPHA / BETA, as a power of two */
 #define MOST_INTEGRAL (FULL_DUTY / 8 * 3)
 
@@ -31,15 +32,15 @@ uint32_t f32_from_q16(int32_t q16) {
     return (q16 < 0 ? 0x80000000u : 0u) | exponent << 23 | (size >> 8 & 0x7FFFFFu);
 }
 
-void tracker_begin(struct tracker *t, int32_t count, uint32_t counts_per_turn) {
+void tracker_begin(struct tracker *t, int32_t count, int32_t moved, int32_t ticks, uint32_t counts_per_turn) {
     t->position = (uint64_t)(uint32_t)count << 16;
-    t->speed = 0;
+    t->speed = clamp(moved, MOST_COUNTS * ticks) * (65536 / ticks);
     t->scale = ((int64_t)60 * TICK_HZ * 65536 + counts_per_turn / 2u) / counts_per_turn;
 }
 
 int32_t tracker_step(struct tracker *t, int32_t count) {
     t->position += (uint64_t)(int64_t)t->speed;
-    int32_t whole = clamp((int32_t)((uint32_t)count - (uint32_t)(t->position >> 16)), 16383);
+    int32_t whole = clamp((int32_t)((uint32_t)count - (uint32_t)(t->position >> 16)), MOST_COUNTS);
     int32_t error = whole * 65536 - (int32_t)(t->position & 0xFFFFu);
     t->position += (uint64_t)(int64_t)((error >> 4) * ALPHA);
     t->speed = clamp(t->speed + (error >> 9) * BETA, (int32_t)1 << 30); /* 16384 counts per tick */

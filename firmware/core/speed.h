@@ -21,7 +21,8 @@ struct tracker {
     int32_t speed;     /* counts per tick in Q16 */
     int64_t scale;     /* factor from `speed` to Q16 rpm, in Q16 */
 };
-void tracker_begin(struct tracker *t, int32_t count, uint32_t counts_per_turn);
+/* `moved`: counts of the last `ticks`, which give the speed at the start. */
+void tracker_begin(struct tracker *t, int32_t count, int32_t moved, int32_t ticks, uint32_t counts_per_turn);
 int32_t tracker_step(struct tracker *t, int32_t count); /* returns the speed [Q16 rpm] */
 
 struct gains {

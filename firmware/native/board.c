@@ -212,7 +212,7 @@ uint32_t board_advance(struct board *b, uint64_t until, uint8_t *out, uint32_t r
 /* For tests of single functions. */
 void board_tamper(struct board *b, int32_t count) {
     b->c.count = b->c.last.count = count;
-    tracker_begin(&b->c.tracker, count, b->settings.counts_per_turn);
+    tracker_begin(&b->c.tracker, count, 0, 1, b->settings.counts_per_turn);
 }
 uint32_t board_counter(const struct board *b, int which) {
     const struct frame_decoder *d = &b->c.decoder;

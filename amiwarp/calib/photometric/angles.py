@@ -9,7 +9,7 @@ u + k/2 sin 2u, to first order in k; one with a square error the tilt by u + k s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,10 +26,11 @@ from amiwarp.calib.photometric.findings import AngleError
 from amiwarp.calib.photometric.linear_fit import SIGNIFICANT, LinearFit, linear_fit, telling
 from amiwarp.calib.photometric.refinement import Refinement
 from amiwarp.calib.photometric.verdicts import refused
-from amiwarp.optics.models import MODELS, Model
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.models.registry import MODELS
 
 if TYPE_CHECKING:
-    from amiwarp.calib.parameters import ParameterSpace
+    from amiwarp.results.parameters import ParameterSpace
 
     Vector = NDArray[np.float64]
 
@@ -43,7 +44,8 @@ FIRST_LOOK = 0.5
 """Share of what is asked of an error of the angle that it must have before all that may look like it is examined."""
 MOST_ANGLE_FITS = 6
 """Largest number of linearised fits of the errors of the angles."""
-FIRST_SHARE, LEAST_SHARE = 0.5, 0.25
+FIRST_SHARE = 0.5
+LEAST_SHARE = 0.25
 """Share of the error that the first linearised fit is taken to find, and the least share of a later one."""
 LEAST_ANGLE_PX = 0.003
 """Length of a correction of the angles below which the search ends [px rms]."""
@@ -59,18 +61,24 @@ def examined_errors(kind: type[Model]) -> tuple[tuple[str, ...], ...]:
     harmonics = tuple(harmonics_of(k) for k in range(kind.ANGLES))
     if kind.ANGLES > 1:
         return harmonics
-    # harmonics of a vibration's angle look like those of its motion
-    return (*harmonics, SKEW) if kind.PRISM else (SKEW,)
+    if kind.PRISM:
+        return (*harmonics, SKEW)
+    # harmonics of a vibration's angle look like harmonics of its motion
+    return (SKEW,)
 
 
 def examine_the_angles_first(state: Refinement) -> Refinement:
     """End if the angles have an error, so that it is corrected before lens and prism are examined."""
-    return state if state.problem.angles_hold else _without_angle_errors(state)
+    if state.problem.angles_hold:
+        return state
+    return _without_angle_errors(state)
 
 
 def examine_the_angles_last(state: Refinement) -> Refinement:
     """Refuse the answer if its angles have an error although lens and prism were corrected first."""
-    return _without_angle_errors(state) if state.problem.angles_hold and not state.refusal else state
+    if state.refusal or not state.problem.angles_hold:
+        return state
+    return _without_angle_errors(state)
 
 
 def _without_angle_errors(state: Refinement) -> Refinement:
@@ -82,21 +90,31 @@ def _without_angle_errors(state: Refinement) -> Refinement:
     errors = find_angle_errors(search, v)
     if errors is None:
         return state
-    kind = MODELS[state.space.model]
-    harmonics = tuple(errors.get(name, 0.0) for k in range(kind.ANGLES) for name in harmonics_of(k))
-    skew = np.array([errors.get(name, 0.0) for name in SKEW])
-    late_us = -skew / (state.problem.direction * state.problem.rad_per_us)
-    found = AngleError(
-        model=state.space.model,
-        harmonics=harmonics if any(harmonics) else (),
-        late_us=(float(late_us[0]), float(late_us[1])),
-        late_px=moved_px(state.space, v, dict(zip(SKEW, skew.tolist(), strict=True))),
-    )
+    found = _as_finding(state, errors)
     state = state.noticing(found)
     if refused(found):
         return state.ending()
     search.cost.renew(v)
     return state
+
+
+def _as_finding(state: Refinement, errors: dict[str, float]) -> AngleError:
+    """Return errors of the angles, given by name, as a finding."""
+    harmonics: list[float] = []
+    for angle in range(MODELS[state.space.model].ANGLES):
+        for name in harmonics_of(angle):
+            harmonics.append(errors.get(name, 0.0))
+
+    # A change of the angle from column to column, and from row to row, is a delay of their read-out.
+    skew = {name: errors.get(name, 0.0) for name in SKEW}
+    rad_per_us = state.problem.direction * state.problem.rad_per_us
+    late_x, late_y = (-each / rad_per_us for each in skew.values())
+    return AngleError(
+        model=state.space.model,
+        harmonics=tuple(harmonics) if any(harmonics) else (),
+        late_us=(late_x, late_y),
+        late_px=moved_px(state.space, state.answer.x, skew),
+    )
 
 
 def find_angle_errors(search: AnswerSearch, v: Vector) -> dict[str, float] | None:
@@ -110,30 +128,37 @@ def find_angle_errors(search: AnswerSearch, v: Vector) -> dict[str, float] | Non
     found = fit_angles(cost, v)
     if found is None or moved_px(cost.space, v, found) < LEAST_MOVE_PX:
         return None
-    names = [*found]
+    names = tuple(found)
+    angles = MODELS[cost.space.model].ANGLES
     azimuth = cost.brightness.pairs.arrays.azimuth
     given = wp.clone(azimuth)
-    patterns = {name: pattern.numpy().reshape(2, -1) for name, pattern in patterns_of(cost).items()}
+    patterns = {}
+    for name, pattern in patterns_of(cost).items():
+        patterns[name] = pattern.numpy().reshape(2, -1)
     total = np.zeros(len(names))
     share = FIRST_SHARE
     at = v
     try:
         for _ in range(MOST_ANGLE_FITS):
-            change = np.array([*found.values()])
+            # Correct the angles by the whole error, of which the fit finds a share.
+            change = np.array(list(found.values()))
             step = change / share
             total += step
             errors = dict(zip(names, total.tolist(), strict=True))
-            azimuth.assign(bent(given.numpy(), errors, patterns, MODELS[cost.space.model].ANGLES))
+            azimuth.assign(bent(given.numpy(), errors, patterns, angles))
             cost.renew(at)
             at = search.descend(at).x
             if moved_px(cost.space, at, found) / share < LEAST_ANGLE_PX:
                 break
+
+            # What the next fit still finds tells how large the share was.
             cost.converge(at)
-            again = fit_angles(cost, at, tuple(names))
+            again = fit_angles(cost, at, names)
             assert again is not None
             found = again
-            left = np.array([*found.values()])
-            share = float(np.clip((change - left) @ step / (step @ step), LEAST_SHARE, 1.0))
+            left = np.array(list(found.values()))
+            share_found = (change - left) @ step / (step @ step)
+            share = float(np.clip(share_found, LEAST_SHARE, 1.0))
     finally:
         azimuth.assign(given)
     return dict(zip(names, total.tolist(), strict=True))
@@ -148,46 +173,70 @@ def patterns_of(cost: Cost) -> dict[str, Any]:
     camera = cost.space.camera
     angles = MODELS[cost.space.model].ANGLES
     if angles == 1:
-        rows = pairs.angle_patterns((0.5 * camera.width, 0.5 * camera.height))
-        return {name: rows[k] for k, name in enumerate((*harmonics_of(0), *SKEW))}
+        middle = (0.5 * camera.width, 0.5 * camera.height)
+        rows = pairs.angle_patterns(middle)
+        names = (*harmonics_of(0), *SKEW)
+        return {name: rows[k] for k, name in enumerate(names)}
     found: dict[str, Any] = {}
-    stored = pairs.arrays.azimuth.numpy().reshape(2, angles, -1)  # first and second events, both angles
+    # First and second events, both angles
+    stored = pairs.arrays.azimuth.numpy().reshape(2, angles, -1)
     for k in range(angles):
         angle = stored[:, k].astype(np.float64)
-        waves = (np.cos(angle), np.sin(angle), np.cos(2.0 * angle), np.sin(2.0 * angle))
+        twice = 2.0 * angle
+        waves = (np.cos(angle), np.sin(angle), np.cos(twice), np.sin(twice))
         for name, wave in zip(harmonics_of(k), waves, strict=True):
-            found[name] = wp.array(wave.ravel().astype(np.float32), dtype=float, device=pairs.device)
+            values = wave.ravel().astype(np.float32)
+            found[name] = wp.array(values, dtype=float, device=pairs.device)
     return found
 
 
-def bent(stored: Vector, errors: dict[str, float], patterns: dict[str, Vector], angles: int) -> NDArray[np.float32]:
+def bent(
+    stored: Vector,
+    errors: dict[str, float],
+    patterns: dict[str, Vector],
+    angles: int,
+) -> NDArray[np.float32]:
     """Return what is stored for the events of pairs after their angles have changed by errors, given by name.
 
     ``stored`` and the result have the form of the pairs' ``azimuth``, shape (4 · padded pairs,).
     """
+    # Two angles are stored as they are, one as its cosine and sine.
     parts = stored.reshape(2, 2, -1)
-    given = parts.swapaxes(0, 1) if angles > 1 else np.arctan2(parts[:, 1], parts[:, 0])[None]
+    if angles > 1:
+        given = parts.swapaxes(0, 1)
+    else:
+        cos = parts[:, 0]
+        sin = parts[:, 1]
+        given = np.arctan2(sin, cos)[None]
     changed = np.array(given, np.float64)  # shape (angles, 2, padded pairs)
     for name, factor in errors.items():
         changed[_angle_of(name)] += factor * patterns[name]
     if angles == 1:
-        changed = np.stack([np.cos(changed[0]), np.sin(changed[0])])
+        (angle,) = changed
+        changed = np.stack([np.cos(angle), np.sin(angle)])
     return changed.swapaxes(0, 1).astype(np.float32).ravel()
 
 
 def _angle_of(name: str) -> int:
     """Return the number of the angle that has an error of this name."""
-    return 0 if name in SKEW else int(name.rpartition(" ")[2])
+    if name in SKEW:
+        return 0
+    _, _, number = name.rpartition(" ")
+    return int(number)
 
 
 def moved_px(space: ParameterSpace, v: Vector, errors: dict[str, float]) -> float:
     """Return how far errors of the angles, given by name, move events at a search vector [px rms]."""
     camera = space.camera
-    spread = {SKEW[0]: camera.width / math.sqrt(12.0), SKEW[1]: camera.height / math.sqrt(12.0)}
-    each = [
-        px_per_rad(space, v, _angle_of(name)) * factor * spread.get(name, math.sqrt(0.5))
-        for name, factor in errors.items()
-    ]
+    # Root mean squares of the patterns: positions over the image, or a harmonic over a turn.
+    pattern_rms = {
+        SKEW[0]: camera.width / math.sqrt(12.0),
+        SKEW[1]: camera.height / math.sqrt(12.0),
+    }
+    each = []
+    for name, factor in errors.items():
+        of_pattern = pattern_rms.get(name, math.sqrt(0.5))
+        each.append(px_per_rad(space, v, _angle_of(name)) * factor * of_pattern)
     return math.hypot(*each)
 
 
@@ -199,57 +248,84 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> dict[st
     """
     space = cost.space
     errors = _by_errors(cost, best)
-    groups = [
-        {name: errors[name] for name in group}
-        for group in examined_errors(MODELS[space.model])
-        if errors.keys() >= {*group}
-    ]
-    if not errors or not (names or telling(cost, groups, LEAST_ANGLE_GAIN)):
+    if not errors:
+        return None
+    groups = []
+    for group in examined_errors(MODELS[space.model]):
+        if errors.keys() >= set(group):
+            groups.append({name: errors[name] for name in group})
+
+    # Two quick looks, because most angles are right.
+    if not names and not telling(cost, groups, LEAST_ANGLE_GAIN):
         return None
     given = slopes(cost, space, best, space.names)
-    if not names and not _told(linear_fit(cost, given | errors), [*given], groups, FIRST_LOOK):
-        return None
+    if not names:
+        quick = linear_fit(cost, given | errors)
+        if not _told(quick, list(given), groups, FIRST_LOOK):
+            return None
+
+    # Beyond what a rotation of the camera, or a wrong camera or prism explains.
     given |= by_rotation(cost, best)
-    if not set(ASPECT.names) & set(space.names):
+    if set(ASPECT.names).isdisjoint(space.names):
         given |= by_cause(cost, best, ASPECT)
     others: dict[str, Any] = {}
     if not names:
-        # cylinder power stands for wobble too, which has nearly the same effect
-        for cause in (c for c in testable(space) if c in SCREENED and c not in (INDEX, SEAT)):
-            others |= {n: x for n, x in by_cause(cost, best, cause).items() if n not in given}
+        others = _by_camera_and_prism(cost, best, given)
     fit = linear_fit(cost, given | errors | others)
     names = names or _told(fit, [*given, *others], groups)
     if not names:
         return None
-    return dict(zip(names, fit.fit((*given, *names)).change[len(given) :].tolist(), strict=True))
+    estimate = fit.fit((*given, *names))
+    changes = estimate.change[len(given) :]
+    return dict(zip(names, changes.tolist(), strict=True))
+
+
+def _by_camera_and_prism(cost: Cost, best: Vector, given: Container[str]) -> dict[str, Any]:
+    """Return the derivatives of the residuals by what may be wrong about camera and prism, other than the given ones.
+
+    Cylinder power stands for wobble too, which has nearly the same effect.
+    """
+    found: dict[str, Any] = {}
+    for cause in testable(cost.space):
+        if cause not in SCREENED or cause in (INDEX, SEAT):
+            continue
+        for name, column in by_cause(cost, best, cause).items():
+            if name not in given:
+                found[name] = column
+    return found
 
 
 def _by_errors(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by errors of the angles, by name, for a still camera."""
     space = cost.space
-    pairs = cost.brightness.pairs
-    drifts = bool(pairs.arrays.slope.shape[0])
+    drifts = cost.brightness.pairs.arrays.slope.shape[0] > 0
     if space.moving or drifts or not orbit_of(space):
         return {}
     patterns = patterns_of(cost)
-    return {
-        name: shifted(cost, best, patterns[name], _angle_of(name))
-        for group in examined_errors(MODELS[space.model])
-        for name in group
-    }
+    columns = {}
+    for group in examined_errors(MODELS[space.model]):
+        for name in group:
+            columns[name] = shifted(cost, best, patterns[name], _angle_of(name))
+    return columns
 
 
 def _told(
-    fit: LinearFit, others: Sequence[str], groups: Sequence[Iterable[str]], share: float = 1.0
+    fit: LinearFit,
+    others: Sequence[str],
+    groups: Sequence[Iterable[str]],
+    share: float = 1.0,
 ) -> tuple[str, ...]:
     """Return the names of those groups of errors of the angles that are significant beyond the columns ``others``.
 
     ``share`` is a factor of what is asked of them.
     """
-    names: tuple[str, ...] = ()
+    names: list[str] = []
     for group in groups:
-        rest = (n for other in groups if other is not group for n in other)
-        _, significance, gain = fit.adding((*others, *rest), (*group,))
+        rest: list[str] = []
+        for other in groups:
+            if other is not group:
+                rest += other
+        _, significance, gain = fit.adding((*others, *rest), tuple(group))
         if significance >= share * SIGNIFICANT and gain >= share * LEAST_ANGLE_GAIN:
-            names = (*names, *group)
-    return names
+            names += group
+    return tuple(names)

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import MOTION, ParameterSpace, like_size
+from amiwarp.calib.nlopt_solver import maximise
 from amiwarp.calib.photometric import limits
 from amiwarp.calib.photometric.causes import SIDE, Cause, turned, with_cause
 from amiwarp.calib.photometric.cost import Cost, size_and_phase_directions
@@ -20,6 +19,8 @@ from amiwarp.calib.photometric.findings import Optimum
 from amiwarp.calib.photometric.verdicts import refused
 from amiwarp.calib.settings import GAUSS_NEWTON, PhotometricSettings
 from amiwarp.optics.camera import LENS
+from amiwarp.results.parameters import MOTION, ParameterSpace, like_size
+from amiwarp.results.search_stage import SearchStage
 
 if TYPE_CHECKING:
     Vector = NDArray[np.float64]
@@ -68,7 +69,7 @@ class Answer:
 
     @property
     def cost(self) -> float:
-        """Remaining cost, relative to that without a map."""
+        """Remaining cost, relative to the cost without a map."""
         return self.optimum.cost
 
 
@@ -79,7 +80,7 @@ class AnswerSearch:
     cost: Cost
     sharpest: Mapping[str, float]
     """Parameter values that the sharpness stage found, in their units, expressed in the cost's space."""
-    left: float
+    free_share: float
     """Share of equations beyond the unknowns of the map."""
     settings: PhotometricSettings
     report: Callable[[float], None]
@@ -112,10 +113,10 @@ class AnswerSearch:
         If there are few events, the map can adapt to wrong parameters so well that no single step lowers the cost. An
         answer that would be refused anyway is not searched for again.
         """
-        return self.judged(self.descend(start))
+        return self.search_on(self.descend(start))
 
-    def judged(self, stage: SearchStage) -> Answer:
-        """Return the answer of a search, or of those that follow it."""
+    def search_on(self, stage: SearchStage) -> Answer:
+        """Return the answer of a search, or of the searches that follow it from lower points near its result."""
         answer, around = _evaluate(self, stage)
         few = self.cost.brightness.count < FEW_PAIRS
         for _ in range(RESTARTS):
@@ -182,7 +183,7 @@ class AnswerSearch:
 def join_runs(first: SearchStage, second: SearchStage) -> SearchStage:
     """Return two successive runs with the same free parameters as one.
 
-    The result is that of the second run, whose brightness map was better converged.
+    The result is the second run's, whose brightness map was better converged.
     """
     return replace(
         second,
@@ -193,7 +194,9 @@ def join_runs(first: SearchStage, second: SearchStage) -> SearchStage:
     )
 
 
-def _evaluate(search: AnswerSearch, stage: SearchStage) -> tuple[Answer, list[tuple[Vector, float]]]:
+def _evaluate(
+    search: AnswerSearch, stage: SearchStage
+) -> tuple[Answer, list[tuple[Vector, float]]]:
     """Evaluate the optimum of ``stage``: final map, covariance and how good it is.
 
     Return the answer, and points near the optimum with their rise in cost, the lowest first.
@@ -223,7 +226,7 @@ def _evaluate(search: AnswerSearch, stage: SearchStage) -> tuple[Answer, list[tu
     slopes = waiting_slopes()
     final = waiting_final()
     around = waiting_around()
-    covariance = slopes.covariance() / search.left**2
+    covariance = slopes.covariance() / search.free_share**2
     unsharp = like_size(space.names)
     is_of_sharpness = np.array([n not in unsharp for n in space.names])
     is_of_prism = np.array([n not in (*unsharp, *MOTION) for n in space.names])
@@ -272,7 +275,9 @@ def search_walls(space: ParameterSpace, low: Vector, high: Vector) -> tuple[Vect
     """Return those bounds of the search box ``low .. high`` on which an answer is refused [px]; infinite for others."""
     given_low, given_high = space.bounds()
     lens = np.array([name in LENS for name in space.names])
-    return np.where(lens | (low > given_low), low, -np.inf), np.where(lens | (high < given_high), high, np.inf)
+    return np.where(lens | (low > given_low), low, -np.inf), np.where(
+        lens | (high < given_high), high, np.inf
+    )
 
 
 def start_costs_around(

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from amiwarp.calib.parameters import MOTION
 from amiwarp.calib.photometric import limits
 from amiwarp.calib.photometric.answers import AnswerSearch
 from amiwarp.calib.photometric.refinement import Refinement
 from amiwarp.calib.photometric.tile_paths import FAST_PATH_TERMS, PATH_TERMS, TilePaths
+from amiwarp.results.parameters import MOTION
 
 LARGEST_OF_LEAST = 2.0
 """A tile whose scene moves on its own path is left out if its cost is over this multiple of the least cost of a tile,
@@ -31,28 +31,37 @@ def follow_a_slow_camera(state: Refinement) -> Refinement:
     """Let the scenes of tiles move on their own paths, if these explain much of the residual.
 
     The camera's rotation stays as it was found; the paths add what it lacks: a rotation that varies faster, and
-    parallax. Tiles that are not explained then, such as those of a moving object, are left out.
+    parallax. Tiles that are not explained then, such as the tiles of a moving object, are left out.
     """
     space = state.space
-    alone = not {*space.names} - {*MOTION}
-    if not space.moving or alone or len(state.search.cost.brightness.tiles.origin) == 1:
+    only_motion_is_free = set(space.names).issubset(MOTION)
+    tiles = len(state.search.cost.brightness.tiles.origin)
+    if not space.moving or only_motion_is_free or tiles == 1:
         return state
+
     free = _with_free_paths(state, PATH_TERMS)
     cost = free.search.cost
     paths = cost.paths
     assert paths is not None
-    v = free.space.to_vector(space.to_values(state.answer.x))
+    values = space.to_values(state.answer.x)
+    v = free.space.to_vector(values)
     cost.slopes(v)
     if paths.gain() <= limits.LARGEST_ROTATION_GAIN:
         state.search.cost.converge(state.answer.x)
         return state
     v = free.search.descend(v).x
     cost.residuals(v, rounds=2)
+
+    # Leave out tiles that are not explained.
     costs = paths.costs(cost.scale)
-    keep = costs <= max(limits.LARGEST_STILL_COST, LARGEST_OF_LEAST * float(costs[costs > 0.0].min()))
-    if not keep[costs > 0.0].all():
+    with_pairs = costs > 0.0
+    least = float(costs[with_pairs].min())
+    largest = max(limits.LARGEST_STILL_COST, LARGEST_OF_LEAST * least)
+    keep = costs <= largest
+    if not keep[with_pairs].all():
         free = _on_tiles(free, keep, v)
-    return replace(free, answer=free.search.search(v))
+    answer = free.search.search(v)
+    return replace(free, answer=answer)
 
 
 def _with_free_paths(state: Refinement, terms: int) -> Refinement:
@@ -61,20 +70,24 @@ def _with_free_paths(state: Refinement, terms: int) -> Refinement:
     The answer is still the one before; the map is solved at it.
     """
     cost = state.search.cost
-    motion = tuple(n for n in state.space.names if n in MOTION)
+    motion = tuple(name for name in state.space.names if name in MOTION)
     values = state.space.to_values(state.answer.x)
-    space = state.space.without(motion).holding({n: values[n] for n in motion})
-    with_paths = cost.in_space(space, TilePaths(cost.brightness, terms))
+    held = {name: values[name] for name in motion}
+    space = state.space.without(motion).holding(held)
+    paths = TilePaths(cost.brightness, terms)
+    with_paths = cost.in_space(space, paths)
     with_paths.residuals(space.to_vector(values), rounds=2)
-    rotation = {n: state.answer.uncertainty[n] for n in motion}
-    return replace(state, search=replace(state.search, cost=with_paths), rotation=rotation)
+    rotation = {name: state.answer.uncertainty[name] for name in motion}
+    search = replace(state.search, cost=with_paths)
+    return replace(state, search=search, rotation=rotation)
 
 
 def _on_tiles(state: Refinement, keep: np.ndarray, v: np.ndarray) -> Refinement:
     """Return the state with the pairs of some tiles only, on a new map that is solved at ``v``."""
     before = state.search.cost
     assert before.paths is not None
-    equations = replace(state.equations, pairs=state.equations.pairs.of_tiles(keep))
+    pairs = state.equations.pairs.of_tiles(keep)
+    equations = replace(state.equations, pairs=pairs)
     on_new_map = equations.cost_on(before.brightness.tiles, before.space)
     paths = TilePaths(on_new_map.brightness, PATH_TERMS)
     paths.set(before.paths.moved_px)

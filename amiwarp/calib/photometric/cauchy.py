@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def cauchy_costs(residuals: NDArray[Any], scale: float) -> NDArray[Any]:
-    """Return the Cauchy cost of each residual [thresholds], relative to that without a map; 1 off the map."""
+    """Return the Cauchy cost of each residual [thresholds], relative to the cost without a map; 1 off the map."""
     without_map = math.log1p(1.0 / scale**2)
     on_map = np.nan_to_num(residuals, nan=1.0)
     return np.asarray(np.log1p((on_map / scale) ** 2) / without_map)

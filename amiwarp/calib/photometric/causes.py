@@ -2,7 +2,7 @@
 
 The photometric stage tests an answer for these causes, and frees the parameters of one (``consistency.py``,
 ``stage.py``). A new cause needs its line in :data:`CAUSES`, and parameters with ranges in
-:func:`amiwarp.calib.parameters.widened`.
+:func:`amiwarp.results.space_setup.widened`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.parameters import ParameterSpace, widened
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, as_wedge
+from amiwarp.results.parameters import ParameterSpace
+from amiwarp.results.space_setup import widened
 
 if TYPE_CHECKING:
     Vector = NDArray[np.float64]
@@ -25,7 +26,7 @@ FLAT_SIDE = "flat_side"
 """Name of the unknown that is 0 for the given flat side of the prism, and 1 for the other."""
 
 CERTAIN = 3.0
-"""Number of whole standard deviations from which on a harmonic is certainly there."""
+"""Number of whole standard deviations above which a harmonic is certainly there."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,9 @@ ASPECT = Cause("the ratio of the focal lengths fy / fx", ("fy_over_fx",))
 AXIS = Cause("the direction of the prism's axis", ("tilt_x", "tilt_y"))
 SEAT = Cause("the prism's seat in its mount", ("wobble_x", "wobble_y"))
 FACES = Cause("the evenness of the prism's faces", ("cylinder_x", "cylinder_y"))
-THIRD = Cause("the vibration's third harmonic", ("third_x", "third_y", "third_backward_x", "third_backward_y"))
+THIRD = Cause(
+    "the vibration's third harmonic", ("third_x", "third_y", "third_backward_x", "third_backward_y")
+)
 CAUSES = (FOCAL_LENGTH, CENTER, SIDE, INDEX, DISTORTION, ASPECT, AXIS, SEAT, FACES, THIRD)
 """All causes that the photometric stage can name and correct, the likeliest first."""
 SHAPES = (SEAT, FACES)
@@ -63,7 +66,9 @@ SCREENED = (FOCAL_LENGTH, CENTER, SIDE, *GATED, THIRD)
 """Causes that every answer is tested for. The effects of the others resemble those of the first two."""
 
 
-def doubtful_harmonic(parameters: Mapping[str, float], uncertainty: Mapping[str, float]) -> dict[str, float]:
+def doubtful_harmonic(
+    parameters: Mapping[str, float], uncertainty: Mapping[str, float]
+) -> dict[str, float]:
     """Return the values without a third harmonic of a vibration, if it was found but may as well be none; else none.
 
     The search frees it where it makes the scatter smaller. Errors of the map and of the sensor's timing, which are part
@@ -77,24 +82,33 @@ def doubtful_harmonic(parameters: Mapping[str, float], uncertainty: Mapping[str,
 
 def turned(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, float]:
     """Return values that deflect the axial ray as before if the prism's other side is flat."""
-    prism, index = as_wedge(space.prism), values.get("index", space.prism.index)
+    prism = as_wedge(space.prism)
+    index = values.get("index", space.prism.index)
     deflection = Prism(values["apex"], index, prism.flat_side).deflection
     phase = math.remainder(values["phase"] + math.pi, math.tau)
-    return {**values, "apex": apex_from_deflection(deflection, index, _other(prism)), "phase": phase}
+    return {
+        **values,
+        "apex": apex_from_deflection(deflection, index, _other(prism)),
+        "phase": phase,
+    }
 
 
 def other_side(space: ParameterSpace) -> ParameterSpace:
     """Return the parameter space with the prism's other side flat."""
     prism = as_wedge(space.prism)
     apex = apex_from_deflection(prism.deflection, prism.index, _other(prism))
-    return replace(space, prism=Prism(apex, prism.index, _other(prism)), start=turned(space, space.start))
+    return replace(
+        space, prism=Prism(apex, prism.index, _other(prism)), start=turned(space, space.start)
+    )
 
 
 def _other(prism: Prism) -> FlatSide:
     return FlatSide.CAMERA if prism.flat_side is FlatSide.SCENE else FlatSide.SCENE
 
 
-def with_cause(space: ParameterSpace, cause: Cause, values: Mapping[str, float]) -> tuple[ParameterSpace, Vector]:
+def with_cause(
+    space: ParameterSpace, cause: Cause, values: Mapping[str, float]
+) -> tuple[ParameterSpace, Vector]:
     """Return the space in which a cause is corrected or free, and the vector of ``values`` there."""
     if cause == SIDE:
         space, values = other_side(space), turned(space, values)

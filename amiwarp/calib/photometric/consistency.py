@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.parameters import RATES, ParameterSpace
 from amiwarp.calib.photometric.causes import (
     ASPECT,
     CAUSES,
@@ -35,15 +34,30 @@ from amiwarp.calib.photometric.causes import (
     with_cause,
 )
 from amiwarp.calib.photometric.cost import size_and_phase_directions
-from amiwarp.calib.photometric.derivatives import SHAKE, by_cause, by_parts_of_pairs, by_rotation, by_shake, orbit_of
+from amiwarp.calib.photometric.derivatives import (
+    SHAKE,
+    by_cause,
+    by_parts_of_pairs,
+    by_rotation,
+    by_shake,
+    orbit_of,
+)
 from amiwarp.calib.photometric.distances import distance
 from amiwarp.calib.photometric.findings import Finding
 from amiwarp.calib.photometric.linear_fit import SIGNIFICANT, LinearFit, linear_fit, telling
-from amiwarp.calib.photometric.stated_errors import hidden_px
-from amiwarp.calib.photometric.systematic import errors_of_a_wrong_lens, gap_errors, lens_errors, map_errors
+from amiwarp.calib.photometric.stated_errors import BOUND, hidden_px
+from amiwarp.calib.photometric.systematic import (
+    errors_of_a_wrong_lens,
+    gap_errors,
+    least_errors,
+    lens_errors,
+    map_errors,
+)
 from amiwarp.optics.camera import LENS
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models.exact import ExactModel
+from amiwarp.optics.models.registry import MODELS
 from amiwarp.optics.prism import as_wedge
+from amiwarp.results.parameters import RATES, ParameterSpace
 
 if TYPE_CHECKING:
     from amiwarp.calib.photometric.cost import Cost
@@ -69,8 +83,13 @@ REGIONS = (3, 2)
 """Number of columns and rows of the parts of the image whose answers are compared."""
 FEWEST_SQUARES = 4
 """Smallest number of squares of pixels with events for a part of the image to be compared."""
+CLOCK = "the encoder's clock or scale"
+"""Words of what could hide in a phase that drifts over the recording."""
+DRIFT_SHARE = 0.3
+"""Share of a drift of the phase that a linearised fit finds: the map absorbs the rest. It was 0.33 of a clock that was
+wrong by 0.2 %."""
 TELLING = 3.0
-"""Number of standard deviations between the two sides of the prism from which on the events tell them apart."""
+"""Number of standard deviations between the two sides of the prism above which the events tell them apart."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +141,10 @@ class Consistency(Finding):
 
         A phase that drifts or differs from place to place blurs the image, but its mean is right.
         """
+        size_drift, _ = self.drift
+        size_spread, _ = self.spread
         of_causes = [each.moved_px for each in self.likely[:1]]
-        return max([*of_causes, abs(self.drift[0]), self.spread[0]])
+        return max([*of_causes, abs(size_drift), size_spread])
 
 
 def check_consistency(cost: Cost, best: Vector) -> Consistency:
@@ -131,9 +152,11 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
     space = cost.space
     causes = testable(space)
     # a lens that was given wrongly once may be wrong in more than one way: then everything is examined at once
-    doubtful = bool(set(LENS) & set(space.names))
+    doubtful = not set(LENS).isdisjoint(space.names)
     least_gain = LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN
-    screened = causes if doubtful else [c for c in causes if c in SCREENED]
+    screened = causes
+    if not doubtful:
+        screened = [cause for cause in causes if cause in SCREENED]
     columns = _screened_columns(cost, best, screened, least_gain)
     fit = linear_fit(cost, columns)
     likely = _likely(cost, best, fit, screened, least_gain)
@@ -146,20 +169,27 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         fit = linear_fit(cost, columns)
         likely = _likely(cost, best, fit, causes, LEAST_GAIN)
         shake_px = _shake(space, fit)
+
     of_lens = lens_errors(space, best, fit, least_gain)
     if doubtful:
         of_lens = of_lens + errors_of_a_wrong_lens(space, fit, causes)
-    brightness = cost.brightness
-    of_map = map_errors(space, best, fit, brightness.count, brightness.tiles.density)
+    pairs = cost.brightness.count
+    density = cost.brightness.tiles.density
+    of_map = map_errors(space, best, fit, pairs, density)
     of_gaps = gap_errors(space, fit)
+    hidden = hidden_px(space, best, fit, causes)
+    # the depth of each pixel makes up for what differs over the image
+    spread = (0.0, 0.0)
+    if space.depths is None:
+        spread = _spread(space, best, fit)
     return Consistency(
         step=fit.fit(space.names).change,
-        systematic=of_gaps + of_map + of_lens,
+        systematic=of_gaps + least_errors(space) + of_map + of_lens,
         method=of_gaps + of_map / BOUND_VARIANCE,
-        hidden_px=hidden_px(space, best, fit, causes),
+        hidden_px=hidden | _clock_bound(space, best, fit),
         likely=tuple(likely),
         drift=_drift(space, best, fit),
-        spread=_spread(space, best, fit),
+        spread=spread,
         rotation_gain=_rotation_gain(space, fit),
         untold_px=_untold(space, best, fit),
         center_px=_center(space, best, fit),
@@ -167,16 +197,22 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
     )
 
 
-def _screened_columns(cost: Cost, best: Vector, screened: Sequence[Cause], least_gain: float) -> dict[str, Any]:
+def _screened_columns(
+    cost: Cost, best: Vector, screened: Sequence[Cause], least_gain: float
+) -> dict[str, Any]:
     """Return the derivatives of the residuals that every answer is examined with."""
     columns = by_parts_of_pairs(cost, best)
     for cause in screened:
         if cause not in GATED:
             columns |= by_cause(cost, best, cause)
     # wobble and index look like cylinder power: where the first look finds none of that, it finds none of them
-    alike = [c for c in screened if c in (INDEX, SEAT)] if FACES in screened else []
-    gates = [c for c in screened if c in GATED and c not in alike]
-    gated = [by_rotation(cost, best), *(by_cause(cost, best, cause) for cause in gates)]
+    alike: list[Cause] = []
+    if FACES in screened:
+        alike = [cause for cause in screened if cause in (INDEX, SEAT)]
+    gated = [by_rotation(cost, best)]
+    for cause in screened:
+        if cause in GATED and cause not in alike:
+            gated.append(by_cause(cost, best, cause))
     for group in telling(cost, gated, least_gain):
         columns |= group
     if set(FACES.names) <= columns.keys():
@@ -191,19 +227,35 @@ def _spread(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float,
     The estimate of DerSimonian and Laird (Controlled Clinical Trials 1986) for the variance between groups.
     """
     names = tuple(orbit_of(space)[:2])  # of the first prism
-    along = np.array(size_and_phase_directions(space, best)[:2])[:, [space.names.index(n) for n in names]]
-    places = np.minimum(fit.xy * REGIONS / (space.camera.width, space.camera.height), np.array(REGIONS) - 0.5)
+    which = [space.names.index(name) for name in names]
+    along = np.array(size_and_phase_directions(space, best)[:2])[:, which]
+
+    # An answer from each part of the image.
+    size_of_image = (space.camera.width, space.camera.height)
+    last = np.array(REGIONS) - 0.5
+    places = np.minimum(fit.xy * REGIONS / size_of_image, last)
     region = places.astype(int) @ (1, REGIONS[0])
-    found = [fit.fit(names, region == k) for k in np.unique(region) if np.count_nonzero(region == k) >= FEWEST_SQUARES]
-    if len(found) < 2:
+    changes = []
+    variances_of_parts = []
+    for number in np.unique(region):
+        inside = region == number
+        if np.count_nonzero(inside) < FEWEST_SQUARES:
+            continue
+        estimate = fit.fit(names, inside)
+        changes.append(along @ estimate.change)
+        variances_of_parts.append(np.diag(along @ estimate.covariance @ along.T))
+    groups = len(changes)
+    if groups < 2:
         return 0.0, 0.0
-    values = np.array([along @ e.change for e in found])
-    variances = np.array([np.diag(along @ e.covariance @ along.T) for e in found])
+
+    values = np.array(changes)
+    variances = np.array(variances_of_parts)
     weights = 1.0 / np.maximum(variances, 1e-12)
     total = weights.sum(axis=0)
     mean = (weights * values).sum(axis=0) / total
-    excess = (weights * (values - mean) ** 2).sum(axis=0) - (len(found) - 1)
-    size, phase = np.sqrt(np.maximum(0.0, excess / (total - (weights**2).sum(axis=0) / total))).tolist()
+    excess = (weights * (values - mean) ** 2).sum(axis=0) - (groups - 1)
+    between = excess / (total - (weights**2).sum(axis=0) / total)
+    size, phase = np.sqrt(np.maximum(0.0, between)).tolist()
     return size, phase
 
 
@@ -211,27 +263,36 @@ def _untold(space: ParameterSpace, best: Vector, fit: LinearFit) -> float:
     """Return the error if the other side of the prism is flat [px rms], if the events do not tell; else 0."""
     if FLAT_SIDE not in fit.names:
         return 0.0
-    std = math.sqrt(float(fit.fit((*space.names, FLAT_SIDE)).covariance[-1, -1]))
+    estimate = fit.fit((*space.names, FLAT_SIDE))
+    std = math.sqrt(float(estimate.covariance[-1, -1]))
     if std * TELLING <= 1.0:
         return 0.0
     values = space.to_values(best)
-    away = distance(other_side(space).build(turned(space, values)), space.build(values))
+    other = other_side(space).build(turned(space, values))
+    away = distance(other, space.build(values))
     return away if away >= LEAST_MOVE_PX else 0.0
 
 
 def _shake(space: ParameterSpace, fit: LinearFit) -> float:
     """Return the amplitude of a shake that explains much of what all causes together leave [px]; 0 if none does."""
-    if not {*SHAKE} <= {*fit.names}:
+    if not set(SHAKE).issubset(fit.names):
         return 0.0
-    causes = tuple(n for cause in CAUSES for n in cause.names if n in fit.names and n not in space.names)
+    causes: list[str] = []
+    for cause in CAUSES:
+        for name in cause.names:
+            if name in fit.names and name not in space.names:
+                causes.append(name)
     # a wrong fy / fx bends the orbit as a shake on an ellipse does: it is freed for both
-    free = (*space.names, *(n for n in causes if n in ASPECT.names))
+    of_aspect = [name for name in causes if name in ASPECT.names]
+    free = (*space.names, *of_aspect)
+    not_free = tuple(name for name in causes if name not in free)
     estimate, significance, gain = fit.adding(free, SHAKE)
-    others = fit.adding(free, tuple(n for n in causes if n not in free))[2]
+    _, _, others = fit.adding(free, not_free)
     _, _, left = fit.adding((*space.names, *causes), SHAKE)
-    if significance < SIGNIFICANT or gain < SHAKE_SHARE * others or left < LEAST_SHAKE_GAIN:
+    if significance < SIGNIFICANT or left < LEAST_SHAKE_GAIN or gain < SHAKE_SHARE * others:
         return 0.0
-    return float(np.linalg.norm(estimate.change[-len(SHAKE) :]) / math.sqrt(2.0))
+    amplitudes = estimate.change[-len(SHAKE) :]
+    return float(np.linalg.norm(amplitudes) / math.sqrt(2.0))
 
 
 def _rotation_gain(space: ParameterSpace, fit: LinearFit) -> float:
@@ -244,28 +305,44 @@ def _rotation_gain(space: ParameterSpace, fit: LinearFit) -> float:
 
 def _center(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, float] | None:
     """Return the correction of the principal point and its standard deviation, as displacements of events [px rms]."""
-    if not set(CENTER.names) <= set(fit.names) - set(space.names):
+    may_be_freed = set(fit.names) - set(space.names)
+    if space.model != ExactModel.NAME or not may_be_freed.issuperset(CENTER.names):
         return None
-    n = len(space.names)
+    count = len(space.names)
     estimate = fit.fit((*space.names, *CENTER.names))
+    change = float(np.linalg.norm(estimate.change[count:]))
+    variance = float(np.trace(estimate.covariance[count:, count:]))
     # the unit of the search vector holds for the nominal prism
     size = space.to_values(best)["apex"] / as_wedge(space.prism).apex
-    std = math.sqrt(float(np.trace(estimate.covariance[n:, n:])))
-    return size * float(np.linalg.norm(estimate.change[n:])), size * std
+    return size * change, size * math.sqrt(variance)
 
 
 def testable(space: ParameterSpace) -> list[Cause]:
-    """Return the causes that can be tested: those of the exact model that are not free anyway, or of a vibration."""
-    if {*THIRD.names} <= {*MODELS[space.model].FREE} and not {*THIRD.names} & {*space.start}:
-        return [THIRD]
-    if space.model != "exact" or not space.cartesian:
+    """Return the causes that can be tested: of what the model has, and what is neither free nor found before."""
+    kind = MODELS[space.model]
+    if kind.SIMPLIFIES is not None or not space.cartesian:
         return []
+    adjustable = {*LENS, *kind.FREE}
+    if space.model == ExactModel.NAME:
+        adjustable.add(FLAT_SIDE)
+    free = set(space.names)
+    causes = []
+    for cause in CAUSES:
+        names = {*cause.names}
+        # a third harmonic is given or was found by an earlier attempt
+        known = cause == THIRD and names & {*space.start}
+        if names <= adjustable and not names & free and not known:
+            causes.append(cause)
     # a prism whose other side is flat looks nearly like one with cylinder power
-    shaped = {n for cause in SHAPES for n in cause.names} & set(space.names)
-    return [c for c in CAUSES if not set(c.names) & set(space.names) and not (shaped and c == SIDE)]
+    shaped = any(set(cause.names) & free for cause in SHAPES)
+    if shaped:
+        causes = [cause for cause in causes if cause != SIDE]
+    return causes
 
 
-def _likely(cost: Cost, best: Vector, fit: LinearFit, causes: Sequence[Cause], least_gain: float) -> list[LikelyCause]:
+def _likely(
+    cost: Cost, best: Vector, fit: LinearFit, causes: Sequence[Cause], least_gain: float
+) -> list[LikelyCause]:
     """Return the significant causes, ordered by the share of the residual that their correction removes."""
     found = []
     for cause in causes:
@@ -277,35 +354,62 @@ def _likely(cost: Cost, best: Vector, fit: LinearFit, causes: Sequence[Cause], l
         moved, start = _corrected(cost, best, cause, estimate.change)
         if moved >= LEAST_MOVE_PX:
             found.append(LikelyCause(cause, moved, gain, significance, start))
-    return sorted(found, key=lambda f: -f.gain)
+    return sorted(found, key=lambda each: -each.gain)
 
 
-def _corrected(cost: Cost, best: Vector, cause: Cause, change: Vector) -> tuple[float, Vector]:
+def _corrected(
+    cost: Cost,
+    best: Vector,
+    cause: Cause,
+    change: Vector,
+) -> tuple[float, Vector]:
     """Return how far the correction of a cause changes the model [px rms], and the corrected search vector."""
     space = cost.space
-    here = space.build(space.to_values(best))
-    wide, v = with_cause(space, cause, space.to_values(best))
+    values = space.to_values(best)
+    here = space.build(values)
+    wide, v = with_cause(space, cause, values)
     if cause == SIDE:
         share = float(change[len(best)])
-        return share * distance(wide.build(wide.to_values(v)), here), v
+        there = wide.build(wide.to_values(v))
+        return share * distance(there, here), v
     low, high = wide.bounds()
     v = np.clip(v + change, low, high)
-    return distance(wide.build(wide.to_values(v)), here), v
+    there = wide.build(wide.to_values(v))
+    return distance(there, here), v
 
 
 def _drift(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, float]:
     """Return the significant change of size and phase over the recording [px rms]."""
+    change, std = _drifts(space, best, fit)
+    significant = np.where(np.abs(change) > SIGNIFICANT * std, change, 0.0)
+    # size and phase of each prism in turn: of the prism for which they change most
+    size = max(significant[0::2].tolist(), key=abs, default=0.0)
+    phase = max(significant[1::2].tolist(), key=abs, default=0.0)
+    return size, phase
+
+
+def _clock_bound(space: ParameterSpace, best: Vector, fit: LinearFit) -> dict[str, float]:
+    """Return by how much events may still move because an encoder's clock or scale is wrong [px rms], by its words."""
+    kind = MODELS[space.model]
+    change, std = _drifts(space, best, fit)
+    if not len(change) or not (kind.PRISM or kind.ANGLES > 1):
+        return {}
+    bounds = (np.abs(change) + BOUND * std) / DRIFT_SHARE
+    return {CLOCK: float(bounds[1::2].max())}
+
+
+def _drifts(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[Vector, Vector]:
+    """Return the changes of size and phase of each prism over the recording, and their standard deviations [px rms].
+
+    Both are empty if they were not examined.
+    """
     late = tuple(name for name in fit.names if name.startswith("late "))
     if len(late) < 2:
-        return 0.0, 0.0
-    n = len(space.names)
+        return np.zeros(0), np.zeros(0)
+    count = len(space.names)
     which = [space.names.index(name.removeprefix("late ")) for name in late]
     estimate = fit.fit((*space.names, *late))
     along = np.array([direction[which] for direction in size_and_phase_directions(space, best)])
-    change = along @ estimate.change[n:]
-    std = np.sqrt(np.diag(along @ estimate.covariance[n:, n:] @ along.T))
-    significant = np.where(np.abs(change) > SIGNIFICANT * std, change, 0.0)
-    # size and phase of each prism in turn: of the prism for which they change most
-    size = max(significant[0::2].tolist(), key=abs)
-    phase = max(significant[1::2].tolist(), key=abs)
-    return size, phase
+    change = along @ estimate.change[count:]
+    covariance = along @ estimate.covariance[count:, count:] @ along.T
+    return change, np.sqrt(np.diag(covariance))

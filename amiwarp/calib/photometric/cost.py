@@ -6,7 +6,7 @@ A map takes long to solve. So the costs of several parameter spaces share one, s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +15,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.brightness.solver import BrightnessMap
-from amiwarp.calib.parameters import ParameterSpace
 from amiwarp.calib.photometric.descent import Slopes
 from amiwarp.calib.photometric.tile_paths import TilePaths
-from amiwarp.kernels.equations import by_shift
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.models import MODELS
+from amiwarp.kernels.residual_slopes import by_shift
+from amiwarp.optics.models.registry import MODELS
+from amiwarp.results.parameters import ParameterSpace
 
 if TYPE_CHECKING:
     Vector = NDArray[np.float64]
@@ -51,7 +51,7 @@ class SharedMap:
     holds in the other space: where the map was solved, and all derivatives. The map itself stays, as a start.
     """
 
-    def __init__(self, brightness: BrightnessMap, steps: int, meanwhile: Iterator[None]) -> None:
+    def __init__(self, brightness: BrightnessMap, steps: int) -> None:
         self.brightness = brightness
         self.steps = steps
         """Number of conjugate-gradient steps of a solution."""
@@ -59,8 +59,6 @@ class SharedMap:
         """Scale of the Cauchy weights [thresholds]."""
         self.evaluations = 0
         """Number of scores that were computed."""
-        self.meanwhile = meanwhile
-        """Other work, whose steps are taken where the host would wait for a GPU."""
         self.solved_at: Vector | None = None
         """Search vector at which the map was last solved; None if it was not, or if the map changed afterwards."""
         self.changes: list[Any] = []
@@ -102,11 +100,9 @@ class Cost:
     """Paths of the tiles; None if their scenes move with the camera's rotation alone."""
 
     @classmethod
-    def on(
-        cls, brightness: BrightnessMap, space: ParameterSpace, steps: int, meanwhile: Iterator[None] | None = None
-    ) -> Cost:
+    def on(cls, brightness: BrightnessMap, space: ParameterSpace, steps: int) -> Cost:
         """Return the cost on a map that must be solved yet, in ``steps`` conjugate-gradient steps."""
-        return cls(space, SharedMap(brightness, steps, iter(()) if meanwhile is None else meanwhile))
+        return cls(space, SharedMap(brightness, steps))
 
     def in_space(self, space: ParameterSpace, paths: TilePaths | None = None) -> Cost:
         """Return the cost in another space, on the same map. This cost stays as it is.
@@ -143,18 +139,23 @@ class Cost:
         """Solve the map more accurately from now on."""
         self.shared.steps *= 2
 
-    def work_meanwhile(self) -> None:
-        """Take a step of other work, because the host would wait for a GPU now."""
-        next(self.shared.meanwhile, None)
-
     def warm_up(self, v: Vector) -> None:
         """Solve the first brightness map at the search vector ``v``, and scale the weights by its residuals."""
+        self.solve_first(v)
+        self.scale_weights(v)
+
+    def solve_first(self, v: Vector) -> None:
+        """Start to solve the first brightness map at the search vector ``v``."""
         self.residuals(v, rounds=3)
-        self.work_meanwhile()
+
+    def scale_weights(self, v: Vector) -> None:
+        """Scale the weights by the residuals of the first map, and solve it again."""
         # a coarse map needs its damping
-        if self.brightness.tiles.density > 1.0 and self.brightness.relax_damping():
+        is_fine = self.brightness.tiles.density > 1.0
+        if is_fine and self.brightness.relax_damping():
             self.residuals(v, rounds=3)
-        self.set_scale(max(0.1, 1.5 * self.brightness.residuals.median()))
+        median = self.brightness.residuals.median()
+        self.set_scale(max(0.1, 1.5 * median))
         self.residuals(v)
 
     def renew(self, v: Vector) -> None:
@@ -182,8 +183,11 @@ class Cost:
         shared.solved(v)
 
     def _is_solved_at(self, v: Vector) -> bool:
+        """Return whether the map was last solved at the search vector ``v``, for this cost."""
         solved_at = self.shared.used_by(self).solved_at
-        return solved_at is not None and np.array_equal(solved_at, v)
+        if solved_at is None:
+            return False
+        return np.array_equal(solved_at, v)
 
     def converge(self, v: Vector) -> None:
         """Solve the brightness map at ``v`` in two rounds, unless it was last solved there."""
@@ -196,7 +200,10 @@ class Cost:
         A second angle of the model turns with the first one by the ratio of their speeds, as in a time that passes. The
         derivatives are on the device, shape (padded pairs,) each. The map must be solved at ``v``.
         """
-        return self._by_angle("all", lambda: self._find_by_drift(self.at(v)))
+        known = self.shared.used_by(self).by_angle
+        if "all" not in known:
+            known["all"] = self._find_by_drift(self.at(v))
+        return known["all"]
 
     def by_angle(self, v: Vector, angle: int = 0) -> tuple[Any, Any]:
         """Return the derivatives as :meth:`by_drift` does, by one of the model's angles while the others stay.
@@ -205,46 +212,45 @@ class Cost:
         """
         if MODELS[self.space.model].ANGLES == 1:
             return self.by_drift(v)
-        return self._by_angle(str(angle), lambda: self._find_by_angle(v, angle))
-
-    def _by_angle(self, name: str, find: Callable[[], tuple[Any, Any]]) -> tuple[Any, Any]:
-        """Return derivatives by an angle, which are found once for each solution of the map."""
         known = self.shared.used_by(self).by_angle
+        name = str(angle)
         if name not in known:
-            known[name] = find()
+            known[name] = self._find_by_angle(v, angle)
         return known[name]
 
     def _find_by_angle(self, v: Vector, angle: int) -> tuple[Any, Any]:
+        """Return the derivatives by one of two angles, see :meth:`by_angle`."""
         values = self.space.to_values(v)
         if angle == 0:
-            return self._find_by_drift(place_arguments(self.space, {**values, "ratio": 0.0}))
-        both = self._find_by_drift(place_arguments(self.space, {**values, "ratio": 1.0}))
-        first = self.by_angle(v, 0)
-        return _difference(both[0], first[0]), _difference(both[1], first[1])
+            only_first = place_arguments(self.space, {**values, "ratio": 0.0})
+            return self._find_by_drift(only_first)
+        both = place_arguments(self.space, {**values, "ratio": 1.0})
+        both_at_first, both_at_second = self._find_by_drift(both)
+        at_first, at_second = self.by_angle(v, 0)
+        return _difference(both_at_first, at_first), _difference(both_at_second, at_second)
 
     def _find_by_drift(self, at: dict[str, Any]) -> tuple[Any, Any]:
-        arrays = self.brightness.pairs.arrays
-        up = {**at, "drift": STEP_RAD}
-        down = {**at, "drift": -STEP_RAD}
-        given = arrays.slope
+        """Return the derivatives by a drift of the angles at the first and at the second events of the pairs."""
+        pairs = self.brightness.pairs
 
         def by(end: int) -> Any:
-            shift = wp.zeros((2, arrays.stride), dtype=float, device=self.brightness.device)
+            shape = (2, pairs.arrays.stride)
+            shift = wp.zeros(shape, dtype=float, device=self.brightness.device)
             shift[end].fill_(1.0)
-            arrays.slope = shift.flatten()
+            drifting = {**at, "arrays": pairs.with_columns(slope=shift.flatten())}
+            up = {**drifting, "drift": STEP_RAD}
+            down = {**drifting, "drift": -STEP_RAD}
             return self.brightness.find_slope(up, down, 2.0 * STEP_RAD)
 
-        try:
-            return by(0), by(1)
-        finally:
-            arrays.slope = given
+        return by(0), by(1)
 
     def column(self, name: str, find: Callable[[], Any]) -> Any:
         """Return a derivative of the residuals by name, which is found once for each solution of the map."""
         columns = self.shared.used_by(self).columns
         if name not in columns:
             columns[name] = find(), None
-        return columns[name][0]
+        column, _ = columns[name]
+        return column
 
     def unexplained_column(self, name: str, column: Any, *, steps: int) -> Any:
         """Return the part of a derivative that no change of the map explains, found once for each solution."""
@@ -256,7 +262,7 @@ class Cost:
         return left
 
     def mean(self) -> float:
-        """Return the mean Cauchy cost, relative to that without a map.
+        """Return the mean Cauchy cost, relative to the cost without a map.
 
         Pairs of events off the map keep their cost without a map.
         """
@@ -303,7 +309,9 @@ class Cost:
     def unexplained(self, column: Any, change: Any = None, *, steps: int) -> Any:
         """Return the part of a derivative that no change of the map and of the tiles' paths explains."""
         left = self.brightness.unexplained(column, change, steps=steps)
-        return left if self.paths is None else self.paths.unexplained(left)
+        if self.paths is None:
+            return left
+        return self.paths.unexplained(left)
 
     def slopes(self, v: Vector, *, with_parts: bool = False) -> Slopes:
         """Return the residuals' derivatives at ``v``, minus the part that a change of the map can explain.
@@ -315,57 +323,83 @@ class Cost:
 
     def start_slopes(self, v: Vector, *, with_parts: bool = False) -> Callable[[], Slopes]:
         """Start to compute :meth:`slopes`. Return a function that waits for them."""
-        brightness, n = self.brightness, len(v)
+        n = len(v)
+        left = self._unexplained_slopes(v)
+        residuals = self.brightness.residuals
+
+        # The upper triangle of the Hessian, then the gradient.
+        rows, columns = np.triu_indices(n)
+        factors = [(left[i], left[j]) for i, j in zip(rows, columns, strict=True)]
+        factors += [(slope, residuals.values) for slope in left]
+        products = residuals.start_products(factors)
+        clusters = None
+        if with_parts:
+            clusters = residuals.start_clusters(left)
+
+        def result() -> Slopes:
+            sums = products()
+            triangle = sums[:-n]
+            hessian = np.zeros((n, n))
+            hessian[rows, columns] = triangle
+            hessian[columns, rows] = triangle
+            parts = np.empty((n, 0)) if clusters is None else clusters()
+            return Slopes(hessian, sums[-n:], parts)
+
+        return result
+
+    def _unexplained_slopes(self, v: Vector) -> list[Any]:
+        """Return the derivatives by the parameters at ``v``, minus the part that a change of the map explains.
+
+        The changes of the map are kept for :meth:`predict`, and as starts at the next point.
+        """
+        brightness = self.brightness
         if not self._is_solved_at(v):
             self.residuals(v)
         brightness.prepare_projection()
         slopes = []
-        for step in np.eye(n) * SLOPE_PX:
-            slopes.append(brightness.find_slope(self.at(v + step), self.at(v - step), 2.0 * SLOPE_PX))
+        for step in np.eye(len(v)) * SLOPE_PX:
+            up = self.at(v + step)
+            down = self.at(v - step)
+            slopes.append(brightness.find_slope(up, down, 2.0 * SLOPE_PX))
         # the derivatives of the map at the last point are near those at this one
-        before = self.shared.changes or [None] * n
+        before = self.shared.changes or [None] * len(v)
         left: list[Any] = []
         changes: list[Any] = []
         self.shared.changes = changes
+        steps = self.steps // 2
         if self.paths is not None:
-            self.paths.linearise(v, self.at(v), self.steps // 2)
+            self.paths.linearise(v, self.at(v), steps)
         for slope, change in zip(slopes, before, strict=True):
-            left.append(self.unexplained(slope, change, steps=self.steps // 2))
+            left.append(self.unexplained(slope, change, steps=steps))
             changes.append(brightness.explaining_change())
-        upper = np.triu_indices(n)
-        pairs = [(left[i], left[j]) for i, j in zip(*upper, strict=True)]
-        products = brightness.residuals.start_products([*pairs, *((row, brightness.residuals.values) for row in left)])
-        clusters = brightness.residuals.start_clusters(left) if with_parts else lambda: np.empty((n, 0))
-
-        def result() -> Slopes:
-            sums = products()
-            hessian = np.zeros((n, n))
-            hessian[upper] = sums[:-n]
-            hessian.T[upper] = sums[:-n]
-            return Slopes(hessian, sums[-n:], clusters())
-
-        return result
+        return left
 
 
 def _difference(column: Any, other: Any) -> Any:
     """Return the difference of two columns on the device."""
-    out = wp.empty_like(column)
-    factors = wp.array(np.repeat([1.0, -1.0], len(column)), dtype=float, device=column.device)
-    launch(by_shift, len(column), [column, other, factors], [out], device=column.device)
-    return out
+    count = len(column)
+    difference = wp.empty_like(column)
+    signs = np.repeat([1.0, -1.0], count)
+    factors = wp.array(signs, dtype=float, device=column.device)
+    launch(by_shift, count, [column, other, factors], [difference], device=column.device)
+    return difference
 
 
 def size_and_phase_directions(space: ParameterSpace, best: Vector) -> list[Vector]:
     """Return unit vectors of the search space along size and phase of each prism, if these are free."""
-    unit = np.eye(len(best))
+    units = np.eye(len(best))
     found: list[Vector] = []
     for size, phase in MODELS[space.model].ORBITS:
         free = [k for k, name in enumerate(space.names) if name in (size, phase)]
         if free and free[0] in space.orbits:
-            x, y = best[free] / max(float(np.linalg.norm(best[free])), 1e-9)
-            along_size = x * unit[free[0]] + y * unit[free[1]]
-            along_phase = x * unit[free[1]] - y * unit[free[0]]
+            # Both are Cartesian coordinates of the orbit.
+            orbit = best[free]
+            x, y = orbit / max(float(np.linalg.norm(orbit)), 1e-9)
+            unit_x = units[free[0]]
+            unit_y = units[free[1]]
+            along_size = x * unit_x + y * unit_y
+            along_phase = x * unit_y - y * unit_x
             found += [along_size, along_phase]
         else:
-            found += [unit[k] for k in free]
+            found += [units[k] for k in free]
     return found

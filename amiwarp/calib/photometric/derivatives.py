@@ -13,14 +13,14 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.calib.parameters import DRIFTS, RATES, ParameterSpace, orbit_names
 from amiwarp.calib.photometric.causes import FLAT_SIDE, SIDE, Cause, other_side, turned, with_cause
 from amiwarp.calib.photometric.cost import place_arguments
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels.equations import by_shift, multiply
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.camera import CameraRotation
-from amiwarp.optics.models import MODELS
+from amiwarp.kernels.residual_slopes import by_shift, multiply
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.models.registry import MODELS
+from amiwarp.results.parameters import DRIFTS, RATES, ParameterSpace, orbit_names
 
 if TYPE_CHECKING:
     from amiwarp.calib.photometric.cost import Cost
@@ -35,13 +35,16 @@ SLOPE_PX = 0.02
 
 def orbit_of(space: ParameterSpace) -> list[str]:
     """Return the names of the free ones of size and phase, of each prism."""
-    return [n for n in space.names if n in orbit_names(MODELS[space.model])]
+    of_orbits = orbit_names(MODELS[space.model])
+    return [name for name in space.names if name in of_orbits]
 
 
 def path_of(space: ParameterSpace) -> list[str]:
     """Return the names of the free parameters that shape the path of the image: size and phase for glass."""
     kind = MODELS[space.model]
-    return orbit_of(space) if kind.PRISM else [n for n in space.names if n in kind.FREE]
+    if kind.PRISM:
+        return orbit_of(space)
+    return [name for name in space.names if name in kind.FREE]
 
 
 def masked(column: Any, factor: Any) -> Any:
@@ -51,7 +54,12 @@ def masked(column: Any, factor: Any) -> Any:
     return out
 
 
-def slopes(cost: Cost, space: ParameterSpace, v: Vector, names: Iterable[str]) -> dict[str, Any]:
+def slopes(
+    cost: Cost,
+    space: ParameterSpace,
+    v: Vector,
+    names: Iterable[str],
+) -> dict[str, Any]:
     """Return the derivatives of the residuals by parameters of ``space`` at its search vector ``v``, by name.
 
     They are on the device. The map must be solved at ``v``.
@@ -64,24 +72,41 @@ def slopes(cost: Cost, space: ParameterSpace, v: Vector, names: Iterable[str]) -
         down = place_arguments(space, space.to_values(v - step))
         return cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
 
-    return {name: cost.column(name, partial(by, name)) for name in names}
+    columns = {}
+    for name in names:
+        columns[name] = cost.column(name, partial(by, name))
+    return columns
 
 
-def shifted(cost: Cost, v: Vector, shift: Any, angle: int | None = None) -> Any:
+def shifted(
+    cost: Cost,
+    v: Vector,
+    shift: Any,
+    angle: int | None = None,
+) -> Any:
     """Return the derivative of the residuals by a factor of ``shift``, changes of the angle at the ends of pairs.
 
     ``angle`` is the number of the only angle that changes; None for a drift of all.
 
     ``shift`` is a Warp array of shape (2 · padded pairs,), or (2, padded pairs). The map must be solved at ``v``.
     """
-    first, second = cost.by_drift(v) if angle is None else cost.by_angle(v, angle)
-    out = wp.empty_like(first)
-    launch(by_shift, len(first), [first, second, shift.flatten()], [out], device=first.device)
-    return out
+    if angle is None:
+        first, second = cost.by_drift(v)
+    else:
+        first, second = cost.by_angle(v, angle)
+    column = wp.empty_like(first)
+    launch(
+        by_shift,
+        len(first),
+        [first, second, shift.flatten()],
+        [column],
+        device=first.device,
+    )
+    return column
 
 
 def by_parts_of_pairs(cost: Cost, best: Vector) -> dict[str, Any]:
-    """Return the derivatives of the residuals by the free parameters, and those of some pairs by size and phase.
+    """Return the derivatives of the residuals by the free parameters, and of some pairs only by size and phase.
 
     ``long …`` are the derivatives of pairs with long gaps only; ``late …`` grow with the time of the pair.
     """
@@ -90,9 +115,11 @@ def by_parts_of_pairs(cost: Cost, best: Vector) -> dict[str, Any]:
     late, long = cost.brightness.pairs.split_by_time()
     for name in path_of(space):
         columns[f"long {name}"] = masked(columns[name], long)
-    drifts = bool(set(DRIFTS) & set(space.names)) or space.moving
-    for name in [] if drifts else orbit_of(space):
-        columns[f"late {name}"] = masked(columns[name], late)
+    # A free drift or a moving camera changes size and phase over time anyway.
+    drifts = not set(DRIFTS).isdisjoint(space.names)
+    if not drifts and not space.moving:
+        for name in orbit_of(space):
+            columns[f"late {name}"] = masked(columns[name], late)
     return columns
 
 
@@ -102,14 +129,20 @@ def by_rotation(cost: Cost, best: Vector) -> dict[str, Any]:
     if space.moving:
         return {}
     at = cost.at(best)
-    half_s = max(0.5 * float(np.ptp(cost.brightness.pairs.some_times)), 1e-6)
+    times = cost.brightness.pairs.some_times
+    half_s = max(0.5 * float(np.ptp(times)), 1e-6)
+    rate = SLOPE_PX / space.camera.fx / half_s  # moves the middle by the step in half the time
 
     def about(axis: Vector) -> Any:
-        x, y, z = axis * (SLOPE_PX / space.camera.fx / half_s)
+        x, y, z = axis * rate
         # one-sided differences: a camera at rest is faster to compute, and only the gain counts
-        return cost.brightness.find_slope({**at, "camera_rotation": CameraRotation((x, y, z))}, at, SLOPE_PX)
+        turning = {**at, "camera_rotation": CameraRotation((x, y, z))}
+        return cost.brightness.find_slope(turning, at, SLOPE_PX)
 
-    return {name: cost.column(name, partial(about, axis)) for name, axis in zip(RATES, np.eye(3), strict=True)}
+    columns = {}
+    for name, axis in zip(RATES, np.eye(3), strict=True):
+        columns[name] = cost.column(name, partial(about, axis))
+    return columns
 
 
 def by_shake(cost: Cost, best: Vector) -> dict[str, Any]:
@@ -118,10 +151,20 @@ def by_shake(cost: Cost, best: Vector) -> dict[str, Any]:
     They are rotations about x and about y by the cosine and by the sine of the encoder's angle [px at the centre].
     """
     kind = MODELS[cost.space.model]
-    if cost.space.moving or not orbit_of(cost.space) or kind.ANGLES > 1 or not kind.PRISM:
+    if cost.space.moving or not orbit_of(cost.space):
         return {}
-    rows = cost.brightness.pairs.angle_patterns((0.0, 0.0))
-    return {name: by_swing(cost, best, rows[k % 2].flatten(), k // 2) for k, name in enumerate(SHAKE)}
+    if kind.ANGLES > 1 or not kind.PRISM:
+        return {}
+    patterns = cost.brightness.pairs.angle_patterns((0.0, 0.0))
+    cos = patterns[0].flatten()
+    sin = patterns[1].flatten()
+    columns = [
+        by_swing(cost, best, cos, axis=0),
+        by_swing(cost, best, sin, axis=0),
+        by_swing(cost, best, cos, axis=1),
+        by_swing(cost, best, sin, axis=1),
+    ]
+    return dict(zip(SHAKE, columns, strict=True))
 
 
 def by_swing(cost: Cost, best: Vector, wave: Any, axis: int) -> Any:
@@ -129,19 +172,19 @@ def by_swing(cost: Cost, best: Vector, wave: Any, axis: int) -> Any:
 
     ``wave`` is a Warp array of its values at the ends of pairs, shape (2 · padded pairs,) or (2, padded pairs).
     """
-    pairs = cost.brightness.pairs
-    at = cost.at(best)
+    # A rotation is linear in time. With the wave as the time, it follows the wave.
+    waving = cost.brightness.pairs.with_columns(time=wave)
+    at = {**cost.at(best), "arrays": waving}
     middle_us = cost.brightness.middle_us
-    x, y = np.eye(2)[axis] * (SLOPE_PX / cost.space.camera.fx)
-    up = {**at, "camera_rotation": CameraRotation((x, y, 0.0), middle_us=middle_us)}
-    down = {**at, "camera_rotation": CameraRotation((-x, -y, 0.0), middle_us=middle_us)}
-    given = pairs.arrays.time
-    try:
-        # a rotation is linear in time: with the wave as the time, it follows the wave
-        pairs.arrays.time = wave
-        return cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
-    finally:
-        pairs.arrays.time = given
+    rate = SLOPE_PX / cost.space.camera.fx
+    x, y = np.eye(2)[axis] * rate
+    there = CameraRotation((x, y, 0.0), middle_us=middle_us)
+    back = CameraRotation((-x, -y, 0.0), middle_us=middle_us)
+    return cost.brightness.find_slope(
+        {**at, "camera_rotation": there},
+        {**at, "camera_rotation": back},
+        2.0 * SLOPE_PX,
+    )
 
 
 def by_wave_of_angle(cost: Cost, best: Vector, wave: Vector) -> Any:
@@ -150,9 +193,10 @@ def by_wave_of_angle(cost: Cost, best: Vector, wave: Vector) -> Any:
     ``wave`` has the shape (2, pairs).
     """
     pairs = cost.brightness.pairs
-    shift = np.zeros((2, pairs.arrays.stride), np.float32)
-    shift[:, : len(pairs)] = wave
-    return shifted(cost, best, wp.array(shift, dtype=float, device=cost.brightness.device))
+    padded = np.zeros((2, pairs.arrays.stride), np.float32)
+    padded[:, : len(pairs)] = wave
+    shift = wp.array(padded, dtype=float, device=cost.brightness.device)
+    return shifted(cost, best, shift)
 
 
 def by_cause(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
@@ -163,7 +207,8 @@ def by_cause(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
         if cause == SIDE:
             other = place_arguments(other_side(space), turned(space, values))
             here = place_arguments(space, values)
-            return {FLAT_SIDE: cost.column(FLAT_SIDE, partial(cost.brightness.find_slope, other, here, 1.0))}
+            by_side = partial(cost.brightness.find_slope, other, here, 1.0)
+            return {FLAT_SIDE: cost.column(FLAT_SIDE, by_side)}
         wide, v = with_cause(space, cause, values)
     except AmiwarpError:
         return {}  # it moves no event

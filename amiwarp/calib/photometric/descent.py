@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.nlopt_solver import SearchStage, best_of
-from amiwarp.calib.parameters import RATES, ParameterSpace
+from amiwarp.calib.nlopt_solver import best_of
 from amiwarp.calib.settings import GAUSS_NEWTON
+from amiwarp.results.parameters import RATES, ParameterSpace
+from amiwarp.results.search_stage import SearchStage
 
 if TYPE_CHECKING:
     Vector = NDArray[np.float64]
@@ -65,7 +66,11 @@ class Slopes:
 def _inverse(hessian: Vector) -> Vector:
     """Return the inverse of the Hessian, with very small eigenvalues raised."""
     values, vectors = np.linalg.eigh(hessian)
-    return np.asarray(vectors @ np.diag(1.0 / np.maximum(values, 1e-9 * max(float(values[-1]), 1e-12))) @ vectors.T)
+    return np.asarray(
+        vectors
+        @ np.diag(1.0 / np.maximum(values, 1e-9 * max(float(values[-1]), 1e-12)))
+        @ vectors.T
+    )
 
 
 UNDETERMINED_PX = 0.3
@@ -137,7 +142,9 @@ def iterate(
             trial = np.clip(v + step, low, high)
             moved = float(np.abs(trial - v).max())
             waiting = start_score(trial)
-            slopes = start_slopes(trial) if early and moved >= tolerance and k + 1 < MOST_STEPS else None
+            slopes = (
+                start_slopes(trial) if early and moved >= tolerance and k + 1 < MOST_STEPS else None
+            )
             value = waiting()
             points.append(trial)
             scores.append(value)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.brightness.solver import BrightnessMap, PairSet, SensorTiming, Tiles, off_excess
-from amiwarp.calib.calibration_events import EventsAhead
-from amiwarp.calib.parameters import LINEAR_UNKNOWNS, ParameterSpace, like_size
+from amiwarp.brightness.pairs import PairSet, off_excess
+from amiwarp.brightness.sensor_timing import SensorTiming
+from amiwarp.brightness.solver import BrightnessMap
+from amiwarp.brightness.tiles import Tiles
 from amiwarp.calib.photometric import limits
 from amiwarp.calib.photometric.answers import AnswerSearch
 from amiwarp.calib.photometric.cost import Cost
@@ -20,15 +21,19 @@ from amiwarp.calib.photometric.descent import determined
 from amiwarp.calib.photometric.pairs import check_pairs, collect_pairs, fine_map_is_determined
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.events.recording import Recording
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.models.registry import MODELS
+from amiwarp.results.parameters import LINEAR_UNKNOWNS, ParameterSpace, like_size
 
 if TYPE_CHECKING:
+    from amiwarp.calib.events_ahead import EventsAhead
     from amiwarp.calib.sharpness_search import Search
 
     Vector = NDArray[np.float64]
 
 LARGEST_FINE_COST = 0.3
-"""Largest cost, relative to that without a map, for which a map has more than one node per pixel along each axis. Where
-half of the events are noise, a finer map follows them, and orbits come out too small."""
+"""Largest cost, relative to the cost without a map, for which a map has more than one node per pixel along each axis.
+Where half of the events are noise, a finer map follows them, and orbits come out too small."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +52,8 @@ class Problem:
     """Cost above which an answer is of no use."""
     ahead: EventsAhead | None = None
     """Events that are on the device already."""
-    meanwhile: Iterator[None] = field(default_factory=lambda: iter(()))
-    """Other work, whose steps are taken where the host would wait for a GPU."""
+    host_work: Callable[[], None] | None = None
+    """Work of the host that is done while a GPU solves the first map."""
 
     @property
     def settings(self) -> PhotometricSettings:
@@ -70,6 +75,19 @@ class Problem:
         """Direction of rotation of the prism: 1 or -1."""
         return math.copysign(1.0, self.rpm)
 
+    @property
+    def start_values(self) -> dict[str, float]:
+        """Values at which the stage starts, in their units: the result of the sharpness stage, before the latency.
+
+        Prisms turn too slowly for a latency to matter.
+        """
+        best = dict(self.sharp.best)
+        kind = MODELS[self.sharp.space.model]
+        late_rad = self.direction * self.rad_per_us * self.settings.sensor.latency_us
+        if kind.PRISM or not late_rad:
+            return best
+        return before_latency(kind, best, late_rad)
+
     def report(self, share: float) -> None:
         """Tell the progress function which share of the stage is finished."""
         self.sharp.report("photometric", share)
@@ -89,7 +107,7 @@ class Equations:
     """Excess of the OFF over the ON threshold, from the numbers of events."""
     cost: Cost
     """Cost on the first map, at the result of the sharpness stage."""
-    left: float
+    free_share: float
     """Share of equations beyond the unknowns of the map."""
 
     @property
@@ -120,16 +138,18 @@ class Equations:
 
         These stay at the answer of sharpness, because the first were found together with them.
         """
-        best = self.problem.sharp.best
+        best = self.problem.start_values
         slopes = self.cost.slopes(self.start, with_parts=True)
-        keep = determined(slopes, self.cost.space, self.left)
+        keep = determined(slopes, self.cost.space, self.free_share)
         held = tuple(n for n in self.cost.space.names if n not in keep)
         space = self.cost.space.without(held).holding({n: x for n, x in best.items() if n in held})
         cost = self.cost.in_space(space)
         if held:
             cost.warm_up(_start_in(space, self.problem))
         problem = self.problem
-        return AnswerSearch(cost, dict(best), self.left, self.settings, problem.report, problem.most_cost), held
+        return AnswerSearch(
+            cost, dict(best), self.free_share, self.settings, problem.report, problem.most_cost
+        ), held
 
 
 def collect_equations(problem: Problem, sensor: SensorTiming) -> Equations:
@@ -137,18 +157,25 @@ def collect_equations(problem: Problem, sensor: SensorTiming) -> Equations:
     recording = problem.recording
     sharp = problem.sharp
     settings = replace(problem.settings, sensor=sensor)
-    found = collect_pairs(recording, sharp, settings, always_tiles=problem.fast, ahead=problem.ahead)
+    found = collect_pairs(
+        recording, sharp, settings, always_tiles=problem.fast, ahead=problem.ahead
+    )
     pairs = found.pairs
     tiles = found.tiles
     # the count of OFF and ON events gives the ratio of thresholds only if brightness returns after a whole turn
     duration_us = recording.events.t_last - recording.events.t_first
-    whole_turn = abs(problem.rpm) * duration_us >= 60e6 and found.silent_share < limits.LEAST_SILENCE
+    whole_turn = (
+        abs(problem.rpm) * duration_us >= 60e6 and found.silent_share < limits.LEAST_SILENCE
+    )
     excess = off_excess(pairs, with_leak="leak" in _linear_unknowns(problem)) if whole_turn else 0.0
     full = sharp.full_space
     space = full.holding({n: x for n, x in sharp.best.items() if n not in full.names})
     start = _start_in(space, problem)
     cost = _cost_on(problem, settings, pairs, excess, tiles, space)
-    cost.warm_up(start)
+    cost.solve_first(start)
+    if problem.host_work is not None:
+        problem.host_work()
+    cost.scale_weights(start)
     mean = cost.start_mean()
     coverage = cost.brightness.coverage(cost.scale)
     few = not fine_map_is_determined(coverage, len(pairs))
@@ -158,13 +185,42 @@ def collect_equations(problem: Problem, sensor: SensorTiming) -> Equations:
         cost = _cost_on(problem, settings, pairs, excess, tiles.at_density(1.0), space)
         cost.warm_up(start)
         coverage = cost.brightness.coverage(cost.scale)
-    left = check_pairs(recording.name, coverage, len(pairs))
-    return Equations(problem, settings, pairs, found.silent_share, excess, cost, left)
+    free_share = check_pairs(recording.name, coverage, len(pairs))
+    return Equations(problem, settings, pairs, found.silent_share, excess, cost, free_share)
 
 
 def _start_in(space: ParameterSpace, problem: Problem) -> Vector:
     """Return the search vector of the sharpness stage's result in a space."""
-    return space.to_vector({**space.start, **problem.sharp.best})
+    return space.to_vector({**space.start, **problem.start_values})
+
+
+def before_latency(
+    kind: type[Model], values: Mapping[str, float], late_rad: float
+) -> dict[str, float]:
+    """Return values of a motion for angles before the latency, from values for angles at the events' time stamps.
+
+    Sharpness takes each event at its time stamp, so that its phases contain the latency. If the image of a mirror
+    moves by 0.3 px within it, the first map at such phases explains so little that no fine map is tried.
+
+    Parameters
+    ----------
+    kind : type of Model
+        Model of the motion.
+    values : mapping of str to float
+        Values by name, in their units.
+    late_rad : float
+        Angle by which the first angle turns within the latency [rad].
+
+    Returns
+    -------
+    dict
+        The values, with other phases.
+    """
+    before = kind.turned_values(values, late_rad)
+    if kind.ANGLES > 1:
+        _, phase = kind.ORBITS[1]
+        before[phase] = values[phase] + values["ratio"] * late_rad
+    return before
 
 
 def _linear_unknowns(problem: Problem) -> tuple[str, ...]:
@@ -189,4 +245,4 @@ def _cost_on(
         with_leak="leak" in linear,
         middle_us=space.middle_us,
     )
-    return Cost.on(brightness, space, settings.steps, problem.meanwhile)
+    return Cost.on(brightness, space, settings.steps)

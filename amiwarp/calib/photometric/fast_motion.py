@@ -16,7 +16,7 @@ from amiwarp.calib.photometric.limits import REFRACTORY_DOUBT_US
 from amiwarp.calib.photometric.linear_fit import SIGNIFICANT, linear_fit, pseudo_inverse
 from amiwarp.calib.photometric.refinement import Refinement
 from amiwarp.calib.photometric.verdicts import refractory_doubt_us
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models.registry import MODELS
 
 if TYPE_CHECKING:
     Vector = NDArray[np.float64]
@@ -25,19 +25,30 @@ if TYPE_CHECKING:
 def bound_what_blind_pixels_hide(state: Refinement) -> Refinement:
     """Note how far the image moves while a pixel is blind, and how much an error of that time changes the answer."""
     kind = MODELS[state.space.model]
-    if kind.PRISM or not (state.are_angles_examined or kind.ANGLES > 1):
+    has_angles = state.are_angles_examined or kind.ANGLES > 1
+    if kind.PRISM or not has_angles:
         return state
     problem = state.problem
     cost = state.search.cost
     v = state.answer.x
     cost.converge(v)
     if problem.recording.encoder is None:
-        state = state.noticing(UnsteadySpeed(change_of_speed_px(cost, v)))
+        moved_px = change_of_speed_px(cost, v)
+        state = state.noticing(UnsteadySpeed(moved_px))
+
     std_us = refractory_doubt_us(state.sensor)
-    doubt = problem.direction * problem.rad_per_us * std_us * by_refractory(cost, v)
-    blind_us = state.sensor.refractory_us or REFRACTORY_DOUBT_US
-    moved_px = fastest_px_per_rad(state.space, v) * (problem.rad_per_us * blind_us)
-    return replace(state, doubt=doubt).noticing(BlindTime(moved_px))
+    doubt = np.zeros(0)
+    if std_us > 0.0:
+        std_rad = problem.direction * problem.rad_per_us * std_us
+        doubt = std_rad * by_refractory(cost, v)
+
+    blind_us = state.sensor.refractory_us
+    if blind_us is None:
+        blind_us = REFRACTORY_DOUBT_US
+    blind_rad = problem.rad_per_us * blind_us
+    moved_px = fastest_px_per_rad(state.space, v) * blind_rad
+    finding = BlindTime(moved_px, state.sensor)
+    return replace(state, doubt=doubt).noticing(finding)
 
 
 def weigh_the_refractory_doubt(state: Refinement) -> Refinement:
@@ -48,8 +59,10 @@ def weigh_the_refractory_doubt(state: Refinement) -> Refinement:
     v = state.answer.x
     doubt = np.zeros(len(v))
     doubt[: len(state.doubt)] = state.doubt
-    moved, here = (space.build(space.to_values(at)) for at in (v + doubt, v))
-    return state.noticing(RefractoryDoubt(state.sensor, distance(moved, here)))
+    moved = space.build(space.to_values(v + doubt))
+    here = space.build(space.to_values(v))
+    moved_px = distance(moved, here)
+    return state.noticing(RefractoryDoubt(state.sensor, moved_px))
 
 
 def by_refractory(cost: Cost, best: Vector) -> Vector:
@@ -59,8 +72,11 @@ def by_refractory(cost: Cost, best: Vector) -> Vector:
     """
     columns = slopes(cost, cost.space, best, cost.space.names)
     columns["refractory"], _ = cost.by_drift(best)
-    hessian = linear_fit(cost, columns).hessian.sum(axis=0)
-    return np.asarray(-pseudo_inverse(hessian[:-1, :-1]) @ hessian[:-1, -1])
+    fit = linear_fit(cost, columns)
+    hessian = fit.hessian.sum(axis=0)
+    of_parameters = hessian[:-1, :-1]
+    by_period = hessian[:-1, -1]
+    return np.asarray(-pseudo_inverse(of_parameters) @ by_period)
 
 
 def change_of_speed_px(cost: Cost, best: Vector) -> float:
@@ -68,13 +84,16 @@ def change_of_speed_px(cost: Cost, best: Vector) -> float:
 
     It is the estimate of a linearised fit, which finds a share of the change only. The map must be solved at ``best``.
     """
-    names = cost.space.names
     times = cost.brightness.pairs.time.astype(np.float64)
     late = (times - times.mean()) / max(float(times.std()), 1e-9)
-    waves = {"late": late, "square": late**2 - np.mean(late**2)}
+    square = late**2 - np.mean(late**2)
+    names = cost.space.names
     columns = slopes(cost, cost.space, best, names)
-    for name, wave in waves.items():
-        columns[name] = by_wave_of_angle(cost, best, wave)
-    estimate, significance, _ = linear_fit(cost, columns).adding((*names, "late"), ("square",))
-    moved = px_per_rad(cost.space, best) * abs(float(estimate.change[-1])) * float(waves["square"].std())
-    return moved if significance >= SIGNIFICANT else 0.0
+    columns["late"] = by_wave_of_angle(cost, best, late)
+    columns["square"] = by_wave_of_angle(cost, best, square)
+    fit = linear_fit(cost, columns)
+    estimate, significance, _ = fit.adding((*names, "late"), ("square",))
+    if significance < SIGNIFICANT:
+        return 0.0
+    change = abs(float(estimate.change[-1]))
+    return px_per_rad(cost.space, best) * change * float(square.std())

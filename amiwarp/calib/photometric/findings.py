@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from amiwarp.brightness.solver import SensorTiming
+from amiwarp.brightness.sensor_timing import SensorTiming
 from amiwarp.calib.photometric.causes import Cause
 from amiwarp.optics.prism import FlatSide
 
@@ -24,7 +24,7 @@ class Optimum(Finding):
     """How good an optimum of the cost is."""
 
     cost: float
-    """Remaining cost, relative to that without a map."""
+    """Remaining cost, relative to the cost without a map."""
     rise: float
     """Smallest rise of the cost for an orbit that is slightly larger, smaller or rotated either way."""
     moved_px: float
@@ -71,10 +71,10 @@ class SectorError(Finding):
 
 @dataclass(frozen=True)
 class RefractoryPeriod(Finding):
-    """Pixels pause after an event, for longer than was given."""
+    """Pixels pause after an event, for a time that was not given."""
 
-    beyond_given_us: float
-    """Time that was found, beyond the given one [us]."""
+    found_us: float
+    """Time that was found [us]."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,8 @@ class BlindTime(Finding):
 
     moved_px: float
     """How far it moves at most [px]."""
+    sensor: SensorTiming
+    """Timing of the sensor, as given or as found."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Vector = NDArray[np.float64]
 
 SIGNIFICANT = 5.0
-"""Number of standard deviations from which on a cause is significant."""
+"""Number of standard deviations above which a cause is significant."""
 SQUARE_PX = 16
 """Side of the squares of pixels over which sums are kept [px]. Pairs of one square are correlated."""
 MAP_STEPS = 12
@@ -46,13 +46,19 @@ class Estimate:
     def covariance(self) -> Vector:
         """Covariance of the change by the sandwich estimate, shape (n, n)."""
         parts = self.parts()
-        spare = len(parts) / max(1, len(parts) - len(self.change))
-        return np.asarray(self.inverse @ (parts.T @ parts) @ self.inverse * spare)
+        squares = len(parts)
+        degrees_of_freedom = max(1, squares - len(self.change))
+        spare = squares / degrees_of_freedom
+        scatter = parts.T @ parts
+        return np.asarray(self.inverse @ scatter @ self.inverse * spare)
 
     def significance(self, first: int) -> float:
         """Return how many standard deviations the parameters from number ``first`` on are away from 0."""
-        x = self.change[first:]
-        return math.sqrt(max(0.0, float(x @ np.linalg.lstsq(self.covariance[first:, first:], x, rcond=1e-15)[0])))
+        change = self.change[first:]
+        covariance = self.covariance[first:, first:]
+        weighted, *_ = np.linalg.lstsq(covariance, change, rcond=1e-15)
+        square = float(change @ weighted)
+        return math.sqrt(max(0.0, square))
 
 
 @dataclass(frozen=True)
@@ -84,21 +90,28 @@ class LinearFit:
         return self._known[names]
 
     def _fit(self, names: tuple[str, ...], where: NDArray[np.bool_] | None) -> Estimate:
-        k = [self.names.index(n) for n in names]
-        all_hessian, all_gradient = self._total if where is None else self._sums(where)
-        hessian = all_hessian[np.ix_(k, k)]
-        gradient = all_gradient[k]
+        columns = [self.names.index(name) for name in names]
+        if where is None:
+            all_hessian, all_gradient = self._total
+        else:
+            all_hessian, all_gradient = self._sums(where)
+        hessian = all_hessian[np.ix_(columns, columns)]
+        gradient = all_gradient[columns]
+
+        # The columns have different units.
         scale = np.sqrt(np.maximum(np.diag(hessian), 1e-30))
         scales = np.outer(scale, scale)
         inverse = pseudo_inverse(hessian / scales) / scales
         change = -inverse @ gradient
-        gain = float(change @ hessian @ change) / max(self.squares_sum, 1e-30)
+        removed = float(change @ hessian @ change)
+        gain = removed / max(self.squares_sum, 1e-30)
 
         def parts() -> Vector:
             all_changes = np.zeros(len(self.names))
-            all_changes[k] = change
+            all_changes[columns] = change
             rows = slice(None) if where is None else where
-            return np.asarray((self.gradient[rows] + self.hessian[rows] @ all_changes)[:, k])
+            gradients = self.gradient[rows] + self.hessian[rows] @ all_changes
+            return np.asarray(gradients[:, columns])
 
         return Estimate(change, gain, inverse, parts)
 
@@ -109,15 +122,24 @@ class LinearFit:
 
     def _sums(self, where: NDArray[np.bool_] | slice) -> tuple[Vector, Vector]:
         """Return the sums of the Hessians and of the gradients over some of the squares."""
-        return self.hessian[where].sum(axis=0), self.gradient[where].sum(axis=0)
+        hessian = self.hessian[where].sum(axis=0)
+        gradient = self.gradient[where].sum(axis=0)
+        return hessian, gradient
 
-    def adding(self, names: tuple[str, ...], more: tuple[str, ...]) -> tuple[Estimate, float, float]:
+    def adding(
+        self,
+        names: tuple[str, ...],
+        more: tuple[str, ...],
+    ) -> tuple[Estimate, float, float]:
         """Return the fit of the columns ``names`` and ``more``, and what ``more`` contributes.
 
-        That is how many standard deviations they are away from 0, and the share of the sum of squares that they remove.
+        They contribute how many standard deviations they are away from 0, and the share of the sum of squares that they
+        remove.
         """
         estimate = self.fit((*names, *more))
-        return estimate, estimate.significance(len(names)), estimate.gain - self.fit(names).gain
+        significance = estimate.significance(len(names))
+        gain = estimate.gain - self.fit(names).gain
+        return estimate, significance, gain
 
 
 def pseudo_inverse(matrix: Vector) -> Vector:
@@ -127,7 +149,8 @@ def pseudo_inverse(matrix: Vector) -> Vector:
     """
     values, vectors = np.linalg.eigh(matrix)
     large = values > 1e-6 * values[-1]
-    return np.asarray(vectors[:, large] / values[large] @ vectors[:, large].T)
+    kept = vectors[:, large]
+    return np.asarray(kept / values[large] @ kept.T)
 
 
 def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
@@ -136,8 +159,9 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     The map must have been solved at the answer.
     """
     cost.brightness.prepare_projection()
-    left = [cost.unexplained_column(name, column, steps=MAP_STEPS) for name, column in columns.items()]
-    cost.work_meanwhile()
+    left = []
+    for name, column in columns.items():
+        left.append(cost.unexplained_column(name, column, steps=MAP_STEPS))
     sums, squares, width = _products_by_square(cost, left)
     xy = np.stack([squares % width, squares // width], axis=1).astype(np.float64)
     return LinearFit(
@@ -149,16 +173,20 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     )
 
 
-def _products_by_square(cost: Cost, columns: list[Any]) -> tuple[Vector, NDArray[np.int64], int]:
+def _products_by_square(
+    cost: Cost,
+    columns: list[Any],
+) -> tuple[Vector, NDArray[np.int64], int]:
     """Return the products of the columns and, as the last one, the residuals, shape (squares, n + 1, n + 1).
 
     Also return the numbers of the squares that hold pairs, row by row, and how many a row has.
     """
     residuals = cost.brightness.residuals
     camera = cost.space.camera
-    width = -(-camera.width // SQUARE_PX)
-    height = -(-camera.height // SQUARE_PX)
-    sums, squares = residuals.products_by_square([*columns, residuals.values], SQUARE_PX, width, height)
+    width = math.ceil(camera.width / SQUARE_PX)
+    height = math.ceil(camera.height / SQUARE_PX)
+    with_residuals = [*columns, residuals.values]
+    sums, squares = residuals.products_by_square(with_residuals, SQUARE_PX, width, height)
     return sums, squares, width
 
 
@@ -169,28 +197,42 @@ GATE_SHARE = 0.15
 the gain with the map's change where it is wrong."""
 
 
-def telling(cost: Cost, groups: list[dict[str, Any]], least_gain: float) -> list[dict[str, Any]]:
+def telling(
+    cost: Cost,
+    groups: list[dict[str, Any]],
+    least_gain: float,
+) -> list[dict[str, Any]]:
     """Return those groups of derivatives of the residuals that may remove the share ``least_gain`` of their squares.
 
     The map has been solved, so that the residuals are nearly orthogonal to what a change of the map explains. So the
     gradient needs no projection, which takes most of the time of a :func:`linear_fit`.
     """
-    columns = {name: column for group in groups for name, column in group.items()}
+    columns: dict[str, Any] = {}
+    for group in groups:
+        columns |= group
     if not columns:
         return []
-    names = [*columns]
-    sums, _, _ = _products_by_square(cost, [*columns.values()])
+    names = list(columns)
+    sums, _, _ = _products_by_square(cost, list(columns.values()))
     total = sums.sum(axis=0)
+    squares_sum = max(float(total[-1, -1]), 1e-30)
 
-    def square(matrix: Vector, vector: Vector) -> float:
-        return max(0.0, float(vector @ np.linalg.lstsq(matrix, vector, rcond=1e-12)[0]))
+    def may_tell(group: dict[str, Any]) -> bool:
+        of_group = [names.index(name) for name in group]
+        hessian = total[np.ix_(of_group, of_group)]
+        gradient = total[of_group, -1]
 
-    def may(group: dict[str, Any]) -> bool:
-        k = [names.index(name) for name in group]
-        each = sums[:, k, -1]
-        gradient = total[k, -1]
-        away = math.sqrt(square(each.T @ each, gradient))
-        gain = square(total[np.ix_(k, k)], gradient) / max(float(total[-1, -1]), 1e-30)
-        return away > math.sqrt(len(group)) + GATE and gain >= GATE_SHARE * least_gain
+        # Far from 0 by the scatter of the squares of pixels, and with a notable gain.
+        each = sums[:, of_group, -1]
+        away = math.sqrt(_weighted_square(each.T @ each, gradient))
+        gain = _weighted_square(hessian, gradient) / squares_sum
+        is_away = away > math.sqrt(len(group)) + GATE
+        return is_away and gain >= GATE_SHARE * least_gain
 
-    return [group for group in groups if group and may(group)]
+    return [group for group in groups if group and may_tell(group)]
+
+
+def _weighted_square(matrix: Vector, vector: Vector) -> float:
+    """Return vectorᵀ matrix⁻¹ vector."""
+    weighted, *_ = np.linalg.lstsq(matrix, vector, rcond=1e-12)
+    return max(0.0, float(vector @ weighted))

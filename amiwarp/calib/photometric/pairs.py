@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,26 +11,31 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.brightness.solver import EventTable, PairSet, SensorTiming, Tiles
-from amiwarp.calib.calibration_events import EventsAhead
+from amiwarp.brightness.event_table import EventTable
+from amiwarp.brightness.pairs import PairSet
+from amiwarp.brightness.sensor_timing import SensorTiming
+from amiwarp.brightness.tiles import Tiles
+from amiwarp.calib.photometric.pair_spans import (
+    most_pairs,
+    time_spans,
+    turn_length,
+    van_der_corput,
+)
 from amiwarp.calib.photometric.tiles import choose_tiles, near_tiles, one_tile
 from amiwarp.calib.settings import PhotometricSettings
-from amiwarp.calib.sharpness_search import reach
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import Events, MemoryEvents, Recording
-from amiwarp.optics.models import MODELS
+from amiwarp.calib.sharpness_objective import reach
+from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.events.recording import Events, Recording
+from amiwarp.optics.models.registry import MODELS
 
 if TYPE_CHECKING:
+    from amiwarp.calib.events_ahead import EventsAhead
     from amiwarp.calib.sharpness_search import Search
 
 MARGIN_PX = 3
 """Border of a tile's brightness map for events that a change of the parameters moves, for a still camera [px]."""
 ROTATION_MARGIN_PX = 8
 """The same for a rotating camera [px]."""
-WITHOUT_GLASS = 3
-"""Factor of the number of pairs for a mirror or a vibrating camera. Their parameters need a map with several nodes per
-pixel: with a coarser one, the worst of 30 simulated mirrors was wrong by 0.024 px, with it by 0.008 px."""
 LONGEST_GAP_US = 60_000
 """Longest time between the two events of a pair [us]. Noise makes longer gaps unreliable."""
 LONGEST_PATH_GAP_US = 200_000
@@ -41,7 +45,7 @@ FEWEST_PAIRS = 1_500
 PAIRS_PER_NODE = 1.5
 """Smallest number of equations per unknown of the brightness map. A map with fewer fits any parameters."""
 MANY_PAIRS = 100_000
-"""Number of pairs from which on fewer of them per node determine a fine map."""
+"""Number of pairs above which fewer of them per node determine a fine map."""
 FINE_PAIRS_PER_NODE = 4.2
 """Smallest number of equations per unknown of a map with more than one node per pixel along each axis, of a recording
 with few pairs."""
@@ -49,14 +53,12 @@ FINE_PAIRS_PER_NODE_OF_MANY = 3.9
 """The same for a recording with :data:`MANY_PAIRS`."""
 FEWEST_TURNS = 2
 """Number of turns of the prism that are always used, if the recording has them."""
-EVENTS_PER_PAIR = 10
-"""Number of events that are copied ahead for each wanted pair. The tiles hold about a tenth of the events as pairs."""
 EVENTS_AT_A_TIME = 4_000_000
 """Mean number of events in each of the time spans that are read one after the other."""
 FEWEST_TILES = 6
 """Number of tiles of the scene that are always used."""
 FEWEST_OF_SECTOR = 20
-"""Median number of events of a part of a turn from which on silence is looked for. The model tells the number of parts.
+"""Median number of events of a part of a turn above which silence is looked for. The model tells the number of parts.
 """
 SILENT_SHARE = 0.05
 """Share of that number below which a part of a turn is silent."""
@@ -98,7 +100,7 @@ class _PairCollector:
         return 1.0 - self._heard_us / max(1, self._read_us)
 
     def read(self, spans: list[tuple[int, int]]) -> int:
-        """Collect the pairs of events inside the time spans [us], which extend those of earlier calls.
+        """Collect the pairs of events inside the time spans [us], which extend the spans of earlier calls.
 
         Return the number of all pairs. Only new spans are read.
         """
@@ -118,8 +120,11 @@ class _PairCollector:
         best = search.best
         calibration_events = search.calibration_events
         joined = None if self._ahead is None else self._ahead.take(spans)
-        sector = turn_length(self._recording, calibration_events.encoder) / MODELS[space.model].SECTORS
-        parts = [part for span in spans for part in split_at_silence(source.between(*span), sector)]
+        turn_us = turn_length(self._recording, calibration_events.encoder)
+        sector_us = turn_us / MODELS[space.model].SECTORS
+        parts: list[Events] = []
+        for span in spans:
+            parts += split_at_silence(source.between(*span), sector_us)
         self._heard_us += sum(int(part.t[-1]) - int(part.t[0]) for part in parts)
         self._read_us += sum(stop - start for start, stop in spans)
         if joined is not None and sum(map(len, parts)) < len(joined):
@@ -128,7 +133,7 @@ class _PairCollector:
         pairs = table.pairs(
             calibration_events.encoder,
             longest_gap_us=self._longest_gap_us,
-            shortest_gap_us=2.0 * self._sensor.refractory_us,
+            shortest_gap_us=2.0 * self._sensor.pause_us,
             sensor=self._sensor,
             middle_us=space.middle_us,
         )
@@ -136,7 +141,9 @@ class _PairCollector:
             return pairs
         if calibration_events.slope_of is not None:
             pairs = pairs.with_slope(calibration_events.slope_of, space.middle_us)
-        return pairs.on_tiles(space.build(best), space.camera_rotation(best), space.drift(best), self._tile_of)
+        return pairs.on_tiles(
+            space.build(best), space.camera_rotation(best), space.drift(best), self._tile_of
+        )
 
 
 def split_at_silence(events: Events, length_us: float) -> list[Events]:
@@ -145,53 +152,21 @@ def split_at_silence(events: Events, length_us: float) -> list[Events]:
     Where a sensor or its link loses all events for a while, the next event of a pixel does not follow the last one.
     """
     t = events.t
-    edges = np.arange(int(t[0]), int(t[-1]) + length_us, length_us) if len(t) else np.zeros(0)
-    at = np.searchsorted(t, np.ceil(edges).astype(np.int64))  # real numbers would make a copy of all times
+    if not len(t):
+        return []
+    edges = np.arange(int(t[0]), int(t[-1]) + length_us, length_us)
+    # Real numbers would make a copy of all times
+    at = np.searchsorted(t, np.ceil(edges).astype(np.int64))
     counts = np.diff(at)
     if not len(counts) or np.median(counts) < FEWEST_OF_SECTOR:
-        return [events] if len(t) else []
-    heard = np.concatenate([[0], (counts >= SILENT_SHARE * np.median(counts)).astype(np.int8), [0]])
-    starts = at[np.flatnonzero(np.diff(heard) == 1)].tolist()
-    stops = at[np.flatnonzero(np.diff(heard) == -1)].tolist()
-    return [events[a:b] for a, b in zip(starts, stops, strict=True)]
+        return [events]
 
-
-def turn_length(recording: Recording, encoder: Encoder) -> float:
-    """Return the duration of a turn of the prism [us]; the duration of the recording if it is shorter."""
-    whole = float(recording.events.t_last - recording.events.t_first + 1)
-    return min(60e6 / max(abs(encoder.rpm), 1e-6), whole)
-
-
-def time_spans(recording: Recording, search: Search) -> list[tuple[int, int]]:
-    """Return the time spans whose events give pairs, in the order of their use [us]: turns of the prism.
-
-    A rotating camera needs successive turns, so it gets one span.
-    """
-    first, last = recording.events.t_first, recording.events.t_last
-    if search.full_space.moving:
-        return [(first, last + 1)]
-    turn = turn_length(recording, search.calibration_events.encoder)
-    turns = max(1, int((last - first + 1) / turn))
-    return [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in van_der_corput(turns)]
-
-
-def upload_ahead(recording: Recording, search: Search) -> AbstractContextManager[EventsAhead | None]:
-    """Start to copy the events that :func:`collect_pairs` will probably need to a GPU.
-
-    Only events in memory are copied. On a CPU, or without a photometric stage, the context gives None.
-    """
-    device = wp.get_device(search.device)
-    source = recording.events
-    settings = search.settings
-    if device.is_cpu or not isinstance(source, MemoryEvents) or "photometric" not in settings.stages:
-        return nullcontext()
-    most = EVENTS_PER_PAIR * most_pairs(search)
-    return EventsAhead(source, time_spans(recording, search), most, device)
-
-
-def most_pairs(search: Search) -> int:
-    """Return the approximate largest number of pairs."""
-    return search.settings.photometric.pairs * (1 if MODELS[search.space.model].PRISM else WITHOUT_GLASS)
+    # Successive times with events are one part.
+    heard = (counts >= SILENT_SHARE * np.median(counts)).astype(np.int8)
+    change = np.diff(np.concatenate([[0], heard, [0]]))
+    starts = at[np.flatnonzero(change == 1)].tolist()
+    stops = at[np.flatnonzero(change == -1)].tolist()
+    return [events[start:stop] for start, stop in zip(starts, stops, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -227,8 +202,12 @@ def collect_pairs(
     if few and not always_tiles:
         tile_of, tiles = one_tile(*recording.events.size, settings.density, margin)
     else:
-        tile_of, tiles = choose_tiles(search.fine.image(search.best), search.pad, settings.density, margin)
-    near = near_tiles(tiles, margin, math.ceil(reach(search.space, search.best)) + 1, tile_of.shape)
+        image = search.fine.image(search.best)
+        tile_of, tiles = choose_tiles(image, search.pad, settings.density, margin)
+    far = math.ceil(reach(search.space, search.best)) + 1
+    near = near_tiles(tiles, margin, far, tile_of.shape)
+
+    # Read turns until there are enough pairs.
     collector = _PairCollector(recording, search, tile_of, near, settings.sensor, ahead=ahead)
     spans = time_spans(recording, search)
     many = min(FEWEST_TURNS, len(spans))
@@ -236,6 +215,8 @@ def collect_pairs(
     while found < most and many < len(spans):
         many = min(len(spans), max(many + 1, math.ceil(many * most / max(found, 1))))
         found = collector.read(spans[:many])
+
+    # Leave out whole tiles if there are too many.
     pairs = collector.pairs()
     count = len(tiles.origin)
     keep = max(FEWEST_TILES, round(count * most / max(len(pairs), 1)))
@@ -252,29 +233,29 @@ def collect_everywhere(
     The pairs come from pixels that are evenly spread over the tiles.
     """
     source = recording.events
-    tile_of, tiles = choose_tiles(search.fine.image(search.best), search.pad, settings.density, MARGIN_PX)
+    image = search.fine.image(search.best)
+    tile_of, tiles = choose_tiles(image, search.pad, settings.density, MARGIN_PX)
     used = van_der_corput(len(tiles.origin))[:most_tiles]
-    number = np.full(len(tiles.origin) + 1, -1, np.int32)  # the last one stands for pixels without a tile
+    # The last one stands for pixels without a tile
+    number = np.full(len(tiles.origin) + 1, -1, np.int32)
     number[used] = np.arange(len(used))
     tile_of = number[tile_of]
     tiles = replace(tiles, origin=tiles.origin[used])
-    near = near_tiles(tiles, MARGIN_PX, math.ceil(reach(search.space, search.best)) + 1, tile_of.shape)
+
+    # Few pixels, from the whole recording.
+    far = math.ceil(reach(search.space, search.best)) + 1
+    near = near_tiles(tiles, MARGIN_PX, far, tile_of.shape)
     share = most / max(1.0, len(source) * float(np.mean(tile_of >= 0)))
     near[np.random.default_rng(0).random(near.shape) >= share] = -1
-    collector = _PairCollector(recording, search, tile_of, near, settings.sensor, longest_gap_us=LONGEST_PATH_GAP_US)
+    collector = _PairCollector(
+        recording, search, tile_of, near, settings.sensor, longest_gap_us=LONGEST_PATH_GAP_US
+    )
     parts = -(-len(source) // EVENTS_AT_A_TIME)
     edges = np.linspace(source.t_first, source.t_last + 1, parts + 1).astype(np.int64).tolist()
     spans = [*itertools.pairwise(edges)]
     for k in range(parts):
         collector.read(spans[: k + 1])
     return collector.pairs(), tiles
-
-
-def van_der_corput(n: int) -> list[int]:
-    """Return 0 … n-1 in van der Corput's order: the first k numbers are evenly spread for every k."""
-    bits = max(1, (n - 1).bit_length())
-    order = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
-    return [k for k in order if k < n]
 
 
 def pairs_per_node(coverage: NDArray[np.float32], pairs: int) -> float:
@@ -294,6 +275,7 @@ def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
     if pairs < FEWEST_PAIRS or ratio < PAIRS_PER_NODE:
         raise AmiwarpError(
             f"{name}: {pairs} pairs of events are too few for the {pairs / ratio:.0f} unknowns of a brightness map; "
-            "record for longer"
+            "record for longer",
+            ErrorCode.CALIBRATION_REFUSED,
         )
     return 1.0 - 1.0 / ratio

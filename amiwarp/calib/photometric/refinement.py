@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.brightness.solver import SensorTiming
-from amiwarp.calib.parameters import ParameterSpace
+from amiwarp.brightness.sensor_timing import SensorTiming
 from amiwarp.calib.photometric.answers import Answer, AnswerSearch
 from amiwarp.calib.photometric.consistency import Consistency
 from amiwarp.calib.photometric.equations import Equations, Problem, collect_equations
-from amiwarp.calib.photometric.findings import Finding
+from amiwarp.calib.photometric.findings import Finding, MotionError
 from amiwarp.calib.photometric.verdicts import refusal
+from amiwarp.results.parameters import ParameterSpace
 
 if TYPE_CHECKING:
     Vector = NDArray[np.float64]
@@ -40,7 +40,7 @@ class Refinement:
     are_angles_examined: bool = False
     """Whether the events tell errors of their angles: for a still camera, if a map explains most of them."""
     is_timing_examined: bool = False
-    """Whether they also tell the timing of the sensor: for one angle."""
+    """Whether they also tell the timing of the sensor: for one angle of a prism."""
     missing_step: float = 0.0
     """Median change of brightness beyond one threshold between the events of a pair [thresholds]."""
     pause_rad: float = 0.0
@@ -84,6 +84,16 @@ class Refinement:
     def noticing(self, *findings: Finding) -> Refinement:
         """Return the state with more findings."""
         return replace(self, findings=(*self.findings, *findings))
+
+    def hiding(self, words: str, bound_px: float) -> Refinement:
+        """Return the state with a further cause, given in words, that could hide, and how far it may move events."""
+        findings = tuple(
+            replace(each, hidden_px={**each.hidden_px, words: bound_px})
+            if isinstance(each, MotionError)
+            else each
+            for each in self.findings
+        )
+        return replace(self, findings=findings)
 
     def ending(self) -> Refinement:
         """Return the state as the last one: no further step is taken."""

@@ -18,18 +18,25 @@ from amiwarp.calib.photometric.distances import px_per_rad
 from amiwarp.calib.photometric.findings import SectorError
 from amiwarp.calib.photometric.linear_fit import SQUARE_PX, pseudo_inverse
 from amiwarp.calib.photometric.refinement import Refinement
-from amiwarp.optics.models import MODELS
+from amiwarp.calib.photometric.verdicts import angle_names
+from amiwarp.optics.models.registry import MODELS
 
 if TYPE_CHECKING:
     Vector = NDArray[np.float64]
+    Integers = NDArray[np.int64]
 
+ERROR_THAT_REPEATS = "an error that repeats with"
+"""Words of what could hide in an angle of the model, before the name of the angle."""
 SECTORS = 12
 """Number of sectors of a turn."""
 FOUND_SHARE = 0.3
 """Share of an error that is found while the map is fixed, which has absorbed the rest. It was 0.27 to 0.3 for third
 harmonics of 1 and 2 degrees of a wedge and of a pair."""
+LEAST_FOUND_SHARE = 0.1
+"""Smallest share of an error that was found, for the bound of what could hide. It was 0.12 of a third harmonic of 1
+degree of a wedge."""
 LEAST_RATIO = 3.0
-"""Size of the offsets relative to the size that chance gives, from which on they are examined."""
+"""Size of the offsets relative to the size that chance gives, above which they are examined."""
 
 
 def note_what_sectors_leave(state: Refinement) -> Refinement:
@@ -44,13 +51,24 @@ def note_what_sectors_leave(state: Refinement) -> Refinement:
     cost = state.search.cost
     v = state.answer.x
     cost.converge(v)
+    all_offsets, ratios = sector_offsets(cost, v)
     found: list[SectorError] = []
-    for angle, (offsets, ratio) in enumerate(zip(*sector_offsets(cost, v), strict=True)):
-        if ratio >= LEAST_RATIO and harmonics_of(angle) in examined_errors(kind):
+    for angle in range(kind.ANGLES):
+        if harmonics_of(angle) not in examined_errors(kind):
+            continue
+        offsets = all_offsets[angle]
+        left_px = px_per_rad(space, v, angle) * float(offsets.std())
+        words = f"{ERROR_THAT_REPEATS} {angle_names(kind)[angle]}"
+        state = state.hiding(words, left_px / LEAST_FOUND_SHARE)
+        if ratios[angle] >= LEAST_RATIO:
             worst = int(np.argmax(np.abs(offsets)))
-            moved_px = px_per_rad(space, v, angle) * float(offsets.std()) / FOUND_SHARE
-            found.append(SectorError(space.model, angle, (worst + 0.5) * math.tau / SECTORS, moved_px))
-    return state.noticing(max(found, key=lambda each: each.moved_px)) if found else state
+            at_rad = (worst + 0.5) * math.tau / SECTORS
+            error_px = left_px / FOUND_SHARE
+            found.append(SectorError(space.model, angle, at_rad, error_px))
+    if not found:
+        return state
+    largest = max(found, key=lambda each: each.moved_px)
+    return state.noticing(largest)
 
 
 def sector_offsets(cost: Cost, v: Vector) -> tuple[Vector, Vector]:
@@ -68,50 +86,80 @@ def sector_offsets(cost: Cost, v: Vector) -> tuple[Vector, Vector]:
         shape (angles,).
     """
     angles = MODELS[cost.space.model].ANGLES
-    pairs = cost.brightness.pairs
-    n = len(pairs)
-    residual = _on_host(cost.brightness.residuals.values, n)
-    weight = _on_host(cost.brightness.residuals.weight, n)
-    # the column of each angle's sector, and the slope by that angle, at both events of a pair
-    column: list[NDArray[np.int64]] = []
+    hessian, gradients = _normal_equations(cost, v)
+
+    # the mean of all sectors of an angle is a part of its phase
+    without_mean = np.eye(SECTORS) - 1.0 / SECTORS
+    centred = np.kron(np.eye(angles), without_mean)
+    inverse = pseudo_inverse(centred @ hessian @ centred)
+    offsets = -inverse @ gradients.sum(axis=0)
+    scatter = (gradients - gradients.mean(axis=0)) @ inverse
+    variances = np.sum(scatter**2, axis=0).reshape(angles, SECTORS)
+    by_chance = np.sqrt(variances.sum(axis=1))
+    of_angles = offsets.reshape(angles, SECTORS)
+    sizes = np.linalg.norm(of_angles, axis=1)
+    return of_angles, sizes / np.maximum(by_chance, 1e-12)
+
+
+def _normal_equations(cost: Cost, v: Vector) -> tuple[Vector, Vector]:
+    """Return the Hessian by the offsets of all sectors, and the gradient of each square of pixels that has pairs."""
+    angles = MODELS[cost.space.model].ANGLES
+    residuals = cost.brightness.residuals
+    pairs = len(cost.brightness.pairs)
+    residual = _on_host(residuals.values, pairs)
+    weight = _on_host(residuals.weight, pairs)
+
+    # The column of each angle's sector, and the slope by that angle, at both events of a pair.
+    column: list[Integers] = []
     slope: list[Vector] = []
     for angle in range(angles):
-        column += [SECTORS * angle + sector for sector in _sectors_of(cost, angle)]
-        slope += [_on_host(end, n) for end in cost.by_angle(v, angle)]
-    # squares of pixels, of which only those with pairs are numbered
-    width = -(-cost.space.camera.width // SQUARE_PX)
-    row_of_squares = pairs.column("y").astype(np.int64) // SQUARE_PX
-    column_of_squares = pairs.column("x").astype(np.int64) // SQUARE_PX
-    used, square = np.unique(row_of_squares * width + column_of_squares, return_inverse=True)
-    count = angles * SECTORS
-    hessian = np.zeros((count, count))
-    parts = np.zeros((len(used), count))
+        for sector in _sectors_of(cost, angle):
+            column.append(SECTORS * angle + sector)
+        for at_event in cost.by_angle(v, angle):
+            slope.append(_on_host(at_event, pairs))
+
+    columns = angles * SECTORS
+    squares, square = _squares_of(cost)
+    hessian = np.zeros((columns, columns))
+    gradients = np.zeros((squares, columns))
     for at, by in zip(column, slope, strict=True):
-        parts += np.bincount(square * count + at, weight * by * residual, parts.size).reshape(parts.shape)
+        place = square * columns + at
+        gradient = np.bincount(place, weight * by * residual, gradients.size)
+        gradients += gradient.reshape(gradients.shape)
         for other_at, other_by in zip(column, slope, strict=True):
-            products = np.bincount(at * count + other_at, weight * by * other_by, hessian.size)
+            place = at * columns + other_at
+            products = np.bincount(place, weight * by * other_by, hessian.size)
             hessian += products.reshape(hessian.shape)
-    # the mean of all sectors of an angle is a part of its phase
-    centred = np.kron(np.eye(angles), np.eye(SECTORS) - 1.0 / SECTORS)
-    inverse = pseudo_inverse(centred @ hessian @ centred)
-    offsets = -inverse @ parts.sum(axis=0)
-    scatter = (parts - parts.mean(axis=0)) @ inverse
-    by_chance = np.sqrt(np.sum(scatter**2, axis=0).reshape(angles, SECTORS).sum(axis=1))
-    each = offsets.reshape(angles, SECTORS)
-    return each, np.linalg.norm(each, axis=1) / np.maximum(by_chance, 1e-12)
+    return hessian, gradients
 
 
-def _sectors_of(cost: Cost, angle: int) -> NDArray[np.int64]:
+def _squares_of(cost: Cost) -> tuple[int, Integers]:
+    """Return the number of the squares of pixels that have pairs, and the number of each pair's square among them."""
+    pairs = cost.brightness.pairs
+    columns = math.ceil(cost.space.camera.width / SQUARE_PX)
+    row = pairs.column("y").astype(np.int64) // SQUARE_PX
+    column = pairs.column("x").astype(np.int64) // SQUARE_PX
+    used, square = np.unique(row * columns + column, return_inverse=True)
+    return len(used), square
+
+
+def _sectors_of(cost: Cost, angle: int) -> Integers:
     """Return the number of the sector of an angle at both events of each pair, shape (2, pairs)."""
     pairs = cost.brightness.pairs
-    stored = pairs.arrays.azimuth.numpy().reshape(2, 2, -1)[:, :, : len(pairs)]
+    padded = pairs.arrays.azimuth.numpy().reshape(2, 2, -1)
+    stored = padded[:, :, : len(pairs)]
     if MODELS[cost.space.model].ANGLES > 1:
         turned = stored[:, angle].astype(np.float64)
     else:
-        turned = np.arctan2(stored[:, 1], stored[:, 0]).astype(np.float64)
-    return np.floor(turned % math.tau / math.tau * SECTORS).astype(np.int64) % SECTORS
+        cos = stored[:, 0]
+        sin = stored[:, 1]
+        turned = np.arctan2(sin, cos).astype(np.float64)
+    share_of_turn = turned % math.tau / math.tau
+    sector = np.floor(share_of_turn * SECTORS)
+    return sector.astype(np.int64) % SECTORS
 
 
 def _on_host(column: Any, count: int) -> Vector:
     """Return a column of the pairs as numbers, with 0 for pairs off the map, shape (count,)."""
-    return np.nan_to_num(column.numpy()[:count]).astype(np.float64)
+    of_pairs = column.numpy()[:count]
+    return np.nan_to_num(of_pairs).astype(np.float64)

@@ -15,17 +15,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.parameters import ParameterSpace
 from amiwarp.calib.photometric.causes import SIDE, Cause, with_cause
 from amiwarp.calib.photometric.distances import FOLLOW_PX
 from amiwarp.calib.photometric.linear_fit import LinearFit
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import MODELS, Model, compensate_by_each
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.models.registry import MODELS
+from amiwarp.optics.models.several import compensate_by_each
+from amiwarp.results.parameters import ParameterSpace
 
 if TYPE_CHECKING:
     Vector = NDArray[np.float64]
 
-ROWS, COLUMNS = 7, 9
+ROWS = 7
+COLUMNS = 9
 """Numbers of rows and columns of pixels at which motions are compared."""
 ANGLES = 12
 """Number of angles in each turn at which motions are compared."""
@@ -54,41 +58,62 @@ def motion_slopes(space: ParameterSpace, v: Vector) -> Vector:
         Changes [px/px], shape (n, points, 2), at pixels and angles over the image and over turns. The mean of each
         pixel is taken out: it moves the picture, not events against each other.
     """
-    camera = space.camera
-    x, y = np.meshgrid(np.linspace(0, camera.width - 1, COLUMNS), np.linspace(0, camera.height - 1, ROWS))
-    xy = np.stack([x.ravel(), y.ravel()], axis=1)
+    xy = _grid(space.camera)
     turns = TURNS[MODELS[space.model].ANGLES]
     theta = np.arange(turns * ANGLES, dtype=np.float64) * (math.tau / ANGLES)
-    steps = [space.to_values(v + FOLLOW_PX * unit) for unit in np.eye(len(v))]
+
+    # By finite differences: each parameter, and a constant lag.
     here = space.build(space.to_values(v))
-    at, *ends = _motions([here, *map(space.build, steps)], xy, theta)
-    late = _motions([here], xy, theta + LAG_RAD)[0]
+    models = [here]
+    for unit in np.eye(len(v)):
+        values = space.to_values(v + FOLLOW_PX * unit)
+        models.append(space.build(values))
+    at, *ends = _motions(models, xy, theta)
+    changes = [(end - at).ravel() for end in ends]
+    slopes = np.array(changes) / FOLLOW_PX
+    (late,) = _motions([here], xy, theta + LAG_RAD)
     lag = (late - at).ravel() / LAG_RAD
-    slopes = np.array([(end - at).ravel() / FOLLOW_PX for end in ends])
+
+    # Take out what a constant lag makes up for.
     seen = np.isfinite(lag) & np.isfinite(slopes).all(axis=0)
     lag = np.where(seen, lag, 0.0)
     slopes = np.where(seen, slopes, 0.0)
     square = float(lag @ lag)
     if square > 0.0:
-        slopes -= np.outer(slopes @ lag / square, lag)
+        by_lag = slopes @ lag / square
+        slopes -= np.outer(by_lag, lag)
     return np.asarray(slopes.reshape(len(v), -1, 2))
+
+
+def _grid(camera: Camera) -> Vector:
+    """Return the pixels at which motions are compared, shape (n, 2)."""
+    columns = np.linspace(0, camera.width - 1, COLUMNS)
+    rows = np.linspace(0, camera.height - 1, ROWS)
+    x, y = np.meshgrid(columns, rows)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def _motions(models: Sequence[Model], xy: Vector, theta: Vector) -> Vector:
     """Return where models move pixels (m, 2) at angles (k,) [px], without the mean of each pixel, (models, m, k, 2)."""
-    points = np.repeat(xy, len(theta), axis=0).astype(np.float32)
-    angles = np.tile(theta, len(xy))
-    moved = compensate_by_each(models, points, angles).reshape(len(models), len(xy), len(theta), 2)
-    return np.asarray(moved - moved.mean(axis=2, keepdims=True))
+    pixels = len(xy)
+    count = len(theta)
+    points = np.repeat(xy, count, axis=0).astype(np.float32)
+    angles = np.tile(theta, pixels)
+    moved = compensate_by_each(models, points, angles)
+    of_pixels = moved.reshape(len(models), pixels, count, 2)
+    mean = of_pixels.mean(axis=2, keepdims=True)
+    return np.asarray(of_pixels - mean)
 
 
 def spread_px(slopes: Vector, covariance: Vector) -> float:
     """Return the standard deviation of the motion of events [px rms] for a covariance of the search vector [px²].
 
-    ``slopes`` are those of :func:`motion_slopes`, shape (n, points, 2).
+    ``slopes`` come from :func:`motion_slopes`, shape (n, points, 2).
     """
-    products = np.einsum("ipk,jpk->ij", slopes, slopes) / slopes.shape[1]
-    return math.sqrt(max(0.0, float(np.sum(products * covariance))))
+    points = slopes.shape[1]
+    products = np.einsum("ipk,jpk->ij", slopes, slopes) / points
+    variance = float(np.sum(products * covariance))
+    return math.sqrt(max(0.0, variance))
 
 
 def shift_px(slopes: Vector, change: Vector) -> float:
@@ -96,25 +121,34 @@ def shift_px(slopes: Vector, change: Vector) -> float:
     return spread_px(slopes, np.outer(change, change))
 
 
-def hidden_px(space: ParameterSpace, v: Vector, fit: LinearFit, causes: Iterable[Cause]) -> dict[str, float]:
+def hidden_px(
+    space: ParameterSpace,
+    v: Vector,
+    fit: LinearFit,
+    causes: Iterable[Cause],
+) -> dict[str, float]:
     """Return by how much the motion may be wrong for each cause that was looked for [px rms], by its words.
 
     A cause may be there by its estimate, and by :data:`BOUND` standard deviations more. The free parameters follow it.
     """
+    alone = fit.fit(space.names)
+    count = len(space.names)
     bounds = {}
     for cause in causes:
-        if cause == SIDE or not {*cause.names} <= {*fit.names} or {*cause.names} & {*space.names}:
+        names = set(cause.names)
+        was_looked_for = cause != SIDE and names.issubset(fit.names)
+        if not was_looked_for or not names.isdisjoint(space.names):
             continue
         try:
             wide, at = with_cause(space, cause, space.to_values(v))
         except AmiwarpError:
             continue  # it moves no event
         estimate = fit.fit((*space.names, *cause.names))
-        alone = fit.fit(space.names)
-        n = len(space.names)
         # What the parameters scatter by anyway belongs to the deviation.
         covariance = estimate.covariance.copy()
-        covariance[:n, :n] -= alone.covariance
+        covariance[:count, :count] -= alone.covariance
         slopes = motion_slopes(wide, at)
-        bounds[cause.words] = shift_px(slopes, estimate.change) + BOUND * spread_px(slopes, covariance)
+        estimate_px = shift_px(slopes, estimate.change)
+        deviation_px = spread_px(slopes, covariance)
+        bounds[cause.words] = estimate_px + BOUND * deviation_px
     return bounds

@@ -19,7 +19,7 @@ from amiwarp.calib.photometric.distances import px_per_rad
 from amiwarp.calib.photometric.findings import UnsteadyMotion
 from amiwarp.calib.photometric.linear_fit import linear_fit, telling
 from amiwarp.calib.photometric.refinement import Refinement
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models.registry import MODELS
 
 if TYPE_CHECKING:
     from amiwarp.calib.photometric.cost import Cost
@@ -32,22 +32,26 @@ WAVES = 8
 """Number of half oscillations over the recording up to which amplitude and speed may change."""
 STEP_SHARE = 0.005
 """Step of the finite difference: a share of the amplitude."""
-SIGNIFICANT, LEAST_GAIN = 5.0, 0.015
-"""Standard deviations and share of the squared residuals from which on one of these is there. A steady ellipse left
+SIGNIFICANT = 5.0
+LEAST_GAIN = 0.015
+"""Standard deviations and share of the squared residuals above which one of these is there. A steady ellipse left
 0.004, an amplitude that varied by 15 % 0.16, a triangle 0.12."""
 LEAST_PX = 0.01
-"""Motion of events by it from which on an answer is refused [px rms]."""
+"""Motion of events by it above which an answer is refused [px rms]."""
 
 
 def refuse_unsteady_motion(state: Refinement) -> Refinement:
     """Note what a vibration does beyond its model."""
-    of_encoder = state.problem.recording.encoder is not None
-    if MODELS[state.space.model].PRISM or of_encoder or not state.are_angles_examined:
+    if MODELS[state.space.model].PRISM or not state.are_angles_examined:
+        return state
+    if state.problem.recording.encoder is not None:
         return state
     cost = state.search.cost
     cost.converge(state.answer.x)
     found = find_unsteady(cost, state.answer.x)
-    return state if found is None else state.noticing(found)
+    if found is None:
+        return state
+    return state.noticing(found)
 
 
 def find_unsteady(cost: Cost, best: Vector) -> UnsteadyMotion | None:
@@ -55,15 +59,20 @@ def find_unsteady(cost: Cost, best: Vector) -> UnsteadyMotion | None:
 
     The map must be solved at ``best``, whose speed is known.
     """
-    groups = {
+    all_groups = {
         "harmonics": _harmonics(cost, best),
         "amplitude": _amplitude(cost, best),
         "speed": _speed(cost, best),
     }
-    told = telling(cost, [*groups.values()], LEAST_GAIN)
-    groups = {kind: group for kind, group in groups.items() if any(group is each for each in told)}
+    # Only some groups are worth a fit.
+    told = telling(cost, list(all_groups.values()), LEAST_GAIN)
+    groups = {}
+    for kind, group in all_groups.items():
+        if any(group is each for each in told):
+            groups[kind] = group
     if not groups:
         return None
+
     names = cost.space.names
     columns = slopes(cost, cost.space, best, names)
     for group in groups.values():
@@ -71,58 +80,80 @@ def find_unsteady(cost: Cost, best: Vector) -> UnsteadyMotion | None:
     fit = linear_fit(cost, columns)
     found = []
     for kind, group in groups.items():
-        estimate, significance, gain = fit.adding(names, (*group,))
-        moved_px = _moved_px(cost, best, kind, estimate.change[len(names) :])
-        if significance >= SIGNIFICANT and gain >= LEAST_GAIN and moved_px >= LEAST_PX:
+        estimate, significance, gain = fit.adding(names, tuple(group))
+        change = estimate.change[len(names) :]
+        moved_px = _moved_px(cost, best, kind, change)
+        is_there = significance >= SIGNIFICANT and gain >= LEAST_GAIN
+        if is_there and moved_px >= LEAST_PX:
             found.append(UnsteadyMotion(kind, moved_px, gain))
     return max(found, key=lambda each: each.gain, default=None)
 
 
 def _moved_px(cost: Cost, best: Vector, kind: str, change: Vector) -> float:
     """Return how far the changes of a group move events [px rms]."""
+    size = float(np.linalg.norm(change))
     if kind == "harmonics":  # amplitudes of a rotation about x and y
-        return float(np.linalg.norm(change)) / math.sqrt(2.0)
-    size = float(np.linalg.norm(best)) if kind == "amplitude" else px_per_rad(cost.space, best)
-    return size * float(np.linalg.norm(change)) / math.sqrt(2.0)
+        return size / math.sqrt(2.0)
+    if kind == "amplitude":
+        amplitude_px = float(np.linalg.norm(best))
+        return amplitude_px * size / math.sqrt(2.0)
+    return px_per_rad(cost.space, best) * size / math.sqrt(2.0)
 
 
 def _harmonics(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by rotations about x and y at multiples of the frequency [px]."""
-    cosine, sine = cost.brightness.pairs.angle_patterns((0.0, 0.0)).numpy()[:2]
+    patterns = cost.brightness.pairs.angle_patterns((0.0, 0.0)).numpy()
+    cosine = patterns[0]
+    sine = patterns[1]
     columns = {}
     for multiple in HIGHER:
         wave = (cosine + 1j * sine) ** multiple
         for part, values in (("cos", wave.real), ("sin", wave.imag)):
-            swing = wp.array(values.astype(np.float32), dtype=float, device=cost.brightness.device)
+            swing = _on_device(cost, values)
             for axis, name in enumerate("xy"):
                 columns[f"harmonic {multiple} {part} {name}"] = by_swing(cost, best, swing, axis)
     return columns
 
 
+def _on_device(cost: Cost, values: NDArray[Any]) -> Any:
+    """Return values of the pairs, or of their ends, on the device of a cost."""
+    single = values.astype(np.float32)
+    return wp.array(single, dtype=float, device=cost.brightness.device)
+
+
 def _waves(cost: Cost) -> dict[int, Vector]:
     """Return cosines over the recording by their number of half oscillations, at both ends of each pair, (2, pairs)."""
     times = cost.brightness.pairs.time.astype(np.float64)
-    share = (times - times.min()) / max(float(np.ptp(times)), 1e-9)
+    duration = max(float(np.ptp(times)), 1e-9)
+    share = (times - times.min()) / duration
     return {k: np.cos(math.pi * k * share) for k in range(1, WAVES + 1)}
 
 
 def _amplitude(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by changes of the amplitude over time, as shares of it."""
-    space, pairs = cost.space, cost.brightness.pairs
+    space = cost.space
+    pairs = cost.brightness.pairs
 
-    def by_size() -> Any:
-        up, down = (place_arguments(space, space.to_values(best * (1.0 + s * STEP_SHARE))) for s in (1.0, -1.0))
-        return cost.brightness.find_slope(up, down, 2.0 * STEP_SHARE)
+    larger = best * (1.0 + STEP_SHARE)
+    smaller = best * (1.0 - STEP_SHARE)
+    by_size = cost.brightness.find_slope(
+        place_arguments(space, space.to_values(larger)),
+        place_arguments(space, space.to_values(smaller)),
+        2.0 * STEP_SHARE,
+    )
 
-    column = by_size()
     columns = {}
     for k, wave in _waves(cost).items():
-        factor = np.zeros(pairs.arrays.stride, np.float32)
-        factor[: len(pairs)] = wave.mean(axis=0)
-        columns[f"amplitude {k}"] = masked(column, wp.array(factor, dtype=float, device=cost.brightness.device))
+        padded = np.zeros(pairs.arrays.stride, np.float32)
+        padded[: len(pairs)] = wave.mean(axis=0)
+        columns[f"amplitude {k}"] = masked(by_size, _on_device(cost, padded))
     return columns
 
 
 def _speed(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by changes of the angle over time that no constant speed makes [rad]."""
-    return {f"speed {k}": by_wave_of_angle(cost, best, wave) for k, wave in _waves(cost).items() if k > 1}
+    columns = {}
+    for k, wave in _waves(cost).items():
+        if k > 1:
+            columns[f"speed {k}"] = by_wave_of_angle(cost, best, wave)
+    return columns

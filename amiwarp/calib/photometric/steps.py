@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from amiwarp.calib.parameters import ParameterSpace
 from amiwarp.calib.photometric.angles import examine_the_angles_first, examine_the_angles_last
 from amiwarp.calib.photometric.camera_motion import follow_a_fast_camera, follow_a_slow_camera
 from amiwarp.calib.photometric.corrections import (
@@ -18,7 +17,10 @@ from amiwarp.calib.photometric.corrections import (
     name_the_corrections,
 )
 from amiwarp.calib.photometric.equations import Problem
-from amiwarp.calib.photometric.fast_motion import bound_what_blind_pixels_hide, weigh_the_refractory_doubt
+from amiwarp.calib.photometric.fast_motion import (
+    bound_what_blind_pixels_hide,
+    weigh_the_refractory_doubt,
+)
 from amiwarp.calib.photometric.findings import AngleError, MotionError, MovingParts
 from amiwarp.calib.photometric.losses import (
     count_lost_events,
@@ -29,9 +31,14 @@ from amiwarp.calib.photometric.losses import (
 from amiwarp.calib.photometric.refinement import Refinement, Step, first_answer
 from amiwarp.calib.photometric.sectors import note_what_sectors_leave
 from amiwarp.calib.photometric.steadiness import refuse_unsteady_motion
-from amiwarp.calib.photometric.timing import estimate_the_timing, find_slow_pixels, find_the_refractory_period
+from amiwarp.calib.photometric.timing import (
+    estimate_the_timing,
+    find_slow_pixels,
+    find_the_refractory_period,
+)
 from amiwarp.calib.photometric.verdicts import accepted_in_words, warnings
-from amiwarp.calib.result import PhotometricSummary, StageSummary
+from amiwarp.results.calibration import PhotometricSummary, StageSummary
+from amiwarp.results.parameters import ParameterSpace
 
 STEPS: tuple[Step, ...] = (
     follow_a_fast_camera,
@@ -91,7 +98,7 @@ def summarised(state: Refinement) -> tuple[PhotometricSummary, StageSummary, Par
         pairs=len(state.equations.pairs),
         off_over_on=answer.off_over_on,
         leak=answer.leak,
-        refractory_us=state.sensor.refractory_us,
+        refractory_us=state.sensor.pause_us,
         time_constant_us=state.time_constant_us,
         rotation_gain=0.0 if check is None else check.rotation_gain,
         center_px=None if check is None else check.center_px,
@@ -102,5 +109,7 @@ def summarised(state: Refinement) -> tuple[PhotometricSummary, StageSummary, Par
         hidden_px=stated[0].hidden_px if stated else {},
         warnings=warnings(state.findings),
     )
-    summary = StageSummary.of("photometric", answer.stage, space.names, map(space.to_values, answer.stage.points))
+    summary = StageSummary.of(
+        "photometric", answer.stage, space.names, map(space.to_values, answer.stage.points)
+    )
     return result, summary, replace(space, names=(*space.names, *state.rotation))

@@ -43,55 +43,93 @@ class TilePaths:
         self._map = brightness
         self.tile: NDArray[np.int32] = pairs.column("tile")
         """Tile of each pair."""
+        # Pairs in the order of their tiles, the tiles that have pairs, and the first pair of each of these
         self._order = np.argsort(self.tile, kind="stable")
         self._used, self._starts = np.unique(self.tile[self._order], return_index=True)
+
         half_s = max(0.5 * float(np.ptp(pairs.some_times)), 1e-6)
-        powers = np.diag(half_s ** -np.arange(1.0, PATH_TERMS + 1.0))[:terms]
+        per_px = half_s ** -np.arange(1.0, PATH_TERMS + 1.0)
+        powers = np.diag(per_px)[:terms]
         self._units = np.kron(np.eye(2), powers)
         """Factors of the powers of time that move a tile by 1 px at the ends of the window, shape (terms, powers)."""
-        self.moved_px: Vector = np.zeros((len(brightness.tiles.origin), 2 * terms))
+        tiles = len(brightness.tiles.origin)
+        self.moved_px: Vector = np.zeros((tiles, 2 * terms))
         """Motion until the end of the window by each power of time along x, then y [px], shape (tiles, terms)."""
-        self._changes: list[Any] = []  # derivatives of the map by each power of time
-        self._slopes: list[Vector] = []  # changes of the paths that explain most of each parameter's derivative
+        # Derivatives of the map by each power of time
+        self._changes: list[Any] = []
+        # Changes of the paths that explain most of each parameter's derivative
+        self._slopes: list[Vector] = []
 
     def set(self, moved_px: Vector) -> None:
         """Set the paths."""
         self.moved_px = moved_px
-        self._map.pairs.set_path(moved_px @ self._units)
+        self._map.pairs.set_path(self._factors_of_time(moved_px))
 
-    def linearise(self, v: Vector, at: Mapping[str, Any], steps: int) -> None:
+    def _factors_of_time(self, moved_px: Vector) -> Vector:
+        """Return the factors of the powers of time for paths [px]."""
+        return np.asarray(moved_px @ self._units)
+
+    def linearise(
+        self,
+        v: Vector,
+        at: Mapping[str, Any],
+        steps: int,
+    ) -> None:
         """Compute the derivatives of the residuals by the paths, at a point ``v`` where the map is solved.
 
         ``at`` are the arguments of :meth:`BrightnessMap.place` there.
         """
         brightness = self._map
-        known: list[Any] = self._changes or [None] * len(self._units)
-        left: list[Vector] = []
+        terms = len(self._units)
+        known: list[Any] = self._changes or [None] * terms
+        columns: list[Vector] = []
         self._at = v
         self._base = self.moved_px
         self._changes = []
         self._slopes = []
-        for k, change in enumerate(known):
-            step = np.zeros_like(self.moved_px)
-            step[:, k] = SLOPE_PX
-            up = brightness.pairs.path_array((self.moved_px + step) @ self._units)
-            down = brightness.pairs.path_array((self.moved_px - step) @ self._units)
-            slope = brightness.find_slope({**at, "path": up}, {**at, "path": down}, 2.0 * SLOPE_PX)
-            left.append(self._on_host(brightness.unexplained(slope, change, steps=steps)))
+        for term, change in enumerate(known):
+            slope = self._slope_by(term, at)
+            unexplained = brightness.unexplained(slope, change, steps=steps)
+            columns.append(self._on_host(unexplained))
             self._changes.append(brightness.explaining_change())
-        self._left = np.stack(left, axis=1)
-        self._weight = self._on_host(brightness.residuals.weight)
-        hessian = self._sums(self._left[:, :, None] * (self._left * self._weight[:, None])[:, None, :])
-        ridge = PATH_RIDGE * np.trace(hessian, axis1=1, axis2=2) / hessian.shape[1] + 1e-9
-        self._inverse = np.linalg.inv(hessian + ridge[:, None, None] * np.eye(hessian.shape[1]))
+
+        # The normal equations of each tile, which is independent of the others.
+        left = np.stack(columns, axis=1)
+        weight = self._on_host(brightness.residuals.weight)
+        weighted = left * weight[:, None]
+        products = left[:, :, None] * weighted[:, None, :]
+        hessian = self._sums(products)
+        curvature = np.trace(hessian, axis1=1, axis2=2)
+        ridge = PATH_RIDGE * curvature / terms + 1e-9
+        damped = hessian + ridge[:, None, None] * np.eye(terms)
+        self._left = left
+        self._weight = weight
+        self._inverse = np.linalg.inv(damped)
         self._step = -self._factors(brightness.residuals.values)
+
+    def _slope_by(self, term: int, at: Mapping[str, Any]) -> Any:
+        """Return the derivative of the residuals by one term of all paths, on the device."""
+        pairs = self._map.pairs
+        step = np.zeros_like(self.moved_px)
+        step[:, term] = SLOPE_PX
+        further = self._factors_of_time(self.moved_px + step)
+        less_far = self._factors_of_time(self.moved_px - step)
+        ahead = pairs.with_columns(path=pairs.path_array(further))
+        behind = pairs.with_columns(path=pairs.path_array(less_far))
+        return self._map.find_slope(
+            {**at, "arrays": ahead},
+            {**at, "arrays": behind},
+            2.0 * SLOPE_PX,
+        )
 
     def unexplained(self, column: Any) -> Any:
         """Return the part of a derivative, on the device, that no change of the paths explains."""
         factors = self._factors(column)
-        rest = column.numpy().copy()
-        rest[: len(self.tile)] -= np.einsum("ij,ij->i", self._left, factors[self.tile])
         self._slopes.append(factors)
+        factors_of_pairs = factors[self.tile]
+        explained = np.einsum("ij,ij->i", self._left, factors_of_pairs)
+        rest = column.numpy().copy()
+        rest[: len(explained)] -= explained
         return wp.array(rest, dtype=float, device=column.device)
 
     def gain(self) -> float:
@@ -100,38 +138,56 @@ class TilePaths:
         It is the share that a quarter of the tiles exceed: the others may show moving objects.
         """
         residual = self._on_host(self._map.residuals.values)
-        removed = -(self._sums(self._left * (residual * self._weight)[:, None]) * self._step).sum(axis=1)
-        share = removed[self._used] / self._sums(residual**2 * self._weight)[self._used]
+        weighted = residual * self._weight
+        gradient = self._sums(self._left * weighted[:, None])
+        removed = -(gradient * self._step).sum(axis=1)
+        squares = self._sums(residual**2 * self._weight)
+        share = removed[self._used] / squares[self._used]
         return float(np.quantile(share, 0.75))
 
     def follow(self, v: Vector) -> None:
         """Change the paths, and the map with them, as :meth:`linearise` predicts for a search vector ``v`` nearby."""
         step = v - self._at
-        moved = self._base + np.clip(self._step, -LONGEST_STEP_PX, LONGEST_STEP_PX)
-        moved = moved - np.tensordot(step, self._slopes[: len(step)], 1)
+        own_step = np.clip(self._step, -LONGEST_STEP_PX, LONGEST_STEP_PX)
+        slopes = self._slopes[: len(step)]
+        explained = np.tensordot(step, slopes, 1)
+        moved = self._base + own_step - explained
         change = moved - self.moved_px
-        nodes = self._map.tiles.nodes
         self.set(moved)
+
+        # The map of each tile follows its own path.
+        tiles = len(change)
+        nodes = self._map.tiles.nodes
         image = self._map.unknowns
-        for by, of_map in zip(change.T, self._changes, strict=True):
-            image[:nodes] -= (of_map.numpy()[:nodes].reshape(len(by), -1) * by[:, None]).ravel()
+        for term, derivative in enumerate(self._changes):
+            of_map = derivative.numpy()[:nodes]
+            followed = of_map.reshape(tiles, -1) * change[:, term, None]
+            image[:nodes] -= followed.ravel()
         self._map.unknowns = image
 
     def costs(self, scale: float) -> Vector:
-        """Return the mean Cauchy cost of each tile, relative to that without a map; 0 without pairs."""
-        cost = cauchy_costs(self._map.residuals.values.numpy()[: len(self.tile)].astype(np.float64), scale)
-        return self._sums(cost) / np.maximum(self._sums(np.ones(len(cost))), 1.0)
+        """Return the mean Cauchy cost of each tile, relative to the cost without a map; 0 without pairs."""
+        padded = self._map.residuals.values.numpy()
+        residual = padded[: len(self.tile)].astype(np.float64)
+        cost = cauchy_costs(residual, scale)
+        count = self._sums(np.ones(len(cost)))
+        return self._sums(cost) / np.maximum(count, 1.0)
 
     def _factors(self, column: Any) -> Vector:
         """Return the changes of the paths that explain most of a column, shape (tiles, terms)."""
-        gradient = self._sums(self._left * (self._on_host(column) * self._weight)[:, None])
+        weighted = self._on_host(column) * self._weight
+        gradient = self._sums(self._left * weighted[:, None])
         return np.asarray(np.einsum("tij,tj->ti", self._inverse, gradient))
 
     def _on_host(self, column: Any) -> Vector:
-        return np.nan_to_num(column.numpy()[: len(self.tile)]).astype(np.float64)
+        """Return a column of the pairs as numbers, with 0 for pairs off the map."""
+        of_pairs = column.numpy()[: len(self.tile)]
+        return np.nan_to_num(of_pairs).astype(np.float64)
 
     def _sums(self, values: Vector) -> Vector:
         """Return the sums of values of the pairs over each tile."""
-        out = np.zeros((len(self.moved_px), *values.shape[1:]))
-        out[self._used] = np.add.reduceat(values[self._order], self._starts, axis=0)
-        return out
+        tiles = len(self.moved_px)
+        sums = np.zeros((tiles, *values.shape[1:]))
+        by_tile = values[self._order]
+        sums[self._used] = np.add.reduceat(by_tile, self._starts, axis=0)
+        return sums

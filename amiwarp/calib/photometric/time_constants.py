@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.brightness.solver import set_lags
+from amiwarp.brightness.slow_pixels import set_lags
 from amiwarp.calib.photometric.answers import AnswerSearch
 from amiwarp.calib.photometric.cauchy import cauchy_costs
 from amiwarp.calib.photometric.distances import px_per_rad
@@ -24,17 +24,19 @@ LIGHT_ROUNDS = 2
 """How many times the light of the tiles is found, and after it the mean time constant."""
 
 
-def find_time_constants(search: AnswerSearch, v: Vector, first: float, direction: float) -> tuple[Vector, float]:
+def find_time_constants(
+    search: AnswerSearch, v: Vector, first: float, direction: float
+) -> tuple[Vector, float]:
     """Return the angle per time constant at median brightness in each tile, and their mean, for the lowest cost [rad].
 
     Events come late in the dark, but their steps of brightness do not tell how dark a tile is compared with another. So
-    each tile has a time constant of its own: the costs of the tiles at three values tell those of all tiles at once.
+    each tile has a time constant of its own: the costs at three values tell the time constants of all tiles at once.
 
     Parameters
     ----------
     search : AnswerSearch
         Search on a map with one node per pixel, on which costs depend smoothly on the angle. The lags of its pairs are
-        set to those of the result.
+        set to the lags of the result.
     v : numpy.ndarray
         Search vector of the answer without lags, shape (n,).
     first : float
@@ -71,7 +73,13 @@ def find_time_constants(search: AnswerSearch, v: Vector, first: float, direction
     def lag(turn: float, longer: float, *, with_offsets: bool) -> None:
         turns = direction * turn * math.exp(longer) * relative
         ahead = math.atan(direction * turn)
-        set_lags(cost.brightness, space.build(space.to_values(at)), turns, ahead, with_offsets=with_offsets)
+        set_lags(
+            cost.brightness,
+            space.build(space.to_values(at)),
+            turns,
+            ahead,
+            with_offsets=with_offsets,
+        )
 
     def cost_at(turn: float) -> float:
         """Return the cost with the lags of an angle."""
@@ -91,8 +99,10 @@ def find_time_constants(search: AnswerSearch, v: Vector, first: float, direction
         for with_offsets in (False, True):
             lag(turn, longer, with_offsets=with_offsets)
             cost.residuals(at, rounds=2, steps=2 * cost.steps)
-        each = cauchy_costs(cost.brightness.residuals.values.numpy()[: len(tile)], cost.scale)
-        return np.bincount(tile, each, tiles) / np.maximum(count, 1)
+        residuals = cost.brightness.residuals.values.numpy()
+        each = cauchy_costs(residuals[: len(tile)], cost.scale)
+        total = np.bincount(tile, each, tiles)
+        return total / np.maximum(count, 1)
 
     angles, costs = bracketed(cost_at, [FACTOR**3 * first, FACTOR**4 * first])
     if is_negligible(angles[int(np.argmin(costs))]):
@@ -103,10 +113,14 @@ def find_time_constants(search: AnswerSearch, v: Vector, first: float, direction
         below = costs_of_tiles(turn, -LIGHT_STEP)
         here = costs_of_tiles(turn, 0.0)
         above = costs_of_tiles(turn, LIGHT_STEP)
+        # The lowest point of a parabola, or a whole step downwards where there is none.
         curved = below + above > 2.0 * here
-        change = 0.5 * (below - above) / np.where(curved, below + above - 2.0 * here, 1.0)
-        change = np.where(curved, change, np.sign(below - above)).clip(-1.0, 1.0) * LIGHT_STEP
-        relative = relative * np.exp(change - np.average(change, weights=count))
+        bend = np.where(curved, below + above - 2.0 * here, 1.0)
+        to_lowest = 0.5 * (below - above) / bend
+        steps = np.where(curved, to_lowest, np.sign(below - above))
+        change = steps.clip(-1.0, 1.0) * LIGHT_STEP
+        mean = np.average(change, weights=count)
+        relative = relative * np.exp(change - mean)
         angles, costs = bracketed(cost_at, [turn, FACTOR * turn])
     turn = lowest(cost_at, angles, costs)
     turn = 0.0 if is_negligible(turn) else turn

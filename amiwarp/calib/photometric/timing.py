@@ -1,7 +1,7 @@
 """Steps of the photometric stage for a timing of the sensor that was not given: refractory period, and slow pixels.
 
 Both shift the angles of the prism at which events tell the brightness. A linearised fit tells whether one of them
-explains much of the residual; then it is searched for. All angles are those by which the prism turns within a time.
+explains much of the residual; then it is searched for. All angles are how far the prism turns within a time.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.brightness.solver import darkness, set_lags
+from amiwarp.brightness.slow_pixels import darkness, set_lags
 from amiwarp.calib.photometric.answers import AnswerSearch, join_runs
 from amiwarp.calib.photometric.cost import Cost
 from amiwarp.calib.photometric.derivatives import shifted, slopes
@@ -51,10 +51,17 @@ def find_the_refractory_period(state: Refinement) -> Refinement:
     """
     problem = state.problem
     given = problem.settings.sensor
-    if not state.pause_rad or given.refractory_us:
+    if not state.pause_rad or given.refractory_us is not None:
         return state
-    turn = find_refractory(state.on_coarse_map(), state.answer.x, state.pause_rad, problem.direction)
-    sensor = replace(given, refractory_us=turn / problem.rad_per_us)
+    turn = find_refractory(
+        state.on_coarse_map(),
+        state.answer.x,
+        first=state.pause_rad,
+        direction=problem.direction,
+    )
+    found_us = turn / problem.rad_per_us
+    # none was found is not the same as none is there
+    sensor = replace(given, refractory_us=found_us or None)
     again = first_answer(problem, sensor)
     _, lag = timing_steps(again.search.cost, again.answer.x, problem.direction)
     state = replace(
@@ -66,8 +73,9 @@ def find_the_refractory_period(state: Refinement) -> Refinement:
         lag_rad=lag,
         timing=_change(state.before_timing, again.answer.x),
     )
-    beyond_us = sensor.refractory_us - given.refractory_us
-    return state.noticing(RefractoryPeriod(beyond_us)) if beyond_us else state
+    if not found_us:
+        return state
+    return state.noticing(RefractoryPeriod(found_us))
 
 
 def find_slow_pixels(state: Refinement) -> Refinement:
@@ -91,16 +99,22 @@ def find_slow_pixels(state: Refinement) -> Refinement:
     set_lags(cost.brightness, model, problem.direction * turns, ahead, with_offsets=True)
     cost.residuals(stage.x)
     again = search.search(stage.x)
-    answer = replace(again, stage=join_runs(join_runs(state.answer.stage, stage), again.stage))
-    fast, slow = (cost.space.build(cost.space.to_values(at)) for at in (v, answer.x))
+    runs = join_runs(state.answer.stage, stage)
+    answer = replace(again, stage=join_runs(runs, again.stage))
+
+    fast = cost.space.build(cost.space.to_values(v))
+    slow = cost.space.build(cost.space.to_values(answer.x))
     time_constant_us = turn / problem.rad_per_us
-    return replace(
+    lag_rad = time_constant_us * problem.rad_per_us
+    state = replace(
         state,
         search=search,
         answer=answer,
         time_constant_us=time_constant_us,
         timing=_change(state.before_timing, answer.x),
-    ).noticing(SlowPixels(time_constant_us, time_constant_us * problem.rad_per_us, distance(fast, slow)))
+    )
+    moved_px = distance(fast, slow)
+    return state.noticing(SlowPixels(time_constant_us, lag_rad, moved_px))
 
 
 def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]:
@@ -109,25 +123,30 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
     A linearised fit at the answer ``v`` estimates each of them. An angle that is not significant is 0.
     """
     cost.converge(v)
-    relative, _ = darkness(cost.brightness, cost.space.build(cost.space.to_values(v)))
-    columns = slopes(cost, cost.space, v, cost.space.names)
+    space = cost.space
+    relative, _ = darkness(cost.brightness, space.build(space.to_values(v)))
+    columns = slopes(cost, space, v, space.names)
     # the refractory period sets the reference of a pair, its first event, later
     columns["refractory"], _ = cost.by_drift(v)
     columns["slow"] = shifted(cost, v, relative)
     fit = linear_fit(cost, columns)
 
     def angle(name: str, sign: float) -> tuple[float, float, float]:
-        estimate, significance, gain = fit.adding(cost.space.names, (name,))
+        estimate, significance, gain = fit.adding(space.names, (name,))
         change = sign * float(estimate.change[-1])
         return change, math.copysign(significance, change), gain
 
     pause, pause_significance, pause_gain = angle("refractory", direction)
     lag, lag_significance, lag_gain = angle("slow", -direction)
     is_pause = pause_significance >= SIGNIFICANT and pause_gain >= LEAST_REFRACTORY_GAIN
+    if not is_pause:
+        pause = 0.0
     # where the lags are long and the light of the tiles differs, they look rather like a refractory period below 0
     is_certain = max(lag_significance, -pause_significance) >= SIGNIFICANT
     is_lag = lag > 0.0 and is_certain and lag_gain >= LEAST_SLOW_GAIN
-    return pause if is_pause else 0.0, lag if is_lag else 0.0
+    if not is_lag:
+        lag = 0.0
+    return pause, lag
 
 
 def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: float) -> float:
@@ -143,9 +162,9 @@ def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: fl
     def cost_at(angle: float) -> float:
         """Return the cost if the references are ``angle`` later."""
         turned = given.reshape(4, -1).copy()
-        z = (turned[0] + 1j * turned[1]) * np.exp(1j * direction * angle)
-        turned[0] = z.real
-        turned[1] = z.imag
+        first_events = (turned[0] + 1j * turned[1]) * np.exp(1j * direction * angle)
+        turned[0] = first_events.real
+        turned[1] = first_events.imag
         azimuth.assign(turned.ravel())
         cost.renew(v)
         at = search.descend(v).x
@@ -153,11 +172,14 @@ def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: fl
         return cost.mean()
 
     try:
-        return lowest(cost_at, *bracketed(cost_at, [FACTOR * first, FACTOR**2 * first]))
+        angles, costs = bracketed(cost_at, [FACTOR * first, FACTOR**2 * first])
+        return lowest(cost_at, angles, costs)
     finally:
         azimuth.assign(given)
 
 
 def _change(before: Vector, after: Vector) -> Vector:
     """Return the change of an answer [px]; nothing if another number of parameters is determined."""
-    return after - before if len(before) == len(after) else np.zeros(0)
+    if len(before) != len(after):
+        return np.zeros(0)
+    return after - before

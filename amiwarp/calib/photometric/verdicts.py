@@ -8,11 +8,10 @@ from functools import singledispatch
 
 import numpy as np
 
-from amiwarp.brightness.solver import SensorTiming
-from amiwarp.calib.parameters import units
+from amiwarp.brightness.sensor_timing import SensorTiming
 from amiwarp.calib.photometric import limits
 from amiwarp.calib.photometric.causes import FLAT_SIDE, Cause
-from amiwarp.calib.photometric.consistency import Consistency
+from amiwarp.calib.photometric.consistency import CLOCK, Consistency
 from amiwarp.calib.photometric.findings import (
     AngleError,
     BlindTime,
@@ -35,7 +34,9 @@ from amiwarp.calib.photometric.findings import (
     UnsteadySpeed,
 )
 from amiwarp.optics.camera import LENS
-from amiwarp.optics.models import MODELS, Model
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.models.registry import MODELS
+from amiwarp.results.parameters import units
 
 REFUSED_IN_ORDER: tuple[type[Finding], ...] = (
     LensBeyondCorrection,
@@ -85,7 +86,13 @@ def refusal(findings: Iterable[Finding]) -> str:
 def warnings(findings: Iterable[Finding]) -> tuple[str, ...]:
     """Return a sentence for all that a user should know of."""
     noticed = [*findings]
-    return tuple(said for kind in SAID_IN_ORDER for each in noticed if type(each) is kind for said in warned(each))
+    return tuple(
+        said
+        for kind in SAID_IN_ORDER
+        for each in noticed
+        if type(each) is kind
+        for said in warned(each)
+    )
 
 
 def accepted_in_words(optimum: Optimum) -> str:
@@ -124,8 +131,14 @@ def _(optimum: Optimum) -> str:
             f"the search did not converge: its next step would be {size}, but no step lowers the cost: too few events, "
             "or many lost"
         )
-    if optimum.rise < min(limits.LEAST_COST_RISE, max(limits.SMALLEST_RISE, limits.RISE_SHARE * optimum.cost)):
-        well = f"as well ({100 * optimum.rise:.1f} % of the residual more)" if optimum.rise > 0.0 else "better"
+    if optimum.rise < min(
+        limits.LEAST_COST_RISE, max(limits.SMALLEST_RISE, limits.RISE_SHARE * optimum.cost)
+    ):
+        well = (
+            f"as well ({100 * optimum.rise:.1f} % of the residual more)"
+            if optimum.rise > 0.0
+            else "better"
+        )
         return (
             f"an orbit that is {limits.PERTURBATION_PX:g} px larger, smaller or rotated explains the events {well}: "
             "too few events, too little contrast, or the scene or the camera moved"
@@ -153,7 +166,11 @@ def _(found: AngleError) -> str:
 
 @warned.register
 def _(found: AngleError) -> Sequence[str]:
-    return [_skew_in_words(found)] if found.late_px >= limits.NOTABLE_SKEW_PX and not refused(found) else []
+    return (
+        [_skew_in_words(found)]
+        if found.late_px >= limits.NOTABLE_SKEW_PX and not refused(found)
+        else []
+    )
 
 
 def _skew_in_words(found: AngleError) -> str:
@@ -169,7 +186,7 @@ def _skew_in_words(found: AngleError) -> str:
 def _(found: SectorError) -> Sequence[str]:
     if found.moved_px < limits.NOTABLE_SECTOR_PX:
         return []
-    name = _angle_names(MODELS[found.model])[found.angle]
+    name = angle_names(MODELS[found.model])[found.angle]
     return [
         f"an error of about {found.moved_px:.2f} px rms is left that repeats with {name}, most at "
         f"{math.degrees(found.at_rad):.0f} deg: it is not corrected; check the angle there, or calibrate again with a "
@@ -181,16 +198,20 @@ def harmonics_in_words(kind: type[Model], harmonics: Sequence[float]) -> str:
     """Return the error of the angles of a model in words: its size, and how often it repeats."""
     turn = "turn" if kind.PRISM else "period"
     said = []
-    for name, of_angle in zip(_angle_names(kind), np.reshape(harmonics, (-1, 4)), strict=False):
+    for name, of_angle in zip(angle_names(kind), np.reshape(harmonics, (-1, 4)), strict=False):
         sizes = [math.degrees(math.hypot(*of_angle[:2])), math.degrees(math.hypot(*of_angle[2:]))]
         often = (f"once a {turn}", f"twice a {turn}")
-        named = [f"{x:.2g} deg {how}" for x, how in zip(sizes, often, strict=True) if x and x >= 0.2 * max(sizes)]
+        named = [
+            f"{x:.2g} deg {how}"
+            for x, how in zip(sizes, often, strict=True)
+            if x and x >= 0.2 * max(sizes)
+        ]
         if named:
             said.append(f"{name} is wrong by {' and '.join(named)}")
     return ", ".join(said)
 
 
-def _angle_names(kind: type[Model]) -> tuple[str, ...]:
+def angle_names(kind: type[Model]) -> tuple[str, ...]:
     """Return what each angle of a model is called."""
     if kind.ANGLES == 1:
         return ("the encoder's angle",)
@@ -205,7 +226,7 @@ def _angle_names(kind: type[Model]) -> tuple[str, ...]:
 @warned.register
 def _(found: RefractoryPeriod) -> Sequence[str]:
     return [
-        f"the events show that pixels pause after an event (refractory period): {found.beyond_given_us:.0f} us of it "
+        f"the events show that pixels pause after an event (refractory period): {found.found_us:.0f} us of it "
         "fit best and were corrected; give the true one by --refractory-us"
     ]
 
@@ -270,15 +291,19 @@ def _(found: BlindTime) -> Sequence[str]:
 
 
 def _blindness_in_words(found: BlindTime) -> str:
-    return (
-        f"the image moves by up to {found.moved_px:.2f} px within the sensor's refractory period, so that events are "
-        "lost: let the image move less, or more slowly"
-    )
+    period = "the sensor's refractory period"
+    remedy = "let the image move less, or more slowly"
+    if found.sensor.refractory_us is None:
+        period += f" if that is {limits.REFRACTORY_DOUBT_US:g} us"
+        remedy = f"give the period by --refractory-us, or {remedy}"
+    return f"the image moves by up to {found.moved_px:.2f} px within {period}, so that events are lost: {remedy}"
 
 
 def refractory_doubt_us(sensor: SensorTiming) -> float:
     """Return the standard deviation of a sensor's refractory period [us]."""
-    return limits.KNOWN_SHARE * sensor.refractory_us if sensor.refractory_us else limits.REFRACTORY_DOUBT_US
+    if sensor.refractory_us is None:
+        return limits.REFRACTORY_DOUBT_US
+    return limits.KNOWN_SHARE * sensor.refractory_us
 
 
 @refused.register
@@ -293,8 +318,8 @@ def _(found: RefractoryDoubt) -> Sequence[str]:
 
 def _doubt_in_words(found: RefractoryDoubt) -> str:
     known = found.sensor.refractory_us
-    given = f"given as {known:.0f} us" if known else "which is not given"
-    remedy = "let the image move less" if known else "give it by --refractory-us"
+    given = "which is not given" if known is None else f"given as {known:.0f} us"
+    remedy = "give it by --refractory-us" if known is None else "let the image move less"
     return (
         f"the image moves fast for the sensor: an error of {refractory_doubt_us(found.sensor):.0f} us in its "
         f"refractory period, {given}, changes the answer by {found.moved_px:.2f} px; {remedy}"
@@ -363,7 +388,9 @@ def _(found: RivalCauses) -> Sequence[str]:
 
 def rivals_in_words(found: RivalCauses) -> str:
     """Return that two explanations explain the events equally well, and what to do."""
-    remedy = " or ".join(f"--free apex,phase,{names}" for names in map(_freed, (found.taken, found.rival)) if names)
+    remedy = " or ".join(
+        f"--free apex,phase,{names}" for names in map(_freed, (found.taken, found.rival)) if names
+    )
     return (
         f"the events do not tell whether {found.taken.words} or {found.rival.words} is wrong: both explain them as "
         f"well, and differ by {found.apart_px:.2f} px rms; choose the right one ({remedy})"
@@ -388,7 +415,9 @@ def _(check: Consistency) -> Sequence[str]:
     out = []
     # what was tried and did not lower the cost is no cause of a small error, unless it explains much
     first = check.likely[0] if check.likely else None
-    if first is not None and (first.moved_px >= limits.NOTABLE_PX or first.gain >= limits.NOTABLE_GAIN):
+    if first is not None and (
+        first.moved_px >= limits.NOTABLE_PX or first.gain >= limits.NOTABLE_GAIN
+    ):
         out.append(
             f"the answer does not hold everywhere in the image: {first.cause.words} seems to be wrong, which amounts "
             f"to {first.moved_px:.2f} px rms"
@@ -399,11 +428,12 @@ def _(check: Consistency) -> Sequence[str]:
             f"the {what} of the orbit differs by {max(check.spread):.2f} px between parts of the image: "
             f"{likeliest(check)}"
         )
-    drift = max(abs(d) for d in check.drift)
-    if drift >= limits.NOTABLE_PX:
-        what = "phase" if abs(check.drift[1]) > abs(check.drift[0]) else "size"
+    size_drift, phase_drift = (abs(d) for d in check.drift)
+    notable_phase = limits.NOTABLE_CLOCK_PX if CLOCK in check.hidden_px else limits.NOTABLE_PX
+    if size_drift >= limits.NOTABLE_PX or phase_drift >= notable_phase:
+        what = "phase" if phase_drift > size_drift else "size"
         out.append(
-            f"the {what} of the orbit drifts over the recording by {drift:.2f} px rms: "
+            f"the {what} of the orbit drifts over the recording by {max(size_drift, phase_drift):.2g} px rms or more: "
             "the scale or the clock of the encoder is wrong, or the camera moved"
         )
     if check.untold_px:
@@ -470,4 +500,6 @@ def _(found: MissingEvents) -> str:
 def _(found: MissingEvents) -> Sequence[str]:
     if not limits.NOTABLE_STEP <= found.step < limits.LARGEST_STEP:
         return []
-    return ["a fifth or more of the events are missing: lower the event rate, or record without a filter"]
+    return [
+        "a fifth or more of the events are missing: lower the event rate, or record without a filter"
+    ]

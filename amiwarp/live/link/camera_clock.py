@@ -2,7 +2,7 @@
 
 A controller sends pulses at pseudo-random intervals to the camera's trigger input, and reports when. Under the right
 shift between the clocks nearly all of them meet a trigger, under any other shift hardly any. So the shift is found
-whatever the reports' delays are, or it is not found: it is never that of a neighbouring pulse.
+whatever the reports' delays are, or it is not found: it never belongs to a neighbouring pulse.
 """
 
 from __future__ import annotations
@@ -37,15 +37,18 @@ BY_CHANCE = 1e-6
 """Expected number of wrong shifts under which as many pulses would meet, below which a shift is accepted."""
 DOUBTFUL = 1e-3
 """The same for another shift, below which two shifts are possible and none is taken."""
-JUDGED, FEWEST_MET = 16, 5
+JUDGED = 16
+FEWEST_MET = 5
 """Number of latest pulses in the time of known triggers, and smallest number of them that must meet one. Below it, the
 map is discarded: one of the clocks has jumped."""
-NO_PULSES_US, NO_TRIGGERS_US = 3_000_000, 6_500_000
+NO_PULSES_US = 3_000_000
+NO_TRIGGERS_US = 6_500_000
 """Time without a pulse of the controller, and time with pulses but without a trigger of the camera, whose reports may
 be late, after which arrival times are used [us]."""
 NO_SHIFT_US = 10_000_000
 """Time with pulses of both sides, but without a shift between them, after which arrival times are used [us]."""
-FEWEST_REGULAR, REGULAR_US = 7, 200.0
+FEWEST_REGULAR = 7
+REGULAR_US = 200.0
 """Smallest number of pulses that can be called regular, and largest deviation of an interval between two of them [us].
 Irregular intervals are whole milliseconds of a wide range, so that so many hardly ever agree."""
 NO_PAIRS = np.zeros((0, 2), np.int64)
@@ -201,23 +204,34 @@ class CameraClock:
         if not (self._sync and self._trigger):
             return
         trigger, sync = (np.array(pulses, np.int64) for pulses in (self._trigger, self._sync))
-        pairs = self._first_pairs(trigger, sync) if self._map is None else self._next_pairs(trigger[:, 0], sync[:, 0])
+        pairs = (
+            self._first_pairs(trigger, sync)
+            if self._map is None
+            else self._next_pairs(trigger[:, 0], sync[:, 0])
+        )
         if not len(pairs):
             return
         self._pairs.extend((int(sync[j, 0]), int(trigger[i, 0])) for i, j in pairs)
         last_trigger, last_sync = pairs.max(axis=0).tolist()
-        for pulses, last in ((self._trigger, trigger[last_trigger, 0]), (self._sync, sync[last_sync, 0])):
+        for pulses, last in (
+            (self._trigger, trigger[last_trigger, 0]),
+            (self._sync, sync[last_sync, 0]),
+        ):
             while pulses and pulses[0][0] <= last:
                 pulses.popleft()
         own, other = np.array(self._pairs).T
         if len(own) >= FEWEST_PAIRS:
             found = fit_to_pulses(own, other)
             if self._regular:  # the shift may be wrong by whole intervals
-                found = replace(found, offset_std_us=max(found.offset_std_us, float(np.diff(own).min())))
+                found = replace(
+                    found, offset_std_us=max(found.offset_std_us, float(np.diff(own).min()))
+                )
             self.relation += self._map is None
             self._map = found
 
-    def _first_pairs(self, trigger: NDArray[np.int64], sync: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _first_pairs(
+        self, trigger: NDArray[np.int64], sync: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
         """Return the pulses that match under the shift that is found, as indices (trigger, sync); none if none is."""
         self._regular = are_multiples(sync[:, 0])
         if self._regular:
@@ -245,7 +259,7 @@ class CameraClock:
         return pairs
 
     def _reach_us(self, sync: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the distance from the map within which a trigger is that of a sync pulse [us], shape (syncs,)."""
+        """Return the distance from the map within which a trigger belongs to a sync pulse [us], shape (syncs,)."""
         assert self._map is not None
         ahead = np.abs(sync - self._pairs[-1][0])
         grown = MATCH_US + (5.0 * self._map.drift_std + UNSTEADY) * ahead
@@ -257,7 +271,7 @@ class FoundShift:
     """Shift between two clocks under which pulses meet."""
 
     shift_us: float
-    """Time of the camera's clock minus that of the controller's [us]."""
+    """Time of the camera's clock minus time of the controller's [us]."""
     pairs: NDArray[np.int64]
     """Indices of the triggers and of the sync pulses that meet, shape ``(n, 2)``."""
     by_chance: float
@@ -284,7 +298,10 @@ def find_shift(trigger_us: NDArray[np.int64], sync_us: NDArray[np.int64]) -> Fou
         if meeting[k] < FEWEST_PAIRS:
             break
         middle = float(np.median(order[first[k] : last[k]]))
-        if any(abs(middle - known.shift_us) <= 4.0 * MATCH_US for known in (*others, *([best] if best else []))):
+        if any(
+            abs(middle - known.shift_us) <= 4.0 * MATCH_US
+            for known in (*others, *([best] if best else []))
+        ):
             continue
         found = _meeting_at(middle, trigger_us, sync_us)
         if best is None or found.by_chance < best.by_chance:
@@ -300,13 +317,18 @@ def find_shift(trigger_us: NDArray[np.int64], sync_us: NDArray[np.int64]) -> Fou
     return best
 
 
-def _meeting_at(shift_us: float, trigger_us: NDArray[np.int64], sync_us: NDArray[np.int64]) -> FoundShift:
+def _meeting_at(
+    shift_us: float, trigger_us: NDArray[np.int64], sync_us: NDArray[np.int64]
+) -> FoundShift:
     """Return which pulses meet under a shift, and how many shifts would do as well by chance."""
     distance = np.abs(trigger_us[:, None] - sync_us[None, :] - shift_us)
     pairs = _nearest_pairs(distance, np.full(len(sync_us), MATCH_US))
     if not len(pairs):
         return FoundShift(shift_us, pairs, math.inf)
-    (first_trigger, first_sync), (last_trigger, last_sync) = pairs.min(axis=0).tolist(), pairs.max(axis=0).tolist()
+    (first_trigger, first_sync), (last_trigger, last_sync) = (
+        pairs.min(axis=0).tolist(),
+        pairs.max(axis=0).tolist(),
+    )
     span_us = max(int(trigger_us[last_trigger] - trigger_us[first_trigger]), 1)
     # A pulse at a random time meets one of the triggers with this chance. Controllers count whole milliseconds, so
     # that pulses meet at random more often than their spread tells.
@@ -321,7 +343,8 @@ def _meeting_at(shift_us: float, trigger_us: NDArray[np.int64], sync_us: NDArray
 def _binomial_tail(tried: int, met: int, chance: float) -> float:
     """Return the probability of at least ``met`` successes of ``tried``, each with a ``chance``."""
     return math.fsum(
-        math.comb(tried, k) * chance**k * (1.0 - chance) ** (tried - k) for k in range(max(met, 0), tried + 1)
+        math.comb(tried, k) * chance**k * (1.0 - chance) ** (tried - k)
+        for k in range(max(met, 0), tried + 1)
     )
 
 
@@ -338,7 +361,7 @@ def _nearest_pairs(distance: NDArray[np.float64], reach: NDArray[np.float64]) ->
 
 
 def are_multiples(sync_us: NDArray[np.int64]) -> bool:
-    """Return whether the intervals between pulses are multiples of one interval, as those of older controllers."""
+    """Return whether the intervals between pulses are multiples of one interval, as with older controllers."""
     intervals = np.diff(sync_us).astype(np.float64)
     if not len(intervals):
         return True

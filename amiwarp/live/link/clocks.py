@@ -16,6 +16,8 @@ from amiwarp.errors import AmiwarpError
 
 WRAP = 1 << 32
 """Period of the controller's 32-bit clock [us]."""
+MOST_ROUNDS = 10
+"""Largest number of fits, each without the outliers of the one before."""
 FEWEST_PAIRS = 3
 """Smallest number of pairs of times to which a clock map is fitted."""
 OUTLIER_STD = 4.0
@@ -55,7 +57,7 @@ class ClockMap:
     at_us: int
     """Reference time of the map on the own clock [us]: the mean time of the fitted pairs."""
     offset_us: float
-    """Time of the other clock minus that of the own clock at :attr:`at_us` [us]."""
+    """Time of the other clock minus time of the own clock at :attr:`at_us` [us]."""
     drift: float
     """Relative difference between the rates of the clocks: 1e-6 is one microsecond per second."""
     offset_std_us: float
@@ -103,32 +105,47 @@ def fit_to_round_trips(sent_us: ArrayLike, other_us: ArrayLike, received_us: Arr
         raise AmiwarpError(
             f"{len(duration)} round trips, the shortest {shortest:g} us; give {FEWEST_PAIRS} or more, none negative"
         )
-    short = duration <= max(SHORT_TRIP * duration.min(), np.partition(duration, FEWEST_PAIRS - 1)[FEWEST_PAIRS - 1])
+    short = duration <= max(
+        SHORT_TRIP * duration.min(), np.partition(duration, FEWEST_PAIRS - 1)[FEWEST_PAIRS - 1]
+    )
     middle = sent + (received - sent) // 2
-    return _fit_line(middle[short], other[short], np.maximum(duration[short], 1.0) / math.sqrt(12.0))
+    return _fit_line(
+        middle[short], other[short], np.maximum(duration[short], 1.0) / math.sqrt(12.0)
+    )
 
 
-def _fit_line(own: NDArray[np.int64], other: NDArray[np.int64], sigma: NDArray[np.float64]) -> ClockMap:
+def _fit_line(
+    own: NDArray[np.int64], other: NDArray[np.int64], sigma: NDArray[np.float64]
+) -> ClockMap:
     """Fit a line to pairs of times, weighted by ``sigma`` [us], and reject outliers iteratively."""
     difference = (other - own).astype(np.float64)
     kept = np.ones(len(own), np.bool_)
-    for _ in range(10):
+    for rounds in range(MOST_ROUNDS):
         at = int(np.rint(np.average(own[kept] - own[0], weights=sigma[kept] ** -2.0))) + int(own[0])
         x = (own - at).astype(np.float64)
         base = float(np.median(difference[kept]))
         weight = sigma[kept] ** -2.0
         slope_weight = float(np.sum(weight * x[kept] ** 2))
         offset = float(np.average(difference[kept] - base, weights=weight))
-        drift = float(np.sum(weight * x[kept] * (difference[kept] - base - offset)) / max(slope_weight, 1e-300))
+        drift = float(
+            np.sum(weight * x[kept] * (difference[kept] - base - offset))
+            / max(slope_weight, 1e-300)
+        )
         residual = (difference - base - offset - drift * x) / sigma
         spread = max(1.0, 1.4826 * float(np.median(np.abs(residual[kept]))))
         again = np.abs(residual) <= OUTLIER_STD * spread
-        if again.sum() < FEWEST_PAIRS or np.array_equal(again, kept):
-            break
+        last = rounds == MOST_ROUNDS - 1
+        if last or again.sum() < FEWEST_PAIRS or np.array_equal(again, kept):
+            break  # the line is of the pairs that are kept
         kept = again
     scale = max(1.0, math.sqrt(float(np.mean(residual[kept] ** 2))))
     std = scale / math.sqrt(float(np.sum(weight)))
     drift_std = scale / math.sqrt(max(slope_weight, 1e-300))
     return ClockMap(
-        at_us=at, offset_us=base + offset, drift=drift, offset_std_us=std, drift_std=drift_std, pairs=int(kept.sum())
+        at_us=at,
+        offset_us=base + offset,
+        drift=drift,
+        offset_std_us=std,
+        drift_std=drift_std,
+        pairs=int(kept.sum()),
     )

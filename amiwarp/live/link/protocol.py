@@ -42,7 +42,12 @@ UNKNOWN_MV = 0xFFFF
 """Value of :attr:`Condition.supply_mv` that means that the controller does not know its supply."""
 BOARD_BYTES = 16
 """Size of :attr:`Identity.board` [bytes]."""
-STORED = ("as built", "saved", "as built: those saved belong to another build", "as built: those saved are damaged")
+STORED = (
+    "as built",
+    "saved",
+    "as built: those saved belong to another build",
+    "as built: those saved are damaged",
+)
 """Meaning of each value of :attr:`Condition.stored`."""
 
 
@@ -302,7 +307,7 @@ class SaveSettings:
 
 @dataclass(frozen=True, slots=True)
 class RestoreSettings:
-    """Command to change all settings back to those of the build, until the next reset."""
+    """Command to change all settings back to the build's, until the next reset."""
 
     KIND: ClassVar[int] = 0x88
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<")
@@ -384,7 +389,9 @@ class FrameDecoder:
 
         The number is None for a message from a text line.
         """
-        return [(sequence, message) for sequence, message in self.units(data) if message is not None]
+        return [
+            (sequence, message) for sequence, message in self.units(data) if message is not None
+        ]
 
     def units(self, data: bytes) -> list[tuple[int | None, Message | None]]:
         """Return the messages like :meth:`feed`, and None for each frame of an unknown type or of a wrong size."""
@@ -440,7 +447,9 @@ class FrameDecoder:
             self._take_held()
             self._whole = True
             return
-        match = _LINE.fullmatch(bytes(self._held).lstrip(b"\n")) if self._whole or self._text else None
+        match = (
+            _LINE.fullmatch(bytes(self._held).lstrip(b"\n")) if self._whole or self._text else None
+        )
         t, count = (int(match[1]), int(match[2])) if match else (1 << 32, 0)
         if t < 1 << 32 and -(1 << 31) <= count < 1 << 31:
             self._text = True
@@ -465,8 +474,13 @@ def _checked(held: bytes) -> bytes | None:
         packet = bytes(cobs.decode(held))
     except cobs.DecodeError:
         return None
-    body, check = packet[: -_CRC.size], packet[-_CRC.size :]
-    if len(body) < _HEADER.size or len(check) < _CRC.size or zlib.crc32(body) != _CRC.unpack(check)[0]:
+    body = packet[: -_CRC.size]
+    check = packet[-_CRC.size :]
+    if (
+        len(body) < _HEADER.size
+        or len(check) < _CRC.size
+        or zlib.crc32(body) != _CRC.unpack(check)[0]
+    ):
         return None
     return body
 

@@ -18,11 +18,15 @@ INSTEAD: Mapping[str, str] = {
 }
 """What to do instead of a setting that a camera does not have."""
 NAMES: Mapping[str, str] = {"most_per_s": "most_mev_s"}
-"""Names of settings in the name of a source, where they differ from those of the fields."""
+"""Names of settings in the name of a source, where they differ from the names of the fields."""
 
 
 def refuse_others(
-    name: str, model: str, settings: CameraSettings, can: Collection[str], elsewhere: Mapping[str, str]
+    name: str,
+    model: str,
+    settings: CameraSettings,
+    can: Collection[str],
+    elsewhere: Mapping[str, str],
 ) -> None:
     """Raise :class:`AmiwarpError` for the first setting that is given, but not among those that the camera ``can``.
 
@@ -32,10 +36,14 @@ def refuse_others(
         # trigger=off is equal to 0 here: a trigger input that the driver does not switch on is off
         if each not in can and getattr(settings, each) not in (None, {}, (), 0):
             remedy = "; or ".join(filter(None, (elsewhere.get(each), INSTEAD[each])))
-            raise AmiwarpError(f"{name}: {model} has no {NAMES.get(each, each)} through this driver; {remedy}")
+            raise AmiwarpError(
+                f"{name}: {model} has no {NAMES.get(each, each)} through this driver; {remedy}"
+            )
 
 
-def check_on_sensor(name: str, settings: CameraSettings, size: tuple[int, int], most_masked: int) -> None:
+def check_on_sensor(
+    name: str, settings: CameraSettings, size: tuple[int, int], most_masked: int
+) -> None:
     """Raise :class:`AmiwarpError` for a region or a pixel outside the sensor, and for too many pixels."""
     width, height = size
     if settings.region is not None and (settings.region[2] > width or settings.region[3] > height):
@@ -45,7 +53,9 @@ def check_on_sensor(name: str, settings: CameraSettings, size: tuple[int, int], 
         )
     for x, y in settings.masked:
         if x >= width or y >= height:
-            raise AmiwarpError(f"{name}: masked pixel {x}:{y} is outside the sensor of {width}x{height} px; correct it")
+            raise AmiwarpError(
+                f"{name}: masked pixel {x}:{y} is outside the sensor of {width}x{height} px; correct it"
+            )
     if len(settings.masked) > most_masked:
         raise AmiwarpError(
             f"{name}: {len(settings.masked)} masked pixels are more than the {most_masked} that the camera can mask; "
@@ -59,12 +69,16 @@ def check_bias(name: str, bias: str, value: int, low: int, high: int) -> None:
         raise AmiwarpError(f"{name}: bias {bias} = {value}; expected {low} .. {high}")
 
 
-def check_bias_names(name: str, model: str, settings: CameraSettings, known: Mapping[str, int]) -> None:
+def check_bias_names(
+    name: str, model: str, settings: CameraSettings, known: Mapping[str, int]
+) -> None:
     """Raise :class:`AmiwarpError` for a bias that is not among the ``known`` ones, with their present values."""
     for bias in settings.biases:
         if bias not in known:
             listed = ", ".join(f"{each} ({value})" for each, value in known.items())
-            raise AmiwarpError(f"{name}: {model} has no bias {bias!r}; its biases, with their values, are {listed}")
+            raise AmiwarpError(
+                f"{name}: {model} has no bias {bias!r}; its biases, with their values, are {listed}"
+            )
 
 
 def check_rate(name: str, most_per_s: int, low: int, high: int) -> None:
@@ -79,7 +93,9 @@ def check_rate(name: str, most_per_s: int, low: int, high: int) -> None:
 def check_band(name: str, band: tuple[int, int], low: int, high: int) -> None:
     """Raise :class:`AmiwarpError` unless a band of frequencies [Hz] is within ``low`` .. ``high``."""
     if not low <= band[0] < band[1] <= high:
-        raise AmiwarpError(f"{name}: flicker_hz = {joined(band)}; the camera removes flicker of {low} .. {high} Hz")
+        raise AmiwarpError(
+            f"{name}: flicker_hz = {joined(band)}; the camera removes flicker of {low} .. {high} Hz"
+        )
 
 
 def difference(settings: CameraSettings, applied: CameraSettings) -> str:

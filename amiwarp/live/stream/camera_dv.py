@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream.camera_checks import check_bias, check_bias_names, check_on_sensor, refuse_others
+from amiwarp.live.stream.camera_checks import (
+    check_bias,
+    check_bias_names,
+    check_on_sensor,
+    refuse_others,
+)
 from amiwarp.live.stream.camera_settings import CameraRequest, CameraSettings
 from amiwarp.live.stream.camera_source import CameraSource, copied_events, library, opening
 from amiwarp.live.stream.packets import IDLE_S, Packet, make_packet
@@ -60,7 +65,11 @@ class DvSource(CameraSource):
     """
 
     def __init__(
-        self, request: CameraRequest, say: Callable[[str], None] = lambda _: None, *, packet_us: int = 1000
+        self,
+        request: CameraRequest,
+        say: Callable[[str], None] = lambda _: None,
+        *,
+        packet_us: int = 1000,
     ) -> None:
         super().__init__(request, say, packet_us=packet_us)
         dv = library("dv_processing", self.name, "pip install 'amiwarp[dv]'")
@@ -120,7 +129,9 @@ class DvSource(CameraSource):
         can = ("region", *(["biases"] if biases else []), *(["trigger"] if detects else []))
         refuse_others(self.name, model, settings, can, ELSEWHERE)
         check_on_sensor(self.name, settings, self.size, 0)
-        check_bias_names(self.name, model, settings, {name: bias.get() for name, bias in biases.items()})
+        check_bias_names(
+            self.name, model, settings, {name: bias.get() for name, bias in biases.items()}
+        )
         for name, value in settings.biases.items():
             check_bias(self.name, name, value, 0, biases[name].largest)
         for name, value in settings.biases.items():
@@ -134,17 +145,23 @@ class DvSource(CameraSource):
             camera.setDetectorFallingEdges(False)
             camera.setDetectorRunning(on)
         elif settings.counts_per_turn:
-            raise AmiwarpError(f"{self.name}: {model} has no trigger input; leave counts_per_turn out")
+            raise AmiwarpError(
+                f"{self.name}: {model} has no trigger input; leave counts_per_turn out"
+            )
         return replace(
             settings,
             biases={name: bias.get() for name, bias in biases.items()},
             region=settings.region and _crop_area(camera),
-            trigger=bool(camera.isDetectorRunning() and camera.getDetectorRisingEdges()) if detects else None,
+            trigger=bool(camera.isDetectorRunning() and camera.getDetectorRisingEdges())
+            if detects
+            else None,
         )
 
     def _triggers(self) -> NDArray[np.int64]:
         batch = self._camera.getNextTriggerBatch() or ()
-        return np.array([trigger.timestamp for trigger in batch if trigger.type == self._rising], np.int64)
+        return np.array(
+            [trigger.timestamp for trigger in batch if trigger.type == self._rising], np.int64
+        )
 
 
 def _crop_area(camera: Any) -> tuple[int, int, int, int]:
@@ -156,17 +173,25 @@ def _biases(camera: Any) -> Mapping[str, _Bias]:
     """Return the biases of a camera, by the library's names."""
     if hasattr(camera, "setContrastThresholdOn"):
         return {
-            name: _Bias(getattr(camera, f"get{name}"), getattr(camera, f"set{name}"), LARGEST_THRESHOLD)
+            name: _Bias(
+                getattr(camera, f"get{name}"), getattr(camera, f"set{name}"), LARGEST_THRESHOLD
+            )
             for name in THRESHOLDS
         }
-    kind = DAVIS_KINDS.get(camera.getSensorModel().name) if hasattr(camera, "getSensorModel") else None
+    kind = (
+        DAVIS_KINDS.get(camera.getSensorModel().name) if hasattr(camera, "getSensorModel") else None
+    )
     if kind is None:
         return {}
     members = getattr(camera, f"{kind}BiasCF").__members__
     read = getattr(camera, f"get{kind}BiasCoarseFine")
     write = getattr(camera, f"set{kind}BiasCoarseFine")
     return {
-        name: _Bias(partial(_coarse_fine, read, bias), partial(_set_coarse_fine, write, bias), LARGEST_COARSE_FINE)
+        name: _Bias(
+            partial(_coarse_fine, read, bias),
+            partial(_set_coarse_fine, write, bias),
+            LARGEST_COARSE_FINE,
+        )
         for name, bias in members.items()
     }
 

@@ -17,7 +17,13 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events
-from amiwarp.live.stream.camera_checks import check_bias, check_bias_names, check_on_sensor, check_rate, refuse_others
+from amiwarp.live.stream.camera_checks import (
+    check_bias,
+    check_bias_names,
+    check_on_sensor,
+    check_rate,
+    refuse_others,
+)
 from amiwarp.live.stream.camera_settings import CameraRequest, CameraSettings
 from amiwarp.live.stream.camera_source import CameraSource, copied_events, library, named, opening
 from amiwarp.live.stream.packets import IDLE_S, NO_TIMES, Packet
@@ -46,7 +52,9 @@ _INIVATION = "open it as dv: through dv-processing"
 ELSEWHERE = {
     EVK4: {"flicker_hz": _PROPHESEE},
     EVK3: dict.fromkeys(("masked", "flicker_hz", "trigger"), _PROPHESEE),
-    "CENTURYARKS_VGA": dict.fromkeys(("region", "masked", "most_per_s", "flicker_hz", "trigger"), _PROPHESEE),
+    "CENTURYARKS_VGA": dict.fromkeys(
+        ("region", "masked", "most_per_s", "flicker_hz", "trigger"), _PROPHESEE
+    ),
     DAVIS: {"trigger": _INIVATION},
     DVXPLORER: dict.fromkeys(("region", "trigger"), _INIVATION),
 }
@@ -67,19 +75,31 @@ def list_cameras() -> list[Any]:
 def _find_camera(which: str) -> Any:
     """Return the camera with the serial number ``which``, or the only one whose model's name contains it."""
     cameras = list_cameras()
-    found = [each for each in cameras if which == each.serial or _squeezed(which) in _squeezed(each.name.value)]
+    found = [
+        each
+        for each in cameras
+        if which == each.serial or _squeezed(which) in _squeezed(each.name.value)
+    ]
     name = f"camera:{which}"
     if not cameras:
-        raise Unreachable(f"{name}: no camera is connected, or none that neuromorphic-drivers knows; plug it in")
+        raise Unreachable(
+            f"{name}: no camera is connected, or none that neuromorphic-drivers knows; plug it in"
+        )
     if len(found) != 1:
         listed = ", ".join(
-            f"camera:{each.serial} ({each.name.value})" if each.serial else f"{each.name.value} ({each.error})"
+            f"camera:{each.serial} ({each.name.value})"
+            if each.serial
+            else f"{each.name.value} ({each.error})"
             for each in found or cameras
         )
-        raise Unreachable(f"{name}: {len(found)} such cameras are connected; choose one of these: {listed}")
+        raise Unreachable(
+            f"{name}: {len(found)} such cameras are connected; choose one of these: {listed}"
+        )
     if found[0].serial is None:
         remedy = "on Linux, 'neuromorphic-drivers-install-udev-rules' gives access rights"
-        raise Unreachable(f"{name}: {found[0].name.value} cannot be opened: {found[0].error}; {remedy}")
+        raise Unreachable(
+            f"{name}: {found[0].name.value} cannot be opened: {found[0].error}; {remedy}"
+        )
     return found[0]
 
 
@@ -95,7 +115,11 @@ class NeuromorphicSource(CameraSource):
     """
 
     def __init__(
-        self, request: CameraRequest, say: Callable[[str], None] = lambda _: None, *, packet_us: int = 1000
+        self,
+        request: CameraRequest,
+        say: Callable[[str], None] = lambda _: None,
+        *,
+        packet_us: int = 1000,
     ) -> None:
         super().__init__(request, say, packet_us=packet_us)
         found = _find_camera(request.which)
@@ -107,7 +131,10 @@ class NeuromorphicSource(CameraSource):
         configuration = _configuration(self.name, found.name, drivers, settings)
         with opening(self.name):
             self._device = drivers.open(
-                configuration, iterator_timeout=IDLE_S, serial=found.serial, iterator_maximum_raw_packets=RAW_PACKETS
+                configuration,
+                iterator_timeout=IDLE_S,
+                serial=found.serial,
+                iterator_maximum_raw_packets=RAW_PACKETS,
             )
         try:
             with opening(self.name):
@@ -115,16 +142,21 @@ class NeuromorphicSource(CameraSource):
                 bounds = self._device.biases_bounds()
             self.size = int(properties.width), int(properties.height)
             for bias, value in settings.biases.items():
-                limits = getattr(bounds, bias, None)  # those of the device; equal if they are unknown
+                # Limits of the device; equal if they are unknown
+                limits = getattr(bounds, bias, None)
                 if limits is not None and limits.minimum < limits.maximum:
                     check_bias(self.name, bias, value, limits.minimum, limits.maximum)
             self._check_axes()
         except BaseException:
             self.close()
             raise
-        self._opened(model, found.serial, _sent(configuration, settings), "as sent: the driver reports none")
+        self._opened(
+            model, found.serial, _sent(configuration, settings), "as sent: the driver reports none"
+        )
         if settings.counts_per_turn and self._model in (DAVIS, DVXPLORER):
-            say(f"{self.name}: as far as is known, this driver leaves the trigger input off; {_INIVATION}")
+            say(
+                f"{self.name}: as far as is known, this driver leaves the trigger input off; {_INIVATION}"
+            )
 
     def packets(self) -> Iterator[Packet]:
         """Yield packets, see :meth:`CameraSource.packets`."""
@@ -148,7 +180,11 @@ class NeuromorphicSource(CameraSource):
     def _check_axes(self) -> None:
         """Refuse a region and a mask if the camera exchanges rows and columns, which the driver forgets for them."""
         settings = self.settings
-        if self._model == DAVIS and (settings.region or settings.masked) and self._device.orientation().dvs_invert_xy:
+        if (
+            self._model == DAVIS
+            and (settings.region or settings.masked)
+            and self._device.orientation().dvs_invert_xy
+        ):
             raise AmiwarpError(
                 f"{self.name}: this camera exchanges rows and columns, for which the driver sets neither region nor "
                 f"mask right; {_INIVATION}"
@@ -163,7 +199,9 @@ class NeuromorphicSource(CameraSource):
     def _packet(self, packet: Any) -> Packet:
         rows = packet.polarity_events
         edges = packet.trigger_events
-        events = None if rows is None else copied_events(rows["x"], rows["y"], rows["t"], rows["on"])
+        events = (
+            None if rows is None else copied_events(rows["x"], rows["y"], rows["t"], rows["on"])
+        )
         if events is not None and self._model == DAVIS:
             events = _without_others(events, self.settings)
         if edges is None:
@@ -174,7 +212,7 @@ class NeuromorphicSource(CameraSource):
 
 
 def _without_others(events: Events, settings: CameraSettings) -> Events:
-    """Return the events within the region, without those of the masked pixels.
+    """Return the events within the region, without the events of the masked pixels.
 
     The driver of the DAVIS346 keeps one column and one row too many, and ignores both settings, without a word, if the
     camera's logic does not have the filters.
@@ -200,11 +238,15 @@ def _configuration(name: str, model: Any, drivers: Any, settings: CameraSettings
     if settings.region is not None:
         left, top, right, bottom = settings.region
         if kind == DAVIS:
-            parts["region_of_interest"] = module.RegionOfInterest(left, top, right - left, bottom - top)
+            parts["region_of_interest"] = module.RegionOfInterest(
+                left, top, right - left, bottom - top
+            )
         else:
             mask = drivers.mask.RowColumnMask(width=size[0], height=size[1], set=True)
-            # Rows of the library's masks are counted from the bottom, those of its events from the top.
-            mask.clear_rectangle(x=left, y=size[1] - bottom, width=right - left, height=bottom - top)
+            # Rows of the library's masks are counted from the bottom, rows of its events from the top.
+            mask.clear_rectangle(
+                x=left, y=size[1] - bottom, width=right - left, height=bottom - top
+            )
             parts |= {"x_mask": mask.x_mask(), "y_mask": mask.y_mask()}
     if settings.masked and kind == EVK4:
         pixels = drivers.PropheseeEvk4PixelMask()
@@ -215,28 +257,41 @@ def _configuration(name: str, model: Any, drivers: Any, settings: CameraSettings
         codes = [1 + x + size[0] * y for x, y in settings.masked]  # 0: the register masks nothing
         parts["pixel_mask"] = tuple(codes + [0] * (MOST_MASKED[kind] - len(codes)))
     if settings.most_per_s:
-        check_rate(name, settings.most_per_s, 1_000_000 // RATE_US, MOST_PER_PERIOD * 1_000_000 // RATE_US)
-        parts["rate_limiter"] = module.RateLimiter(RATE_US, settings.most_per_s * RATE_US // 1_000_000)
+        check_rate(
+            name, settings.most_per_s, 1_000_000 // RATE_US, MOST_PER_PERIOD * 1_000_000 // RATE_US
+        )
+        parts["rate_limiter"] = module.RateLimiter(
+            RATE_US, settings.most_per_s * RATE_US // 1_000_000
+        )
     if settings.trigger is not None and "trigger" in CAN.get(kind, ()):
         parts["enable_external_trigger"] = settings.trigger
     return module.Configuration(**parts)
 
 
 def _biases(name: str, model: str, kind: Any, settings: CameraSettings) -> Any:
-    """Return the biases of a camera model, with those of the settings in place of their defaults."""
+    """Return the biases of a camera model, with the biases of the settings instead of their defaults."""
     known: dict[str, Any] = {each.name: each for each in dataclasses.fields(kind)}
-    check_bias_names(name, model, settings, {bias: int(each.default) for bias, each in known.items()})
+    check_bias_names(
+        name, model, settings, {bias: int(each.default) for bias, each in known.items()}
+    )
     for bias, value in settings.biases.items():
-        whole = get_args(known[bias].type)  # of the type's NumPy and Python names; none for a switch
+        # Of the type's NumPy and Python names; none for a switch
+        whole = get_args(known[bias].type)
         low, high = (np.iinfo(whole[0]).min, np.iinfo(whole[0]).max) if whole else (0, 1)
         check_bias(name, bias, value, low, high)
-    return kind(**{bias: type(known[bias].default)(value) for bias, value in settings.biases.items()})
+    return kind(
+        **{bias: type(known[bias].default)(value) for bias, value in settings.biases.items()}
+    )
 
 
 def _sent(configuration: Any, settings: CameraSettings) -> CameraSettings:
     """Return the settings that a configuration contains, with all biases."""
     limiter = getattr(configuration, "rate_limiter", None)
-    rate = 0 if limiter is None else limiter.maximum_events_per_period * 1_000_000 // limiter.reference_period_us
+    rate = (
+        0
+        if limiter is None
+        else limiter.maximum_events_per_period * 1_000_000 // limiter.reference_period_us
+    )
     biases = {bias: int(value) for bias, value in dataclasses.asdict(configuration.biases).items()}
     trigger = getattr(configuration, "enable_external_trigger", settings.trigger)
     return replace(settings, biases=biases, most_per_s=rate, trigger=trigger)

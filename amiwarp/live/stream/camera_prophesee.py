@@ -43,7 +43,11 @@ class PropheseeSource(CameraSource):
     """
 
     def __init__(
-        self, request: CameraRequest, say: Callable[[str], None] = lambda _: None, *, packet_us: int = 1000
+        self,
+        request: CameraRequest,
+        say: Callable[[str], None] = lambda _: None,
+        *,
+        packet_us: int = 1000,
     ) -> None:
         super().__init__(request, say, packet_us=packet_us)
         remedy = "install OpenEB or the Metavision SDK (they are not on PyPI)"
@@ -59,11 +63,15 @@ class PropheseeSource(CameraSource):
             serial = request.which or str(identity.get_serial())
             self.name = request.name(serial)
             self.size = int(geometry.get_width()), int(geometry.get_height())
-            self._facilities = {name: getattr(device, getter)() for name, getter in FACILITIES.items()}
+            self._facilities = {
+                name: getattr(device, getter)() for name, getter in FACILITIES.items()
+            }
             model = str(identity.get_sensor_info().name)
             self._apply(model)  # before the stream begins
             self._iterator = event_io.EventsIterator.from_device(device=device, delta_t=packet_us)
-            self._opened(model, serial, self._reported(), "reported by the camera; the region as sent")
+            self._opened(
+                model, serial, self._reported(), "reported by the camera; the region as sent"
+            )
 
     def packets(self) -> Iterator[Packet]:
         """Yield packets, see :meth:`CameraSource.packets`."""
@@ -77,7 +85,9 @@ class PropheseeSource(CameraSource):
             if events is None:
                 self.problem = self.problem or "the camera stopped; was it unplugged?"
                 return
-            yield self._make_packet(copied_events(events["x"], events["y"], events["t"], events["p"]), rising)
+            yield self._make_packet(
+                copied_events(events["x"], events["y"], events["t"], events["p"]), rising
+            )
 
     def close(self) -> None:
         """Release the camera, see :meth:`Source.close`."""
@@ -104,7 +114,9 @@ class PropheseeSource(CameraSource):
             highest = filter_.get_max_supported_frequency()
             check_band(self.name, settings.flicker_hz, lowest, highest)
         if settings.counts_per_turn and "trigger" not in can:
-            raise AmiwarpError(f"{self.name}: {model} has no trigger input; leave counts_per_turn out")
+            raise AmiwarpError(
+                f"{self.name}: {model} has no trigger input; leave counts_per_turn out"
+            )
         self._set_biases(model)
         if settings.region is not None:
             left, top, right, bottom = settings.region
@@ -123,13 +135,21 @@ class PropheseeSource(CameraSource):
             self._accepted("flicker_hz", filter_.set_filtering_mode(band_stop))
             self._accepted("flicker_hz", filter_.enable(True))
         if "trigger" in can:
-            switch = facilities["trigger"].disable if settings.trigger is False else facilities["trigger"].enable
+            switch = (
+                facilities["trigger"].disable
+                if settings.trigger is False
+                else facilities["trigger"].enable
+            )
             self._accepted("trigger", switch(hal.I_TriggerIn.Channel.MAIN))
 
     def _set_biases(self, model: str) -> None:
         """Check the biases and set them. Their names may lack the library's prefix ``bias_``."""
         facility = self._facilities["biases"]
-        known = {} if facility is None else {str(name): int(value) for name, value in facility.get_all_biases().items()}
+        known = (
+            {}
+            if facility is None
+            else {str(name): int(value) for name, value in facility.get_all_biases().items()}
+        )
         given = {
             name if name in known else f"bias_{name.removeprefix('bias_')}": value
             for name, value in self.settings.biases.items()
@@ -140,13 +160,17 @@ class PropheseeSource(CameraSource):
             info = facility.get_bias_info(name)
             check_bias(self.name, name, value, *info.get_bias_allowed_range())
             if not info.is_modifiable():
-                raise AmiwarpError(f"{self.name}: bias {name} cannot be set, it is {known[name]}; leave it out")
+                raise AmiwarpError(
+                    f"{self.name}: bias {name} cannot be set, it is {known[name]}; leave it out"
+                )
         for name, value in given.items():
             self._accepted(name, facility.set(name, value))
 
     def _accepted(self, setting: str, accepted: bool) -> None:
         if not accepted:
-            raise AmiwarpError(f"{self.name}: the camera did not accept the setting {setting}; leave it out")
+            raise AmiwarpError(
+                f"{self.name}: the camera did not accept the setting {setting}; leave it out"
+            )
 
     def _reported(self) -> CameraSettings:
         """Return the settings that the camera has. The library does not report the region."""
@@ -160,7 +184,11 @@ class PropheseeSource(CameraSource):
         filter_ = facilities["flicker_hz"]
         limited = limiter is not None and limiter.is_enabled()
         filtering = filter_ is not None and filter_.is_enabled()
-        band = (int(filter_.get_band_low_frequency()), int(filter_.get_band_high_frequency())) if filtering else None
+        band = (
+            (int(filter_.get_band_low_frequency()), int(filter_.get_band_high_frequency()))
+            if filtering
+            else None
+        )
         trigger = facilities["trigger"]
         channel = self._hal.I_TriggerIn.Channel.MAIN
         return replace(

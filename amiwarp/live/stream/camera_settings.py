@@ -11,7 +11,8 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import guarded, instance, shown, vector, whole
+from amiwarp.schema.calls import guarded
+from amiwarp.validation import instance, shown, vector, whole
 
 LARGEST_BIAS = 1 << 31
 """Largest magnitude of a bias. What a camera accepts is less, and its driver's to say."""
@@ -63,33 +64,50 @@ class CameraSettings:
 
     def __post_init__(self) -> None:
         biases = {
-            name: whole(value, f"bias {name}", -LARGEST_BIAS, LARGEST_BIAS) for name, value in self.biases.items()
+            name: whole(value, f"bias {name}", -LARGEST_BIAS, LARGEST_BIAS)
+            for name, value in self.biases.items()
         }
         for name in biases:
             if not name.isidentifier() or name in FORMS:
-                raise AmiwarpError(f"bias {name!r} is no name of a bias; give those of the camera's driver")
+                raise AmiwarpError(
+                    f"bias {name!r} is no name of a bias; give a name of the camera's driver"
+                )
         object.__setattr__(self, "biases", biases)
         if self.region is not None:
             left, top, right, bottom = region = vector(self.region, 4, "region", _pixel)
             if not (left < right and top < bottom):
-                raise AmiwarpError(f"region is {self.region}; give left, top, right and bottom [px] of a part")
+                raise AmiwarpError(
+                    f"region is {self.region}; give left, top, right and bottom [px] of a part"
+                )
             object.__setattr__(self, "region", region)
-        if not isinstance(self.masked, list | tuple | np.ndarray) or getattr(self.masked, "ndim", 1) == 0:
-            raise AmiwarpError(f"masked is {shown(self.masked)}; expected pixels, each as x and y [px]")
+        if (
+            not isinstance(self.masked, list | tuple | np.ndarray)
+            or getattr(self.masked, "ndim", 1) == 0
+        ):
+            raise AmiwarpError(
+                f"masked is {shown(self.masked)}; expected pixels, each as x and y [px]"
+            )
         masked = tuple(vector(pixel, 2, "masked", _pixel) for pixel in self.masked)
-        object.__setattr__(self, "masked", tuple(dict.fromkeys(masked)))  # a pixel given twice would waste a register
-        object.__setattr__(self, "most_per_s", whole(self.most_per_s, "most_per_s", 0, LARGEST_PER_S, " events/s"))
+        # A pixel given twice would waste a register
+        object.__setattr__(self, "masked", tuple(dict.fromkeys(masked)))
+        object.__setattr__(
+            self, "most_per_s", whole(self.most_per_s, "most_per_s", 0, LARGEST_PER_S, " events/s")
+        )
         if self.flicker_hz is not None:
             low, high = band = vector(self.flicker_hz, 2, "flicker_hz", _frequency)
             if not low < high:
-                raise AmiwarpError(f"flicker_hz is {self.flicker_hz}; give the lowest and the highest frequency [Hz]")
+                raise AmiwarpError(
+                    f"flicker_hz is {self.flicker_hz}; give the lowest and the highest frequency [Hz]"
+                )
             object.__setattr__(self, "flicker_hz", band)
         if self.trigger is not None:
             instance(self.trigger, bool, "trigger")
         counts = whole(self.counts_per_turn, "counts_per_turn", -LARGEST_COUNTS, LARGEST_COUNTS)
         object.__setattr__(self, "counts_per_turn", counts)
         if counts and self.trigger is False:
-            raise AmiwarpError("counts_per_turn counts edges at the trigger input; leave it out, or set the trigger on")
+            raise AmiwarpError(
+                "counts_per_turn counts edges at the trigger input; leave it out, or set the trigger on"
+            )
 
     def __str__(self) -> str:
         """Return the settings as the name of a source has them."""
@@ -136,7 +154,9 @@ class CameraRequest:
 
     def name(self, serial: str = "") -> str:
         """Return the name of the camera with this serial number, and with these settings, for messages."""
-        return ",".join(part for part in (f"{self.kind}:{serial or self.which}", self.given) if part)
+        return ",".join(
+            part for part in (f"{self.kind}:{serial or self.which}", self.given) if part
+        )
 
 
 def parse_camera(spec: str) -> CameraRequest:
@@ -164,7 +184,9 @@ def _parse_settings(parts: Sequence[str]) -> CameraSettings:
             found |= {each.name: getattr(saved, each.name) for each in fields(saved)}
             biases |= saved.biases
             continue
-        field_name, read, form = FORMS.get(name, ("", _number, "NAME=WHOLE_NUMBER, as in diff_on=20"))
+        field_name, read, form = FORMS.get(
+            name, ("", _number, "NAME=WHOLE_NUMBER, as in diff_on=20")
+        )
         try:
             content = read(value)
         except (ValueError, OverflowError) as error:
@@ -218,11 +240,27 @@ def _switch(text: str) -> bool:
 
 
 FORMS: Mapping[str, tuple[str, Callable[[str], Any], str]] = {
-    "region": ("region", _numbers, "region=LEFT:TOP:RIGHT:BOTTOM, in pixels, right and bottom exclusive"),
+    "region": (
+        "region",
+        _numbers,
+        "region=LEFT:TOP:RIGHT:BOTTOM, in pixels, right and bottom exclusive",
+    ),
     "masked": ("masked", _pixels, "masked=X:Y+X:Y, the pixels that shall send no events"),
-    "most_mev_s": ("most_per_s", _per_s, "most_mev_s=NUMBER, the largest rate in million events per second"),
-    "flicker_hz": ("flicker_hz", _numbers, "flicker_hz=LOWEST:HIGHEST, the frequencies to remove, in Hz"),
+    "most_mev_s": (
+        "most_per_s",
+        _per_s,
+        "most_mev_s=NUMBER, the largest rate in million events per second",
+    ),
+    "flicker_hz": (
+        "flicker_hz",
+        _numbers,
+        "flicker_hz=LOWEST:HIGHEST, the frequencies to remove, in Hz",
+    ),
     "trigger": ("trigger", _switch, "trigger=on or trigger=off"),
-    "counts_per_turn": ("counts_per_turn", _counts, "counts_per_turn=WHOLE_NUMBER, negative for backwards"),
+    "counts_per_turn": (
+        "counts_per_turn",
+        _counts,
+        "counts_per_turn=WHOLE_NUMBER, negative for backwards",
+    ),
 }
 """Settings in the name of a source that are no biases: field, function that reads the value, and how to write it."""

@@ -6,13 +6,13 @@ import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import import_module
+from math import tau as TWO_PI
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI
 from amiwarp.events.recording import Events, MetadataValue
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.camera_checks import difference
@@ -36,7 +36,11 @@ class CameraSource:
     size: tuple[int, int]
 
     def __init__(
-        self, request: CameraRequest, say: Callable[[str], None] = lambda _: None, *, packet_us: int = 1000
+        self,
+        request: CameraRequest,
+        say: Callable[[str], None] = lambda _: None,
+        *,
+        packet_us: int = 1000,
     ) -> None:
         self.request = request
         self._say = say
@@ -65,7 +69,9 @@ class CameraSource:
 
     def reopened(self) -> CameraSource:
         """Return a new source of the same camera, with the same settings, after this one was closed."""
-        return type(self)(replace(self.request, which=self.serial), self._say, packet_us=self._packet_us)
+        return type(self)(
+            replace(self.request, which=self.serial), self._say, packet_us=self._packet_us
+        )
 
     def _opened(self, model: str, serial: str, applied: CameraSettings, reported: str) -> None:
         """Note the camera that was opened, and its settings.
@@ -86,7 +92,9 @@ class CameraSource:
             rising = rising[:0]
         if not counts:
             return make_packet(now, events, rising)
-        angle = np.arange(self._count, self._count + rising.size, dtype=np.float64) * (TWO_PI / counts)
+        angle = np.arange(self._count, self._count + rising.size, dtype=np.float64) * (
+            TWO_PI / counts
+        )
         self._count += rising.size
         return make_packet(now, events, rising, rising, angle)
 
@@ -105,7 +113,9 @@ def library(name: str, camera: str, remedy: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise AmiwarpError(f"{camera}: needs the library {name.partition('.')[0]} ({error}); {remedy}") from error
+        raise AmiwarpError(
+            f"{camera}: needs the library {name.partition('.')[0]} ({error}); {remedy}"
+        ) from error
 
 
 @contextlib.contextmanager
@@ -117,7 +127,9 @@ def named(camera: str, doing: str, kind: type[AmiwarpError] = AmiwarpError) -> I
         raise
     except BaseException as error:
         lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-        raise kind(f"{camera}: {doing}: {lines[0][:200]}; check cable, power and access rights") from error
+        raise kind(
+            f"{camera}: {doing}: {lines[0][:200]}; check cable, power and access rights"
+        ) from error
 
 
 def opening(camera: str) -> contextlib.AbstractContextManager[None]:
@@ -127,4 +139,6 @@ def opening(camera: str) -> contextlib.AbstractContextManager[None]:
 
 def copied_events(x: Any, y: Any, t: Any, p: Any) -> Events:
     """Copy the columns of a library's rows into new events, because the library reuses its memory."""
-    return Events(x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), (p > 0).astype(np.uint8))
+    return Events(
+        x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), (p > 0).astype(np.uint8)
+    )

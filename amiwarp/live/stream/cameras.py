@@ -10,7 +10,11 @@ from amiwarp.live.stream.camera_prophesee import PropheseeSource
 from amiwarp.live.stream.camera_settings import parse_camera
 from amiwarp.live.stream.camera_source import CameraSource
 
-CAMERAS: dict[str, type[CameraSource]] = {"camera": NeuromorphicSource, "dv": DvSource, "prophesee": PropheseeSource}
+CAMERAS: dict[str, type[CameraSource]] = {
+    "camera": NeuromorphicSource,
+    "dv": DvSource,
+    "prophesee": PropheseeSource,
+}
 """Class of the sources of each driver."""
 
 

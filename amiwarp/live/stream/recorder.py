@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events
-from amiwarp.io.native_format import LiveWriter
+from amiwarp.io.native.live_writer import LiveWriter
 
 Samples = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Times [us] and angles [rad] of encoder samples, each of shape ``(n,)``."""
@@ -25,7 +25,8 @@ class StreamRecorder:
         """``writer``: function that returns the writer of a file."""
         self.problem = ""
         """Why the last recording has ended by itself; empty if it has not."""
-        self._make, self._lock = writer, threading.Lock()
+        self._make = writer
+        self._lock = threading.Lock()
         self._writer: LiveWriter | None = None
         self._open = ExitStack()
 
@@ -33,19 +34,24 @@ class StreamRecorder:
     def text(self) -> str:
         """Name of the file that is being written, and its number of events; empty if there is none."""
         with self._lock:
-            return "" if self._writer is None else f"{self._writer.path.name}: {len(self._writer):,} events"
+            return (
+                ""
+                if self._writer is None
+                else f"{self._writer.path.name}: {len(self._writer):,} events"
+            )
 
     def start(self, path: Path, samples: Iterable[tuple[bool, Samples]]) -> None:
         """Begin a new file.
 
-        ``samples``: encoder samples that have come already, of events that have not; whether they are those of the
+        ``samples``: encoder samples that have come already, of events that have not; whether they belong to the
         second encoder, and times and angles. Raises :class:`AmiwarpError` if a recording runs, or the file cannot be
         made.
         """
         with self._lock:
             if self._writer is not None:
                 raise AmiwarpError(f"{self._writer.path}: is being recorded; stop it first")
-            self._writer, self.problem = self._open.enter_context(self._make(path)), ""
+            self._writer = self._open.enter_context(self._make(path))
+            self.problem = ""
             try:
                 for second, (t_us, angle) in samples:
                     self._writer.append_encoder(t_us, angle, second=second)
@@ -63,7 +69,12 @@ class StreamRecorder:
         self._write(lambda writer: writer.append(events))
 
     def append_encoder(
-        self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: NDArray[np.int64], *, second: bool
+        self,
+        t_us: NDArray[np.int64],
+        angle: NDArray[np.float64],
+        index_t_us: NDArray[np.int64],
+        *,
+        second: bool,
     ) -> None:
         """Write encoder samples and index pulses, on the events' clock."""
         self._write(lambda writer: writer.append_encoder(t_us, angle, index_t_us, second=second))
@@ -85,7 +96,9 @@ class StreamRecorder:
     def _finish(self, problem: str) -> str:
         if self._writer is None:
             return ""
-        writer, self._writer, self.problem = self._writer, None, problem
+        writer = self._writer
+        self._writer = None
+        self.problem = problem
         try:
             self._open.close()
         except (AmiwarpError, OSError) as error:

@@ -11,11 +11,43 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import edge_blur
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import CircleModel, ExactModel, Model, ModelError, predicted_error, rms
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.models.circle import CircleModel
+from amiwarp.optics.models.comparison import ModelError, predicted_error, rms
+from amiwarp.optics.models.exact import ExactModel
 from amiwarp.optics.prism import Prism
-from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.claims import Claim, differences, judge, judge_number, untestable, untestable_as_stated
-from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Streams, Table
+from amiwarp.studies.evaluate.claims import (
+    Claim,
+    differences,
+    judge,
+    judge_number,
+    untestable,
+    untestable_as_stated,
+)
+from amiwarp.studies.evaluate.conditions import (
+    BANDWIDTH,
+    DISCS,
+    IDEAL,
+    INDEX,
+    LIMITS,
+    Condition,
+    Settings,
+)
+from amiwarp.studies.evaluate.discs import BACKGROUND, DiscTarget, robust_spread
+from amiwarp.studies.evaluate.event_images import thinned
+from amiwarp.studies.evaluate.results import (
+    Amount,
+    CellResult,
+    Chart,
+    ChartKind,
+    Count,
+    Table,
+    Value,
+    finite,
+    grouped,
+    rows_of,
+)
+from amiwarp.studies.evaluate.streams import Stream, Streams
 
 TITLE = "Apex angle and speed"
 PROTOCOL = (
@@ -24,7 +56,7 @@ PROTOCOL = (
     "not saturate; edge blur is the paper's measure, the standard deviation of events across edges that are found in "
     "the events themselves (amiwarp.edge_blur). The events are compensated by the true model, so that no error of a "
     "calibration adds to it. The constant delay of the sensor shifts the phase and is removed as a calibration would: "
-    "by the delay up to 8 ms at which the blur is smallest. Bandwidth is that of the photoreceptors at white; a "
+    "by the delay up to 8 ms at which the blur is smallest. Bandwidth is the photoreceptors' at white; a "
     "darker pixel is slower in proportion, so that 100 Hz is also a sensor of 1000 Hz in a tenth of the light. To "
     "find what limits the speed, an ideal sensor is given one limit of the DVXplorer's model at a time. Errors of "
     "synchronisation are added to the encoder's times of the same recordings: independent errors of its samples, a "
@@ -38,7 +70,7 @@ PROTOCOL = (
 DIFFERENCES = (
     "The paper measures one sensor, whose bandwidth and light it does not state, with events of real edges; a motor "
     "that vibrates more at high speed would blur them too, and is not simulated. Here the bandwidth is varied; the "
-    "other values are those of the DVXplorer's model. The paper's measure leaves out events over 3 px from an edge, so "
+    "other values come from the DVXplorer's model. The paper's measure leaves out events over 3 px from an edge, so "
     "it saturates near 1 px."
 )
 VERSION = 4
@@ -46,30 +78,41 @@ NEEDS_TRUTH = True
 
 APEX_DEG = (0.5, 1.0, 2.0)
 """Apex angles [deg]."""
-SPEEDS, QUICK_SPEEDS = (180.0, 360.0, 720.0, 1440.0, 2880.0), (360.0, 720.0, 1440.0)
+SPEEDS = (180.0, 360.0, 720.0, 1440.0, 2880.0)
+QUICK_SPEEDS = (360.0, 720.0, 1440.0)
 """Speeds of the prism [turns/min]."""
-BANDWIDTHS, QUICK_BANDWIDTHS = (0.0, 1000.0, 300.0, 100.0), (1000.0, 100.0)
+BANDWIDTHS = (0.0, 1000.0, 300.0, 100.0)
+QUICK_BANDWIDTHS = (1000.0, 100.0)
 """Bandwidths of the photoreceptors at white [Hz]; 0 for unlimited."""
-LIMITS, QUICK_LIMITS = (study.IDEAL, *study.LIMITS), (study.IDEAL, study.BANDWIDTH)
+SENSORS = (IDEAL, *LIMITS)
+QUICK_SENSORS = (IDEAL, BANDWIDTH)
 """Single limits of the sensors at the usual apex angle."""
 WHOLE = (640, 480)
 """Width and height of the whole sensor [px]."""
-USUAL_DEG, USUAL_HZ = 0.5, 1000.0
+USUAL_DEG = 0.5
+USUAL_HZ = 1000.0
 """Apex angle [deg] and bandwidth [Hz] of the sensors with one limit."""
-DELAYS_US, COARSE = np.arange(0, 8001, 100), 10
+DELAYS_US = np.arange(0, 8001, 100)
+COARSE = 10
 """Delays that are tried [us]; of each ``COARSE`` of them one at first."""
-BLUR_EVENTS, MOST_EVENTS = 30_000, 200_000
+BLUR_EVENTS = 30_000
+MOST_EVENTS = 200_000
 """Largest number of events of which the blur is measured, and the edge blur."""
-NONE, SAMPLES, WANDER = "none", "error of each sample", "slow wander"
-OFFSET, DRIFT = "offset, calibrated at 720 rpm", "drift"
+NONE = "none"
+SAMPLES = "error of each sample"
+WANDER = "slow wander"
+OFFSET = "offset, calibrated at 720 rpm"
+DRIFT = "drift"
 """Kinds of timing errors of the encoder."""
-ERRORS_US, QUICK_ERRORS_US = (250.0, 500.0, 1000.0, 2000.0), (1000.0,)
+ERRORS_US = (250.0, 500.0, 1000.0, 2000.0)
+QUICK_ERRORS_US = (1000.0,)
 """Sizes of the timing errors: their rms [us]."""
 USUAL_US = 1000.0
 """Size of the timing error in the verdicts [us]."""
 WANDER_US = 20_000.0
 """Time between the knots of a slow wander [us]."""
-EXACT, CIRCLE = "exact model", "circle"
+EXACT = "exact model"
+CIRCLE = "circle"
 """Models that compensate: the true one, and the paper's."""
 CIRCLE_PX = 2.0
 """Error of the circle in a field of view of 90° that the paper states [px]."""
@@ -79,35 +122,39 @@ USUAL_RPM = 720.0
 """Speed above which the paper reports a surge [turns/min]."""
 SURGE = 0.1
 """Least amount by which the relative growth of an error above :data:`USUAL_RPM`, per doubling, exceeds that below."""
-FIELDS = {"90° across the width": 90.0,
-          "90° across the diagonal": float(np.degrees(2.0 * np.arctan(WHOLE[0] / np.hypot(*WHOLE))))}  # fmt: skip
+FIELDS = {
+    "90° across the width": 90.0,
+    "90° across the diagonal": float(np.degrees(2.0 * np.arctan(WHOLE[0] / np.hypot(*WHOLE)))),
+}
 """Fields of view of 90° [deg, across the width]: the paper does not say across what."""
 
 
 class _Row(TypedDict):
-    degrees: study.Amount
-    blur: study.Amount | None
-    delay: study.Count
-    edge_blur: study.Amount | None
-    mev_per_s: study.Amount
+    degrees: Amount
+    blur: Amount | None
+    delay: Count
+    edge_blur: Amount | None
+    mev_per_s: Amount
 
 
 class _Light(TypedDict):
-    degrees: study.Amount
+    degrees: Amount
     light: Literal["bright", "dark"]
-    blur: study.Amount | None
-    own_delay: study.Count
-    own_blur: study.Amount | None
+    blur: Amount | None
+    own_delay: Count
+    own_blur: Amount | None
 
 
 class _Error(TypedDict):
-    degrees: study.Amount
+    degrees: Amount
     model: Literal["exact model", "circle"]
-    timing: Literal["none", "error of each sample", "slow wander", "offset, calibrated at 720 rpm", "drift"]
-    error_us: study.Amount
-    displacement: study.Amount
-    blur: study.Amount | None
-    edge_blur: study.Amount | None
+    timing: Literal[
+        "none", "error of each sample", "slow wander", "offset, calibrated at 720 rpm", "drift"
+    ]
+    error_us: Amount
+    displacement: Amount
+    blur: Amount | None
+    edge_blur: Amount | None
 
 
 class Values(TypedDict):
@@ -123,23 +170,28 @@ def conditions(settings: Settings) -> list[Condition]:
 
     At the usual speed and bandwidth there is also the whole sensor, at whose border the circle is worst.
     """
-    speeds, bandwidths, limits = (
-        (QUICK_SPEEDS, QUICK_BANDWIDTHS, QUICK_LIMITS) if settings.quick else (SPEEDS, BANDWIDTHS, LIMITS)
-    )
+    speeds = QUICK_SPEEDS if settings.quick else SPEEDS
+    bandwidths = QUICK_BANDWIDTHS if settings.quick else BANDWIDTHS
+    limits = QUICK_SENSORS if settings.quick else SENSORS
     size = replace(settings, width=min(settings.width, 320), height=min(settings.height, 240))
-    grid: list[dict[str, Any]] = [{"apex": a, "cutoff_hz": hz} for a in APEX_DEG for hz in bandwidths]
-    grid += [{"apex": USUAL_DEG, "only": limit} for limit in limits]
-    grid.append({"apex": USUAL_DEG, "only": study.BANDWIDTH, "cutoff_hz": min(bandwidths[1:])})
-    turns = [
-        replace(condition, rpm=rpm, duration_s=60.0 / rpm)
-        for values in grid
-        for rpm in speeds
-        for condition in size.conditions(
-            world=study.DISCS, trajectory="still", **{**values, "apex": float(np.radians(values["apex"]))}
-        )
-    ]
+    grid: list[dict[str, Any]] = []
+    for degrees in APEX_DEG:
+        for hz in bandwidths:
+            grid.append({"apex": degrees, "cutoff_hz": hz})
+    for limit in limits:
+        grid.append({"apex": USUAL_DEG, "only": limit})
+    grid.append({"apex": USUAL_DEG, "only": BANDWIDTH, "cutoff_hz": min(bandwidths[1:])})
+
+    turns = []
+    for values in grid:
+        apex = float(np.radians(values["apex"]))
+        for rpm in speeds:
+            of_seeds = size.conditions(world=DISCS, trajectory="still", **{**values, "apex": apex})
+            for condition in of_seeds:
+                turns.append(replace(condition, rpm=rpm, duration_s=60.0 / rpm))
     usual = [c for c in turns if (c.only, c.cutoff_hz, c.rpm) == (None, USUAL_HZ, USUAL_RPM)]
-    return turns + [replace(c, width=WHOLE[0], height=WHOLE[1]) for c in usual]
+    width, height = WHOLE
+    return turns + [replace(condition, width=width, height=height) for condition in usual]
 
 
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
@@ -156,15 +208,33 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
             if delay not in blur:
                 blur[delay] = seen.blur(delay)
     best = {name: min(blur, key=lambda d: blur[d][name]) for name in ("all", "bright", "dark")}
+    delay = best["all"]
+
     condition = streams.condition
     known = {"degrees": round(float(np.degrees(condition.apex)), 3)}
     count = streams.count(Stream.RAW, 0, streams.end_us)
-    row = {"blur": study.finite(blur[best["all"]]["all"]), "delay": best["all"],
-           "edge_blur": seen.edge_blur(best["all"]), "mev_per_s": count / streams.end_us}  # fmt: skip
-    light = [known | {"light": name, "blur": study.finite(blur[best["all"]][name]), "own_delay": best[name],
-                      "own_blur": study.finite(blur[best[name]][name])} for name in ("bright", "dark")]  # fmt: skip
-    usual = (condition.only, condition.cutoff_hz) == (None, USUAL_HZ)
-    errors = seen.errors(best["all"], QUICK_ERRORS_US if settings.quick else ERRORS_US) if usual else []
+    row = {
+        "blur": finite(blur[delay]["all"]),
+        "delay": delay,
+        "edge_blur": seen.edge_blur(delay),
+        "mev_per_s": count / streams.end_us,
+    }
+    light = []
+    for name in ("bright", "dark"):
+        own_delay = best[name]
+        of_light = {
+            "light": name,
+            "blur": finite(blur[delay][name]),
+            "own_delay": own_delay,
+            "own_blur": finite(blur[own_delay][name]),
+        }
+        light.append(known | of_light)
+
+    errors = []
+    is_usual = condition.only is None and condition.cutoff_hz == USUAL_HZ
+    if is_usual:
+        sizes_us = QUICK_ERRORS_US if settings.quick else ERRORS_US
+        errors = seen.errors(delay, sizes_us)
     return {"rows": [known | row], "light": light, "errors": [known | error for error in errors]}
 
 
@@ -173,37 +243,48 @@ class _Seen:
 
     def __init__(self, streams: Streams) -> None:
         self._streams = streams
-        self._discs = study.DiscTarget.of_seed(streams.size, streams.condition.seed)
+        self._discs = DiscTarget.of_seed(streams.size, streams.condition.seed)
         encoder = streams.recording.encoder
         assert encoder is not None
-        self._events = study.thinned(streams.recording.events.slice(0, len(streams.recording.events)), MOST_EVENTS)
+        source = streams.recording.events
+        self._events = thinned(source.slice(0, len(source)), MOST_EVENTS)
         self._angle = encoder.angle_at(self._events.t)
         self._interval_us = encoder.interval_us
 
-    def places(self, late_us: float | NDArray[np.float64], most: int, model: Model | None = None) -> NDArray[Any]:
+    def places(
+        self, late_us: float | NDArray[np.float64], most: int, model: Model | None = None
+    ) -> NDArray[Any]:
         """Return where a model puts the events if they are late by ``late_us``, shape (n, 2), by default the true one.
 
         At most ``most`` events are used. ``late_us``: delay of all, or of each event [us].
         """
-        angle = self._angle - np.radians(6.0 * self._streams.condition.rpm) * np.asarray(late_us) * 1e-6
+        rad_per_s = np.radians(6.0 * self._streams.condition.rpm)
+        angle = self._angle - rad_per_s * np.asarray(late_us) * 1e-6
         step = max(1, -(-len(angle) // most))
         xy = np.stack([self._events.x, self._events.y], axis=1)[::step].astype(np.float32)
         return np.asarray((model or self._streams.true_model).compensate_points(xy, angle[::step]))
 
     def blur(
-        self, late_us: float | NDArray[np.float64], model: Model | None = None, most: int = BLUR_EVENTS
+        self,
+        late_us: float | NDArray[np.float64],
+        model: Model | None = None,
+        most: int = BLUR_EVENTS,
     ) -> dict[str, float]:
-        """Return the blur of all edges, and of those of bright and of dark discs [px]; inf without events."""
+        """Return the blur of all edges, and of the edges of bright and of dark discs [px]; inf without events."""
         xy = self.places(late_us, most, model)
-        distance, luminance = self._discs.distances(xy[np.isfinite(xy).all(axis=1)])
-        bright = luminance > study.BACKGROUND
+        xy = xy[np.isfinite(xy).all(axis=1)]
+        distance, luminance = self._discs.distances(xy)
+        bright = luminance > BACKGROUND
+        dark = ~bright
         return {
-            "all": study.robust_spread(distance, luminance),
-            "bright": study.robust_spread(distance[bright], luminance[bright]),
-            "dark": study.robust_spread(distance[~bright], luminance[~bright]),
+            "all": robust_spread(distance, luminance),
+            "bright": robust_spread(distance[bright], luminance[bright]),
+            "dark": robust_spread(distance[dark], luminance[dark]),
         }
 
-    def edge_blur(self, late_us: float | NDArray[np.float64], model: Model | None = None) -> float | None:
+    def edge_blur(
+        self, late_us: float | NDArray[np.float64], model: Model | None = None
+    ) -> float | None:
         """Return the paper's measure [px], or None if there are no edges."""
         xy = self.places(late_us, MOST_EVENTS, model)
         try:
@@ -215,25 +296,36 @@ class _Seen:
         """Return displacement error, blur and edge blur [px] of both models, without and with timing errors."""
         circle = best_circle(self._streams.true_model)
         true = self.places(delay_us, MOST_EVENTS)
-        cases = [(NONE, 0.0), *((kind, us) for kind in (SAMPLES, WANDER, OFFSET, DRIFT) for us in sizes_us)]
+        cases = [
+            (NONE, 0.0),
+            *((kind, us) for kind in (SAMPLES, WANDER, OFFSET, DRIFT) for us in sizes_us),
+        ]
         rows = []
         for kind, us in cases:
             late = delay_us + self._timing(kind, us)
             for name, model in ((EXACT, self._streams.true_model), (CIRCLE, circle)):
-                rows.append({
-                    "model": name, "timing": kind, "error_us": us,
-                    "displacement": rms(self.places(late, MOST_EVENTS, model) - true),
-                    "blur": study.finite(self.blur(late, model)["all"]), "edge_blur": self.edge_blur(late, model),
-                })  # fmt: skip
+                rows.append(
+                    {
+                        "model": name,
+                        "timing": kind,
+                        "error_us": us,
+                        "displacement": rms(self.places(late, MOST_EVENTS, model) - true),
+                        "blur": finite(self.blur(late, model)["all"]),
+                        "edge_blur": self.edge_blur(late, model),
+                    }
+                )
         return rows
 
     def _timing(self, kind: str, us: float) -> NDArray[np.float64]:
         """Return the timing error of each event [us], shape (n,): those drawn at random have the rms ``us``."""
         t = (self._events.t - self._events.t[0]).astype(np.float64)
         if kind not in (SAMPLES, WANDER):
-            absorbed = USUAL_RPM / self._streams.condition.rpm if kind == OFFSET else 0.0  # by the calibrated phase
+            # By the calibrated phase
+            absorbed = USUAL_RPM / self._streams.condition.rpm if kind == OFFSET else 0.0
             return np.full(len(t), us * (1.0 - absorbed))
-        knots = np.arange(0.0, t[-1] + 2.0 * WANDER_US, self._interval_us if kind == SAMPLES else WANDER_US)
+        knots = np.arange(
+            0.0, t[-1] + 2.0 * WANDER_US, self._interval_us if kind == SAMPLES else WANDER_US
+        )
         drawn = np.random.default_rng([self._streams.condition.seed, 2]).normal(size=len(knots))
         error = np.interp(t, knots, drawn)
         return np.asarray(us * error / np.sqrt(np.mean(error**2)))
@@ -249,16 +341,20 @@ def best_circle(true: Model) -> CircleModel:
     def circle(deflection: float) -> CircleModel:
         return CircleModel(true.camera, deflection, true.phase, true.prism.flat_side)
 
+    def error(deflection: float) -> float:
+        return predicted_error(circle(deflection), true, grid=12).rms
+
     bounds = (0.8 * middle, 1.3 * middle)
-    return circle(minimize_scalar(lambda d: predicted_error(circle(d), true, grid=12).rms, bounds=bounds,
-                                  method="bounded", options={"xatol": 1e-4 * middle}).x)  # fmt: skip
+    tolerance = 1e-4 * middle
+    found = minimize_scalar(error, bounds=bounds, method="bounded", options={"xatol": tolerance})
+    return circle(found.x)
 
 
 @cache
 def circle_error(degrees: float, fov_deg: float) -> ModelError:
     """Return how far the best circle is from the true model of an apex angle, over the whole sensor."""
     camera = Camera.from_fov(*WHOLE, float(np.radians(fov_deg)))
-    true = ExactModel.from_prism(camera, Prism(float(np.radians(degrees)), study.INDEX), 0.0)
+    true = ExactModel.from_prism(camera, Prism(float(np.radians(degrees)), INDEX), 0.0)
     return predicted_error(best_circle(true), true)
 
 
@@ -270,94 +366,224 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
     def over_speed(name: str, title: str, value: str, label: str, caption: str) -> Table:
         chart = Chart("speed [rpm]", label, "bandwidth", "std", panels=("apex",), log_x=True)
-        return Table(name, title, (*columns, "seeds", label, "std"),
-                     study.grouped(whole, ("apex_name", "bandwidth", "rpm"), [value]), caption, chart)  # fmt: skip
+        return Table(
+            name,
+            title,
+            (*columns, "seeds", label, "std"),
+            grouped(whole, ("apex_name", "bandwidth", "rpm"), [value]),
+            caption,
+            chart,
+        )
 
     errors = [r | {"size": f"{r['error_us'] * 1e-3:g} ms"} for r in _rows(results, "errors")]
     crop = [r for r in errors if _cropped(r) and r["model"] == EXACT]
     timings = [r for r in crop if r["error_us"] in (0.0, USUAL_US)]
     sizes = [r for r in crop if r["timing"] in (NONE, WANDER)]
-    models = [r | {"timing": f"{r['timing']} of {r['size']}" if r["error_us"] else "no timing error"}
-              for r in _whole_sensor(errors)]  # fmt: skip
-    measures = ("displacement [px]", "std of displacement", "blur [px]", "std", "edge blur [px]", "std of edge blur")
+    models = [
+        r | {"timing": f"{r['timing']} of {r['size']}" if r["error_us"] else "no timing error"}
+        for r in _whole_sensor(errors)
+    ]
+    measures = (
+        "displacement [px]",
+        "std of displacement",
+        "blur [px]",
+        "std",
+        "edge blur [px]",
+        "std of edge blur",
+    )
     return [
-        over_speed("apex_speed_blur", "Blur of edges over speed", "blur", "blur [px]",
-                   "Distance of events from the true edges, compensated by the true model with the best delay."),
-        over_speed("apex_speed_edge_blur", "The paper's measure of blur over speed", "edge_blur", "edge blur [px]",
-                   "Edges are found in the events themselves, and events more than 3 px away do not count."),
-        Table("apex_speed_limits", "Blur of a sensor with one limit only (apex 0.5°)",
-              ("limit", "speed [rpm]", "seeds", "blur [px]", "std"), _limits(rows),
-              f"An ideal sensor (limit: {study.IDEAL}) with one limit of the DVXplorer's model, or with a lower "
-              "bandwidth; and the model with all limits.",
-              Chart("speed [rpm]", "blur [px]", "limit", "std", log_x=True)),
-        Table("apex_speed_light", "Blur and delay of bright and dark edges (apex 0.5°)",
-              ("bandwidth", "edges of discs", "speed [rpm]", "seeds", "blur [px]", "std", "own delay [us]",
-               "std of delay", "blur with own delay [px]", "std of blur"),
-              study.grouped([r for r in _rows(results, "light", cropped=True)
-                       if r["only"] is None and r["degrees"] == USUAL_DEG],
-                      ("bandwidth", "light", "rpm"), ["blur", "own_delay", "own_blur"]),
-              "One phase for all pixels removes the mean delay, not its difference between bright and dark pixels.",
-              Chart("speed [rpm]", "blur [px]", "edges of discs", "std", panels=("bandwidth",), log_x=True)),
-        Table("apex_speed_timing", "Error over speed with timing errors of 1 ms",
-              ("apex", "timing error", "speed [rpm]", "seeds", *measures),
-              study.grouped(timings, ("apex_name", "timing", "rpm"), ["displacement", "blur", "edge_blur"]),
-              f"True model, {USUAL_HZ:g} Hz. Displacement: rms distance from the places without the timing error.",
-              Chart("speed [rpm]", "blur [px]", "timing error", "std", panels=("apex",), log_x=True)),
-        Table("apex_speed_timing_size", "Error over speed with a slow wander of the encoder's clock",
-              ("apex", "rms timing error", "speed [rpm]", "seeds", *measures),
-              study.grouped(sizes, ("apex_name", "size", "rpm"), ["displacement", "blur", "edge_blur"]),
-              f"True model, {USUAL_HZ:g} Hz.",
-              Chart("speed [rpm]", "blur [px]", "rms timing error", "std", panels=("apex",), log_x=True)),
-        Table("apex_speed_surge", "Surge of the error above 720 rpm over the timing error (slow wander)",
-              ("measure", "apex", "rms timing error [ms]", "seeds", "growth 360 to 720 rpm", "std of growth below",
-               "growth 720 to 1440 rpm", "std of growth above", "surge", "std"),
-              study.grouped([r | {"measure": measure.replace("_", " "), "ms": r["error_us"] * 1e-3}
-                             for measure in ("edge_blur", "blur") for r in surge_of(sizes, measure)],
-                            ("measure", "apex_name", "ms"), ["below", "above", "surge"]),
-              f"The error surges if the second growth is larger by more than {SURGE:g}.",
-              Chart("rms timing error [ms]", "surge", "apex", "std", panels=("measure",), marks={"surge": SURGE})),
-        Table("apex_speed_models", "Error of the circle and of the exact model over the whole sensor",
-              ("apex", "timing error", "model", "seeds", *measures),
-              study.grouped(models, ("apex_name", "timing", "model"), ["displacement", "blur", "edge_blur"]),
-              "640x480 px, 720 rpm. Displacement: rms distance of the events from their places by the true model.",
-              Chart("apex", "displacement [px]", "model", "std of displacement", panels=("timing error",),
-                    kind=study.ChartKind.BARS, marks={"the paper's system": PRACTICAL_PX})),
-        Table("apex_speed_circle", "Distance of the best circle from exact refraction, computed",
-              ("apex", "field of view", "rms [px]", "largest [px]"),
-              [(f"apex {degrees:g}°", f"{fov:.3g}°", error.rms, error.worst)
-               for degrees in (APEX_DEG if models else ()) for fov in (60.0, FIELDS["90° across the diagonal"], 90.0)
-               for error in (circle_error(degrees, fov),)],
-              "Over 640x480 px and a turn. The field of view is that across the width; 77.3° are 90° across the "
-              "diagonal. The paper states 2 px in 90°, without apex angle and focal length."),
-        over_speed("apex_speed_delay", "Delay of the sensor over speed", "delay", "delay [us]",
-                   "Delay at which the blur is smallest."),
-        over_speed("apex_speed_rate", "Event rate over speed", "mev_per_s", "rate [Mev/s]",
-                   "A limited bandwidth loses events at high speed."),
-    ]  # fmt: skip
+        over_speed(
+            "apex_speed_blur",
+            "Blur of edges over speed",
+            "blur",
+            "blur [px]",
+            "Distance of events from the true edges, compensated by the true model with the best delay.",
+        ),
+        over_speed(
+            "apex_speed_edge_blur",
+            "The paper's measure of blur over speed",
+            "edge_blur",
+            "edge blur [px]",
+            "Edges are found in the events themselves, and events more than 3 px away do not count.",
+        ),
+        Table(
+            "apex_speed_limits",
+            "Blur of a sensor with one limit only (apex 0.5°)",
+            ("limit", "speed [rpm]", "seeds", "blur [px]", "std"),
+            _limits(rows),
+            f"An ideal sensor (limit: {IDEAL}) with one limit of the DVXplorer's model, or with a lower "
+            "bandwidth; and the model with all limits.",
+            Chart("speed [rpm]", "blur [px]", "limit", "std", log_x=True),
+        ),
+        Table(
+            "apex_speed_light",
+            "Blur and delay of bright and dark edges (apex 0.5°)",
+            (
+                "bandwidth",
+                "edges of discs",
+                "speed [rpm]",
+                "seeds",
+                "blur [px]",
+                "std",
+                "own delay [us]",
+                "std of delay",
+                "blur with own delay [px]",
+                "std of blur",
+            ),
+            grouped(
+                [
+                    r
+                    for r in _rows(results, "light", cropped=True)
+                    if r["only"] is None and r["degrees"] == USUAL_DEG
+                ],
+                ("bandwidth", "light", "rpm"),
+                ["blur", "own_delay", "own_blur"],
+            ),
+            "One phase for all pixels removes the mean delay, not its difference between bright and dark pixels.",
+            Chart(
+                "speed [rpm]",
+                "blur [px]",
+                "edges of discs",
+                "std",
+                panels=("bandwidth",),
+                log_x=True,
+            ),
+        ),
+        Table(
+            "apex_speed_timing",
+            "Error over speed with timing errors of 1 ms",
+            ("apex", "timing error", "speed [rpm]", "seeds", *measures),
+            grouped(timings, ("apex_name", "timing", "rpm"), ["displacement", "blur", "edge_blur"]),
+            f"True model, {USUAL_HZ:g} Hz. Displacement: rms distance from the places without the timing error.",
+            Chart("speed [rpm]", "blur [px]", "timing error", "std", panels=("apex",), log_x=True),
+        ),
+        Table(
+            "apex_speed_timing_size",
+            "Error over speed with a slow wander of the encoder's clock",
+            ("apex", "rms timing error", "speed [rpm]", "seeds", *measures),
+            grouped(sizes, ("apex_name", "size", "rpm"), ["displacement", "blur", "edge_blur"]),
+            f"True model, {USUAL_HZ:g} Hz.",
+            Chart(
+                "speed [rpm]", "blur [px]", "rms timing error", "std", panels=("apex",), log_x=True
+            ),
+        ),
+        Table(
+            "apex_speed_surge",
+            "Surge of the error above 720 rpm over the timing error (slow wander)",
+            (
+                "measure",
+                "apex",
+                "rms timing error [ms]",
+                "seeds",
+                "growth 360 to 720 rpm",
+                "std of growth below",
+                "growth 720 to 1440 rpm",
+                "std of growth above",
+                "surge",
+                "std",
+            ),
+            grouped(
+                [
+                    r | {"measure": measure.replace("_", " "), "ms": r["error_us"] * 1e-3}
+                    for measure in ("edge_blur", "blur")
+                    for r in surge_of(sizes, measure)
+                ],
+                ("measure", "apex_name", "ms"),
+                ["below", "above", "surge"],
+            ),
+            f"The error surges if the second growth is larger by more than {SURGE:g}.",
+            Chart(
+                "rms timing error [ms]",
+                "surge",
+                "apex",
+                "std",
+                panels=("measure",),
+                marks={"surge": SURGE},
+            ),
+        ),
+        Table(
+            "apex_speed_models",
+            "Error of the circle and of the exact model over the whole sensor",
+            ("apex", "timing error", "model", "seeds", *measures),
+            grouped(
+                models, ("apex_name", "timing", "model"), ["displacement", "blur", "edge_blur"]
+            ),
+            "640x480 px, 720 rpm. Displacement: rms distance of the events from their places by the true model.",
+            Chart(
+                "apex",
+                "displacement [px]",
+                "model",
+                "std of displacement",
+                panels=("timing error",),
+                kind=ChartKind.BARS,
+                marks={"the paper's system": PRACTICAL_PX},
+            ),
+        ),
+        Table(
+            "apex_speed_circle",
+            "Distance of the best circle from exact refraction, computed",
+            ("apex", "field of view", "rms [px]", "largest [px]"),
+            [
+                (f"apex {degrees:g}°", f"{fov:.3g}°", error.rms, error.worst)
+                for degrees in (APEX_DEG if models else ())
+                for fov in (60.0, FIELDS["90° across the diagonal"], 90.0)
+                for error in (circle_error(degrees, fov),)
+            ],
+            "Over 640x480 px and a turn. The field of view is that across the width; 77.3° are 90° across the "
+            "diagonal. The paper states 2 px in 90°, without apex angle and focal length.",
+        ),
+        over_speed(
+            "apex_speed_delay",
+            "Delay of the sensor over speed",
+            "delay",
+            "delay [us]",
+            "Delay at which the blur is smallest.",
+        ),
+        over_speed(
+            "apex_speed_rate",
+            "Event rate over speed",
+            "mev_per_s",
+            "rate [Mev/s]",
+            "A limited bandwidth loses events at high speed.",
+        ),
+    ]
 
 
-def _limits(rows: Sequence[dict[str, Any]]) -> list[tuple[study.Value, ...]]:
+def _limits(rows: Sequence[dict[str, Any]]) -> list[tuple[Value, ...]]:
     """Return the blur over limit and speed; all limits together last."""
-    bandwidth = study.BANDWIDTH
-    chosen = [r | {"limit": f"bandwidth {r['cutoff_hz'] or USUAL_HZ:g} Hz" if r["only"] == bandwidth else r["only"]}
-              for r in rows if r["only"] is not None]  # fmt: skip
-    chosen += [r | {"limit": "all"} for r in rows
-               if (r["only"], r["cutoff_hz"], r["degrees"]) == (None, USUAL_HZ, USUAL_DEG)]  # fmt: skip
-    return study.grouped(chosen, ("limit", "rpm"), ["blur"])
+    single = []
+    together = []
+    for row in rows:
+        limit = row["only"]
+        if limit is None:
+            if row["cutoff_hz"] == USUAL_HZ and row["degrees"] == USUAL_DEG:
+                together.append(row | {"limit": "all"})
+            continue
+        if limit == BANDWIDTH:
+            limit = f"bandwidth {row['cutoff_hz'] or USUAL_HZ:g} Hz"
+        single.append(row | {"limit": limit})
+    return grouped([*single, *together], ("limit", "rpm"), ["blur"])
 
 
 def _cropped(row: dict[str, Any]) -> bool:
-    """Return whether a row is that of the middle of the sensor."""
+    """Return whether a row belongs to the middle of the sensor."""
     return (row["width"], row["height"]) != WHOLE
 
 
-def _rows(results: Sequence[CellResult], name: str, *, cropped: bool = False) -> list[dict[str, Any]]:
+def _rows(
+    results: Sequence[CellResult], name: str, *, cropped: bool = False
+) -> list[dict[str, Any]]:
     """Return rows with the names of apex and bandwidth; those without events are left out.
 
-    With ``cropped``, those of the whole sensor are left out, too.
+    With ``cropped``, rows of the whole sensor are left out, too.
     """
-    rows = [r for r in study.rows_of(results, name) if r["blur"] is not None and (_cropped(r) or not cropped)]
-    return [{**r, "bandwidth": _name(r["cutoff_hz"]), "apex_name": f"apex {r['degrees']:g}°"} for r in rows]
+    named = []
+    for row in rows_of(results, name):
+        if row["blur"] is None or (cropped and not _cropped(row)):
+            continue
+        names = {"bandwidth": _name(row["cutoff_hz"]), "apex_name": f"apex {row['degrees']:g}°"}
+        named.append({**row, **names})
+    return named
 
 
 def _name(cutoff_hz: float | None) -> str:
@@ -367,89 +593,223 @@ def _name(cutoff_hz: float | None) -> str:
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the surge above 720 rpm and its cause, on 2 deg, and on apex and speed in general."""
     rows = [r for r in _rows(results, "rows", cropped=True) if r["only"] is None]
-    bandwidths = sorted({r["cutoff_hz"] for r in rows if r["cutoff_hz"] != USUAL_HZ}, key=lambda hz: hz or np.inf)
+    bandwidths = sorted(
+        {r["cutoff_hz"] for r in rows if r["cutoff_hz"] != USUAL_HZ}, key=lambda hz: hz or np.inf
+    )
     usual = [r for r in rows if (r["rpm"], r["cutoff_hz"]) == (USUAL_RPM, USUAL_HZ)]
     errors = _rows(results, "errors")
     crop = [r for r in errors if _cropped(r) and r["model"] == EXACT]
-    timed, none = (
-        [r for r in crop if (r["timing"], r["error_us"]) == kind] for kind in ((WANDER, USUAL_US), (NONE, 0.0))
-    )
+    timed = [r for r in crop if (r["timing"], r["error_us"]) == (WANDER, USUAL_US)]
+    none = [r for r in crop if (r["timing"], r["error_us"]) == (NONE, 0.0)]
     apex = [r for r in rows if (r["degrees"], r["cutoff_hz"]) == (USUAL_DEG, USUAL_HZ)]
-    fast, slow = {"rpm": 2 * USUAL_RPM}, {"rpm": USUAL_RPM}
-    growth = [{"degrees": float(degrees), "seed": seed, "growth": value}
-              for degrees, values in differences(timed, "edge_blur", fast, slow, by=("degrees",)).items()
-              for seed, value in values.items()]  # fmt: skip
+    fast = {"rpm": 2 * USUAL_RPM}
+    slow = {"rpm": USUAL_RPM}
+    growth = []
+    by_degrees = differences(timed, "edge_blur", fast, slow, by=("degrees",))
+    for degrees, of_seeds in by_degrees.items():
+        for seed, value in of_seeds.items():
+            growth.append({"degrees": float(degrees), "seed": seed, "growth": value})
     large = f"timing errors of {USUAL_US * 1e-3:g} ms"
 
-    def surges(text: str, rows: Sequence[dict[str, Any]], degrees: float, measure: str, *, no: bool = False) -> Claim:
+    def surges(
+        text: str, rows: Sequence[dict[str, Any]], degrees: float, measure: str, *, no: bool = False
+    ) -> Claim:
         surge = surge_of([r for r in rows if r["degrees"] == degrees], measure)
         limit: Any = {"below" if no else "above": SURGE}
-        return judge(None, text, differences(surge, "surge", {}, by=("apex_name",)), f"the {_growth(measure)}", **limit)
+        return judge(
+            None,
+            text,
+            differences(surge, "surge", {}, by=("apex_name",)),
+            f"the {_growth(measure)}",
+            **limit,
+        )
 
     def caused(degrees: float, measure: str) -> Claim:
-        both = [s | {"kind": kind} for kind, rows in (("timed", timed), ("none", none))
-                for s in surge_of([r for r in rows if r["degrees"] == degrees], measure)]  # fmt: skip
+        both = []
+        for kind, rows in (("timed", timed), ("none", none)):
+            of_apex = [r for r in rows if r["degrees"] == degrees]
+            both += [surge | {"kind": kind} for surge in surge_of(of_apex, measure)]
         found = differences(both, "surge", {"kind": "timed"}, {"kind": "none"}, by=("apex_name",))
         growths = f"growth of the {_named(measure)} above 720 rpm relative to that below"
         text = f"{large.capitalize()} rms enlarge the {growths} (apex {degrees:g}°)."
-        return judge(None, text, found, f"the {_growth(measure)}, with timing errors less without,", above=0.0)
+        return judge(
+            None,
+            text,
+            found,
+            f"the {_growth(measure)}, with timing errors less without,",
+            above=0.0,
+        )
 
     def of(degrees: float, model: str) -> dict[str, Any]:
         return {"degrees": degrees, "model": model}
 
     return [
-        untestable(13, "The error surges dramatically above 720 rpm, because of synchronisation errors, and more with "
-                   "a larger apex.", "the paper states neither how large the synchronisation errors are nor from which "
-                   f"growth on an error surges dramatically; see the checks for {large}, our choice"),
+        untestable(
+            13,
+            "The error surges dramatically above 720 rpm, because of synchronisation errors, and more with "
+            "a larger apex.",
+            "the paper states neither how large the synchronisation errors are nor from which "
+            f"growth on an error surges dramatically; see the checks for {large}, our choice",
+        ),
         *(caused(degrees, measure) for measure in ("edge_blur", "blur") for degrees in (0.5, 1.0)),
-        *(surges(f"With {large} rms, the {_named(measure)} surges by more than {SURGE:.0%} (apex {degrees:g}°).",
-                 timed, degrees, measure) for measure in ("edge_blur", "blur") for degrees in (0.5, 1.0)),
-        *(surges(f"Without timing errors, the {_named(measure)} does not surge by more than {SURGE:.0%} (apex "
-                 f"{degrees:g}°).", none, degrees, measure, no=True)
-          for measure in ("edge_blur", "blur") for degrees in (0.5, 1.0)),
-        judge(None, f"With {large} rms, the edge blur grows more at 1° than at 0.5° (720 to 1440 rpm).",
-              differences(growth, "growth", {"degrees": 1.0}, {"degrees": 0.5}, by=()),
-              "the growth of the edge blur at 1° less that at 0.5°", above=0.0, unit="px"),
-        *(surges(f"The blur surges above 720 rpm without timing errors (apex 0.5°, bandwidth {_name(hz)}).",
-                 [r for r in rows if r["cutoff_hz"] == hz], 0.5, "blur") for hz in bandwidths),
-        untestable(11, "Events are compensated with an error of about 1.5 to 2.0 px.",
-                   "this is the error of the paper's rig, whose timing errors are not stated; see the checks for 1 ms"),
-        *(judge(None, f"The error of a system as the paper's, with the circle and {large}, is at most {PRACTICAL_PX:g} "
+        *(
+            surges(
+                f"With {large} rms, the {_named(measure)} surges by more than {SURGE:.0%} (apex {degrees:g}°).",
+                timed,
+                degrees,
+                measure,
+            )
+            for measure in ("edge_blur", "blur")
+            for degrees in (0.5, 1.0)
+        ),
+        *(
+            surges(
+                f"Without timing errors, the {_named(measure)} does not surge by more than {SURGE:.0%} (apex "
+                f"{degrees:g}°).",
+                none,
+                degrees,
+                measure,
+                no=True,
+            )
+            for measure in ("edge_blur", "blur")
+            for degrees in (0.5, 1.0)
+        ),
+        judge(
+            None,
+            f"With {large} rms, the edge blur grows more at 1° than at 0.5° (720 to 1440 rpm).",
+            differences(growth, "growth", {"degrees": 1.0}, {"degrees": 0.5}, by=()),
+            "the growth of the edge blur at 1° less that at 0.5°",
+            above=0.0,
+            unit="px",
+        ),
+        *(
+            surges(
+                f"The blur surges above 720 rpm without timing errors (apex 0.5°, bandwidth {_name(hz)}).",
+                [r for r in rows if r["cutoff_hz"] == hz],
+                0.5,
+                "blur",
+            )
+            for hz in bandwidths
+        ),
+        untestable(
+            11,
+            "Events are compensated with an error of about 1.5 to 2.0 px.",
+            "this is the error of the paper's rig, whose timing errors are not stated; see the checks for 1 ms",
+        ),
+        *(
+            judge(
+                None,
+                f"The error of a system as the paper's, with the circle and {large}, is at most {PRACTICAL_PX:g} "
                 f"px (rms, apex {degrees:g}°, 720 rpm, whole sensor).",
-                differences(_whole_sensor(errors, USUAL_US), "displacement", of(degrees, CIRCLE), by=()),
-                "the rms displacement error", below=PRACTICAL_PX, unit="px") for degrees in (0.5, 1.0, 2.0)),
-        untestable(11, "Compensation runs in real time on an onboard computer.",
-                   "no onboard computer was at hand: the documentation states the rate on two cores of a server"),
-        *untestable_as_stated(12, f"The circle's error is within {CIRCLE_PX:g} px in a field of view of 90°.",
-                              "the apex angle, along which axis the 90° are, and whether the error is the rms or the "
-                              "largest one", [
-            judge_number(None, f"The circle's error is within {CIRCLE_PX:g} px {where} (apex {degrees:g}°, {fov}).",
-                         getattr(circle_error(degrees, FIELDS[fov]), name), f"the {what} over 640x480 px and a turn",
-                         below=CIRCLE_PX, unit="px")
-            for degrees in ((USUAL_DEG, 1.0) if errors else ()) for fov in FIELDS
-            for where, name, what in (("in the rms", "rms", "rms error"),
-                                      ("everywhere in the image", "worst", "largest error"))]),
-        untestable(14, "The compensation error of 2° is too high to be practical.",
-                   "the paper states no error from which on a prism is not practical; see the checks"),
-        *(judge(number, f"With {word}, {timing}, the error of 2° is {more} than that of 1° with the circle (720 rpm, "
+                differences(
+                    _whole_sensor(errors, USUAL_US), "displacement", of(degrees, CIRCLE), by=()
+                ),
+                "the rms displacement error",
+                below=PRACTICAL_PX,
+                unit="px",
+            )
+            for degrees in (0.5, 1.0, 2.0)
+        ),
+        untestable(
+            11,
+            "Compensation runs in real time on an onboard computer.",
+            "no onboard computer was at hand: the documentation states the rate on two cores of a server",
+        ),
+        *untestable_as_stated(
+            12,
+            f"The circle's error is within {CIRCLE_PX:g} px in a field of view of 90°.",
+            "the apex angle, along which axis the 90° are, and whether the error is the rms or the "
+            "largest one",
+            [
+                judge_number(
+                    None,
+                    f"The circle's error is within {CIRCLE_PX:g} px {where} (apex {degrees:g}°, {fov}).",
+                    getattr(circle_error(degrees, FIELDS[fov]), name),
+                    f"the {what} over 640x480 px and a turn",
+                    below=CIRCLE_PX,
+                    unit="px",
+                )
+                for degrees in ((USUAL_DEG, 1.0) if errors else ())
+                for fov in FIELDS
+                for where, name, what in (
+                    ("in the rms", "rms", "rms error"),
+                    ("everywhere in the image", "worst", "largest error"),
+                )
+            ],
+        ),
+        untestable(
+            14,
+            "The compensation error of 2° is too high to be practical.",
+            "the paper states no error at which a prism is not practical; see the checks",
+        ),
+        *(
+            judge(
+                number,
+                f"With {word}, {timing}, the error of 2° is {more} than the error of 1° with the circle (720 rpm, "
                 "whole sensor).",
-                differences(_whole_sensor(errors, us), "displacement", of(2.0, model), of(1.0, CIRCLE), by=()),
-                "the difference of the rms displacement errors", above=low, below=high, unit="px")
-          for number, model, word, more, low, high in (
-              (15, CIRCLE, "the circle", "larger", 0.0, np.inf),
-              (None, EXACT, "exact refraction", "smaller", -np.inf, 0.0))
-          for timing, us in (("without timing errors", 0.0), ("with timing errors of 1 ms", USUAL_US))),
-        *(judge(14, f"A prism of 2° gives more events than one of {other:g}° (720 rpm).",
+                differences(
+                    _whole_sensor(errors, us),
+                    "displacement",
+                    of(2.0, model),
+                    of(1.0, CIRCLE),
+                    by=(),
+                ),
+                "the difference of the rms displacement errors",
+                above=low,
+                below=high,
+                unit="px",
+            )
+            for number, model, word, more, low, high in (
+                (15, CIRCLE, "the circle", "larger", 0.0, np.inf),
+                (None, EXACT, "exact refraction", "smaller", -np.inf, 0.0),
+            )
+            for timing, us in (
+                ("without timing errors", 0.0),
+                ("with timing errors of 1 ms", USUAL_US),
+            )
+        ),
+        *(
+            judge(
+                14,
+                f"A prism of 2° gives more events than one of {other:g}° (720 rpm).",
                 differences(usual, "mev_per_s", {"degrees": 2.0}, {"degrees": other}, by=("rpm",)),
-                f"the event rate at 2° less that at {other:g}°", above=0.0, unit="Mev/s") for other in (1.0, 0.5)),
-        *(judge(15, f"{word} gives more {what}.", differences(chosen, value, first, second, by=("only",)),
-                f"the {name} {sides}", above=0.0, unit=unit)
-          for value, what, name, unit in (
-              ("mev_per_s", "events", "event rate", "Mev/s"), ("edge_blur", "error", "edge blur", "px"))
-          for word, chosen, first, second, sides in (
-              ("A larger apex (720 rpm)", usual, {"degrees": 1.0}, {"degrees": 0.5}, "at 1° less that at 0.5°"),
-              ("A higher speed (apex 0.5°)", apex, fast, slow, "at 1440 rpm less that at 720 rpm"))),
-    ]  # fmt: skip
+                f"the event rate at 2° less that at {other:g}°",
+                above=0.0,
+                unit="Mev/s",
+            )
+            for other in (1.0, 0.5)
+        ),
+        *(
+            judge(
+                15,
+                f"{word} gives more {what}.",
+                differences(chosen, value, first, second, by=("only",)),
+                f"the {name} {sides}",
+                above=0.0,
+                unit=unit,
+            )
+            for value, what, name, unit in (
+                ("mev_per_s", "events", "event rate", "Mev/s"),
+                ("edge_blur", "error", "edge blur", "px"),
+            )
+            for word, chosen, first, second, sides in (
+                (
+                    "A larger apex (720 rpm)",
+                    usual,
+                    {"degrees": 1.0},
+                    {"degrees": 0.5},
+                    "at 1° less that at 0.5°",
+                ),
+                (
+                    "A higher speed (apex 0.5°)",
+                    apex,
+                    fast,
+                    slow,
+                    "at 1440 rpm less that at 720 rpm",
+                ),
+            )
+        ),
+    ]
 
 
 def _named(measure: str) -> str:
@@ -472,8 +832,11 @@ def surge_of(rows: Sequence[dict[str, Any]], measure: str) -> list[dict[str, Any
     out = []
     for speeds in found.values():
         if {USUAL_RPM / 2.0, USUAL_RPM, 2.0 * USUAL_RPM} <= set(speeds):
-            low, usual, high = (speeds[rpm][measure] for rpm in (USUAL_RPM / 2.0, USUAL_RPM, 2.0 * USUAL_RPM))
-            below, above = usual / low - 1.0, high / usual - 1.0
+            low = speeds[USUAL_RPM / 2.0][measure]
+            usual = speeds[USUAL_RPM][measure]
+            high = speeds[2.0 * USUAL_RPM][measure]
+            below = usual / low - 1.0
+            above = high / usual - 1.0
             out.append(speeds[USUAL_RPM] | {"below": below, "above": above, "surge": above - below})
     return out
 

@@ -46,35 +46,65 @@ class PaperClaim:
 
 
 PAPER = {
-    1: PaperClaim("The event stream is more uniform, and depends less on the camera's motion (static scene).",
-                  "variance 0.196, S-EV 0.425"),
-    2: PaperClaim("Event images are more complete and more stable: their ODS-F is higher and steadier, their entropy "
-                  "is higher."),
+    1: PaperClaim(
+        "The event stream is more uniform, and depends less on the camera's motion (static scene).",
+        "variance 0.196, S-EV 0.425",
+    ),
+    2: PaperClaim(
+        "Event images are more complete and more stable: their ODS-F is higher and steadier, their entropy "
+        "is higher."
+    ),
     3: PaperClaim("Motion along most edges hurts the S-EV, and not the AMI-EV."),
-    4: PaperClaim("Reconstructed video is better at rest, where the S-EV fades, and better in motion.", "NIQE, curves"),
-    5: PaperClaim("In rare moments the motions of prism and camera cancel: a small degradation.", "film"),
-    6: PaperClaim("More corners are detected and tracked than by the S-EV and, in hard light, by a standard camera. "
-                  "They live substantially longer. Their error does not depend on the camera's motion.",
-                  "error about 1.5 px"),
-    7: PaperClaim("The update rate of S-EV and AMI-EV is far above that of standard cameras."),
-    8: PaperClaim("The prism's motion does not influence the segmentation of moving bodies; S-EV and AMI-EV are better "
-                  "than a standard camera.", "pictures"),
-    9: PaperClaim("Human pose is better than with the S-EV at every rate of pictures, and the rate can be much higher.",
-                  "PDJ and IoU, curves"),
+    4: PaperClaim(
+        "Reconstructed video is better at rest, where the S-EV fades, and better in motion.",
+        "NIQE, curves",
+    ),
+    5: PaperClaim(
+        "In rare moments the motions of prism and camera cancel: a small degradation.", "film"
+    ),
+    6: PaperClaim(
+        "More corners are detected and tracked than by the S-EV and, in hard light, by a standard camera. "
+        "They live substantially longer. Their error does not depend on the camera's motion.",
+        "error about 1.5 px",
+    ),
+    7: PaperClaim(
+        "The update rate of S-EV and AMI-EV is far above the update rate of standard cameras."
+    ),
+    8: PaperClaim(
+        "The prism's motion does not influence the segmentation of moving bodies; S-EV and AMI-EV are better "
+        "than a standard camera.",
+        "pictures",
+    ),
+    9: PaperClaim(
+        "Human pose is better than with the S-EV at every rate of pictures, and the rate can be much higher.",
+        "PDJ and IoU, curves",
+    ),
     10: PaperClaim("Optical flow of static objects gets slightly worse.", "+0.19 px"),
     11: PaperClaim("Events are compensated with a small error, in real time.", "1.5 to 2.0 px"),
     12: PaperClaim("The circle's error is within 2 px in a field of view of 90°.", "2 px"),
-    13: PaperClaim("The error surges dramatically above 720 rpm at 0.5° and 1.0°, because of small synchronisation "
-                   "errors, and more with a larger apex."),
-    14: PaperClaim("A prism of 2° gives the most data, but its compensation error is too high to be practical."),
-    15: PaperClaim("A larger apex and a higher speed give more events and more error; a quarter turn must fit the "
-                   "window.", "455 rpm at least"),
-    16: PaperClaim("Recordings of 2 s calibrate well; the optimum is unique, and the cost is convex in a domain.",
-                   "costs 29,569 and 2,382"),
-    17: PaperClaim("Future: adaptive speed, no moving parts, an ellipse, polarity, the motion used without moving "
-                   "events, a learned compensation.", "–",
-                   "no claim to test: see 'The paper's results' in the documentation for what exists"),
-}  # fmt: skip
+    13: PaperClaim(
+        "The error surges dramatically above 720 rpm at 0.5° and 1.0°, because of small synchronisation "
+        "errors, and more with a larger apex."
+    ),
+    14: PaperClaim(
+        "A prism of 2° gives the most data, but its compensation error is too high to be practical."
+    ),
+    15: PaperClaim(
+        "A larger apex and a higher speed give more events and more error; a quarter turn must fit the "
+        "window.",
+        "455 rpm at least",
+    ),
+    16: PaperClaim(
+        "Recordings of 2 s calibrate well; the optimum is unique, and the cost is convex in a domain.",
+        "costs 29,569 and 2,382",
+    ),
+    17: PaperClaim(
+        "Future: adaptive speed, no moving parts, an ellipse, polarity, the motion used without moving "
+        "events, a learned compensation.",
+        "–",
+        "no claim to test: see 'The paper's results' in the documentation for what exists",
+    ),
+}
 """The paper's claims by their number here."""
 
 
@@ -94,22 +124,29 @@ class Interval:
     @classmethod
     def of(cls, values: Sequence[float]) -> Interval:
         """Return the interval of the mean of independent values, one for each seed."""
-        n, mean = len(values), float(np.mean(values))
+        n = len(values)
+        mean = float(np.mean(values))
         if n < 2:
             return cls(mean, -math.inf, math.inf, n)
-        half = float(special.stdtrit(n - 1, 0.5 + LEVEL / 2.0) * np.std(values, ddof=1) / math.sqrt(n))
+        half = float(
+            special.stdtrit(n - 1, 0.5 + LEVEL / 2.0) * np.std(values, ddof=1) / math.sqrt(n)
+        )
         return cls(mean, mean - half, mean + half, n)
 
     def verdict(self, above: float, below: float) -> Verdict:
         """Return the verdict on the claim that the mean is larger than ``above`` and smaller than ``below``."""
         if self.low > above and self.high < below:
             return Verdict.REPRODUCED
-        return Verdict.NOT_REPRODUCED if self.high < above or self.low > below else Verdict.UNDECIDED
+        return (
+            Verdict.NOT_REPRODUCED if self.high < above or self.low > below else Verdict.UNDECIDED
+        )
 
     def text(self, unit: str = "") -> str:
         """Return the mean, the interval and the number of seeds in words."""
         ends = f" [{self.low:.3g}, {self.high:.3g}]" if self.seeds > 1 else ""
-        return f"{self.mean:.3g}{ends}{unit and ' '}{unit}, {self.seeds} seed{'s'[: self.seeds != 1]}"
+        return (
+            f"{self.mean:.3g}{ends}{unit and ' '}{unit}, {self.seeds} seed{'s'[: self.seeds != 1]}"
+        )
 
 
 @dataclass(frozen=True)
@@ -136,16 +173,26 @@ class Claim:
 
 
 def judge(
-    number: int | None, text: str, found: Differences, what: str, *,
-    above: float = -math.inf, below: float = math.inf, unit: str = "",
-) -> Claim:  # fmt: skip
+    number: int | None,
+    text: str,
+    found: Differences,
+    what: str,
+    *,
+    above: float = -math.inf,
+    below: float = math.inf,
+    unit: str = "",
+) -> Claim:
     """Return the claim that a mean over the seeds lies above a limit, below one, or between two.
 
     A seed's value is the mean over its cases, so that seeds are independent. Every seed runs all cases; one that lacks
     the value of a case, as of a refused calibration, is counted in the text. "No worse by more than m" is
     ``above=-m`` where larger is better. ``what``: the value in words.
     """
-    limits = [f"{word} {value:g}" for word, value in (("above", above), ("below", below)) if math.isfinite(value)]
+    limits = [
+        f"{word} {value:g}"
+        for word, value in (("above", above), ("below", below))
+        if math.isfinite(value)
+    ]
     rule = f"the 95 % interval over the seeds of {what} lies {' and '.join(limits)}{unit and ' '}{unit}"
     by_seed: dict[int, list[float]] = {}
     for values in found.values():
@@ -159,17 +206,25 @@ def judge(
     verdict = interval.verdict(above, below)
     ours = interval.text(unit)
     for other in (Verdict.REPRODUCED, Verdict.NOT_REPRODUCED):
-        among = [case for case, one in inside.items() if one.verdict(above, below) is other is not verdict]
+        among = [
+            case
+            for case, one in inside.items()
+            if one.verdict(above, below) is other is not verdict
+        ]
         ours += f"; {other} in {' and '.join(among)}" if among else ""
     ours += f"; seeds that lack a case: {fewer}" if fewer else ""
     cases = {case: one.text(unit) for case, one in inside.items()} if len(inside) > 1 else {}
     return Claim(number, text, ours, verdict, rule, cases)
 
 
-def judge_number(number: int | None, text: str, value: float, what: str, *, below: float, unit: str) -> Claim:
+def judge_number(
+    number: int | None, text: str, value: float, what: str, *, below: float, unit: str
+) -> Claim:
     """Return the claim that a number lies below a limit, which is computed without recordings and has no spread."""
     verdict = Verdict.REPRODUCED if value < below else Verdict.NOT_REPRODUCED
-    return Claim(number, text, f"{value:.3g} {unit}, computed", verdict, f"{what} is below {below:g} {unit}")
+    return Claim(
+        number, text, f"{value:.3g} {unit}, computed", verdict, f"{what} is below {below:g} {unit}"
+    )
 
 
 def untestable(number: int, text: str, reason: str) -> Claim:
@@ -177,7 +232,9 @@ def untestable(number: int, text: str, reason: str) -> Claim:
     return Claim(number, text, "–", Verdict.NOT_TESTABLE, reason)
 
 
-def untestable_as_stated(number: int, text: str, missing: str, readings: Sequence[Claim]) -> list[Claim]:
+def untestable_as_stated(
+    number: int, text: str, missing: str, readings: Sequence[Claim]
+) -> list[Claim]:
     """Return a claim that cannot be tested as it is stated, and its readings, which are checks with their verdicts.
 
     ``missing``: what the paper does not state.
@@ -190,9 +247,14 @@ def untestable_as_stated(number: int, text: str, missing: str, readings: Sequenc
 
 
 def differences(
-    rows: Sequence[Mapping[str, Any]], value: str, first: Mapping[str, Any], second: Mapping[str, Any] | None = None,
-    *, by: Sequence[str] = ("scene", "camera"), relative: bool = False,
-) -> dict[str, dict[int, float]]:  # fmt: skip
+    rows: Sequence[Mapping[str, Any]],
+    value: str,
+    first: Mapping[str, Any],
+    second: Mapping[str, Any] | None = None,
+    *,
+    by: Sequence[str] = ("scene", "camera"),
+    relative: bool = False,
+) -> dict[str, dict[int, float]]:
     """Return the difference of a column between two kinds of rows, by case and seed.
 
     ``first`` and ``second``: values of columns that the rows of either kind have, such as their stream. Rows of one
@@ -216,23 +278,35 @@ def _means(
     found: dict[tuple[str, int], list[float]] = {}
     for row in rows:
         given = row.get(value)
-        if given is not None and math.isfinite(given) and all(row[name] == v for name, v in kind.items()):
-            found.setdefault((", ".join(str(row[name]) for name in by), row["seed"]), []).append(float(given))
+        if (
+            given is not None
+            and math.isfinite(given)
+            and all(row[name] == v for name, v in kind.items())
+        ):
+            found.setdefault((", ".join(str(row[name]) for name in by), row["seed"]), []).append(
+                float(given)
+            )
     return {key: float(np.mean(values)) for key, values in found.items()}
 
 
-def ranges(rows: Sequence[Mapping[str, Any]], value: str, over: str = "camera") -> list[dict[str, Any]]:
+def ranges(
+    rows: Sequence[Mapping[str, Any]], value: str, over: str = "camera"
+) -> list[dict[str, Any]]:
     """Return the range of a column over the values of another one, for each scene, seed and stream, as rows.
 
     Those with fewer than two values are left out.
     """
     found: dict[tuple[Any, ...], dict[Any, list[float]]] = {}
     for row in rows:
-        if row.get(value) is not None:
-            found.setdefault((row["scene"], row["seed"], row["stream"]), {}).setdefault(row[over], []).append(
-                float(row[value])
-            )
-    return [
-        {"scene": scene, "seed": seed, "stream": stream, value: float(np.ptp([np.mean(v) for v in values.values()]))}
-        for (scene, seed, stream), values in found.items() if len(values) > 1
-    ]  # fmt: skip
+        if row.get(value) is None:
+            continue
+        of_case = found.setdefault((row["scene"], row["seed"], row["stream"]), {})
+        of_case.setdefault(row[over], []).append(float(row[value]))
+
+    ranges_of_cases = []
+    for (scene, seed, stream), values in found.items():
+        if len(values) > 1:
+            means = [np.mean(several) for several in values.values()]
+            case = {"scene": scene, "seed": seed, "stream": stream}
+            ranges_of_cases.append(case | {value: float(np.ptp(means))})
+    return ranges_of_cases

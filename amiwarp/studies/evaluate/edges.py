@@ -6,152 +6,57 @@ from typing import Annotated, Any, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import maximum_flow
-from scipy.spatial import KDTree
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.iwe import iwe
-from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.claims import Claim, differences, judge, ranges
-from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Frames, Settings, Stream, Streams, Table
-
-# Agreement of edge pixels with true edges: one-to-one matches within a tolerance, precision, recall and F-score.
-
-THRESHOLDS = np.arange(3, 100, 3) / 100.0
-"""Thresholds that are swept, relative to the scale of an event image."""
-SCALE_PERCENTILE = 99.0
-"""Percentile of the pixels with events that is the scale of an event image."""
-
-
-@dataclass(frozen=True)
-class Counts:
-    """Numbers of edge pixels, added up over a set of images, for each threshold, shape (n,)."""
-
-    matched: NDArray[np.int64]
-    """Number of found pixels that match a true pixel, one to one."""
-    found: NDArray[np.int64]
-    """Number of found pixels."""
-    true: NDArray[np.int64]
-    """Number of true pixels."""
-
-    @property
-    def precision(self) -> NDArray[np.float64]:
-        """Part of the found pixels that match, 0 without any."""
-        return self.matched / np.maximum(self.found, 1)
-
-    @property
-    def recall(self) -> NDArray[np.float64]:
-        """Part of the true pixels that match, 0 without any."""
-        return self.matched / np.maximum(self.true, 1)
-
-    @property
-    def f_score(self) -> NDArray[np.float64]:
-        """Harmonic mean of precision and recall."""
-        return 2.0 * self.matched / np.maximum(self.found + self.true, 1)
-
-
-def match(found: NDArray[np.bool_], true: NDArray[np.bool_], tolerances: Sequence[float]) -> list[NDArray[np.bool_]]:
-    """Return for each tolerance [px] which of the true pixels match a found one, shape (height, width).
-
-    Pixels are matched one to one, in as many pairs as possible. They are the largest flow from the true pixels to the
-    found ones (Dinic, by SciPy), whose time is bounded; SciPy's matching takes up to minutes on such images.
-    """
-    places, wanted = np.argwhere(found), np.flatnonzero(true)
-    out = [np.zeros(true.shape, np.bool_) for _ in tolerances]
-    if not len(places) or not len(wanted):
-        return out
-    tree, n, m = KDTree(np.argwhere(true)), len(wanted), len(places)
-    pairs = tree.sparse_distance_matrix(KDTree(places), max(tolerances) + 1e-9, output_type="coo_matrix")
-    source, sink = n + m, n + m + 1
-    for mask, tolerance in zip(out, tolerances, strict=True):
-        near = pairs.data <= tolerance + 1e-9
-        begin = np.concatenate([np.full(n, source), pairs.row[near], n + np.arange(m)])
-        end = np.concatenate([np.arange(n), n + pairs.col[near], np.full(m, sink)])
-        graph = csr_array((np.ones(len(begin), np.int32), (begin, end)), (sink + 1, sink + 1))
-        flow = maximum_flow(graph, source, sink, method="dinic").flow
-        mask.ravel()[wanted[flow[[source]].toarray()[0, :n] > 0]] = True
-    return out
-
-
-def normalised(image: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return an event image relative to its scale, :data:`SCALE_PERCENTILE` of the pixels with events."""
-    positive = image[image > 0]
-    return np.asarray(image / np.percentile(positive, SCALE_PERCENTILE) if positive.size else image, np.float64)
-
-
-def best_f(counts: Counts) -> tuple[int, float]:
-    """Return the index of the threshold with the highest F-score, and the score: the ODS-F of the set."""
-    scores = counts.f_score
-    best = int(np.argmax(scores))
-    return best, float(scores[best])
-
-
-def binary_entropy(mask: NDArray[np.bool_]) -> float:
-    """Return the entropy of a binary image [bit/px]: 1 if half of its pixels are set, 0 if none or all are."""
-    p = float(mask.mean())
-    return 0.0 if p in (0.0, 1.0) else float(-p * np.log2(p) - (1 - p) * np.log2(1 - p))
-
-
-# True edges of a world: those of its grey picture by Canny, and those of its geometry.
-
-CANNY_SIGMA = 2.0
-"""Standard deviation of Canny's Gaussian [px]. At 1 px the texture of walls fills a quarter of the image with edges."""
-DEPTH_STEP = 0.05
-"""Smallest relative step of depth at a geometric edge. A slanted surface has smaller steps."""
-CREASE_COS = 0.94
-"""Cosine of the smallest angle between the normals at a geometric edge, 20 deg."""
-
-
-def grey_picture(intensity: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return grey values 0 .. 1 of a picture of luminance, of which the brightest half percent is white."""
-    top = float(np.percentile(intensity, 99.5)) or 1.0
-    return np.asarray(np.clip(intensity / top, 0.0, 1.0) ** study.GAMMA, np.float64)
-
-
-def canny_edges(intensity: NDArray[np.floating], sigma: float = CANNY_SIGMA) -> NDArray[np.bool_]:
-    """Return the Canny edges of a picture of luminance, smoothed by a Gaussian of ``sigma`` [px]."""
-    return np.asarray(study.library("skimage.feature").canny(grey_picture(intensity), sigma=sigma), np.bool_)
-
-
-def edge_strength(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the gradient of a frame at the maxima that Canny's method keeps, and 0 elsewhere."""
-    picture = grey / 255.0
-    ridges = study.library("skimage.feature").canny(picture, CANNY_SIGMA, low_threshold=0.0, high_threshold=0.0)
-    return np.asarray(np.where(ridges, ndimage.gaussian_gradient_magnitude(picture, CANNY_SIGMA), 0.0))
-
-
-def geometric_edges(frame: FrameTruth) -> NDArray[np.bool_]:
-    """Return the pixels where instance, depth or normal change to the right or lower neighbour."""
-    edges = np.zeros(frame.depth.shape, np.bool_)
-    for here, there in (((slice(None), slice(-1)), (slice(None), slice(1, None))), ((slice(-1),), (slice(1, None),))):
-        edges[here] |= _differ(frame, here, there)
-    return np.asarray(study.library("skimage.morphology").skeletonize(edges), np.bool_)
-
-
-def _differ(frame: FrameTruth, here: Any, there: Any) -> NDArray[np.bool_]:
-    """Return where neighbouring pixels see different surfaces."""
-    near, far = frame.depth[here].astype(np.float64), frame.depth[there].astype(np.float64)
-    with np.errstate(invalid="ignore"):  # two pixels of the sky
-        step = np.abs(near - far) > DEPTH_STEP * np.minimum(near, far)
-    crease = np.sum(frame.normal[here] * frame.normal[there], axis=-1) < CREASE_COS
-    sky = (frame.instance[here] == 0) & (frame.instance[there] == 0)
-    return np.asarray((frame.instance[here] != frame.instance[there]) | ((step | crease) & ~sky))
-
-
-# Evaluation.
+from amiwarp.studies.evaluate.conditions import Condition, Settings
+from amiwarp.studies.evaluate.edge_agreement import (
+    THRESHOLDS,
+    Counts,
+    best_f,
+    binary_entropy,
+    match,
+    normalised,
+)
+from amiwarp.studies.evaluate.libraries import library
+from amiwarp.studies.evaluate.results import (
+    Amount,
+    CellResult,
+    Chart,
+    ChartKind,
+    Compared,
+    Count,
+    Share,
+    Table,
+    grouped,
+    rows_of,
+)
+from amiwarp.studies.evaluate.stored_pictures import (
+    Picture,
+    check_pictures,
+    decode_picture,
+    encode_picture,
+)
+from amiwarp.studies.evaluate.streams import ENOUGH, Frames, Stream, Streams
+from amiwarp.studies.evaluate.true_edges import (
+    CANNY_SIGMA,
+    canny_edges,
+    edge_strength,
+    geometric_edges,
+    grey_picture,
+)
 
 TITLE = "Edges"
 PROTOCOL = (
     "The events of 33 ms are voted into an image, which is divided by its 99th percentile, binarised by a threshold "
     "and thinned. Its pixels are matched one to one with true edge pixels within a tolerance, in as many pairs as "
-    "possible. The F-score is that of the best threshold for all images of a stream and a camera motion together "
+    "possible. The F-score belongs to the best threshold for all images of a stream and a camera motion together "
     f"(ODS), of {len(THRESHOLDS)} thresholds. True edges are Canny's (σ = 2 px) of the noise-free grey picture without "
     "the prism at the middle of the window, or steps of instance, depth (5 %) or normal (20°). Chance is the score of "
     "the same images turned by 180°, at the threshold that is best for them then: each stream has its own. The margin "
-    "is what a score has above it. The entropy is that of the binarised image before thinning. Of the standard "
+    "is what a score has above it. The entropy is the entropy of the binarised image before thinning. Of the standard "
     "camera, the last frame that is complete at the end of the window is used: the "
     "image is its gradient (σ = 2 px) at the maxima that Canny's method keeps."
 )
@@ -167,16 +72,23 @@ NEEDS_TRUTH = True
 
 WINDOW_US = 33_000
 """Length of a window [us]."""
-TOLERANCES, QUICK_TOLERANCES = (1.0, 1.5, 2.0, 3.0, 4.5, 6.0), (1.5, 3.0, 6.0)
+TOLERANCES = (1.0, 1.5, 2.0, 3.0, 4.5, 6.0)
+QUICK_TOLERANCES = (1.5, 3.0, 6.0)
 """Tolerances [px]."""
-USUAL, STRICT = 6.0, 1.5
+USUAL = 6.0
+STRICT = 1.5
 """Tolerances of the comparison with the paper and of the strict one [px]."""
-CANNY, GEOMETRY = "Canny", "geometry"
+CANNY = "Canny"
+GEOMETRY = "geometry"
 """Kinds of true edges in the comparison."""
 SIGMAS = {1.0: "Canny, σ 1 px", CANNY_SIGMA: CANNY, 3.0: "Canny, σ 3 px"}
 """Standard deviations of Canny's Gaussian in the sensitivity curve [px], and the kinds of edges that they give. The
 curve is that at the strict tolerance."""
-VALUES_IN_WORDS = {"f": "the ODS-F", "margin": "the margin of the ODS-F over its own chance", "entropy": "the entropy"}
+VALUES_IN_WORDS = {
+    "f": "the ODS-F",
+    "margin": "the margin of the ODS-F over its own chance",
+    "entropy": "the entropy",
+}
 """What the values are called in the claims."""
 SET = ("scene", "camera", "stream", "truth", "tolerance")
 """Columns whose values make a set of images with one best threshold."""
@@ -189,24 +101,24 @@ SLOWEST = 5.0
 
 
 class _Summary(TypedDict):
-    stream: study.Compared
-    found: list[study.Count]
-    entropy: list[study.Share]
+    stream: Compared
+    found: list[Count]
+    entropy: list[Share]
 
 
 class _Row(TypedDict):
-    stream: study.Compared
+    stream: Compared
     truth: Literal["Canny", "geometry", "Canny, σ 1 px", "Canny, σ 3 px"]
-    tolerance: study.Amount
-    matched: list[study.Count]
-    chance: list[study.Count]
-    true: study.Count
+    tolerance: Amount
+    matched: list[Count]
+    chance: list[Count]
+    true: Count
 
 
 class _Sector(TypedDict):
-    stream: study.Compared
-    angle: study.Amount
-    recall: study.Share
+    stream: Compared
+    angle: Amount
+    recall: Share
 
 
 class _Values(TypedDict):
@@ -218,11 +130,13 @@ class _Values(TypedDict):
 
 def _checked(values: _Values, what: str) -> _Values:
     """Return the values if each row has its images and numbers for each threshold."""
-    study.check_pictures(list(values["pictures"].values()), 2, f"{what}.pictures")
+    check_pictures(list(values["pictures"].values()), 2, f"{what}.pictures")
     lists = [row[name] for name in ("found", "entropy") for row in values["images"]]
     lists += [row[name] for name in ("matched", "chance") for row in values["rows"]]
     if any(len(numbers) != len(THRESHOLDS) for numbers in lists):
-        raise AmiwarpError(f"{what} has lists of other lengths than the {len(THRESHOLDS)} thresholds")
+        raise AmiwarpError(
+            f"{what} has lists of other lengths than the {len(THRESHOLDS)} thresholds"
+        )
     images = {row["stream"] for row in values["images"]}
     for row in values["rows"]:
         if row["stream"] not in images:
@@ -262,14 +176,20 @@ class _Image:
             above = np.asarray(self.image >= threshold, np.bool_)
             count = int(above.sum())
             if count not in known:
-                known[count] = (above, np.asarray(study.library("skimage.morphology").skeletonize(above), np.bool_))
+                known[count] = (
+                    above,
+                    np.asarray(library("skimage.morphology").skeletonize(above), np.bool_),
+                )
             out.append(known[count])
         return out
 
 
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     """Return counts of matches over the thresholds, entropies, recall by direction, and example pictures."""
-    images, rows, sectors, pictures = [], [], [], {}
+    images = []
+    rows = []
+    sectors = []
+    pictures = {}
     middle_us = streams.end_us // 2
     names: list[str] = [s.value for s in streams.names if _enough(streams, s)]
     names += [camera.value for camera in Frames]
@@ -288,7 +208,12 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     true = _true(frame)
     pictures |= {name: _shown(true[name]) for name in (CANNY, GEOMETRY)}
     first = streams.condition.seed == settings.first_seed
-    return {"images": images, "rows": rows, "sectors": sectors, "pictures": pictures if first else {}}
+    return {
+        "images": images,
+        "rows": rows,
+        "sectors": sectors,
+        "pictures": pictures if first else {},
+    }
 
 
 def _enough(streams: Streams, stream: Stream) -> bool:
@@ -296,7 +221,7 @@ def _enough(streams: Streams, stream: Stream) -> bool:
     if stream is not Stream.SAME_COUNT:
         return True
     span = streams.end_us // 2 - WINDOW_US // 2, streams.end_us // 2 + WINDOW_US // 2
-    return len(streams.window(stream, *span)) >= study.ENOUGH * streams.count(Stream.RAW, *span)
+    return len(streams.window(stream, *span)) >= ENOUGH * streams.count(Stream.RAW, *span)
 
 
 def _true(frame: FrameTruth) -> dict[str, NDArray[np.bool_]]:
@@ -313,7 +238,9 @@ def _image(streams: Streams, name: str, middle_us: int) -> _Image:
         assert exposed is not None
         return _Image(normalised(edge_strength(streams.grey_frame(exposed))), _true(frame), frame)
     events = streams.window(Stream(name), *span)
-    return _Image(normalised(iwe(events, *streams.size, device=streams.device)), _true(frame), frame)
+    return _Image(
+        normalised(iwe(events, *streams.size, device=streams.device)), _true(frame), frame
+    )
 
 
 def _summary(name: str, masks: Sequence[Masks]) -> dict[str, Any]:
@@ -323,35 +250,51 @@ def _summary(name: str, masks: Sequence[Masks]) -> dict[str, Any]:
     return {"stream": name, "found": found, "entropy": entropy.round(4).tolist()}
 
 
-def _count(name: str, image: _Image, masks: Sequence[Masks], usual: Sequence[float]) -> list[dict[str, Any]]:
+def _count(
+    name: str, image: _Image, masks: Sequence[Masks], usual: Sequence[float]
+) -> list[dict[str, Any]]:
     """Return the number of matches over the thresholds for each kind of true edges and tolerance, usually ``usual``.
 
-    ``chance`` is that of the image turned by 180 deg.
+    ``chance`` belongs to the image turned by 180 deg.
     """
     rows = []
     for truth, edges in image.true.items():
         tolerances = usual if truth in (CANNY, GEOMETRY) else (STRICT,)
-        matched, chance = (
-            np.transpose(_matched(masks, true, tolerances)).tolist() for true in (edges, edges[::-1, ::-1])
-        )
-        rows += [{"stream": name, "truth": truth, "tolerance": tolerance, "matched": m, "chance": c,
-                  "true": int(edges.sum())}
-                 for tolerance, m, c in zip(tolerances, matched, chance, strict=True)]  # fmt: skip
+        turned = edges[::-1, ::-1]
+        matched = np.transpose(_matched(masks, edges, tolerances)).tolist()
+        chance = np.transpose(_matched(masks, turned, tolerances)).tolist()
+        for k, tolerance in enumerate(tolerances):
+            row = {
+                "stream": name,
+                "truth": truth,
+                "tolerance": tolerance,
+                "matched": matched[k],
+                "chance": chance[k],
+                "true": int(edges.sum()),
+            }
+            rows.append(row)
     return rows
 
 
-def _matched(masks: Sequence[Masks], true: NDArray[np.bool_], tolerances: Sequence[float]) -> list[list[int]]:
+def _matched(
+    masks: Sequence[Masks], true: NDArray[np.bool_], tolerances: Sequence[float]
+) -> list[list[int]]:
     """Return the number of matches for each threshold and tolerance."""
     counts: list[list[int]] = []
     for k, (_, thin) in enumerate(masks):
-        same = k > 0 and thin is masks[k - 1][1]
-        counts.append(counts[-1] if same else [int(np.count_nonzero(m)) for m in match(thin, true, tolerances)])
+        same_as_before = k > 0 and thin is masks[k - 1][1]
+        if same_as_before:
+            counts.append(counts[-1])
+            continue
+        matches = match(thin, true, tolerances)
+        counts.append([int(np.count_nonzero(matched)) for matched in matches])
     return counts
 
 
 def _counts(row: dict[str, Any], images: dict[str, Any], which: str = "matched") -> Counts:
     """Return the counts of a row of matches and of the summary of its images; ``which`` may be "chance"."""
-    matched, found = np.array(row[which]), np.array(images["found"])
+    matched = np.array(row[which])
+    found = np.array(images["found"])
     return Counts(matched, found, np.full(len(found), row["true"]))
 
 
@@ -374,7 +317,8 @@ def _sectors(name: str, image: _Image, found: NDArray[np.bool_]) -> list[dict[st
 def _angle(frame: FrameTruth) -> NDArray[np.float64]:
     """Return the angle between image motion and brightness gradient, 0 .. 90 [deg]; NaN where nothing moves."""
     gy, gx = np.gradient(grey_picture(frame.intensity))
-    u, v = frame.flow[..., 0].astype(np.float64), frame.flow[..., 1].astype(np.float64)
+    u = frame.flow[..., 0].astype(np.float64)
+    v = frame.flow[..., 1].astype(np.float64)
     speed = np.hypot(u, v)
     with np.errstate(invalid="ignore", divide="ignore"):
         cos = np.abs(gx * u + gy * v) / (np.hypot(gx, gy) * speed)
@@ -383,7 +327,7 @@ def _angle(frame: FrameTruth) -> NDArray[np.float64]:
 
 def _shown(image: NDArray[Any]) -> str:
     """Return an image as text; black on white for events and edges."""
-    return study.encode_picture(np.asarray(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0, np.uint8))
+    return encode_picture(np.asarray(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0, np.uint8))
 
 
 @dataclass(frozen=True)
@@ -402,18 +346,22 @@ class _Member:
 
 def _sets(results: Sequence[CellResult]) -> dict[tuple[Any, ...], list[_Member]]:
     """Return the recordings of each scene, motion, stream, kind of truth and tolerance."""
-    images = {(_recording(r), r["stream"]): r for r in study.rows_of(results, "images")}
+    images = {(_recording(r), r["stream"]): r for r in rows_of(results, "images")}
     sets: dict[tuple[Any, ...], list[_Member]] = {}
-    for row in study.rows_of(results, "rows"):
+    for row in rows_of(results, "rows"):
         seen = images[_recording(row), row["stream"]]
-        member = _Member(row["seed"], _counts(row, seen), _counts(row, seen, "chance"), seen["entropy"])
+        member = _Member(
+            row["seed"], _counts(row, seen), _counts(row, seen, "chance"), seen["entropy"]
+        )
         sets.setdefault(tuple(row[c] for c in SET), []).append(member)
     return sets
 
 
 def _best(members: Sequence[Counts]) -> tuple[Counts, int]:
     """Return the counts of a set, and the index of its best threshold."""
-    total = Counts(*(np.sum([getattr(c, n) for c in members], axis=0) for n in ("matched", "found", "true")))
+    total = Counts(
+        *(np.sum([getattr(c, n) for c in members], axis=0) for n in ("matched", "found", "true"))
+    )
     return total, best_f(total)[0]
 
 
@@ -423,13 +371,21 @@ def scores(results: Sequence[CellResult]) -> list[dict[str, Any]]:
     for key, members in _sets(results).items():
         total, best = _best([m.counts for m in members])
         chance, worst = _best([m.chance for m in members])
-        f, level = float(total.f_score[best]), float(chance.f_score[worst])
-        out.append({
-            **dict(zip(SET, key, strict=True)), "f": f, "chance": level, "margin": f - level,
-            "std": float(np.std([m.counts.f_score[best] for m in members])), "precision": float(total.precision[best]),
-            "seeds": len(members), "recall": float(total.recall[best]),
-            "entropy": float(np.mean([m.entropy[best] for m in members])),
-        })  # fmt: skip
+        f = float(total.f_score[best])
+        level = float(chance.f_score[worst])
+        out.append(
+            {
+                **dict(zip(SET, key, strict=True)),
+                "f": f,
+                "chance": level,
+                "margin": f - level,
+                "std": float(np.std([m.counts.f_score[best] for m in members])),
+                "precision": float(total.precision[best]),
+                "seeds": len(members),
+                "recall": float(total.recall[best]),
+                "entropy": float(np.mean([m.entropy[best] for m in members])),
+            }
+        )
     return out
 
 
@@ -437,10 +393,20 @@ def _by_seed(results: Sequence[CellResult]) -> list[dict[str, Any]]:
     """Return score, margin over chance and entropy of each recording, at the best thresholds of its set."""
     out = []
     for key, members in _sets(results).items():
-        best, worst = _best([m.counts for m in members])[1], _best([m.chance for m in members])[1]
-        out += [{**dict(zip(SET, key, strict=True)), "seed": m.seed, "f": float(m.counts.f_score[best]),
-                 "margin": float(m.counts.f_score[best] - m.chance.f_score[worst]), "entropy": m.entropy[best]}
-                for m in members]  # fmt: skip
+        _, best = _best([member.counts for member in members])
+        _, best_of_chance = _best([member.chance for member in members])
+        known = dict(zip(SET, key, strict=True))
+        for member in members:
+            score = member.counts.f_score[best]
+            by_chance = member.chance.f_score[best_of_chance]
+            row = {
+                **known,
+                "seed": member.seed,
+                "f": float(score),
+                "margin": float(score - by_chance),
+                "entropy": member.entropy[best],
+            }
+            out.append(row)
     return out
 
 
@@ -451,52 +417,150 @@ def _recording(row: dict[str, Any]) -> tuple[Any, ...]:
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return scores at two tolerances, the curve over the tolerance, and the recall by direction."""
     found = scores(results)
-    names = ("scene", "camera", "true edges", "tolerance [px]", "stream", "ODS-F", "std", "chance",
-             "margin over chance", "precision", "recall", "entropy [bit/px]", "seeds")  # fmt: skip
-    keys = ("scene", "camera", "truth", "tolerance", "stream", "f", "std", "chance", "margin", "precision", "recall",
-            "entropy", "seeds")  # fmt: skip
+    names = (
+        "scene",
+        "camera",
+        "true edges",
+        "tolerance [px]",
+        "stream",
+        "ODS-F",
+        "std",
+        "chance",
+        "margin over chance",
+        "precision",
+        "recall",
+        "entropy [bit/px]",
+        "seeds",
+    )
+    keys = (
+        "scene",
+        "camera",
+        "truth",
+        "tolerance",
+        "stream",
+        "f",
+        "std",
+        "chance",
+        "margin",
+        "precision",
+        "recall",
+        "entropy",
+        "seeds",
+    )
     usual = [r for r in found if r["truth"] in (CANNY, GEOMETRY)]
     widths = {name: sigma for sigma, name in SIGMAS.items()}
-    smoothed = [r | {"sigma": widths[r["truth"]]} for r in found
-                if r["truth"] in widths and r["tolerance"] == STRICT]  # fmt: skip
-    sectors = study.grouped(study.rows_of(results, "sectors"), ("scene", "camera", "angle", "stream"), ["recall"])
+    smoothed = [
+        r | {"sigma": widths[r["truth"]]}
+        for r in found
+        if r["truth"] in widths and r["tolerance"] == STRICT
+    ]
+    sectors = grouped(
+        rows_of(results, "sectors"), ("scene", "camera", "angle", "stream"), ["recall"]
+    )
     return [
-        Table("edges", "F-score, entropy, precision and recall at two tolerances", names,
-              [tuple(r[k] for k in keys) for r in usual if r["tolerance"] in (USUAL, STRICT)],
-              "Scores are those of the best threshold of each row. The spread is that of the seeds at this threshold."),
-        Table("edges_tolerance", "F-score over the tolerance", names, [tuple(r[k] for k in keys) for r in usual],
-              "A wide tolerance hides blur and errors of the compensation, and rewards chance.",
-              Chart("tolerance [px]", "ODS-F", "stream", "std", panels=("scene", "camera", "true edges"))),
-        Table("edges_margin", "Margin of the F-score over chance, over the tolerance", names,
-              [tuple(r[k] for k in keys) for r in usual], "What a stream's score has above its own chance.",
-              Chart("tolerance [px]", "margin over chance", "stream", panels=("scene", "camera", "true edges"))),
-        Table("edges_canny", "Margin over chance over the smoothing of the true edges (Canny, 1.5 px)",
-              ("scene", "camera", "σ [px]", "stream", "margin over chance", "std", "ODS-F", "chance"),
-              [tuple(r[k] for k in ("scene", "camera", "sigma", "stream", "margin", "std", "f", "chance"))
-               for r in smoothed],
-              "With little smoothing the true edges include the fine texture of walls, which chance finds too.",
-              Chart("σ [px]", "margin over chance", "stream", "std", panels=("scene", "camera"))),
-        Table("edges_direction", "Recall by the direction of edges (Canny, 1.5 px)",
-              ("scene", "camera", "angle between motion and edge normal [deg]", "stream", "windows", "recall", "std"),
-              sectors, "At 90° an edge lies along the motion, and a plain event camera loses it. The threshold is the "
-              "best of the recording. A still camera has no motion.",
-              Chart("angle between motion and edge normal [deg]", "recall", "stream", "std",
-                    panels=("scene", "camera"), kind=study.ChartKind.LINES)),
-    ]  # fmt: skip
+        Table(
+            "edges",
+            "F-score, entropy, precision and recall at two tolerances",
+            names,
+            [tuple(r[k] for k in keys) for r in usual if r["tolerance"] in (USUAL, STRICT)],
+            "Scores belong to the best threshold of each row. The spread is over the seeds at this threshold.",
+        ),
+        Table(
+            "edges_tolerance",
+            "F-score over the tolerance",
+            names,
+            [tuple(r[k] for k in keys) for r in usual],
+            "A wide tolerance hides blur and errors of the compensation, and rewards chance.",
+            Chart(
+                "tolerance [px]", "ODS-F", "stream", "std", panels=("scene", "camera", "true edges")
+            ),
+        ),
+        Table(
+            "edges_margin",
+            "Margin of the F-score over chance, over the tolerance",
+            names,
+            [tuple(r[k] for k in keys) for r in usual],
+            "What a stream's score has above its own chance.",
+            Chart(
+                "tolerance [px]",
+                "margin over chance",
+                "stream",
+                panels=("scene", "camera", "true edges"),
+            ),
+        ),
+        Table(
+            "edges_canny",
+            "Margin over chance over the smoothing of the true edges (Canny, 1.5 px)",
+            ("scene", "camera", "σ [px]", "stream", "margin over chance", "std", "ODS-F", "chance"),
+            [
+                tuple(
+                    r[k]
+                    for k in ("scene", "camera", "sigma", "stream", "margin", "std", "f", "chance")
+                )
+                for r in smoothed
+            ],
+            "With little smoothing the true edges include the fine texture of walls, which chance finds too.",
+            Chart("σ [px]", "margin over chance", "stream", "std", panels=("scene", "camera")),
+        ),
+        Table(
+            "edges_direction",
+            "Recall by the direction of edges (Canny, 1.5 px)",
+            (
+                "scene",
+                "camera",
+                "angle between motion and edge normal [deg]",
+                "stream",
+                "windows",
+                "recall",
+                "std",
+            ),
+            sectors,
+            "At 90° an edge lies along the motion, and a plain event camera loses it. The threshold is the "
+            "best of the recording. A still camera has no motion.",
+            Chart(
+                "angle between motion and edge normal [deg]",
+                "recall",
+                "stream",
+                "std",
+                panels=("scene", "camera"),
+                kind=ChartKind.LINES,
+            ),
+        ),
+    ]
 
 
-def pictures(results: Sequence[CellResult]) -> list[study.Picture]:
+def pictures(results: Sequence[CellResult]) -> list[Picture]:
     """Return the first event images of each motion, side by side."""
     out = []
-    for camera in dict.fromkeys(r.condition.trajectory for r in results if isinstance(r.condition, Condition)):
-        cells = [r for r in results if isinstance(r.condition, Condition) and r.condition.trajectory == camera]
+    for camera in dict.fromkeys(
+        r.condition.trajectory for r in results if isinstance(r.condition, Condition)
+    ):
+        cells = [
+            r
+            for r in results
+            if isinstance(r.condition, Condition) and r.condition.trajectory == camera
+        ]
         given = next((r.values["pictures"] for r in cells if r.values.get("pictures")), None)
         if given is not None:
-            names = [n for n in ("grey picture", CANNY, GEOMETRY, Stream.PLAIN, Stream.CALIBRATED, Frames.FAST)
-                     if n in given]  # fmt: skip
+            names = [
+                n
+                for n in (
+                    "grey picture",
+                    CANNY,
+                    GEOMETRY,
+                    Stream.PLAIN,
+                    Stream.CALIBRATED,
+                    Frames.FAST,
+                )
+                if n in given
+            ]
             caption = f"Camera {camera}. From left to right: {', '.join(names)}."
             out.append(
-                study.Picture(f"edges_{camera}", caption, [_mosaic([study.decode_picture(given[n]) for n in names])])
+                Picture(
+                    f"edges_{camera}",
+                    caption,
+                    [_mosaic([decode_picture(given[n]) for n in names])],
+                )
             )
     return out
 
@@ -508,7 +572,8 @@ def _mosaic(images: Sequence[NDArray[np.uint8]], columns: int = 3) -> NDArray[np
     rows = -(-len(images) // columns)
     out = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap), 255, np.uint8)
     for k, image in enumerate(images):
-        top, left = (k // columns) * (height + gap), (k % columns) * (width + gap)
+        top = (k // columns) * (height + gap)
+        left = (k % columns) * (width + gap)
         out[top : top + height, left : left + width] = image
     return out
 
@@ -517,49 +582,124 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the F-score, its steadiness, the entropy and the recall by direction; and robustness."""
     rows = _by_seed(results)
 
-    def more(number: int | None, text: str, value: str, *, other: Stream = Stream.PLAIN, moving: bool = True,
-             tolerance: float = USUAL, truth: str = CANNY) -> Claim:  # fmt: skip
-        chosen = [r for r in rows if r["tolerance"] == tolerance and r["truth"] == truth
-                  and (r["camera"] != "still") == moving]  # fmt: skip
+    def more(
+        number: int | None,
+        text: str,
+        value: str,
+        *,
+        other: Stream = Stream.PLAIN,
+        moving: bool = True,
+        tolerance: float = USUAL,
+        truth: str = CANNY,
+    ) -> Claim:
+        chosen = [
+            r
+            for r in rows
+            if r["tolerance"] == tolerance
+            and r["truth"] == truth
+            and (r["camera"] != "still") == moving
+        ]
         found = differences(chosen, value, {"stream": Stream.CALIBRATED}, {"stream": other})
-        return judge(number, text, found, f"{VALUES_IN_WORDS[value]} of '{Stream.CALIBRATED}' less that of '{other}'",
-                     above=0.0)  # fmt: skip
+        return judge(
+            number,
+            text,
+            found,
+            f"{VALUES_IN_WORDS[value]} of '{Stream.CALIBRATED}' less the same of '{other}'",
+            above=0.0,
+        )
 
     def steadier(number: int | None, text: str, value: str, tolerance: float) -> Claim:
-        moving = [r for r in rows if r["camera"] != "still" and r["tolerance"] == tolerance and r["truth"] == CANNY]
-        found = differences(ranges(moving, value), value, {"stream": Stream.CALIBRATED}, {"stream": Stream.PLAIN},
-                            by=("scene",))  # fmt: skip
-        return judge(number, text, found, f"the range of {VALUES_IN_WORDS[value]} over the motions of "
-                     f"'{Stream.CALIBRATED}' less that of '{Stream.PLAIN}'", below=0.0)  # fmt: skip
+        moving = [
+            r
+            for r in rows
+            if r["camera"] != "still" and r["tolerance"] == tolerance and r["truth"] == CANNY
+        ]
+        found = differences(
+            ranges(moving, value),
+            value,
+            {"stream": Stream.CALIBRATED},
+            {"stream": Stream.PLAIN},
+            by=("scene",),
+        )
+        return judge(
+            number,
+            text,
+            found,
+            f"the range of {VALUES_IN_WORDS[value]} over the motions of "
+            f"'{Stream.CALIBRATED}' less the same of '{Stream.PLAIN}'",
+            below=0.0,
+        )
 
     return [
-        more(2, "Event images of the moving AMI-EV fit the picture's edges better (Canny, 6 px).", "f"),
+        more(
+            2,
+            "Event images of the moving AMI-EV fit the picture's edges better (Canny, 6 px).",
+            "f",
+        ),
         steadier(2, "They do so more steadily over the camera's motions.", "f", USUAL),
         more(2, "Their entropy is higher (moving camera).", "entropy"),
-        *_fading(study.rows_of(results, "sectors")),
-        more(None, "They are better than chance by a larger margin at 6 px, where chance scores high.", "margin"),
+        *_fading(rows_of(results, "sectors")),
+        more(
+            None,
+            "They are better than chance by a larger margin at 6 px, where chance scores high.",
+            "margin",
+        ),
         more(None, "So they are at rest, where the S-EV sees nothing.", "margin", moving=False),
-        more(None, "The margin over chance is larger at a tolerance of 1.5 px.", "margin", tolerance=STRICT),
+        more(
+            None,
+            "The margin over chance is larger at a tolerance of 1.5 px.",
+            "margin",
+            tolerance=STRICT,
+        ),
         steadier(None, "That margin is steadier over the camera's motions.", "margin", STRICT),
-        more(None, "It is larger for geometric edges, at 1.5 px.", "margin", tolerance=STRICT, truth=GEOMETRY),
-        more(None, "It is larger at 1.5 px than that of an S-EV with as many events.", "margin", tolerance=STRICT,
-             other=Stream.SAME_COUNT),
-        more(None, "The entropy is higher than that of an S-EV with as many events.", "entropy",
-             other=Stream.SAME_COUNT),
-    ]  # fmt: skip
+        more(
+            None,
+            "It is larger for geometric edges, at 1.5 px.",
+            "margin",
+            tolerance=STRICT,
+            truth=GEOMETRY,
+        ),
+        more(
+            None,
+            "It is larger at 1.5 px than with an S-EV with as many events.",
+            "margin",
+            tolerance=STRICT,
+            other=Stream.SAME_COUNT,
+        ),
+        more(
+            None,
+            "The entropy is higher than with an S-EV with as many events.",
+            "entropy",
+            other=Stream.SAME_COUNT,
+        ),
+    ]
 
 
 def _fading(rows: Sequence[dict[str, Any]]) -> list[Claim]:
     """Judge whether edges along the motion fade from the S-EV, and whether they do not from the AMI-EV."""
-    sides = [r | {"along": r["angle"] > 60.0} for r in rows if r["angle"] > 60.0 or r["angle"] < 30.0]
+    sides = [
+        r | {"along": r["angle"] > 60.0} for r in rows if r["angle"] > 60.0 or r["angle"] < 30.0
+    ]
 
     def judged(text: str, stream: Stream, **limit: Any) -> Claim:
         across = {"stream": stream, "along": False}
         found = differences(sides, "recall", across | {"along": True}, across, relative=True)
-        return judge(3, text, found, f"the recall by '{stream}' of edges whose normal is over 60° from the motion, "
-                     "less that of edges below 30°, relative to the latter,", **limit)  # fmt: skip
+        return judge(
+            3,
+            text,
+            found,
+            f"the recall by '{stream}' of edges whose normal is over 60° from the motion, "
+            "less the same of edges below 30°, relative to the latter,",
+            **limit,
+        )
 
     return [
-        judged("The S-EV finds fewer of the edges along the motion than of those across it.", Stream.PLAIN, below=0.0),
-        judged(f"The AMI-EV finds no fewer of them, within {KEPT:.0%}.", Stream.CALIBRATED, above=-KEPT),
+        judged(
+            "The S-EV finds fewer of the edges along the motion than of those across it.",
+            Stream.PLAIN,
+            below=0.0,
+        ),
+        judged(
+            f"The AMI-EV finds no fewer of them, within {KEPT:.0%}.", Stream.CALIBRATED, above=-KEPT
+        ),
     ]

@@ -12,14 +12,26 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
-from amiwarp.optics.camera import CameraRotation
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.models.exact import ExactModel
 from amiwarp.optics.prism import Prism
-from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.simulation.pictures import DARK
-from amiwarp.studies.evaluate import study
+from amiwarp.reconstruction.reconstruct import Reconstruction
+from amiwarp.simulation.picture_light import DARK
+from amiwarp.studies.evaluate.camera_motion import estimate_rotation
 from amiwarp.studies.evaluate.claims import Claim, differences, judge, untestable
-from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Frames, Settings, Stream, Streams, Table
+from amiwarp.studies.evaluate.conditions import Condition, Settings
+from amiwarp.studies.evaluate.naturalness import BLOCK, niqe
+from amiwarp.studies.evaluate.results import (
+    Amount,
+    CellResult,
+    Chart,
+    Compared,
+    Table,
+    grouped,
+    rows_of,
+)
+from amiwarp.studies.evaluate.similarity import displayed, fitted, similarity
+from amiwarp.studies.evaluate.streams import Frames, Stream, Streams
 from amiwarp.validation import real
 
 # Grey pictures of a stream: by our own reconstruction, or by a given function such as a learned one.
@@ -28,7 +40,7 @@ Made = list[tuple["Window", "NDArray[np.float64]"]]
 """Windows with their pictures."""
 Reconstructor = Callable[[Events], NDArray[Any]]
 """Function that returns the picture of a window's events, shape (height, width), in any unit of log intensity. The
-events are compensated, with float32 coordinates, or those of a plain camera."""
+events are compensated, with float32 coordinates, or come from a plain camera."""
 
 LEAST_CONTRAST = 1e-4
 """Range of log intensity up to which our own picture is uniform: rounding leaves about 1e-8, a faint edge 0.01."""
@@ -56,7 +68,7 @@ class PictureMaker:
     streams: Streams
     """Streams of a recording."""
     stream: Stream
-    """Stream; our own reconstruction refuses that of equal count, because it needs all events of a pixel."""
+    """Stream; our own reconstruction refuses the stream of equal count, because it needs all events of a pixel."""
     reconstructor: Reconstructor | None = None
     """Function that makes a picture of events, or None."""
     _work: Reconstruction | None = field(init=False, default=None)
@@ -66,16 +78,20 @@ class PictureMaker:
             recording, model, encoder = own_inputs(self.streams, self.stream)
             if len(recording.events):
                 self._work = Reconstruction(
-                    recording, model=model, encoder=encoder, camera_rotation=self._rotation(),
+                    recording,
+                    model=model,
+                    encoder=encoder,
+                    camera_rotation=self._rotation(),
                     device=self.streams.device,
-                )  # fmt: skip
+                )
 
     def _rotation(self) -> CameraRotation:
         """Return the camera's mean rotation, as found in the middle of the recording."""
         if not self.streams.simulation.scene.trajectory.moves:  # type: ignore[union-attr]  # a world
             return CameraRotation()
-        middle, half = (self.streams.start_us + self.streams.end_us) // 2, 25_000
-        return study.estimate_rotation(
+        middle = (self.streams.start_us + self.streams.end_us) // 2
+        half = 25_000
+        return estimate_rotation(
             self.streams.window(self.stream, middle - half, middle + half), self.streams.camera
         )
 
@@ -93,8 +109,12 @@ class PictureMaker:
                 yield np.asarray(self.reconstructor(events), np.float64)
                 continue
             if self._work is not None:
-                with contextlib.suppress(AmiwarpError):  # no pixel fires twice: the picture before stays
-                    last = self._work.window(window.start_us, window.end_us - window.start_us, last=last)
+                with contextlib.suppress(
+                    AmiwarpError
+                ):  # no pixel fires twice: the picture before stays
+                    last = self._work.window(
+                        window.start_us, window.end_us - window.start_us, last=last
+                    )
             picture = np.zeros((height, width)) if last is None else last.log.astype(np.float64)
             yield picture if np.ptp(picture) > LEAST_CONTRAST else np.zeros_like(picture)
 
@@ -141,33 +161,36 @@ STEP_US = 1000
 """Time between the pictures [us]: 1,000 pictures/s."""
 STANDARD_TURNS = 0.25
 """Length of the windows of the pictures over time [turns]."""
-TURNS, QUICK_TURNS = (0.25, 0.5, 1.0), (0.25, 1.0)
+TURNS = (0.25, 0.5, 1.0)
+QUICK_TURNS = (0.25, 1.0)
 """Lengths in the sensitivity curve [turns]."""
-RATES_HZ, HOLD = (30.0, 100.0, 1000.0), (0.0, 0.5, 1.0)
+RATES_HZ = (30.0, 100.0, 1000.0)
+HOLD = (0.0, 0.5, 1.0)
 """Rates of the pictures in the sensitivity curve [1/s], and times of comparison as shares of the interval."""
-PICTURES, QUICK_PICTURES = 6, 3
+PICTURES = 6
+QUICK_PICTURES = 3
 """Number of pictures over time."""
 
 
 class _Quality(TypedDict):
-    stream: study.Compared
+    stream: Compared
     method: Literal["own", "frames"]
     psnr: Annotated[float, partial(real, low=-1e3, high=1e3)] | None
     ssim: Annotated[float, partial(real, low=-1.0, high=1.0)]
 
 
 class _Row(_Quality):
-    time_ms: study.Amount
-    niqe: study.Amount | None
-    niqe_truth: study.Amount | None
+    time_ms: Amount
+    niqe: Amount | None
+    niqe_truth: Amount | None
 
 
 class _OverLength(_Row):
-    turns: study.Amount
+    turns: Amount
 
 
 class _OverRate(_Quality):
-    rate: study.Amount
+    rate: Amount
 
 
 class Values(TypedDict):
@@ -182,7 +205,9 @@ def conditions(settings: Settings) -> list[Condition]:
     """Return the room at rest and moving; in full also in fast motion, and the desk, moving."""
     scenes = [("room", "still"), ("room", "handheld")]
     scenes += [] if settings.quick else [("room", "fast"), ("desk", "handheld")]
-    return [c for world, motion in scenes for c in settings.conditions(world=world, trajectory=motion)]
+    return [
+        c for world, motion in scenes for c in settings.conditions(world=world, trajectory=motion)
+    ]
 
 
 def measure(
@@ -193,13 +218,17 @@ def measure(
     ``reconstructors``: learned or other reconstructions by name, which are judged next to our own.
     """
     methods: dict[str, Reconstructor | None] = {"own": None, **(reconstructors or {})}
-    over_time, over_length, over_rate = [], [], []
+    over_time = []
+    over_length = []
+    over_rate = []
     count = QUICK_PICTURES if settings.quick else PICTURES
     for method, reconstructor in methods.items():
         for stream in reconstructed_streams(streams):
             maker = PictureMaker(streams, stream, reconstructor)
             known = {"stream": stream.value, "method": method}
-            over_time += [{**known, **row} for row in _scores(streams, _made(maker, STANDARD_TURNS, count))]
+            over_time += [
+                {**known, **row} for row in _scores(streams, _made(maker, STANDARD_TURNS, count))
+            ]
             for turns in QUICK_TURNS if settings.quick else TURNS:
                 made = _made(maker, turns, 1)
                 over_length += [{**known, "turns": turns, **row} for row in _scores(streams, made)]
@@ -213,7 +242,10 @@ def measure(
 
 def _frames(streams: Streams, camera: Frames, count: int) -> Made:
     """Return the windows of the pictures over time, with the last frame that is complete at the end of each."""
-    found = ((w, streams.last_exposure(camera, w.end_us)) for w in windows(streams, STANDARD_TURNS, count))
+    found = (
+        (w, streams.last_exposure(camera, w.end_us))
+        for w in windows(streams, STANDARD_TURNS, count)
+    )
     return [(w, np.log(streams.frame_luminance(t) + DARK)) for w, t in found if t is not None]
 
 
@@ -237,9 +269,16 @@ def _scores(streams: Streams, made: Made) -> list[dict[str, Any]]:
     rows = []
     for window, picture in made:
         truth = log_truth(streams, window.middle_us)
-        found = study.similarity(*study.fitted(picture, truth))
-        rows.append({"time_ms": (window.middle_us - made[0][0].middle_us) * 1e-3, "psnr": found.psnr_db,
-                     "ssim": found.ssim, "niqe": naturalness(picture), "niqe_truth": naturalness(truth)})  # fmt: skip
+        found = similarity(*fitted(picture, truth))
+        rows.append(
+            {
+                "time_ms": (window.middle_us - made[0][0].middle_us) * 1e-3,
+                "psnr": found.psnr_db,
+                "ssim": found.ssim,
+                "niqe": naturalness(picture),
+                "niqe_truth": naturalness(truth),
+            }
+        )
     return rows
 
 
@@ -250,7 +289,7 @@ def _held(streams: Streams, made: Made) -> list[dict[str, Any]]:
         for rate in RATES_HZ:
             for share in HOLD:
                 t_us = min(window.middle_us + round(share * 1e6 / rate), streams.end_us)
-                found = study.similarity(*study.fitted(picture, log_truth(streams, t_us)))
+                found = similarity(*fitted(picture, log_truth(streams, t_us)))
                 rows.append({"rate": rate, "psnr": found.psnr_db, "ssim": found.ssim})
     return rows
 
@@ -262,66 +301,146 @@ def log_truth(streams: Streams, t_us: int) -> NDArray[np.float64]:
 
 def naturalness(picture: NDArray[Any]) -> float | None:
     """Return the NIQE of a picture, or None if it is uniform or smaller than two blocks."""
-    rows, columns = (side // study.BLOCK for side in picture.shape)
-    return study.niqe(study.displayed(picture)) if rows * columns >= 2 and np.ptp(picture) > 0.0 else None
+    rows, columns = (side // BLOCK for side in picture.shape)
+    if rows * columns >= 2 and np.ptp(picture) > 0.0:
+        return niqe(displayed(picture))
+    return None
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the mean scores, and the scores over time, over the length of the window, and over the pictures' rate."""
-    over_time, over_length, over_rate = (study.rows_of(results, name) for name in ("time", "length", "rate"))
+    over_time, over_length, over_rate = (
+        rows_of(results, name) for name in ("time", "length", "rate")
+    )
     names = ("scene", "camera", "method", "stream")
-    columns = ("seeds x pictures", "PSNR [dB]", "std of PSNR", "SSIM", "std of SSIM", "NIQE", "std of NIQE")
+    columns = (
+        "seeds x pictures",
+        "PSNR [dB]",
+        "std of PSNR",
+        "SSIM",
+        "std of SSIM",
+        "NIQE",
+        "std of NIQE",
+    )
     scores = ["psnr", "ssim", "niqe"]
     return [
-        Table("pictures", "Quality of the pictures, windows of a quarter turn", (*names, *columns, "NIQE of the truth",
-              "std of the truth"), study.grouped(over_time, names, [*scores, "niqe_truth"]),
-              "PSNR and SSIM: higher is better. NIQE: lower is better."),
-        Table("pictures_time", "Quality over time, 1,000 pictures/s", (*names, "time [ms]", *columns),
-              study.grouped(over_time, (*names, "time_ms"), scores), "The first picture is solved from scratch.",
-              Chart("time [ms]", "NIQE", "stream", "std of NIQE", panels=("scene", "camera"))),
-        Table("pictures_window", "Quality over the length of the window", (*names, "window [turns]", *columns),
-              study.grouped(over_length, (*names, "turns"), scores), "A long window has more events and more motion.",
-              Chart("window [turns]", "SSIM", "stream", "std of SSIM", panels=("scene", "camera"), log_x=True)),
-        Table("pictures_rate", "Quality over the rate of the pictures", (*names, "rate [1/s]", *columns[:5]),
-              study.grouped(over_rate, (*names, "rate"), scores[:2]), "A picture is shown until the next one, and "
-              "compared with the truth at three times in between.",
-              Chart("rate [1/s]", "SSIM", "stream", "std of SSIM", panels=("scene", "camera"), log_x=True)),
-    ]  # fmt: skip
+        Table(
+            "pictures",
+            "Quality of the pictures, windows of a quarter turn",
+            (*names, *columns, "NIQE of the truth", "std of the truth"),
+            grouped(over_time, names, [*scores, "niqe_truth"]),
+            "PSNR and SSIM: higher is better. NIQE: lower is better.",
+        ),
+        Table(
+            "pictures_time",
+            "Quality over time, 1,000 pictures/s",
+            (*names, "time [ms]", *columns),
+            grouped(over_time, (*names, "time_ms"), scores),
+            "The first picture is solved from scratch.",
+            Chart("time [ms]", "NIQE", "stream", "std of NIQE", panels=("scene", "camera")),
+        ),
+        Table(
+            "pictures_window",
+            "Quality over the length of the window",
+            (*names, "window [turns]", *columns),
+            grouped(over_length, (*names, "turns"), scores),
+            "A long window has more events and more motion.",
+            Chart(
+                "window [turns]",
+                "SSIM",
+                "stream",
+                "std of SSIM",
+                panels=("scene", "camera"),
+                log_x=True,
+            ),
+        ),
+        Table(
+            "pictures_rate",
+            "Quality over the rate of the pictures",
+            (*names, "rate [1/s]", *columns[:5]),
+            grouped(over_rate, (*names, "rate"), scores[:2]),
+            "A picture is shown until the next one, and "
+            "compared with the truth at three times in between.",
+            Chart(
+                "rate [1/s]",
+                "SSIM",
+                "stream",
+                "std of SSIM",
+                panels=("scene", "camera"),
+                log_x=True,
+            ),
+        ),
+    ]
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the quality at rest and in motion by NIQE; and by SSIM and PSNR."""
-    rows = [r for r in study.rows_of(results, "time") if r["method"] == "own"]
-    lengths = [r for r in study.rows_of(results, "length") if r["method"] == "own"]
+    rows = [r for r in rows_of(results, "time") if r["method"] == "own"]
+    lengths = [r for r in rows_of(results, "length") if r["method"] == "own"]
 
-    def claim(number: int | None, text: str, moving: bool, score: str, unit: str = "", rows: Any = rows) -> Claim:
-        found = differences([r for r in rows if (r["camera"] != "still") == moving], score,
-                            {"stream": Stream.CALIBRATED}, {"stream": Stream.PLAIN})  # fmt: skip
-        what = f"the {score.upper()} of '{Stream.CALIBRATED}' less that of '{Stream.PLAIN}'"
+    def claim(
+        number: int | None, text: str, moving: bool, score: str, unit: str = "", rows: Any = rows
+    ) -> Claim:
+        chosen = [row for row in rows if (row["camera"] != "still") == moving]
+        compensated = {"stream": Stream.CALIBRATED}
+        plain = {"stream": Stream.PLAIN}
+        found = differences(chosen, score, compensated, plain)
+        what = f"the {score.upper()} of '{Stream.CALIBRATED}' less the {score.upper()} of '{Stream.PLAIN}'"
         limit = {"below": 0.0} if score == "niqe" else {"above": 0.0}
         return judge(number, text, found, what, unit=unit, **limit)
 
     return [
-        claim(4, "Pictures are better at rest (SSIM of our own reconstruction; recordings begin at rest, so that an "
-              "S-EV's are uniform, which has no NIQE).", False, "ssim"),
-        untestable(4, "Pictures are better in motion.",
-                   "the paper reconstructs them with the network E2VID, which remembers what it saw before and is not "
-                   "part of amiwarp, and NIQE depends on the window that our own reconstruction gets; see the checks"),
-        untestable(4, "Pictures of both cameras are satisfying in motion.",
-                   "the paper states no NIQE from which on a picture is satisfying"),
-        claim(None, "Pictures are better in motion (NIQE with statistics of our own).", True, "niqe"),
+        claim(
+            4,
+            "Pictures are better at rest (SSIM of our own reconstruction; recordings begin at rest, so that an "
+            "S-EV's are uniform, which has no NIQE).",
+            False,
+            "ssim",
+        ),
+        untestable(
+            4,
+            "Pictures are better in motion.",
+            "the paper reconstructs them with the network E2VID, which remembers what it saw before and is not "
+            "part of amiwarp, and NIQE depends on the window that our own reconstruction gets; see the checks",
+        ),
+        untestable(
+            4,
+            "Pictures of both cameras are satisfying in motion.",
+            "the paper states no NIQE at which a picture is satisfying",
+        ),
+        claim(
+            None, "Pictures are better in motion (NIQE with statistics of our own).", True, "niqe"
+        ),
         claim(None, "Pictures are better in motion (SSIM).", True, "ssim"),
         claim(None, "Better in motion by PSNR.", True, "psnr", "dB"),
-        *(claim(None, f"Better in motion if each has the window that is best for it ({score.upper()}).", True, score,
-                rows=_best_lengths(lengths, score)) for score in ("ssim", "niqe")),
-    ]  # fmt: skip
+        *(
+            claim(
+                None,
+                f"Better in motion if each has the window that is best for it ({score.upper()}).",
+                True,
+                score,
+                rows=_best_lengths(lengths, score),
+            )
+            for score in ("ssim", "niqe")
+        ),
+    ]
 
 
 def _best_lengths(rows: Sequence[dict[str, Any]], score: str) -> list[dict[str, Any]]:
     """Return the rows of each stream's best length of the window, by the mean SSIM or NIQE over the seeds of a case."""
-    rows = [r for r in rows if r[score] is not None]
+    rows = [row for row in rows if row[score] is not None]
     names = ("scene", "camera", "stream", "turns")
-    mean: dict[tuple[Any, ...], Any] = {row[:4]: row[5] for row in study.grouped(rows, names, [score])}
+    # Mean score of each case, by the length of the window
+    means: dict[tuple[Any, ...], dict[Any, Any]] = {}
+    for scene, camera, stream, turns, _, mean, *_ in grouped(rows, names, [score]):
+        means.setdefault((scene, camera, stream), {})[turns] = mean
+
     choose = min if score == "niqe" else max
-    best = {key[:3]: choose((k for k in mean if k[:3] == key[:3]), key=lambda k: mean[k]) for key in mean}
-    return [r for r in rows if tuple(r[n] for n in names) == best[tuple(r[n] for n in names[:3])]]
+    best_turns = {}
+    for case, by_turns in means.items():
+        best_turns[case] = choose(by_turns, key=by_turns.__getitem__)
+    return [
+        row
+        for row in rows
+        if row["turns"] == best_turns[row["scene"], row["camera"], row["stream"]]
+    ]

@@ -30,5 +30,8 @@ class PlainFinder(PathFinder):
 
 
 _names = json.loads((Path(os.environ["AMIWARP_PLAIN_FOLDER"]) / "names.json").read_text())
-PlainFinder.modules, PlainFinder.distributions = frozenset(_names["modules"]), frozenset(_names["distributions"])
+PlainFinder.modules, PlainFinder.distributions = (
+    frozenset(_names["modules"]),
+    frozenset(_names["distributions"]),
+)
 sys.meta_path[:] = [PlainFinder if finder is PathFinder else finder for finder in sys.meta_path]

@@ -1,0 +1,1 @@
+"""AEDAT files of iniVation and jAER."""

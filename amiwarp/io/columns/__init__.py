@@ -1,0 +1,1 @@
+"""Files of plain columns of any layout: NumPy, HDF5, MATLAB, Parquet, and what text shares with them."""

@@ -1,0 +1,1 @@
+"""Prophesee's RAW and DAT files, and the decoders of their words."""

@@ -1,0 +1,1 @@
+"""Text files of events: the format of the Event Camera Dataset, and tables."""

@@ -1,0 +1,5 @@
+"""What machine learning needs: data sets of simulated recordings, and trained networks."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

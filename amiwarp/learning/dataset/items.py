@@ -1,0 +1,242 @@
+"""Recordings of a data set: every combination of source, trajectory, prism, speed, sensor and seed."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.inputs import errors_name
+from amiwarp.learning.dataset import specification as spec
+from amiwarp.learning.dataset.sources import Source, content_digest, find_sources
+from amiwarp.simulation.worlds.world_choice import POSE_FILES
+from amiwarp.validation import shown
+
+
+@dataclass(frozen=True)
+class Item:
+    """One recording of a data set."""
+
+    recipe: Mapping[str, Any]
+    """Everything that determines the recording, as JSON data."""
+    folder: Path
+    """Folder to which the names in the recipe are relative."""
+    split: str
+    """Split that it belongs to."""
+    labels: Mapping[str, Any]
+    """Labels by name."""
+    licence: str
+    """Licence of the source."""
+
+    @cached_property
+    def key(self) -> str:
+        """Digest of the recipe, which identifies the recording."""
+        return _digest(self.recipe)[:16]
+
+    @property
+    def kind(self) -> str:
+        """Kind of the source, one of :data:`amiwarp.learning.dataset.specification.KINDS`."""
+        return str(self.recipe["source"]["kind"])
+
+    @property
+    def source(self) -> str:
+        """Name of the source."""
+        return str(self.recipe["source"]["name"])
+
+    @property
+    def seed(self) -> int:
+        """Seed of all random numbers except a named world's. It depends on the recipe alone.
+
+        Tensors are made of the recording that the same specification gives without output, so they have its seed.
+        """
+        recorded = {name: value for name, value in self.recipe.items() if name != "output"}
+        return int(_digest(recorded)[:16], 16) & spec.LARGEST_SEED
+
+    @property
+    def file(self) -> str:
+        """Path of the recording, relative to the folder of the data set."""
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", Path(self.source).stem)[:60]
+        return f"{self.split}/{stem}-{self.key}{'.npz' if 'output' in self.recipe else '.h5'}"
+
+    @property
+    def output(self) -> spec.OutputEntry | None:
+        """Tensors that are written instead of a recording; None for a recording."""
+        return spec.OutputEntry(**self.recipe["output"]) if "output" in self.recipe else None
+
+
+def _digest(data: Any) -> str:
+    """Return the SHA-256 of JSON data, in hexadecimal."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def list_items(specification: spec.Specification) -> list[Item]:
+    """Return all recordings of a specification, in its order.
+
+    Raises :class:`AmiwarpError` for sources not found, and for more than :data:`MOST_RECORDINGS` recordings.
+    """
+    found = [(source, _axes(specification, source)) for source in find_sources(specification)]
+    count = sum(math.prod(map(len, axes)) for _, axes in found)
+    if count > spec.MOST_RECORDINGS:
+        raise AmiwarpError(
+            f"{specification.path}: describes {count:,} recordings; divide it among specifications of at most "
+            f"{spec.MOST_RECORDINGS:,} recordings each"
+        )
+    sources = [source for source, _ in found]
+    divide = _drawn if specification.stratify is None else _stratified
+    splits = divide(specification, sources)
+    items = []
+    for source, axes in found:
+        for recipe in _recipes(specification, source, axes):
+            split = splits[_identity(source, recipe.get("seed"))]
+            licence = source.entry.licence
+            items.append(Item(recipe, specification.folder, split, source.labels, licence))
+    return items
+
+
+def _identity(source: Source, seed: int | None) -> str:
+    """Return what identifies a source for its split. Equal files, and the worlds of one seed, are the same source."""
+    return source.digest or f"{source.name} {seed}"
+
+
+def _identities(specification: spec.Specification, source: Source) -> list[str]:
+    """Return all identities of a source: one, or one for each seed of a named world."""
+    if source.path is not None:
+        return [_identity(source, None)]
+    return [_identity(source, seed) for seed in specification.seeds]
+
+
+def _axes(specification: spec.Specification, source: Source) -> tuple[Sequence[Any], ...]:
+    """Return what one source is combined with: trajectories, optics, sensors and seeds."""
+    if source.entry.kind == "recordings":
+        return ()
+    prisms = [asdict(prism) for prism in specification.prisms]
+    optics = [
+        {"prism": prism, "rpm": rpm}
+        for prism, rpm in itertools.product(prisms, specification.speeds_rpm)
+    ]
+    if specification.no_prism:
+        optics.append({"prism": None, "rpm": None})
+    sensors = [{"name": name, **asdict(sensor)} for name, sensor in specification.sensors.items()]
+    return _trajectories(specification, source), optics, sensors, specification.seeds
+
+
+def _recipes(
+    specification: spec.Specification, source: Source, axes: Sequence[Sequence[Any]]
+) -> Iterator[dict[str, Any]]:
+    """Yield what determines each recording of one source."""
+    entry = source.entry
+    base: dict[str, Any] = {
+        "source": {"kind": entry.kind, "name": source.name, "sha256": source.digest}
+    }
+    if specification.output is not None:
+        base |= {"output": specification.output.given}
+    if entry.kind == "recordings":
+        yield base
+        return
+    base |= {"camera": asdict(specification.camera)}
+    if entry.kind in ("videos", "translated"):
+        base |= {"fps": entry.fps, "duration_s": entry.duration_s}
+    else:
+        base |= {"duration_s": entry.duration_s or specification.duration_s}
+    if entry.kind in ("worlds", "world_files"):
+        base |= {"truth_hz": specification.truth_hz}
+    if entry.rotate_deg_s is not None:
+        base |= {"rotate_deg_s": entry.rotate_deg_s}
+    for trajectory, optic, sensor, seed in itertools.product(*axes):
+        yield base | trajectory | optic | {"sensor": sensor, "seed": seed}
+
+
+def _trajectories(specification: spec.Specification, source: Source) -> list[dict[str, Any]]:
+    """Return the camera motions through a world, with the digest of a file of poses. Other sources have none."""
+    if source.entry.kind == "world_files" and source.entry.trajectories is None:
+        return [{"trajectory": None}]
+    if source.entry.kind not in ("worlds", "world_files"):
+        return [{}]
+    motions = []
+    for name in source.entry.trajectories or ("handheld",):
+        motion = {"trajectory": name}
+        if name.lower().endswith(POSE_FILES):
+            motion["poses_sha256"] = content_digest(specification.folder / name)
+        motions.append(motion)
+    return motions
+
+
+def _drawn(specification: spec.Specification, sources: Sequence[Source]) -> dict[str, str]:
+    """Return the split of each source by its identity, drawn by a hash of it and of the split seed."""
+    names = dict.fromkeys(same for source in sources for same in _identities(specification, source))
+    return {same: _split(specification, same) for same in names}
+
+
+def _split(specification: spec.Specification, same: str) -> str:
+    """Return the split of the source with an identity."""
+    drawn = int(_draw(specification, same)[:13], 16) / 16**13
+    total = 0.0
+    for name, share in specification.splits.items():
+        total += share
+        if drawn < total:
+            return name
+    return [name for name, share in specification.splits.items() if share > 0.0][-1]
+
+
+def _draw(specification: spec.Specification, same: str) -> str:
+    """Return the hash of a source's identity and of the split seed."""
+    return _digest([specification.split_seed, same])
+
+
+def _stratified(specification: spec.Specification, sources: Sequence[Source]) -> dict[str, str]:
+    """Return the split of each source by its identity, so that the splits share the sources of every class.
+
+    The sources of a class are ordered by their hash, and this order is cut at the shares. Raises
+    :class:`AmiwarpError` for a source without class or with two of them, and for a class with fewer sources than
+    splits.
+    """
+    label = str(specification.stratify)
+    first: dict[str, Source] = {}
+    classes: defaultdict[Any, list[str]] = defaultdict(list)
+    with errors_name(specification.path, lambda: f"field stratify is {shown(label)}"):
+        for source in sources:
+            if label not in source.labels:
+                raise AmiwarpError(f"{source.name} has no such label; add it, or remove stratify")
+            for same in _identities(specification, source):
+                known = first.setdefault(same, source)
+                if known is source:
+                    classes[source.labels[label]].append(same)
+                elif known.labels[label] != source.labels[label]:
+                    raise AmiwarpError(
+                        f"{known.name} and {source.name} have the same content but the labels "
+                        f"{shown(known.labels[label])} and {shown(source.labels[label])}; remove one of them"
+                    )
+        shares = {name: share for name, share in specification.splits.items() if share > 0.0}
+        splits: dict[str, str] = {}
+        for value, members in classes.items():
+            if len(members) < len(shares):
+                raise AmiwarpError(
+                    f"class {shown(value)} has {len(members)} different sources for the {len(shares)} splits "
+                    f"{', '.join(shares)}; add sources of it, or give fewer splits"
+                )
+            members.sort(key=partial(_draw, specification))
+            names = []
+            for name, count in _counts(shares, len(members)).items():
+                names += [name] * count
+            splits.update(zip(members, names, strict=True))
+    return splits
+
+
+def _counts(shares: Mapping[str, float], total: int) -> dict[str, int]:
+    """Return how many of ``total`` sources each split gets: its share, rounded, but at least one."""
+    exact = {name: share * total for name, share in shares.items()}
+    counts = {name: max(1, math.floor(value)) for name, value in exact.items()}
+    while (spare := total - sum(counts.values())) != 0:
+        able = [name for name in counts if spare > 0 or counts[name] > 1]
+        name = max(able, key=lambda name: math.copysign(1.0, spare) * (exact[name] - counts[name]))
+        counts[name] += 1 if spare > 0 else -1
+    return counts

@@ -1,0 +1,304 @@
+"""Making of one recording of a data set, by a worker."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import socket
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp._version import __version__
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import DeviceEvents
+from amiwarp.events.recording import Events
+from amiwarp.events.truth import MAPS, FrameTruth
+from amiwarp.imaging.windows import windows
+from amiwarp.io import convert, open_recording
+from amiwarp.io.output_formats import make_folder
+from amiwarp.io.outputs import put_in_place
+from amiwarp.io.tensor_files import save_tensors
+from amiwarp.learning.dataset import specification as spec
+from amiwarp.learning.dataset.items import Item
+from amiwarp.learning.dataset.sources import content_digest
+from amiwarp.optics.camera import LARGEST_SIZE, Camera
+from amiwarp.optics.prism import Prism
+from amiwarp.schema.records import LARGEST_INTEGER
+from amiwarp.simulation.description import Scene
+from amiwarp.simulation.engine import Engine
+from amiwarp.simulation.motion import CameraMotion, PrismMotion
+from amiwarp.simulation.recorded_truth import RecordedTruth, chosen_instants
+from amiwarp.simulation.sensor_model import SensorModel
+from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.translation.translator import translation
+from amiwarp.simulation.worlds.world_choice import POSE_FILES, open_world
+from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.studies import cluster
+from amiwarp.studies.failures import failure_text
+from amiwarp.tasks import limited_cpu_threads
+from amiwarp.validation import real, shown, whole
+
+
+def _of_pattern(pattern: str, text: str, what: str) -> str:
+    """Return text that a regular expression matches; raise :class:`AmiwarpError` for other text."""
+    if not re.fullmatch(pattern, text):
+        raise AmiwarpError(f"{what} is {shown(text)}; expected text of the form {pattern}")
+    return text
+
+
+@dataclass(frozen=True)
+class Made:
+    """A recording that was made, as the journal keeps it."""
+
+    key: Annotated[str, partial(_of_pattern, "[0-9a-f]{16}")]
+    """Key of the item."""
+    file: Annotated[
+        str, partial(_of_pattern, "[A-Za-z0-9_-]+/[A-Za-z0-9_-]*-[0-9a-f]{16}[.](h5|npz)")
+    ]
+    """Path, relative to the folder of the data set."""
+    bytes: Annotated[int, partial(whole, low=0, high=LARGEST_INTEGER)]
+    """Size [bytes]."""
+    sha256: Annotated[str, partial(_of_pattern, "[0-9a-f]{64}")]
+    """SHA-256 of the file, in hexadecimal."""
+    events: Annotated[int, partial(whole, low=0, high=LARGEST_INTEGER)]
+    """Number of events."""
+    duration_s: Annotated[float, partial(real, low=0.0, high=LARGEST_INTEGER * 1e-6)]
+    """Duration: as simulated, or from the first event to the last [s]."""
+    width: Annotated[int, partial(whole, low=1, high=LARGEST_SIZE)]
+    """Width of the sensor [px]."""
+    height: Annotated[int, partial(whole, low=1, high=LARGEST_SIZE)]
+    """Height of the sensor [px]."""
+    seconds: Annotated[float, partial(real, low=0.0, high=1e9)]
+    """Time that the worker took [s]."""
+    processor_s: Annotated[float, partial(real, low=0.0, high=1e9)]
+    """Processor time that its process took [s]."""
+    device: Annotated[str, partial(_of_pattern, "cpu|cuda:[0-9]{1,3}")]
+    """Device that it was computed on."""
+    amiwarp: Annotated[str, partial(_of_pattern, "[A-Za-z0-9.+-]{1,64}")]
+    """Version of amiwarp."""
+
+    def __post_init__(self) -> None:
+        if not Path(self.file).stem.endswith(self.key):  # the file may be moved or removed
+            raise AmiwarpError(
+                f"file is {shown(self.file)}; expected a name with the key {self.key}"
+            )
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A recording that could not be made."""
+
+    key: str
+    """Key of the item."""
+    error: str
+    """Message of the error."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a worker gets."""
+
+    item: Item
+    """Recording to make."""
+    out: Path
+    """Folder of the data set."""
+    scratch: Path
+    """Folder for unfinished files, on the same disk."""
+    device: str
+    """Device; :data:`amiwarp.studies.cluster.ANY_GPU` is the worker's GPU."""
+    threads: int | None
+    """Number of CPU threads that the worker may use; None for all."""
+
+
+def make(job: Job) -> Made | Failed:
+    """Make a recording. Raises :class:`AmiwarpError` if the folder of the data set is not visible to this worker."""
+    if not job.scratch.is_dir():
+        raise AmiwarpError(
+            f"the worker on {socket.gethostname()} does not see {job.scratch.parent}; put the data set and its sources "
+            "on a disk that all workers share under the same path"
+        )
+    try:
+        with limited_cpu_threads(job.threads):
+            return _make(job)
+    except Exception as error:  # whatever one recording raises must not stop the others
+        return Failed(job.item.key, failure_text(error))
+
+
+def _make(job: Job) -> Made:
+    began = time.perf_counter()
+    began_processor = time.process_time()
+    item = job.item
+    device = "cuda:0" if job.device == cluster.ANY_GPU else job.device
+    path = job.out / item.file
+    part = job.scratch / path.name
+    written = write_recording(item, part, device)
+    digest = content_digest(part, noted=False)
+    make_folder(path.parent)
+    put_in_place(part, path, overwrite=True)
+    return Made(
+        item.key,
+        item.file,
+        path.stat().st_size,
+        digest,
+        *written,
+        round(time.perf_counter() - began, 6),
+        round(time.process_time() - began_processor, 6),
+        device,
+        __version__,
+    )
+
+
+def write_recording(
+    item: Item, path: Path, device: str, duration_s: float | None = None
+) -> tuple[int, float, int, int]:
+    """Write a recording or its tensors to ``path``, replacing it. ``duration_s`` shortens a simulated recording.
+
+    Return its number of events, its duration (as simulated, or from the first event to the last) [s], and the width and
+    height of the sensor [px].
+    """
+    if item.kind == "recordings":
+        return _write_existing(item, path, device)
+    simulation = simulation_of(item, device, duration_s)
+    rate = item.recipe.get("truth_hz")
+    size = (simulation.camera.width, simulation.camera.height)
+    if item.output is None:
+        events = simulation.write(path, truth_hz=rate, overwrite=True)
+    else:
+        events = _write_simulated_tensors(simulation, item.output, path, rate)
+    return events, simulation.duration_s, *size
+
+
+def _write_existing(item: Item, path: Path, device: str) -> tuple[int, float, int, int]:
+    """Write what a source of the kind ``recordings`` gives, as :func:`write_recording` does."""
+    source = item.folder / item.source
+    if item.output is None:
+        done = convert(source, path, overwrite=True)
+        count = done.events
+        first = done.t_first
+        last = done.t_last
+        size = (done.width, done.height)
+    else:
+        events = open_recording(source).events
+        count = len(events)
+        size = events.size
+        first, last = (events.t_first, events.t_last) if count else (None, None)
+        save_tensors(path, _tensors(events.slice(0, count), size, item.output, device=device))
+    return count, 0.0 if first is None or last is None else (last - first) * 1e-6, *size
+
+
+def _write_simulated_tensors(
+    simulation: Simulation, output: spec.OutputEntry, path: Path, truth_hz: float | None
+) -> int:
+    """Simulate a recording and write its tensors, which are made on the device. Return the number of events.
+
+    The ground truth of instants is written too, if there is some. The ground truth of events is not computed.
+    """
+    recorded = RecordedTruth(simulation, chosen_instants(simulation.duration_us, truth_hz))
+    blocks = list[DeviceEvents]()
+    frames = list[FrameTruth]()
+    engine = Engine(simulation)
+    for block in engine.run():
+        blocks.append(block.on_device()[0])
+        frames.extend(recorded.frames_before(engine.now_us))
+    events = DeviceEvents.concatenate(blocks)
+    arrays = _tensors(events, (simulation.camera.width, simulation.camera.height), output)
+    if frames:
+        arrays["truth_t"] = np.array([frame.t_us for frame in frames], np.int64)
+        arrays |= {name: np.stack([getattr(frame, name) for frame in frames]) for name in MAPS}
+    save_tensors(path, arrays)
+    return len(events)
+
+
+def _tensors(
+    events: Events | DeviceEvents, size: tuple[int, int], output: spec.OutputEntry, **options: Any
+) -> dict[str, NDArray[Any]]:
+    """Return the tensors of a recording by name: ``tensor``, and the times of its windows if there are several."""
+    found = windows(events, **output.windows) if output.windows else None
+    tensor = output.function(events, *size, windows=found, **output.options, **options)
+    times = {} if found is None else {"t_start": found.t_start, "t_end": found.t_end}
+    return {"tensor": tensor if isinstance(tensor, np.ndarray) else tensor.numpy(), **times}
+
+
+def simulation_of(item: Item, device: str, duration_s: float | None = None) -> Simulation:
+    """Return the simulation of a recording. ``duration_s`` shortens it."""
+    if item.recipe["prism"] is None:
+        return _seen_through(item, Prism(0.0), PrismMotion(), device, duration_s).without_prism()
+    prism = spec.PrismEntry(**item.recipe["prism"]).build()
+    motion = PrismMotion(item.recipe["rpm"])
+    return _seen_through(item, prism, motion, device, duration_s)
+
+
+def _seen_through(
+    item: Item, prism: Prism, motion: PrismMotion, device: str, duration_s: float | None
+) -> Simulation:
+    """Return the simulation of a recording through a prism."""
+    recipe = item.recipe
+    camera = spec.CameraEntry(**recipe["camera"])
+    source = os.fspath(item.folder / item.source)
+    length = recipe["duration_s"] if duration_s is None else duration_s
+    sensor = SensorModel(
+        **{name: value for name, value in recipe["sensor"].items() if name != "name"}
+    )
+    if item.kind == "translated":
+        return translation(
+            open_recording(source),
+            prism,
+            duration_s=length,
+            motion=motion,
+            sensor=sensor,
+            seed=item.seed,
+            device=device,
+        )
+    if item.kind == "videos":
+        return _of_video(
+            item,
+            source,
+            camera,
+            duration_s=length,
+            prism=prism,
+            motion=motion,
+            sensor=sensor,
+            seed=item.seed,
+            device=device,
+        )
+    scene = Scene.from_picture(source) if item.kind == "pictures" else _world(item, source)
+    turning = CameraMotion(
+        [math.radians(rate) for rate in recipe.get("rotate_deg_s", (0.0, 0.0, 0.0))]
+    )
+    return Simulation(
+        scene,
+        camera.build(),
+        prism,
+        length,
+        motion,
+        turning,
+        sensor=sensor,
+        seed=item.seed,
+        device=device,
+    )
+
+
+def _of_video(item: Item, source: str, entry: spec.CameraEntry, **settings: Any) -> Simulation:
+    """Return the simulation of a video, whose size is the camera's unless the specification gives one."""
+    from amiwarp.simulation.picture_opening import open_pictures
+
+    pictures = open_pictures(source, fps=item.recipe["fps"])
+    camera: Camera = entry.build(pictures.size)
+    return translation(pictures, camera=camera, **settings)
+
+
+def _world(item: Item, source: str) -> WorldScene:
+    """Return the world of a recording. The seed of a named world is the specification's."""
+    recipe = item.recipe
+    way = recipe["trajectory"]
+    if way is not None and way.lower().endswith(POSE_FILES):
+        way = os.fspath(item.folder / way)
+    name = item.source if item.kind == "worlds" else source
+    return WorldScene(*open_world(name, way, seed=recipe["seed"], duration_s=recipe["duration_s"]))

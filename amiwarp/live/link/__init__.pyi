@@ -1,0 +1,33 @@
+# Public names of the link, kept by hand: what a controller, its emulator and a program that drives it exchange.
+
+from .camera_clock import ClockSource as ClockSource
+from .clocks import monotonic_us as monotonic_us
+from .conformance import check_controller as check_controller
+from .emulator import Controller as Controller
+from .emulated_faults import EmulatedFault as EmulatedFault
+from .rotors import Motor as Motor
+from .rotors import Played as Played
+from .pseudo_terminal import PseudoTerminal as PseudoTerminal
+from .follower import Follower as Follower
+from .link import Link as Link
+from .updates import LinkUpdate as LinkUpdate
+from .protocol import Answer as Answer
+from .protocol import Ask as Ask
+from .protocol import Condition as Condition
+from .protocol import ControllerStatus as ControllerStatus
+from .protocol import FrameDecoder as FrameDecoder
+from .protocol import Identity as Identity
+from .protocol import Index as Index
+from .protocol import Message as Message
+from .protocol import Ping as Ping
+from .protocol import Pong as Pong
+from .protocol import RestoreSettings as RestoreSettings
+from .protocol import Samples as Samples
+from .protocol import SaveSettings as SaveSettings
+from .protocol import SetCounts as SetCounts
+from .protocol import SetSetting as SetSetting
+from .protocol import SetSpeed as SetSpeed
+from .protocol import Setting as Setting
+from .protocol import Stop as Stop
+from .protocol import Sync as Sync
+from .protocol import encode as encode

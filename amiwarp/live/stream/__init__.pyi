@@ -1,0 +1,33 @@
+# Public names of streams, kept by hand: packets and their bytes, sources, sinks and sessions.
+
+from .adaptive import SpeedController as SpeedController
+from .adaptive import SpeedKeeper as SpeedKeeper
+from .emulated_camera import EmulatedCamera as EmulatedCamera
+from .stream_format import EncoderSamples as EncoderSamples
+from .stream_format import End as End
+from .stream_format import HEADER as HEADER
+from .stream_format import HELLO as HELLO
+from .stream_format import Hello as Hello
+from .stream_format import MAGIC as MAGIC
+from .stream_format import PacketDecoder as PacketDecoder
+from .stream_format import encode_compensated as encode_compensated
+from .stream_format import encode_encoder as encode_encoder
+from .stream_format import encode_end as encode_end
+from .stream_format import encode_events as encode_events
+from .stream_format import encode_hello as encode_hello
+from .stream_format import encode_triggers as encode_triggers
+from .packets import make_packet as make_packet
+from .phase_check import PhaseCheck as PhaseCheck
+from .picture_film import PictureFilm as PictureFilm
+from .picture_page import PicturePage as PicturePage
+from .picture_stream import PictureStream as PictureStream
+from .recent_events import LiveSource as LiveSource
+from .recent_events import RecentEvents as RecentEvents
+from .session import Session as Session
+from .session_status import SessionStatus as SessionStatus
+from .sinks import PipeSink as PipeSink
+from .sinks import SocketSink as SocketSink
+from .sources import open_source as open_source
+from .sources import reopen_source as reopen_source
+from .stream_source import FileSource as FileSource
+from .stream_source import StreamSource as StreamSource

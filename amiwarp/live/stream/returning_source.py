@@ -1,0 +1,238 @@
+"""Stream over a socket, or of a camera, that continues when the lost sender or camera returns."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Events
+from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.stream.camera_source import CameraSource
+from amiwarp.live.stream.cameras import CAMERAS, open_camera_source
+from amiwarp.live.stream.packets import IDLE_S, Packet, make_packet
+from amiwarp.live.stream.sockets import Unreachable, iter_accepted, iter_connected
+from amiwarp.live.stream.stream_source import (
+    HELLO_S,
+    StreamSource,
+    open_connection,
+    open_stream,
+)
+
+LATE_US = 10_000
+"""Largest step backwards of the event time when a sender returns [us]: events are sorted across a smaller step."""
+CLOCK_US = 2_000_000
+"""After a reconnection, the length of the gap by the camera's clock is compared with that by the host's clock. A larger
+difference than this warns the user [us]."""
+REOPEN_S = 1.0
+"""Interval between attempts to open a camera that is gone, and longest wait for the hello of a sender that returns [s].
+"""
+SOCKETS = ("tcp", "unix", "tcp-listen", "unix-listen")
+"""Kinds of sources whose sender can return. Cameras can return, too."""
+
+
+def can_return(spec: str) -> bool:
+    """Return whether a source with this name can be opened again after its stream broke off."""
+    return spec.partition(":")[0] in (*SOCKETS, *CAMERAS)
+
+
+class ReturningSource:
+    """Source for a stream that is opened again after a break, if its sender or camera returns within ``wait_s`` [s].
+
+    It must be the same camera. The clock of a sender must have continued: otherwise events of the two parts could not
+    be ordered, and :class:`AmiwarpError` is raised. The clock of a camera begins anew: its later times are shifted, so
+    that the gap is as long as on the host's clock. It is opened with the same settings. ``say`` is called with a
+    message when the stream breaks off, when it returns, and when the durations of the gap on the sender's and the
+    host's clock disagree. Raises :class:`AmiwarpError` for a source other than a socket or a camera, or if no sender is
+    there at first.
+    """
+
+    def __init__(
+        self, spec: str, wait_s: float, say: Callable[[str], None], *, packet_us: int = 1000
+    ) -> None:
+        if not can_return(spec):
+            what = "give camera:, dv, prophesee, tcp:, unix:, tcp-listen: or unix-listen:, or omit the option"
+            raise AmiwarpError(
+                f"{spec}: --wait-for-source applies to sockets and cameras only, because other sources cannot be "
+                f"reopened; {what}"
+            )
+        self._wait_s = wait_s
+        self._say = say
+        self._restarts = spec.partition(":")[0] in CAMERAS
+        self._source: StreamSource | CameraSource = (
+            open_camera_source(spec, say, packet_us=packet_us)
+            if self._restarts
+            else open_stream(spec)
+        )
+        source = self._source
+        self.name = source.name
+        self.size = source.size
+        self.camera = source.camera
+        self.prism = source.prism
+        self.encoders = source.encoders
+        self.metadata = getattr(source, "metadata", {})
+        self.lost = 0
+        """Number of USB packets that were lost, see :attr:`CameraSource.lost`."""
+        self.problem: str | None = None
+        """How the stream ended, in one line; None if it ended with its end message."""
+        self.returns = 0
+        """Number of times that the sender returned."""
+        self._events = 0
+        self._last: tuple[int, int] | None = (
+            None  # latest event time, and the host's time of its arrival [us]
+        )
+        self._shift_us = 0
+
+    def packets(self) -> Iterator[Packet]:
+        """Yield packets, see :meth:`Source.packets`."""
+        while True:
+            yield from self._part()
+            self.problem = self._source.problem
+            if self.problem is None:
+                return
+            self._say(
+                f"{self.name}: the stream broke off after {self._events:,} events ({self.problem}); "
+                f"waiting up to {self._wait_s:g} s for {self._awaited}"
+            )
+            self._source.close()  # or the library holds the camera
+            began = time.monotonic()
+            before = self.returns
+            yield from self._wait(began + self._wait_s)
+            if self.returns == before:
+                self.problem = f"{self.problem}, and {self._awaited} was not back in {time.monotonic() - began:.1f} s"
+                return
+            same = ", the camera with the same settings" if self._restarts else ""
+            self._say(
+                f"{self.name}: the stream is back after {time.monotonic() - began:.1f} s{same}"
+            )
+
+    def close(self) -> None:
+        """Close the connection, see :meth:`Source.close`."""
+        self._source.close()
+
+    def _part(self) -> Iterator[Packet]:
+        """Yield packets of one connection until the stream ends or breaks off."""
+        fresh = unchecked = self.returns > 0
+        lost_before = self.lost
+        for packet in self._source.packets():
+            self.lost = lost_before + getattr(self._source, "lost", 0)
+            if self._restarts:
+                packet, unchecked = self._shifted(packet, unchecked), unchecked and packet.empty
+            if len(packet.events):
+                if unchecked:
+                    self._check_clock(packet)
+                    unchecked = False
+                self._events += len(packet.events)
+                newest = int(packet.events.t.max())
+                self._last = max(newest, self._last[0] if self._last else newest), packet.arrived_us
+            yield replace(packet, returned=True) if fresh else packet
+            fresh = False
+
+    @property
+    def _awaited(self) -> str:
+        return "the camera" if self._restarts else "its sender"
+
+    def _shifted(self, packet: Packet, first: bool) -> Packet:
+        """Return the packet on the clock of the packets before the break. ``first``: none came since the return."""
+        times = np.concatenate([packet.events.t, packet.triggers])
+        if first and times.size and self._last is not None:
+            last, then = self._last
+            by_host = last + packet.arrived_us - then - int(times.max())
+            self._shift_us = max(by_host, last + 1 - int(times.min()))
+        if not (self._shift_us and times.size):
+            return packet
+        events = Events(
+            packet.events.x, packet.events.y, packet.events.t + self._shift_us, packet.events.p
+        )
+        return replace(
+            packet,
+            events=events,
+            triggers=packet.triggers + self._shift_us,
+            encoder_t=packet.encoder_t + self._shift_us,
+        )
+
+    def _check_clock(self, packet: Packet) -> None:
+        if self._last is None:
+            return
+        (last, then), first = self._last, int(packet.events.t.min())
+        if first < last - LATE_US:
+            what = f"its clock restarted ({first:,} us, the last event before was at {last:,} us)"
+            raise AmiwarpError(
+                f"{self.name}: is back, but {what}; record the new events to another file"
+            )
+        gap = first - last
+        passed = packet.arrived_us - then
+        if abs(gap - passed) > CLOCK_US:
+            what = f"{gap * 1e-6:.1f} s passed on the camera's clock, {passed * 1e-6:.1f} s on the host's"
+            self._say(
+                f"{self.name}: {what}: its clock may have restarted, times across the gap may be wrong"
+            )
+
+    def _wait(self, until: float) -> Iterator[Packet]:
+        """Yield empty packets until the sender returns or the time ``until`` is over.
+
+        :attr:`problem` is None if the sender returned.
+        """
+        lost = self._source
+        again = (
+            _camera_attempts(lost) if isinstance(lost, CameraSource) else socket_attempts(self.name)
+        )
+        with contextlib.closing(again) as attempts:
+            for reopen in attempts:
+                if reopen is not None:
+                    try:
+                        left = max(until - time.monotonic(), 1.0)
+                        self._continue_with(reopen(hello_s=min(HELLO_S, left)))
+                        return
+                    except (
+                        Unreachable
+                    ):  # the sender left before its hello message: wait for its next connection
+                        pass
+                if time.monotonic() >= until:
+                    return
+                yield make_packet(monotonic_us())
+
+    def _continue_with(self, source: StreamSource | CameraSource) -> None:
+        """Continue with a new connection, if it comes from the same camera."""
+        if source.size != self.size:
+            source.close()
+            sizes = f"{source.size[0]}x{source.size[1]} pixels, before it had {self.size[0]}x{self.size[1]}"
+            raise AmiwarpError(
+                f"{self.name}: is back with a camera of {sizes}; record this camera to another file"
+            )
+        if (source.camera, source.prism, source.encoders) != (
+            self.camera,
+            self.prism,
+            self.encoders,
+        ):
+            source.close()
+            raise AmiwarpError(
+                f"{self.name}: is back with another camera, prism or number of encoders; record this camera to another "
+                "file"
+            )
+        self._source = source
+        self.problem = None
+        self.returns += 1
+
+
+def socket_attempts(spec: str) -> Generator[Callable[..., StreamSource] | None, None, None]:
+    """Yield functions of ``hello_s`` that open the stream of a socket's sender again; None at least every second."""
+    iterate = iter_accepted if spec.partition(":")[0].endswith("-listen") else iter_connected
+    for connection in iterate(spec.replace("-listen", "", 1)):
+        yield None if connection is None else partial(open_connection, spec, connection)
+
+
+def _camera_attempts(
+    lost: CameraSource,
+) -> Generator[Callable[..., CameraSource] | None, None, None]:
+    """Yield functions that open a camera again that was lost, every :data:`REOPEN_S`; None in between."""
+    while True:
+        for _ in range(round(REOPEN_S / IDLE_S)):
+            yield None
+            time.sleep(IDLE_S)
+        yield lambda hello_s: lost.reopened()

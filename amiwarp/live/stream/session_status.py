@@ -1,0 +1,122 @@
+"""Status of a live session, and the figures in it that are measured between two reports."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from amiwarp.choices import Sharpness
+from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
+from amiwarp.imaging.canvas import CanvasShape
+from amiwarp.imaging.sharpness import SharpnessMeter
+from amiwarp.live.link.camera_clock import ClockSource
+from amiwarp.live.link.clocks import ClockMap
+
+IMAGE_US = 33_333
+"""Length of the time window whose image gives the reported sharpness [us]."""
+
+
+@dataclass(slots=True)
+class SessionStatus:
+    """Progress of a session. Counts are totals; shares, rates and latencies refer to the time since the last report."""
+
+    seconds: float = 0.0
+    """Duration of the session [s]."""
+    events: int = 0
+    """Number of events received so far."""
+    done: int = 0
+    """Number of events compensated so far."""
+    outside: int = 0
+    """Number of events displaced out of the image."""
+    guessed: int = 0
+    """Number of events compensated with an extrapolated prism angle."""
+    unknown: int = 0
+    """Number of events without a prism angle."""
+    dropped: int = 0
+    """Number of events dropped by the queue, see :class:`Policy`."""
+    late: int = 0
+    """Number of events that were out of order and got a later time."""
+    waiting: int = 0
+    """Number of events that wait in the queue or for encoder samples."""
+    rate_mev_s: float = 0.0
+    """Rate of the received events since the last report [million events/s]."""
+    covered: float = 1.0
+    """Share of events since the last report whose prism angle was interpolated between encoder samples."""
+    latency_ms: tuple[float, float] = (0.0, 0.0)
+    """Median and 99th percentile of the time from an event to its output [ms], with all that it waited for.
+
+    It counts from the event's own time if the clocks are known, else from the earliest time at which the event can have
+    happened: as if the packet with the shortest delay so far had none.
+    """
+    sharpness: float | None = None
+    """Sharpness of the latest image of compensated events, over :data:`IMAGE_US`; None before the first."""
+    rpm: float | None = None
+    """Speed of the prism [turns/min]; None if it is unknown."""
+    clock: ClockMap | None = None
+    """Map from the controller's clock to the camera's; None without a link."""
+    clock_source: ClockSource | None = None
+    """How this map is known; None without a link."""
+    coverage: float | None = None
+    """Share of the scene's edges that the last window showed, 0 to 1; None without adaptive speed."""
+
+
+class IntervalFigures:
+    """Event rate, latency, and coverage by encoder samples, all since the last report."""
+
+    def __init__(self, began_us: int) -> None:
+        # at the last report: time [us]; numbers of events received, compensated, without a measured angle
+        self._reported = (began_us, 0, 0, 0)
+        self._latencies: list[float] = []
+
+    def add(self, packet: Compensated, delay_us: float, status: SessionStatus) -> None:
+        """Count a compensated packet in the figures of the interval. ``delay_us``: time from its last event [us]."""
+        flags = packet.flags
+        status.done += len(flags)
+        if flags.any():
+            status.outside += int(np.count_nonzero(flags & OUTSIDE))
+            status.guessed += int(np.count_nonzero(flags & EXTRAPOLATED))
+            status.unknown += int(np.count_nonzero(flags & NO_ANGLE))
+        self._latencies.append(delay_us)
+
+    def report(self, now_us: int, status: SessionStatus) -> None:
+        """Write the figures since the last report into the status, and start the next interval."""
+        then_us, events, done, unsure_then = self._reported
+        unsure = status.guessed + status.unknown
+        status.rate_mev_s = (status.events - events) / max(now_us - then_us, 1)
+        status.covered = (
+            1.0 - (unsure - unsure_then) / (status.done - done) if status.done > done else 1.0
+        )
+        self._reported = (now_us, status.events, status.done, unsure)
+        if self._latencies:
+            median, slow = np.percentile(self._latencies, [50, 99]) * 1e-3
+            status.latency_ms = float(median), float(slow)
+            self._latencies.clear()
+
+
+class WindowSharpness:
+    """Measures the sharpness of the compensated image of one time window per report."""
+
+    def __init__(self, compensator: Compensator, size: tuple[int, int], device: str) -> None:
+        self._compensator = compensator
+        self._meter = SharpnessMeter(
+            CanvasShape(*size), Sharpness.VARIANCE, smoothing=1.0, device=device
+        )
+        self._start_us: int | None = None
+        self._wanted = True
+
+    def update(self, t: int) -> float | None:
+        """Return the sharpness once the window is complete; ``t``: time up to which events are compensated [us]."""
+        if self._start_us is None:
+            self._compensator.image()  # discards the events before the window
+            self._start_us = t
+        elif self._wanted and t - self._start_us >= IMAGE_US:
+            self._meter.image.write(self._compensator.image()[None])
+            sharpness = self._meter.measure()
+            self._start_us = t
+            self._wanted = False
+            return sharpness
+        return None
+
+    def restart(self) -> None:
+        """Begin a new time window."""
+        self._start_us = None
+        self._wanted = True

@@ -1,0 +1,1 @@
+"""The optical models, a file for each kind."""

@@ -1,0 +1,17 @@
+# Public names of this room. Written by .ci/public_names.py from the front door's.
+
+from .depth_at_rest import depth as depth
+from .image_in_phase import PhaseImage as PhaseImage
+from .image_in_phase import phase_image as phase_image
+from .phase_camera import LivePicture as LivePicture
+from .phase_camera import PhaseCamera as PhaseCamera
+from .phase_window import PhaseReconstruction as PhaseReconstruction
+from .picture import Picture as Picture
+from .picture_in_phase import phase_picture as phase_picture
+from .pixels import pixel_thresholds as pixel_thresholds
+from .reconstruct import Reconstruction as Reconstruction
+
+# Names that are in this room only, kept by hand: what people who add to it need.
+
+from .film_files import save_film as save_film
+from .picture_files import save_picture as save_picture

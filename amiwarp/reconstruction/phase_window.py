@@ -1,0 +1,288 @@
+"""Pictures and images in phase of time windows of a recording: whole turns, summed."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from amiwarp.compensation.recordings import check_size
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import device_of, read_between
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_speed import turn_between
+from amiwarp.events.recording import EventSource, Recording
+from amiwarp.imaging.phase import PhaseSums, phase_sums
+from amiwarp.imaging.windows import turn_edges
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.orbit import image_grid, orbits_of
+from amiwarp.reconstruction.picture import Picture
+from amiwarp.reconstruction.picture_in_phase import phase_picture, pixel_motion
+from amiwarp.reconstruction.windows import window_count, window_span
+from amiwarp.results.calibration import Calibration
+from amiwarp.schema.calls import guarded
+
+HARMONICS_PER_PX = 1.5
+"""Number of harmonics for each pixel of the orbit's mean radius. Finer waves have more, but hardly stand out of the
+noise: more of them change the picture of an orbit of 6 px by 0.0003 of its correlation."""
+FEWEST_HARMONICS = 5
+MOST_HARMONICS = 31
+"""Limits of the number of harmonics: small orbits need some, and 64 bins hold no more."""
+LEAST_TURN = 0.98
+"""Shortest window that counts as a whole turn [turns]. It is lengthened to a turn."""
+
+
+@guarded
+class PhaseReconstruction:
+    """Pictures of a still scene from sums in phase, for windows of whole turns of one recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        Recording with events.
+    calibration : Calibration
+        Calibration of the same sensor size. It provides model and encoder. An optic with one angle.
+    device : str or warp.Device, optional
+        Device on which events are summed, by default the events' device or the CPU.
+
+    Raises
+    ------
+    AmiwarpError
+        If the recording has no events, the sensor sizes differ, there is no encoder, the model has two angles or moves
+        pixels along a line, or the calibration says that the camera rotates.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> picture = np.random.default_rng(0).random((64, 64)).astype(np.float32)
+    >>> camera, prism = amiwarp.Camera.from_fov(64, 48, 1.0), amiwarp.Prism(0.03)
+    >>> recording = amiwarp.simulate(picture, camera, prism, duration_s=0.2)
+    >>> found = amiwarp.calibrate(recording, amiwarp.Settings(stages=("sharpness",), model="circle"))
+    >>> work = amiwarp.PhaseReconstruction(recording, found)
+    >>> work.window(*work.span(turns=1.0)).log.shape
+    (48, 64)
+    """
+
+    def __init__(
+        self, recording: Recording, calibration: Calibration, *, device: Any = None
+    ) -> None:
+        if not len(recording.events):
+            raise AmiwarpError(f"{recording.name}: has no events; give a recording with events")
+        check_size(calibration, recording.events.size, recording.name)
+        rotation = calibration.camera_rotation
+        if rotation is not None and rotation.moves:
+            raise AmiwarpError(
+                f"{recording.name}: the calibration says that the camera rotates; sums in phase need a still camera, "
+                "use the method 'solver'"
+            )
+        self.recording = recording
+        self.model: Model = calibration.model
+        first_us = recording.events.t_first
+        last_us = recording.events.t_last
+        encoder = calibration.encoder_for(recording.encoder, first_us, last_us)
+        if encoder is None:
+            raise AmiwarpError(f"{recording.name}: give a recording with an encoder")
+        self.encoder = encoder
+        self.turn_us = turn_between(encoder, first_us, last_us)
+        self.harmonics = harmonics_for(self.model)
+        pixel_motion(self.model)  # refuses an optic that moves the image along a line
+        self.device = device_of(recording.events, device)
+
+    def span(
+        self, start_us: int | None = None, length_us: int | None = None, turns: float | None = None
+    ) -> tuple[int, int]:
+        """Return start and length of a time window.
+
+        Parameters
+        ----------
+        start_us : int, optional
+            Start [us]; by default one turn after the first event, or as late as possible.
+        length_us : int, optional
+            Length [us]; by default one turn.
+        turns : float, optional
+            Length [turns], instead of ``length_us``.
+
+        Returns
+        -------
+        tuple of int
+            Start and length [us].
+
+        Raises
+        ------
+        AmiwarpError
+            If the window has no events, or both lengths are given.
+        """
+        return window_span(self.recording, self.turn_us, start_us, length_us, turns)
+
+    def sums(self, start_us: int, length_us: int) -> PhaseSums:
+        """Sum the events of the whole turns of a window in phase with the optic.
+
+        Parameters
+        ----------
+        start_us : int
+            Start [us].
+        length_us : int
+            Length [us]. The end moves to the end of the last whole turn.
+
+        Returns
+        -------
+        PhaseSums
+            The sums.
+
+        Raises
+        ------
+        AmiwarpError
+            If the window is shorter than a turn, or has no events.
+        """
+        sums, stop_us = sums_of_turns(
+            self.recording.events,
+            self.encoder,
+            start_us,
+            length_us,
+            harmonics=self.harmonics,
+            device=self.device,
+        )
+        if not sums.events:
+            where = f"{start_us} .. {stop_us} us"
+            raise AmiwarpError(f"{self.recording.name}: no events in {where}; give another window")
+        return sums
+
+    def window(self, start_us: int, length_us: int) -> Picture:
+        """Make the picture of the whole turns of a window.
+
+        Parameters
+        ----------
+        start_us : int
+            Start [us].
+        length_us : int
+            Length [us], at least a turn.
+
+        Returns
+        -------
+        Picture
+            The picture. Its numbers of pairs and hot pixels, smoothness and residual are 0: there are no equations of
+            pairs.
+
+        Raises
+        ------
+        AmiwarpError
+            If the window is shorter than a turn, or has no events.
+        """
+        began = time.perf_counter()
+        sums = self.sums(start_us, length_us)
+        log = phase_picture(sums, self.model)
+        return Picture(
+            log=log,
+            known=(sums.on + sums.off) > 0,
+            start_us=start_us,
+            length_us=length_us,
+            pairs=0,
+            off_excess=sums.off_ratio - 1.0,
+            smoothness=0.0,
+            residual=0.0,
+            hot=0,
+            seconds=time.perf_counter() - began,
+            unknowns=np.zeros(0, np.float32),
+        )
+
+    def windows(self, start_us: int, length_us: int, *, step_us: float) -> Iterator[Picture]:
+        """Yield pictures of sliding windows, up to the last complete one.
+
+        Parameters
+        ----------
+        start_us : int
+            Start of the first window [us].
+        length_us : int
+            Length of each window [us], at least a turn.
+        step_us : float
+            Distance between the starts of windows [us].
+
+        Yields
+        ------
+        Picture
+            Picture of each window.
+        """
+        for k in range(self.count(start_us, length_us, step_us=step_us)):
+            yield self.window(start_us + round(k * step_us), length_us)
+
+    def count(self, start_us: int, length_us: int, *, step_us: float) -> int:
+        """Return the number of pictures that :meth:`windows` yields.
+
+        Parameters
+        ----------
+        start_us : int
+            Start of the first window [us].
+        length_us : int
+            Length of each window [us].
+        step_us : float
+            Distance between the starts of windows [us].
+
+        Returns
+        -------
+        int
+            Number of pictures, at least 1.
+        """
+        return window_count(self.recording, start_us, length_us, step_us)
+
+
+def sums_of_turns(
+    source: EventSource,
+    encoder: Encoder,
+    start_us: int,
+    length_us: int,
+    *,
+    harmonics: int,
+    device: Any,
+) -> tuple[PhaseSums, int]:
+    """Return the sums of the whole turns that begin at ``start_us`` within a window, and where they end [us].
+
+    Raises :class:`AmiwarpError` as :func:`whole_turns`.
+    """
+    stop_us, turns = whole_turns(encoder, start_us, length_us)
+    events = read_between(source, start_us, stop_us)
+    width, height = source.size
+    sums = phase_sums(
+        events,
+        encoder,
+        width,
+        height,
+        turns=float(turns),
+        harmonics=harmonics,
+        device=device,
+    )
+    return sums, stop_us
+
+
+def harmonics_for(model: Model) -> int:
+    """Return the number of harmonics that a picture through an optic needs."""
+    radius = orbits_of(model, image_grid(model.camera, 5, 5)).radius
+    return int(np.clip(math.ceil(HARMONICS_PER_PX * radius), FEWEST_HARMONICS, MOST_HARMONICS))
+
+
+@guarded
+def whole_turns(encoder: Encoder, start_us: int, length_us: int) -> tuple[int, int]:
+    """Return the end of the whole turns that begin at ``start_us`` within a window [us], and their number.
+
+    Raises :class:`AmiwarpError` if the window is shorter than a turn, or the encoder ends before the turn does.
+    """
+    ends = encoder.angle_at(np.array([start_us, start_us + length_us]))
+    swept = abs(float(ends[1] - ends[0])) / math.tau
+    turns = math.floor(swept + 1.0 - LEAST_TURN)
+    if turns < 1:
+        raise AmiwarpError(
+            f"the window {start_us} .. {start_us + length_us} us has {swept:.2f} turns of the optic; sums in phase "
+            "need a whole turn: give a longer window, or use the method 'solver'"
+        )
+    # The last turn may end a little after the window does.
+    longest_us = round(length_us * max(1.0, turns / swept) * (2.0 - LEAST_TURN))
+    limit_us = min(encoder.coverage[1], start_us + longest_us)
+    edges = turn_edges(encoder, start_us, limit_us, 1.0, incomplete=False)
+    if len(edges) <= turns:
+        raise AmiwarpError(
+            f"the encoder ends at {encoder.coverage[1]} us, before the turn that begins at {start_us} us is complete; "
+            "give an earlier window"
+        )
+    return int(edges[turns]), turns

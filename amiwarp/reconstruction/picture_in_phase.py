@@ -1,0 +1,218 @@
+"""A picture of the scene from sums in phase, in closed form: no event is moved, and no equation is iterated.
+
+The detail comes from tiles (:mod:`amiwarp.reconstruction.phase_tiles`), which hold no waves that are longer than
+themselves. These come from the gradient, which the first sum gives at each pixel, by Poisson's equation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+from scipy.special import jv
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.phase import PhaseSums
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.orbit import Orbits, image_grid, orbits_of
+from amiwarp.reconstruction.phase_lag import lag_of
+from amiwarp.reconstruction.phase_tiles import scene_of_tiles
+from amiwarp.schema.calls import guarded
+from amiwarp.tasks import cpu_threads
+from amiwarp.validation import real
+
+LONG_WAVES = 1.2
+"""Waves longer than 2π r / LONG_WAVES come from the gradient, with r the radius of the orbit [px]."""
+LEAST_ATTENUATION = 0.2
+"""Smallest attenuation of a wave in the first sum that is undone: shorter waves come from the tiles."""
+LEAST_WIDTH = 0.05
+"""Smallest difference of the two rotations of an orbit, relative to the larger one: motion along a line shows no edge
+that lies along it."""
+GRID_PX = 32
+"""Distance of the points at which orbits are computed for the gradient [px]; between them they are interpolated."""
+
+
+@guarded
+def phase_picture(
+    sums: PhaseSums, model: Model, *, lag: float | None = None
+) -> NDArray[np.float32]:
+    """Return the log intensity of the scene from sums in phase with the optic.
+
+    Parameters
+    ----------
+    sums : PhaseSums
+        Sums of whole turns in phase with the angle of the optic, as the encoder gives it.
+    model : Model
+        Optical model of the same image size, with one angle.
+    lag : float, optional
+        Angle by which the optic has turned on before an event is seen [rad], because of the sensor's latency and its
+        threshold; by default found from the sums.
+
+    Returns
+    -------
+    ndarray
+        Log intensity [ON thresholds], median 0, float32, shape ``(height, width)``.
+
+    Raises
+    ------
+    AmiwarpError
+        If the sizes differ, the model has two angles, or it moves pixels along a line or not at all.
+
+    Examples
+    --------
+    >>> camera, prism = amiwarp.Camera.from_fov(32, 24, 1.0), amiwarp.Prism(0.03)
+    >>> events = amiwarp.Events.from_arrays([5], [5], [0], [1])
+    >>> sums = amiwarp.phase_sums(events, amiwarp.Encoder.constant_speed(720.0, 0, 1000), 32, 24)
+    >>> amiwarp.phase_picture(sums, amiwarp.ExactModel.from_prism(camera, prism, 0.0)).shape
+    (24, 32)
+    """
+    motion = motion_of(sums, model)
+    lag = lag_of(sums, model) if lag is None else real(lag, "lag", -math.pi, math.pi, " rad")
+    slopes = motion.gradient(sums.values[0], lag)
+    detail = scene_of_tiles(sums, model, lag, with_rest=False).detail
+    return joined_picture(detail, slopes, model)
+
+
+def motion_of(sums: PhaseSums, model: Model) -> FirstSum:
+    """Return how first sums give the gradient.
+
+    Raises :class:`AmiwarpError` if the model belongs to another camera, or moves the image along a line.
+    """
+    _, height, width = sums.values.shape
+    camera = model.camera
+    if (camera.width, camera.height) != (width, height):
+        raise AmiwarpError(
+            f"the model is for {camera.width}x{camera.height} px, the sums for {width}x{height}; give both of one "
+            "camera"
+        )
+    return pixel_motion(model)
+
+
+def joined_picture(
+    detail: NDArray[np.float32], slopes: NDArray[np.complex64], model: Model
+) -> NDArray[np.float32]:
+    """Return the detail of the tiles with its long waves from the gradient, and a median of 0."""
+    picture = with_long_waves(detail, slopes, pixel_motion(model).radius)
+    return picture - np.median(picture)
+
+
+@dataclass(frozen=True)
+class FirstSum:
+    """How the first sum of each pixel gives the gradient, by its orbit a exp(iθ) + b exp(-iθ)."""
+
+    forward: NDArray[np.complex64]
+    """a / (\\|a\\|² - \\|b\\|²) [1/px], shape (height, width)."""
+    backward: NDArray[np.complex64]
+    """b / (\\|a\\|² - \\|b\\|²) [1/px], shape (height, width)."""
+    radius: float
+    """Mean radius of the orbits [px]."""
+
+    @classmethod
+    def of(cls, orbits: Orbits) -> FirstSum:
+        """Return it for the orbits of pixels. Raises :class:`AmiwarpError` if the optic moves some along a line."""
+        a = orbits.forward
+        b = orbits.backward
+        larger = np.maximum(np.abs(a), np.abs(b))
+        smaller = np.minimum(np.abs(a), np.abs(b))
+        if np.any(larger - smaller <= LEAST_WIDTH * larger):
+            raise AmiwarpError(
+                "the optic moves some pixels along a line, or not at all; sums in phase need an orbit around each "
+                "point, use the method 'solver'"
+            )
+        area = np.abs(a) ** 2 - np.abs(b) ** 2
+        return cls((a / area).astype(np.complex64), (b / area).astype(np.complex64), orbits.radius)
+
+    def gradient(self, first: NDArray[np.complex64], lag: float) -> NDArray[np.complex64]:
+        """Return the gradient of the log intensity from the first sum [thresholds/px]: along x, and i times along y.
+
+        For waves much longer than the orbit, A_1 = i/2 (conj(g) a + g conj(b)). ``lag`` is the lag of events [rad].
+        """
+        # conj(g) a + g conj(b) = s, and its conjugate: two equations for g
+        s = np.complex64(-2j * np.exp(1j * lag)) * first
+        return np.conj(s) * self.forward - s * self.backward
+
+
+@lru_cache(maxsize=4)
+def pixel_motion(model: Model) -> FirstSum:
+    """Return how the first sums of all pixels give the gradient. Orbits are interpolated between some pixels.
+
+    Raises :class:`AmiwarpError` if the model has two angles, or moves pixels along a line or not at all.
+    """
+    width = model.camera.width
+    height = model.camera.height
+    columns = max(2, 1 + math.ceil((width - 1) / GRID_PX))
+    rows = max(2, 1 + math.ceil((height - 1) / GRID_PX))
+    found = orbits_of(model, image_grid(model.camera, columns, rows))
+
+    def spread(values: NDArray[Any]) -> NDArray[Any]:
+        grid = values.reshape(rows, columns)
+        lines = _interpolated(grid, np.linspace(0.0, rows - 1.0, height))
+        return _interpolated(lines.T, np.linspace(0.0, columns - 1.0, width)).T
+
+    orbits = Orbits(
+        spread(found.mean), spread(found.forward), spread(found.backward), spread(found.rest)
+    )
+    return FirstSum.of(orbits)
+
+
+def _interpolated(rows: NDArray[Any], places: NDArray[np.float64]) -> NDArray[Any]:
+    """Return the rows of an array at places between them, interpolated linearly."""
+    below = np.minimum(places.astype(np.intp), len(rows) - 2)
+    share = (places - below)[:, None]
+    return rows[below] + share * (rows[below + 1] - rows[below])
+
+
+@dataclass(frozen=True)
+class _Filters:
+    """Filters over the cosine waves of an image, shape (height, width)."""
+
+    by_divergence: NDArray[np.float32]
+    """What the divergence of the gradient is multiplied with: Poisson's equation, and the share of a wave."""
+    of_detail: NDArray[np.float32]
+    """What the detail is multiplied with: the rest of the share."""
+
+
+@lru_cache(maxsize=4)
+def _filters(height: int, width: int, radius: float) -> _Filters:
+    """Return the filters that take waves which are long beside an orbit from the gradient."""
+    kx = math.pi * np.arange(width) / width
+    ky = math.pi * np.arange(height) / height
+    square = kx[None, :] ** 2 + ky[:, None] ** 2
+    share = np.exp(-0.5 * square * (radius / LONG_WAVES) ** 2)
+
+    # The gradient is known between pixels: differences of pixels instead of derivatives.
+    laplace = -4.0 * (np.sin(0.5 * kx[None, :]) ** 2 + np.sin(0.5 * ky[:, None]) ** 2)
+    laplace[0, 0] = -np.inf
+
+    # The first sum holds J_1, of which the gradient is the beginning.
+    reach = np.maximum(np.sqrt(square) * radius, 1e-6)
+    attenuation = np.maximum(2.0 * jv(1, reach) / reach, LEAST_ATTENUATION)
+    by_divergence = share / (laplace * attenuation)
+    return _Filters(by_divergence.astype(np.float32), (1.0 - share).astype(np.float32))
+
+
+def with_long_waves(
+    detail: NDArray[np.float32], slopes: NDArray[np.complex64], radius: float
+) -> NDArray[np.float32]:
+    """Return the picture with its waves that are long beside the orbit replaced by the waves of its gradient."""
+    height, width = detail.shape
+
+    # Divergence of the gradient between pixels, with no flow over the border: the cosine waves of the picture have
+    # none.
+    divergence = np.zeros((height, width), np.float32)
+    along_x = np.float32(0.5) * (slopes.real[:, 1:] + slopes.real[:, :-1])
+    along_y = np.float32(0.5) * (slopes.imag[1:] + slopes.imag[:-1])
+    divergence[:, :-1] += along_x
+    divergence[:, 1:] -= along_x
+    divergence[:-1] += along_y
+    divergence[1:] -= along_y
+
+    filters = _filters(height, width, radius)
+    waves = scipy.fft.dctn(divergence, workers=cpu_threads()) * filters.by_divergence
+    waves += scipy.fft.dctn(detail, workers=cpu_threads()) * filters.of_detail
+    return scipy.fft.idctn(waves, workers=cpu_threads(), overwrite_x=True)

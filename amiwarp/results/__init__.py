@@ -1,0 +1,5 @@
+"""Values that the searches find, with their files: calibrations, parameters, depth maps and pixel maps."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

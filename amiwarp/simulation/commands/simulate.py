@@ -1,0 +1,180 @@
+"""``amiwarp simulate``: simulated recording of a picture or a world, with its ground truth."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from amiwarp.cli import common as cli
+from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.io import open_recording
+from amiwarp.results.pixel_map import PixelMap
+from amiwarp.simulation.choices import Optic
+from amiwarp.simulation.commands.rig_options import (
+    EncoderModelOptions,
+    MirrorOptions,
+    OpticOptions,
+    RigOptions,
+    SensorOptions,
+    SteererOptions,
+    VibrationOptions,
+    build_optic,
+    sensor_option,
+)
+from amiwarp.simulation.commands.world_options import WorldOptions
+from amiwarp.simulation.description import Scene
+from amiwarp.simulation.motion import CameraMotion
+from amiwarp.simulation.worlds.world_scene import BLUR_PX, WorldScene
+
+if TYPE_CHECKING:
+    from amiwarp.simulation.simulator import Simulation
+
+
+AVERAGE_S = 600.0
+"""Time over which the speed of a simulation is averaged to predict its end [s]. A block of a slow world may take
+minutes."""
+_in_scene = partial(typer.Option, rich_help_panel="Scene")
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Options for the picture and the camera's rotation in front of it."""
+
+    scene_fov_deg: Annotated[
+        float | None,
+        _in_scene(
+            help="Horizontal extent of the picture (deg). Default: it fills the field of view at all times."
+        ),
+    ] = None
+    blur_px: Annotated[float, _in_scene(help="Standard deviation of the optical blur (px).")] = (
+        BLUR_PX
+    )
+
+    rotate_deg_s: Annotated[
+        str,
+        _in_scene(
+            help="Angular velocity of the camera about its x, y and z axes (deg/s).",
+            metavar="X,Y,Z",
+        ),
+    ] = "0,0,0"
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Angular velocity of the camera [rad/s]."""
+        return tuple(math.radians(v) for v in cli.numbers(self.rotate_deg_s, 3, "--rotate-deg-s"))
+
+    @property
+    def fov(self) -> float | None:
+        """Horizontal angle that the picture spans [rad], or None for the default."""
+        return (
+            None
+            if self.scene_fov_deg is None
+            else cli.fov_from(self.scene_fov_deg, "--scene-fov-deg")
+        )
+
+
+def run_simulate(
+    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), cli.OUTPUT],
+    *,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of the scene: JPEG, PNG, TIFF ...")
+    ] = None,
+    duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 1.0,
+    world: WorldOptions,
+    scene: SceneOptions,
+    vibration: VibrationOptions,
+    mirror: MirrorOptions,
+    steerer: SteererOptions,
+    optic: OpticOptions,
+    rig: RigOptions,
+    sensor: SensorOptions,
+    pixels: Annotated[
+        Path | None,
+        sensor_option(
+            help="Thresholds of every pixel, hot and dead pixels: map from 'amiwarp pixels' (.npz)."
+        ),
+    ] = None,
+    encoder: EncoderModelOptions,
+    common: cli.Common,
+) -> None:
+    """Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth.
+
+    A picture lies at infinity. A world is three-dimensional, and the camera moves through it: give --world room.
+    With --optic vibration, the camera vibrates instead of the prism; with --optic mirror, it looks at
+    a mirror; with --optic steerer, through a beam steerer.
+    """
+    from amiwarp.simulation.simulator import Simulation
+
+    if (picture is None) == (world.world is None):
+        raise typer.BadParameter("give one of them", param_hint="--picture, --world")
+    world.check()
+    device = cli.choose_device(common.device)
+    simulation = Simulation(
+        _scene(picture, world, scene, duration, common.seed),
+        rig.build_camera(),
+        build_optic(optic, rig, vibration, mirror, steerer, encoder),
+        duration,
+        motion=rig.build_motion(),
+        camera_motion=CameraMotion(scene.rates),
+        sensor=sensor.build(),
+        pixels=None if pixels is None else PixelMap.load(pixels),
+        encoder_model=encoder.build(),
+        nominal_prism=rig.build_nominal() if optic.optic is Optic.WEDGE else None,
+        seed=common.seed,
+        device=device,
+    )
+    world.draw_preview(simulation)
+    write(
+        simulation.without_prism() if world.no_prism else simulation,
+        out,
+        common,
+        truth_hz=world.truth_hz,
+    )
+
+
+def _scene(
+    picture: Path | None, world: WorldOptions, scene: SceneOptions, duration: float, seed: int
+) -> Scene | WorldScene:
+    """Return the scene of the simulation: a picture or a world."""
+
+    if picture is not None:
+        return Scene.from_picture(picture, fov=scene.fov, blur=scene.blur_px)
+    if scene.fov is not None or any(scene.rates):
+        raise AmiwarpError(
+            "--scene-fov-deg and --rotate-deg-s apply to a picture; give --trajectory for a world",
+            ErrorCode.OPTIONS,
+        )
+    return world.build_scene(duration, seed=seed, blur=scene.blur_px)
+
+
+def write(
+    simulation: Simulation, out: Path, common: cli.Common, *, truth_hz: float | None = None
+) -> None:
+    """Run a simulation, write its recording to ``out`` and print the result."""
+    began = time.perf_counter()
+    with cli.progress("simulating", average_s=AVERAGE_S) as advance:
+        simulation.write(out, truth_hz=truth_hz, progress=advance)
+    seconds = time.perf_counter() - began
+    data: dict[str, Any] = {
+        "file": str(out),
+        "events": len(open_recording(out).events),
+        "duration_s": simulation.duration_s,
+        "seconds": seconds,
+        "times_real_time": seconds / simulation.duration_s,
+        "device": simulation.device,
+    }
+    cli.report(common, data, [_line(data)])
+
+
+def _line(d: dict[str, Any]) -> str:
+    rate = d["events"] / max(d["seconds"], 1e-9) / 1e6
+    return (
+        f"{d['file']}: {d['events']:,} events, {d['duration_s']:.6g} s simulated in {d['seconds']:.2f} s "
+        f"({d['times_real_time']:.3g} x real time, {rate:.3g} Mev/s on {d['device']})"
+    )

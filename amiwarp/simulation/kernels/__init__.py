@@ -1,0 +1,1 @@
+"""Warp kernels of the simulator, which no other room launches. Private."""

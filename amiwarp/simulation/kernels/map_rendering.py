@@ -1,0 +1,146 @@
+"""Maps of a simulated world: rendering, anti-aliasing and blur.
+
+A map is a picture of the world without the prism. A map is rendered in tiles of 8 by 8 texels, so that a renderer can
+skip the tiles in which no body moves.
+"""
+
+import warp as wp
+
+from amiwarp.simulation.kernels.edges import FirstHits, on_edge
+from amiwarp.simulation.kernels.image_tiles import TILE, place_in_tile
+from amiwarp.simulation.kernels.ray_casting import FAR, cast
+from amiwarp.simulation.kernels.world import Pose, World
+from amiwarp.simulation.kernels.world_light import illumination, luminance, radiance
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class MapFrame:
+    """Image plane of a map at distance 1 from the camera, the grid of texels on the plane, and the tiles to render."""
+
+    pose: Pose  # pose of the plane's frame; its z axis is the plane's normal
+    left: float  # x coordinate of the map's left edge on the plane
+    top: float  # y coordinate of the map's top edge on the plane
+    pitch_x: float  # texels per unit of x on the plane
+    pitch_y: float  # texels per unit of y on the plane
+    width: int  # width of the map [texels]
+    height: int  # height of the map [texels]
+    # Positions of a texel's samples relative to its centre [texels]
+    offsets: wp.array(dtype=wp.vec2)
+    cone: float  # angular width of a sample [rad]
+    instant: int  # number of the instant that is rendered: row of World.poses
+    first: int  # index of the map's first texel in the arrays of all maps
+    tiles: wp.array(dtype=int)  # numbers of the tiles to render, counted row by row
+
+
+@wp.func
+def texel_of_tile(f: MapFrame, k: int) -> int:
+    """Return the index of the texel that thread ``k`` computes; -1 if the texel lies outside of the map."""
+    tile = f.tiles[k / (TILE * TILE)]
+    texel = k % (TILE * TILE)
+    return place_in_tile(f.width, f.height, tile * TILE * TILE + texel)
+
+
+@wp.func
+def map_direction(f: MapFrame, x: float, y: float) -> wp.vec3:
+    """Return the unit vector in the world's frame through texel coordinates; whole numbers are texel centres."""
+    plane = wp.vec3(f.left + (x + 0.5) / f.pitch_x, f.top + (y + 0.5) / f.pitch_y, 1.0)
+    return f.pose.rotation * wp.normalize(plane)
+
+
+@wp.kernel
+def render_map(world: World, f: MapFrame, start: int, faces: wp.array(dtype=int), out: FirstHits):
+    """Cast one ray through the centre of each texel of the tiles, and store the result and the face."""
+    i = texel_of_tile(f, start + wp.tid())
+    if i < 0:
+        return
+    row = i / f.width
+    direction = map_direction(f, float(i - row * f.width), float(row))
+    hit = cast(world, f.instant, f.pose.position, direction, FAR)
+    white = illumination(world, f.instant, f.pose.position, direction, hit)
+    out.white[i] = white
+    out.light[i] = luminance(world, direction, hit, f.cone, white)
+    out.normal[i] = hit.normal
+    out.face[i] = hit.face
+    faces[f.first + i] = hit.face
+
+
+@wp.kernel
+def smooth_edges(
+    world: World, f: MapFrame, hits: FirstHits, start: int, out: wp.array(dtype=float)
+):
+    """Replace the luminance of texels on edges by the mean of several rays.
+
+    Textures need no further rays, because each ray averages the texture over the ray's angular width.
+    """
+    i = texel_of_tile(f, start + wp.tid())
+    if i < 0:
+        return
+    value = float(hits.light[i])
+    if on_edge(world, hits, 0, f.width, f.height, 1, i):
+        row = i / f.width
+        col = i - row * f.width
+        value = float(0.0)
+        rays = f.offsets.shape[0]
+        for k in range(rays):
+            offset = f.offsets[k]
+            direction = map_direction(f, float(col) + offset[0], float(row) + offset[1])
+            light = radiance(world, f.instant, f.pose.position, direction, f.cone)
+            value += light / float(rays)
+    out[i] = value
+
+
+@wp.kernel
+def blur_lines(
+    f: MapFrame,
+    image: wp.array(dtype=float),
+    weights: wp.array(dtype=float),
+    across: int,
+    start: int,
+    out: wp.array(dtype=float),
+):
+    """Convolve the rows (``across`` 0) or columns (``across`` 1) of an image with ``weights``.
+
+    Texels on the border are repeated.
+    """
+    i = texel_of_tile(f, start + wp.tid())
+    if i < 0:
+        return
+    row = i / f.width
+    col = i - row * f.width
+    half = weights.shape[0] / 2
+    total = float(0.0)
+    for k in range(weights.shape[0]):
+        c = wp.clamp(col + wp.where(across == 0, k - half, 0), 0, f.width - 1)
+        r = wp.clamp(row + wp.where(across == 1, k - half, 0), 0, f.height - 1)
+        total += weights[k] * image[r * f.width + c]
+    out[i] = total
+
+
+@wp.func
+def log_texel(f: MapFrame, light: wp.array(dtype=float), col: int, row: int, dark: float) -> float:
+    """Return the log intensity of a texel; texels on the right and lower border are repeated."""
+    c = wp.min(col, f.width - 1)
+    r = wp.min(row, f.height - 1)
+    return wp.log(light[r * f.width + c] + dark)
+
+
+@wp.kernel
+def log_pieces(
+    f: MapFrame, light: wp.array(dtype=float), dark: float, start: int, out: wp.array(dtype=wp.vec4)
+):
+    """Compute the four coefficients of bilinear interpolation of the log intensity at each texel.
+
+    The coefficients are the factors of 1, x, y and xy between the texel and its right and lower neighbours.
+    """
+    i = texel_of_tile(f, start + wp.tid())
+    if i < 0:
+        return
+    row = i / f.width
+    col = i - row * f.width
+    a = log_texel(f, light, col, row, dark)
+    b = log_texel(f, light, col + 1, row, dark) - a
+    c = log_texel(f, light, col, row + 1, dark) - a
+    d = log_texel(f, light, col + 1, row + 1, dark) - a - b - c
+    out[f.first + i] = wp.vec4(a, b, c, d)

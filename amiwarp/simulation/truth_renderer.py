@@ -1,0 +1,393 @@
+"""Ground truth of a simulated world at an instant: depth, normals, instances, optical flow and luminance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.truth import FrameTruth
+from amiwarp.kernels import prism_view
+from amiwarp.optics.models.angles import wrap_angle
+from amiwarp.optics.models.base import Model
+from amiwarp.optics.models.plate import PlateModel
+from amiwarp.schema.calls import guarded
+from amiwarp.simulation.description import SimulationValues
+from amiwarp.simulation.engine import azimuths_of, second_bends, true_angles
+from amiwarp.simulation.motion import Moved
+from amiwarp.simulation.view import mirrored, prism_view_of
+from amiwarp.simulation.worlds.device_world import DeviceWorld
+from amiwarp.simulation.worlds.sight import WorldSight
+from amiwarp.simulation.worlds.surfaces import SurfaceView, pixel_rays, surfaces_at
+from amiwarp.simulation.worlds.world_scene import WorldScene
+
+ANGLE = 1e-3
+"""Half of the angle over which derivatives with respect to direction are difference quotients [rad]."""
+DEFLECTING_STEPS = 4
+"""Number of steps of the fixed-point iteration that finds the pixel that sees a point through a plate."""
+NEARER = 1e-3
+"""Relative difference of depth from which a surface hides a point."""
+OUTSIDE = 2
+"""Value of :attr:`amiwarp.FrameTruth.occlusion` for points outside the image."""
+MOMENT_S = 1e-4
+"""Time between the moments whose difference quotient is the optical flow [s]."""
+
+
+def rate_of_change(
+    value_at: Callable[[float], NDArray[np.float64]], t: float, duration_s: float
+) -> NDArray[np.float64]:
+    """Return the rate at which a value changes at the time ``t`` [s], from its values at two or three moments.
+
+    ``value_at`` returns the value at a moment [s]. All moments lie within the recording, because cameras, bodies and
+    optics may rest before and after it. At its ends the rate is the slope of the parabola through three moments on one
+    side, elsewhere the central difference quotient.
+    """
+    step = min(MOMENT_S, duration_s / 2.0)
+    centre = t
+    if 0.0 <= t <= duration_s:
+        centre = min(max(t, step), duration_s - step)
+    after_t = (centre - t) + step * np.array([-1.0, 0.0, 1.0])
+
+    # The weights of all three moments sum to 0. So only changes since the first moment count, and a value that does
+    # not change has no rate, not even a rounding error.
+    first = value_at(t + float(after_t[0]))
+    rate = np.zeros_like(first)
+    for k in (1, 2):
+        others = np.delete(after_t, k)
+        weight = float(-others.sum() / np.prod(after_t[k] - others))
+        if weight:
+            rate += weight * (value_at(t + float(after_t[k])) - first)
+    return rate
+
+
+@guarded
+class TruthRenderer:
+    """Renders the ground truth of a simulated world at any instant.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        Simulation whose scene is a :class:`amiwarp.WorldScene`.
+
+    Raises
+    ------
+    AmiwarpError
+        If the scene of the simulation is a picture.
+
+    Examples
+    --------
+    >>> square = amiwarp.Mesh([[-1, 2, -1], [1, 2, -1], [1, 2, 1], [-1, 2, 1]], [[0, 1, 2], [0, 2, 3]])
+    >>> world = amiwarp.World("example", (amiwarp.Body("wall", square),))
+    >>> way = amiwarp.Trajectory.still([0, 0, 0], look_at=[0, 1, 0])
+    >>> simulation = amiwarp.Simulation(
+    ...     amiwarp.WorldScene(world, way), amiwarp.Camera.from_fov(32, 24, 1.0), amiwarp.Prism(0.01), duration_s=0.01)
+    >>> round(float(amiwarp.TruthRenderer(simulation).at(0).depth[12, 16]), 3)
+    2.0
+    """
+
+    def __init__(self, simulation: SimulationValues) -> None:
+        if not isinstance(simulation.scene, WorldScene):
+            raise AmiwarpError(
+                "the scene is a picture at infinity, which has no depth; give a WorldScene as the scene"
+            )
+        self._simulation = simulation
+        self._scene = simulation.scene
+        self._world = DeviceWorld(self._scene.world, simulation.device)
+        self._sight = WorldSight(simulation, self._scene, self._world)
+        self._sight_at_rest = self._sight
+        if isinstance(simulation.prism, Moved):
+            self._sight_at_rest = WorldSight(simulation.at_rest, self._scene, self._world)
+        self._rays = pixel_rays(simulation.camera)
+        self._pixels = simulation.camera.rays_to_pixels(self._rays)
+
+    def at(self, t_us: int, next_us: int | None = None) -> FrameTruth:
+        """Return the ground truth of all pixels at a time.
+
+        Parameters
+        ----------
+        t_us : int
+            Time from the start of the recording [us].
+        next_us : int, optional
+            Time of the next instant [us], to which displacements and occlusion refer. Without it, they are unknown.
+
+        Returns
+        -------
+        FrameTruth
+            Depth, normals, instances, optical flow, displacement and luminance of all pixels, the pose of the camera,
+            and the positions of the joints.
+        """
+        t = t_us * 1e-6
+        next_t = t if next_us is None else next_us * 1e-6
+        camera = self._simulation.camera
+        (rotation,), (position,) = self._poses([t])
+        self._world.set_instants(np.array([t, next_t]))
+
+        # What each pixel sees without the prism.
+        pixels = self._pixels
+        bare = surfaces_at(self._world, self._rays, rotation, position)
+        flow = self._flow(bare, pixels, t)
+        moved, occluded = self._moved(bare, pixels, t_us, next_us, prism=False)
+
+        # What it sees through the prism or the plate, and where this would appear without it.
+        if self._simulation.plate is None:
+            theta = self._angles(t_us)
+            model = self._simulation.moving_model
+            places = model.compensate_points(pixels, theta)
+            through = surfaces_at(self._world, camera.pixels_to_rays(places), rotation, position)
+            speed = self._flow(through, places, t)
+            prism_flow = self._prism_flow(model, places, speed, theta, t_us)
+        else:
+            through, places = self._through_plate(t, rotation, position)
+            prism_flow = self._plate_flow(self._simulation.plate, through, places, t)
+        prism_moved, prism_occluded = self._moved(through, places, t_us, next_us, prism=True)
+
+        size = (camera.height, camera.width)
+        joints = self._scene.world.joints
+        return FrameTruth(
+            t_us=t_us,
+            depth=bare.depth.reshape(size),
+            normal=bare.normal.reshape(*size, 3),
+            instance=bare.instance.reshape(size).astype(np.uint16),
+            flow=flow.astype(np.float32).reshape(*size, 2),
+            flow_with_prism=prism_flow.astype(np.float32).reshape(*size, 2),
+            displacement=moved.astype(np.float32).reshape(*size, 2),
+            displacement_with_prism=prism_moved.astype(np.float32).reshape(*size, 2),
+            occlusion=occluded.reshape(size),
+            occlusion_with_prism=prism_occluded.reshape(size),
+            intensity=self.luminance(t_us),
+            intensity_with_prism=self._intensity(t_us, prism=True).reshape(size),
+            rotation=rotation @ mirrored(self._simulation).T,
+            position=position,
+            joints={name: path.poses([t])[1][0] for name, path in joints.items()},
+        )
+
+    def luminance(self, t_us: int) -> NDArray[np.float32]:
+        """Return the linear luminance without the prism at a time, which takes a fraction of the time of :meth:`at`.
+
+        Parameters
+        ----------
+        t_us : int
+            Time from the start of the recording [us].
+
+        Returns
+        -------
+        numpy.ndarray
+            Luminance of all pixels, shape ``(height, width)``.
+        """
+        camera = self._simulation.camera
+        return self._intensity(t_us, prism=False).reshape(camera.height, camera.width)
+
+    def _poses(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return how directions of the camera at rest look in the world at times [s], (n, 3, 3), and its places."""
+        rotation, position = self._scene.trajectory.poses(t)
+        return rotation @ mirrored(self._simulation), position
+
+    def _flow(
+        self, seen: SurfaceView, pixels: NDArray[np.float64], t: float
+    ) -> NDArray[np.float64]:
+        """Return the optical flow [px/s] of the points that pixels see at time ``t`` [s], shape (n, 2).
+
+        ``seen``: surfaces that appear at ``pixels`` [px] in the image without the prism.
+        """
+
+        def ray_at(later: float) -> NDArray[np.float64]:
+            rays, _ = self._ray_at(seen, pixels, t, later)
+            return rays
+
+        change = rate_of_change(ray_at, t, self._simulation.duration_s)
+        rate = np.linalg.norm(change, axis=1, keepdims=True)
+
+        # The same small angle to both sides for all points, however slowly they move.
+        aside = ANGLE * change / np.maximum(rate, 1e-12)
+        camera = self._simulation.camera
+        rays = camera.pixels_to_rays(pixels).astype(np.float64)
+        before = camera.rays_to_pixels(rays - aside).astype(np.float64)
+        after = camera.rays_to_pixels(rays + aside).astype(np.float64)
+        return np.asarray((after - before) / (2.0 * ANGLE) * rate)
+
+    def _ray_at(
+        self, seen: SurfaceView, pixels: NDArray[np.float64], t: float, later: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return unit rays from the camera at time ``later`` [s] to the points that pixels see at time ``t`` [s].
+
+        The rays are in the camera's frame, shape (n, 3). The second array has the depths of the points [m], shape (n,).
+        """
+        (rotation, later_rotation), (position, later_position) = self._poses([t, later])
+        rays = self._simulation.camera.pixels_to_rays(pixels).astype(np.float64)
+        distance = seen.depth.astype(np.float64) / rays[:, 2]
+        sky = ~np.isfinite(distance)
+        reach = np.where(sky, 1.0, distance)[:, None]
+        points = position + reach * (rays @ rotation.T)
+
+        # Points on moving bodies move with these.
+        for k, body in enumerate(self._world.movers):
+            on_body = (seen.mover == k) & ~sky
+            if body.trajectory is not None and on_body.any():
+                (turn, later_turn), (place, later_place) = body.trajectory.poses([t, later])
+                in_body = (points[on_body] - place) @ turn
+                points[on_body] = in_body @ later_turn.T + later_place
+
+        # The sky is at infinity: it does not see that the camera moves.
+        from_camera = np.where(sky[:, None], points - position, points - later_position)
+        directions = from_camera @ later_rotation
+        depth = np.where(sky, np.inf, directions[:, 2])
+        length = np.linalg.norm(directions, axis=1, keepdims=True)
+        return directions / length, depth
+
+    def _angles(self, t_us: int) -> NDArray[np.float64]:
+        """Return the prism angle of all pixels at a time [rad], shape (n,), or (n, 2) for two prisms."""
+        angles = wrap_angle(self._simulation.prism_motion.angles([t_us]))
+        return np.repeat(angles, len(self._rays), axis=0)
+
+    def _moved(
+        self,
+        seen: SurfaceView,
+        places: NDArray[np.float64],
+        t_us: int,
+        next_us: int | None,
+        *,
+        prism: bool,
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """Return the displacement of what the pixels see until ``next_us`` [px], shape (n, 2), and its occlusion, (n,).
+
+        ``seen``: surfaces that appear at ``places`` [px] in the image without the prism; ``prism``: whether the pixels
+        see them through the prism.
+        """
+        n = len(self._rays)
+        if next_us is None:
+            return np.full((n, 2), np.nan), np.full(n, OUTSIDE, np.uint8)
+        later = next_us * 1e-6
+        camera = self._simulation.camera
+        plate = self._simulation.plate if prism else None
+
+        # Pixels that will see the points, and the rays that will lead there.
+        centres = None
+        rays, depth = self._ray_at(seen, places, t_us * 1e-6, later)
+        ends = camera.rays_to_pixels(rays)
+        if plate is not None:
+            ends = self._plate_pixels(plate, rays, depth, later)
+            known = np.isfinite(ends).all(axis=1, keepdims=True)
+            rays = np.where(known, camera.pixels_to_rays(ends), self._rays)
+            centres, behind = self._behind_plate(rays, later)
+            rays = behind.astype(np.float64)
+        elif prism:
+            ends = self._simulation.moving_model.deflect_points(ends, self._angles(next_us))
+
+        # A point is hidden if something nearer will lie on its ray.
+        (rotation,), (position,) = self._poses([later])
+        hit = surfaces_at(self._world, rays, rotation, position, instant=1, centres=centres)
+        hidden = hit.depth < depth * (1.0 - NEARER)
+        size = np.array([camera.width, camera.height])
+        inside = ((ends > -0.5) & (ends < size - 0.5)).all(axis=1)
+        occlusion = np.where(inside, hidden, OUTSIDE).astype(np.uint8)
+        return ends - self._pixels, occlusion
+
+    def _prism_flow(
+        self,
+        model: Model,
+        places: NDArray[np.float64],
+        speed: NDArray[np.float64],
+        theta: NDArray[np.float64],
+        t_us: int,
+    ) -> NDArray[np.float64]:
+        """Return the optical flow [px/s] that pixels see through the turning prism, shape (n, 2).
+
+        ``places``: points [px] that the pixels would see without the prism; ``speed``: the flow at these points without
+        the prism [px/s]; ``theta``: prism angle [rad].
+        """
+        # What the scene moves, seen through the prism at rest: one pixel to both sides along the motion.
+        size = np.linalg.norm(speed, axis=1, keepdims=True)
+        aside = speed / np.maximum(size, 1e-9)
+        before = model.deflect_points(places - aside, theta)
+        after = model.deflect_points(places + aside, theta)
+        flow = (after - before) / 2.0 * size
+
+        # What each angle of the prism moves.
+        motion = self._simulation.prism_motion
+
+        def angles_at(t: float) -> NDArray[np.float64]:
+            return motion.angles([1e6 * t])[0]
+
+        rates = np.atleast_1d(rate_of_change(angles_at, t_us * 1e-6, self._simulation.duration_s))
+        for rate, only_this in zip(rates, np.eye(len(rates)), strict=True):
+            step = ANGLE * only_this if len(rates) > 1 else ANGLE
+            before = model.deflect_points(places, theta - 10.0 * step)
+            after = model.deflect_points(places, theta + 10.0 * step)
+            flow = flow + (after - before) / (20.0 * ANGLE) * rate
+        return np.asarray(flow)
+
+    def _through_plate(
+        self, t: float, rotation: NDArray[np.float64], position: NDArray[np.float64]
+    ) -> tuple[SurfaceView, NDArray[np.float64]]:
+        """Return the surfaces that the pixels see through the turning plate at time ``t`` [s], and where they appear
+        without it [px], shape (n, 2)."""
+        centres, rays = self._behind_plate(self._rays, t)
+        seen = surfaces_at(self._world, rays, rotation, position, centres=centres)
+        # The sky appears where the rays point to.
+        is_surface = np.isfinite(seen.depth)[:, None]
+        from_camera = (seen.place - position) @ rotation
+        directions = np.where(is_surface, from_camera, rays)
+        return seen, self._simulation.camera.rays_to_pixels(directions)
+
+    def _behind_plate(
+        self, rays: NDArray[np.float64], t: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return where rays of the camera begin through the plate at time ``t`` [s], and their directions there.
+
+        Places [m] and directions have the shape (n, 3).
+        """
+        motion = self._simulation.prism_motion
+        azimuth = motion.phase + float(motion.angle([t * 1e6])[0])
+        return self._sight.through_plate(rays, azimuth)
+
+    def _plate_pixels(
+        self, model: PlateModel, rays: NDArray[np.float64], depth: NDArray[np.float64], later: float
+    ) -> NDArray[np.float64]:
+        """Return the pixels that see points through the plate at time ``later`` [s], shape (n, 2).
+
+        ``rays``, ``depth``: directions and depths [m] of the points from the camera at this time.
+        """
+        (angle,) = self._simulation.prism_motion.angle([later * 1e6])
+        theta = np.full(len(rays), float(angle))
+        without_plate = self._simulation.camera.rays_to_pixels(rays)
+        inverse_depth = 1.0 / depth
+        observed = self._pixels
+        for _ in range(DEFLECTING_STEPS):
+            compensated = model.compensate_at(observed, theta, inverse_depth)
+            observed = observed - (compensated - without_plate)
+        return observed
+
+    def _plate_flow(
+        self, model: PlateModel, seen: SurfaceView, places: NDArray[np.float64], t: float
+    ) -> NDArray[np.float64]:
+        """Return the optical flow [px/s] that the pixels see through the turning plate at time ``t`` [s], (n, 2).
+
+        ``seen``, ``places``: from :meth:`_through_plate`.
+        """
+
+        def pixels_at(later: float) -> NDArray[np.float64]:
+            rays, depth = self._ray_at(seen, places, t, later)
+            return self._plate_pixels(model, rays, depth, later)
+
+        return rate_of_change(pixels_at, t, self._simulation.duration_s)
+
+    def _intensity(self, t_us: int, *, prism: bool) -> NDArray[np.float32]:
+        """Return the luminance of all pixels at a time, through the prism or without the prism, shape (n,)."""
+        device = self._world.device
+        simulation = self._simulation if prism else self._simulation.at_rest
+        sight = self._sight if prism else self._sight_at_rest
+        # Both may be the same, so that the plate is put in or taken out each time.
+        sight.set_plate(self._simulation.plate if prism else None)
+        instant = np.array([float(t_us)])
+        sight.set_instants(instant, prism_view_of(simulation, device))
+        first, second = true_angles(simulation.prism_motion, instant)
+        table: NDArray[Any] = np.zeros(1, cast("Any", prism_view.Step).numpy_dtype())
+        table["azimuth"] = azimuths_of(first)
+        table["second"] = second_bends(simulation, instant, second)
+        steps = prism_view.Steps()
+        steps.at = wp.array(table, dtype=prism_view.Step, device=device)
+        return np.array(sight.light(steps, 0, 1).numpy()[0])

@@ -1,0 +1,329 @@
+"""Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh. Colours become luminance.
+
+A file of a few bytes may declare a mesh of many gigabytes, so trimesh runs in the reading process, which has limits
+of memory and processor time (:mod:`amiwarp.io.reading_process`).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import urllib.parse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.io.inputs import errors_name, note_input, open_input
+from amiwarp.io.reading_process import Allowance, borrow, give_back
+from amiwarp.simulation.picture_light import (
+    BAND,
+    LUMINANCE,
+    MOST_PIXELS,
+    PICTURE_FORMATS,
+    srgb_to_linear,
+)
+from amiwarp.simulation.worlds.bodies import Material, Mesh
+from amiwarp.validation import one_of, real
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+FORMATS = ("glb", "gltf", "obj", "ply", "stl")
+"""Supported suffixes of mesh files."""
+Y_UP = ("glb", "gltf")
+"""Suffixes of the formats in which, by specification, the y axis points up and colours are linear."""
+PICTURES = (
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".bmp",
+    ".tif",
+    ".tiff",
+    ".webp",
+    ".ppm",
+    ".gif",
+    ".tga",
+    ".dds",
+    ".ktx2",
+    ".exr",
+)
+"""Suffixes of picture files that a mesh file may use as textures."""
+TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Rotation matrix from a frame in which y points up to a frame in which z points up."""
+DEFAULT_REFLECTANCE = 0.5
+"""Reflectance of meshes whose file gives neither colours nor a material."""
+
+Arrays = tuple[NDArray[Any] | None, ...]
+"""Vertices, faces, texture coordinates, light and texture of a part; None for an array that it has not."""
+
+
+class LoadedMesh(NamedTuple):
+    """One mesh of a mesh file, with its material."""
+
+    mesh: Mesh
+    """Triangles in the frame of the file, turned so that z points up [m]."""
+    material: Material
+    """Reflectance and texture that the file gives the mesh."""
+    name: str
+    """Name of the mesh's node in the file."""
+
+
+def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) -> list[LoadedMesh]:
+    """Read the meshes of a glTF, GLB, OBJ, PLY or STL file.
+
+    Needs trimesh: ``pip install "amiwarp[worlds]"``.
+
+    Parameters
+    ----------
+    path : str or Path
+        Mesh file. Files that an OBJ or glTF file refers to (materials, textures, buffers) are read as well.
+    up : str, optional
+        Axis of the file that points up, ``"y"`` or ``"z"``. None means y in glTF and GLB files, and z in other files.
+    scale : float
+        Length of the file's unit [m].
+
+    Returns
+    -------
+    list of LoadedMesh
+        Mesh, material and name of each part. The meshes are in the frame of the file, with z up.
+
+    Raises
+    ------
+    AmiwarpError
+        If the file does not exist, has an unknown format or no faces, or refers to a file that is missing.
+    """
+    path = Path(path)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise AmiwarpError(
+            f"{path}: has an unknown mesh format {path.suffix!r}; give one of {', '.join(FORMATS)}",
+            ErrorCode.FORMAT_UNKNOWN,
+        )
+    default_up = "y" if kind in Y_UP else "z"
+    up = one_of(up or default_up, ("y", "z"), "axis that points up")
+    rotation = TO_Z_UP if up == "y" else np.eye(3)
+    turn = real(scale, "mesh scale", 1e-9, 1e9) * rotation
+    _check_trimesh(path)
+    with errors_name(path, lambda: "cannot be read as a mesh"):
+        found, arrays = _called(path, kind, turn)
+        parts = [_received(about, arrays) for about in found["parts"]]
+    if not parts:
+        raise AmiwarpError(
+            f"{path}: holds no faces; give a file with triangles, not points or lines alone"
+        )
+    return parts
+
+
+def mesh_files(path: Path) -> list[Path]:
+    """Return the files that a mesh file refers to; none for a file that cannot be read as a mesh."""
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        return []
+    _check_trimesh(path)
+    try:
+        with errors_name(path, lambda: "cannot be read as a mesh"):
+            found, _ = _called(path, kind, np.eye(3))
+    except AmiwarpError:
+        return []
+    return [Path(file) for file in found["files"]]
+
+
+def _check_trimesh(path: Path) -> None:
+    """Raise :class:`AmiwarpError` if trimesh is not installed."""
+    if importlib.util.find_spec("trimesh") is None:
+        raise AmiwarpError(
+            f"{path}: mesh files need trimesh; run: pip install 'amiwarp[worlds]'",
+            ErrorCode.PACKAGE_MISSING,
+        )
+
+
+def _called(
+    path: Path, kind: str, turn: NDArray[np.float64]
+) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Return what :func:`read_parts` returns, and register the files as inputs."""
+    # a glTF file has its arrays in files next to it
+    allowance = Allowance(path, path.parent) if kind == "gltf" else Allowance(path)
+    process = borrow()
+    try:
+        found, arrays = process.call(
+            f"{__name__}:read_parts", path, kind, turn.tolist(), allowance=allowance
+        )
+    finally:
+        give_back(process)
+    for file in found["files"]:
+        note_input(Path(file))
+    return found, arrays
+
+
+def _received(about: dict[str, Any], arrays: list[NDArray[Any]]) -> LoadedMesh:
+    """Return a part that :func:`read_parts` described, and remove its arrays from the front of the list."""
+    values: list[Any] = [
+        None if shape is None else arrays.pop(0).reshape(shape) for shape in about["shapes"]
+    ]
+    vertices, faces, uv, light, texture = values
+    mesh = Mesh(vertices, faces, uv, light)
+    material = Material(about["reflectance"], texture)
+    return LoadedMesh(mesh, material, about["name"])
+
+
+def read_parts(
+    path: str, kind: str, turn: list[list[float]]
+) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Read the parts of a mesh file, in the reading process.
+
+    ``kind``: suffix of the file; ``turn``: matrix (3, 3) by which vertices are multiplied. The first value holds the
+    files that the mesh file refers to, and of each part the name, the reflectance and the shapes of its arrays:
+    vertices, faces, texture coordinates, light and texture. A shape is None if the part has no such array.
+    """
+    scene, files = _open(Path(path), kind)
+    parts: list[dict[str, Any]] = []
+    arrays: list[NDArray[Any]] = []
+    for node in sorted(scene.graph.nodes_geometry):
+        placed, geometry = scene.graph[node]
+        part = scene.geometry[geometry]
+        if len(getattr(part, "faces", ())):
+            matrix = np.array(turn) @ placed[:3]
+            values, reflectance = _part(part, matrix[:, :3], matrix[:, 3], kind)
+            shapes = [None if value is None else value.shape for value in values]
+            parts.append({"name": str(node), "reflectance": reflectance, "shapes": shapes})
+            arrays += [value.ravel() for value in values if value is not None]
+    return {"files": files, "parts": parts}, arrays
+
+
+def _open(path: Path, kind: str) -> tuple[Any, list[str]]:
+    """Return the file as a trimesh scene, and the files that it refers to."""
+    import trimesh
+
+    files = _named_files(path)
+    with open_input(path) as file:
+        try:
+            scene = trimesh.load(file, file_type=kind, resolver=files, force="scene", process=False)
+        except Exception:
+            if files.missing is None:
+                raise
+        if files.missing is not None:
+            raise AmiwarpError(
+                f"refers to the file {files.missing}; put a valid file next to the mesh file"
+            )
+    return scene, files.read
+
+
+def _named_files(path: Path) -> Any:
+    """Return a resolver of referenced files that records the first failure, because trimesh ignores failures."""
+    from trimesh.resolvers import FilePathResolver
+
+    class NamedFiles(FilePathResolver):
+        """Resolver of the files that a mesh file refers to."""
+
+        missing: str | None = None
+        """First file that cannot be read, with the reason, for a message."""
+
+        def __init__(self) -> None:
+            super().__init__(str(path))
+            self.read: list[str] = []
+
+        def get(self, name: str) -> bytes:
+            """Return the content of a file; its name is relative to the folder of the mesh file."""
+            file = path.parent / name.replace("\\", "/")
+            if not file.exists():
+                file = path.parent / urllib.parse.unquote(name)
+            try:
+                with open_input(file) as opened:
+                    data = opened.read()
+                if file.suffix.lower() in PICTURES:
+                    _check_picture(data)
+            except Exception as error:
+                if self.missing is None:
+                    missing = isinstance(error, AmiwarpError)
+                    what = "is missing" if missing else f"cannot be read ({error})"
+                    self.missing = f"{name!r}, which {what}"
+                raise
+            self.read.append(str(file))
+            return data
+
+    return NamedFiles()
+
+
+def _check_picture(data: bytes) -> None:
+    """Raise an exception if the bytes are no picture in a supported format."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data), formats=PICTURE_FORMATS) as image:
+        image.verify()
+
+
+def _part(
+    part: Trimesh, matrix: NDArray[Any], offset: NDArray[Any], kind: str
+) -> tuple[Arrays, float]:
+    """Return the arrays and the reflectance of one geometry of the file.
+
+    ``matrix`` and ``offset``: transformation from the geometry to the world; ``kind``: suffix of the file.
+    """
+    vertices = np.asarray(part.vertices, np.float64) @ matrix.T + offset
+    faces = np.asarray(part.faces)
+    visual: Any = part.visual
+    if visual.kind == "texture":
+        return _textured(visual, vertices, faces, kind)
+    if visual.kind == "face":
+        # Faces of different colours cannot share vertices: each face gets its own three.
+        light = np.repeat(_reflectance(visual.face_colors, kind), 3)
+        own_vertices = vertices[faces.ravel()]
+        own_faces = np.arange(faces.size).reshape(-1, 3)
+        return (own_vertices, own_faces, None, light, None), 1.0
+    if visual.kind == "vertex":
+        return (vertices, faces, None, _reflectance(visual.vertex_colors, kind), None), 1.0
+    return (vertices, faces, None, None, None), DEFAULT_REFLECTANCE
+
+
+def _textured(
+    visual: Any, vertices: NDArray[Any], faces: NDArray[Any], kind: str
+) -> tuple[Arrays, float]:
+    """Return arrays and reflectance of a geometry whose file gives a material, with or without a texture."""
+    material = visual.material
+    pbr = hasattr(material, "baseColorFactor")
+    picture = material.baseColorTexture if pbr else material.image
+    colour = material.baseColorFactor if pbr else material.diffuse
+    factor = 1.0 if pbr and colour is None else float(_reflectance(np.atleast_2d(colour), kind)[0])
+    shade = visual.vertex_attributes.get("color")
+    light = None if shade is None else _reflectance(shade, kind)
+    if picture is None or visual.uv is None:
+        return (vertices, faces, None, light, None), factor
+    if not pbr:
+        factor = 1.0  # in OBJ files, a texture replaces the diffuse colour
+    return (vertices, faces, np.asarray(visual.uv)[:, :2], light, _luminance(picture)), factor
+
+
+def _luminance(picture: Any) -> NDArray[np.float32]:
+    """Return the linear luminance of a Pillow picture. A single row or column is duplicated."""
+    if picture.width * picture.height > MOST_PIXELS:
+        raise AmiwarpError(
+            f"a texture has {picture.width}x{picture.height} pixels, more than {MOST_PIXELS}; give a smaller picture"
+        )
+    table = srgb_to_linear(np.arange(256, dtype=np.float32) / 255)
+    light = np.empty((picture.height, picture.width), np.float32)
+    rows = max(1, BAND // (3 * picture.width))
+    # In bands, because a large picture as a whole would need four times its memory
+    for top in range(0, picture.height, rows):
+        bottom = min(top + rows, picture.height)
+        band = picture.crop((0, top, picture.width, bottom)).convert("RGB")
+        light[top:bottom] = table[np.asarray(band)] @ np.array(LUMINANCE, np.float32)
+    if light.shape[0] < 2:
+        light = np.repeat(light, 2, axis=0)
+    if light.shape[1] < 2:
+        light = np.repeat(light, 2, axis=1)
+    return light
+
+
+def _reflectance(colours: Any, kind: str) -> NDArray[np.float64]:
+    """Return the luminance of colours (integers, or floats from 0 to 1), shape (n,).
+
+    Colours are linear in glTF and GLB files, and sRGB in other files.
+    """
+    given = np.asarray(colours)
+    white = np.iinfo(given.dtype).max if given.dtype.kind in "iu" else 1.0
+    values = given[:, :3].astype(np.float64) / white
+    linear = values if kind in Y_UP else srgb_to_linear(values)
+    return np.asarray(np.clip(linear @ np.array(LUMINANCE), 0.0, 1.0), np.float64)

@@ -1,0 +1,49 @@
+"""Worlds and camera trajectories by name: built-in worlds, or files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.simulation.worlds.named.catalogue import named_world
+from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.simulation.worlds.world import World
+from amiwarp.simulation.worlds.world_files import load_world
+
+if TYPE_CHECKING:
+    pass
+
+WORLD_FILES = (".toml", ".json")
+"""File suffixes of world files."""
+POSE_FILES = (".txt", ".csv", ".tum")
+"""File suffixes of files with poses."""
+
+
+def open_world(
+    name: str, trajectory: str | None, *, seed: int, duration_s: float
+) -> tuple[World, Trajectory]:
+    """Return a world and the camera's trajectory through it.
+
+    ``name`` is the name of a built-in world or of a world file. ``trajectory`` is a kind of motion of the built-in
+    worlds, or a file of poses; None is handheld motion, or the trajectory of the world file. Raises
+    :class:`AmiwarpError` if one of them does not exist or they do not belong together.
+    """
+    is_file = trajectory is not None and trajectory.lower().endswith(POSE_FILES)
+    poses = Trajectory.from_file(str(trajectory)) if is_file else None
+    if not name.lower().endswith(WORLD_FILES):
+        kind = "still" if poses is not None else trajectory or "handheld"
+        world, own = named_world(name, kind, seed=seed, duration_s=duration_s)
+        return world, poses or own
+    world, stored = load_world(Path(name))
+    if trajectory is not None and poses is None:
+        raise AmiwarpError(
+            f"trajectory {trajectory} applies only to named worlds; give a file of poses for {name}"
+        )
+    chosen = poses or stored
+    if chosen is None:
+        raise AmiwarpError(
+            f"{name}: has no camera trajectory; give a file of poses (.txt, .csv) as trajectory",
+            ErrorCode.CONTENT_MISSING,
+        )
+    return world, chosen

@@ -1,0 +1,456 @@
+"""Troubles of encoders that calibration corrects: lost counts, and pulses that leave the angle between them open."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Encoder,
+    EncoderModel,
+    Events,
+    MemoryEvents,
+    Prism,
+    PrismMotion,
+    Settings,
+    calibrate,
+)
+from amiwarp.calib import checks, encoder_attempts
+from amiwarp.calib.calibrator import Calibrator
+from amiwarp.calib.lost_counts import Step, changes_of_mean, lost_counts, without_steps
+from amiwarp.calib.photometric import limits
+from amiwarp.calib.photometric.losses import step_if_missing
+from amiwarp.calib.prism_path import PathFit
+from amiwarp.calib.pulses import confirm, pulses_only, smooth_path
+from amiwarp.calib.repeated_turns import steps_in_events
+from amiwarp.calib.start_burst import burst_size, without_start_burst
+from amiwarp.viewer import Inspector
+from benchmarks import encoder_troubles
+from benchmarks.encoder_troubles import (
+    Trouble,
+    compensation_error,
+    hunting,
+    losing,
+    recorded,
+    steady,
+    turns_of,
+)
+from tests.conftest import COARSE
+
+SIZE = (160, 120)
+LOST_AT = 337_300
+"""Time at which the encoder loses counts [us]."""
+STEP = math.radians(100 * 360 / 4096)
+
+
+@pytest.fixture(scope="module")
+def still() -> Trouble:
+    """Eight turns of a steady prism with a good encoder."""
+    return recorded(SIZE, steady(), seconds=0.68)
+
+
+def found_in(trouble: Trouble) -> Calibration:
+    return calibrate(trouble.recording, model="exact", photometric=COARSE)
+
+
+def samples(
+    motion: PrismMotion, counts: int, *, index: bool, within_us: int = 0, **model: Any
+) -> Encoder:
+    """Return an encoder without events that loses counts at 0.337 s."""
+    encoder = replace(EncoderModel(counts_per_turn=4096), **model).sample(motion, 1_000_000, 1)
+    lost = np.clip((encoder.t - LOST_AT) / max(within_us, 1), 0.0, 1.0)
+    given = Encoder(encoder.t, encoder.angle - np.rint(counts * lost) * (math.tau / 4096))
+    return (
+        given.with_index(turns_of(motion, int(encoder.t[0]), int(encoder.t[-1])))
+        if index
+        else given
+    )
+
+
+@pytest.mark.parametrize(
+    "motion", [steady(), hunting(0.3, 0.7), PrismMotion(-720.0)], ids=["steady", "slow", "back"]
+)
+@pytest.mark.parametrize("index", [True, False])
+@pytest.mark.parametrize("counts", [10, 100, -500])
+def test_samples_show_when_counts_were_lost(motion: PrismMotion, index: bool, counts: int) -> None:
+    [step] = lost_counts(samples(motion, counts, index=index))
+    assert step.angle == pytest.approx(-counts * math.tau / 4096, abs=math.radians(0.15))
+    assert step.first_us <= LOST_AT <= step.last_us
+    assert step.last_us - step.first_us < 1100
+
+
+@pytest.mark.parametrize("index", [True, False])
+@pytest.mark.parametrize(
+    "model",
+    [
+        {},
+        {"jitter_us": 50.0},
+        {"dropouts_hz": 10.0},
+        {"harmonics": (0.05, 0.02, 0.01, 0.0)},
+        {"rate_hz": 1e4},
+    ],
+    ids=["plain", "late", "gaps", "eccentric", "fast"],
+)
+def test_a_right_encoder_has_no_step(index: bool, model: dict[str, Any]) -> None:
+    for motion in (steady(), hunting(0.3, 0.7), hunting(0.1, 60.0)):
+        assert lost_counts(samples(motion, 0, index=index, **model)) == ()
+
+
+def test_an_index_shows_counts_that_were_lost_gradually() -> None:
+    [step] = lost_counts(samples(steady(), 100, index=True, within_us=40_000))
+    assert step.angle == pytest.approx(-STEP, abs=1e-3)
+    assert step.first_us <= LOST_AT
+    assert step.last_us >= LOST_AT + 40_000
+    assert step.last_us - step.first_us < 84_000
+
+
+def test_two_losses_are_two_steps() -> None:
+    once = samples(steady(), 100, index=True)
+    twice = replace(once, angle=once.angle + 0.1 * (once.t > 700_000))
+    first, second = lost_counts(twice)
+    assert (first.angle, second.angle) == pytest.approx((-STEP, 0.1), abs=1e-3)
+    mended = without_steps(twice, (first, second))
+    assert float(np.abs(mended.slip()).max()) < 3e-3
+
+
+def test_a_drift_is_no_step() -> None:
+    assert changes_of_mean(np.linspace(0.0, 1.0, 40)) == []
+    noise = np.random.default_rng(0).normal(0.0, 0.001, 40)
+    assert changes_of_mean(np.where(np.arange(40) < 17, 0.0, 0.3) + noise) == [
+        (17, pytest.approx(0.3, abs=0.002))
+    ]
+
+
+def test_events_show_counts_that_were_lost_backwards() -> None:
+    slipped = losing(
+        recorded(SIZE, PrismMotion(-720.0, 1.0), seconds=0.68), 100, LOST_AT, index=False
+    ).recording
+    assert slipped.encoder is not None
+    [step] = steps_in_events(slipped, slipped.encoder)
+    assert step.angle == pytest.approx(-STEP, abs=math.radians(0.5))
+    assert step.first_us <= LOST_AT <= step.last_us
+
+
+def test_events_show_counts_that_were_lost(still: Trouble) -> None:
+    encoder = still.recording.encoder
+    assert encoder is not None
+    assert steps_in_events(still.recording, encoder) == ()
+    for within_us in (0, 40_000):
+        slipped = losing(still, 100, LOST_AT, index=False, within_us=within_us).recording
+        assert slipped.encoder is not None
+        [step] = steps_in_events(slipped, slipped.encoder)
+        assert step.angle == pytest.approx(-STEP, abs=math.radians(0.5))
+        assert step.first_us <= LOST_AT + within_us
+        assert step.last_us >= LOST_AT
+
+
+def test_steps_come_on_the_encoder_s_clock(still: Trouble) -> None:
+    slipped = losing(still, 100, LOST_AT, index=False).recording
+    assert slipped.encoder is not None
+    late = replace(slipped.encoder, t=slipped.encoder.t + 500_000, clock_offset_us=500_000.0)
+    [step] = steps_in_events(slipped, late)
+    assert step.first_us - 500_000 <= LOST_AT <= step.last_us - 500_000
+    assert "at 0.337 s" in Step(337_000, 338_000, STEP).in_words(0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", [True, False])
+def test_lost_counts_are_put_back(still: Trouble, index: bool, tmp_path: Path) -> None:
+    trouble = losing(still, 100, LOST_AT, index=index)
+    found = found_in(trouble)
+    assert compensation_error(trouble, found)[0] < 0.015  # px; 0.13 without the correction
+    shown = "its index pulses" if index else "the events"
+    assert "the encoder's angle steps by -8." in found.warnings[-1]
+    assert f"at 0.337 s, as {shown} show" in found.warnings[-1]
+    found.save(tmp_path / "c.json")
+    again = Calibration.load(tmp_path / "c.json")
+    encoder, events = trouble.recording.encoder, trouble.recording.events
+    assert encoder is not None
+    ends = events.t_first, events.t_last
+    mended = again.encoder_for(encoder, *ends)
+    assert found.path is not None
+    np.testing.assert_array_equal(mended.angle, found.path.angle)
+    inspector = Inspector(trouble.recording, again)
+    np.testing.assert_array_equal(inspector.encoder.angle, found.path.angle)
+    # the encoder of another recording keeps its angles
+    other = replace(encoder, t=encoder.t + 1)
+    np.testing.assert_array_equal(again.encoder_for(other, *ends).angle, other.angle)
+    # of a part of the same recording they are replaced
+    part = Encoder(encoder.t[100:500], encoder.angle[100:500])
+    np.testing.assert_array_equal(again.encoder_for(part, *part.coverage).angle, found.path.angle)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", [True, False])
+def test_counts_that_were_lost_gradually_are_put_back(still: Trouble, index: bool) -> None:
+    trouble = losing(still, 100, LOST_AT, index=index, within_us=40_000)
+    found = found_in(trouble)
+    assert compensation_error(trouble, found)[0] < 0.03
+    assert "the encoder's angle steps by" in found.warnings[-1]
+
+
+def test_a_right_encoder_is_left_alone(still: Trouble) -> None:
+    found = found_in(still)
+    assert found.path is None
+    assert found.warnings == ()
+
+
+def test_pulses_have_a_smooth_path() -> None:
+    motion = hunting(0.05, 3.0)
+    t = turns_of(motion, -200_000, 1_200_000)
+    pulses = Encoder(t, np.rint(motion.angle(t) / math.tau) * math.tau, 25.0)
+    assert pulses_only(pulses)
+    assert not pulses_only(samples(motion, 0, index=True))
+    path = smooth_path(pulses)
+    assert path.clock_offset_us == 25.0
+    inside = (path.t > 0) & (path.t < 1_000_000)
+    away = (path.angle - motion.angle(path.t))[inside]
+    assert float(np.std(away)) < 0.01  # rad; linear between the pulses it is 0.027
+    assert set(t.tolist()) <= set(path.t.tolist())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("motion", "jitter_us"),
+    [(steady, 500.0), (lambda: hunting(0.06, 17.0), 0.0), (lambda: hunting(0.05, 3.0), 0.0)],
+    ids=["jitter", "17 Hz", "3 Hz"],
+)
+def test_the_angle_between_pulses_is_found(
+    motion: Callable[[], PrismMotion], jitter_us: float
+) -> None:
+    trouble = encoder_troubles.pulses_only(recorded(SIZE, motion()), jitter_us)
+    found = found_in(trouble)
+    assert compensation_error(trouble, found)[0] < 0.02
+    assert "the encoder gives pulses only" in found.warnings[-1]
+
+
+def test_even_pulses_keep_their_angles() -> None:
+    trouble = encoder_troubles.pulses_only(recorded(SIZE, steady(), seconds=0.4))
+    found = found_in(trouble)
+    assert found.path is None
+    assert found.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("tick_us", "stamps", "before_us"),
+    [(1, 1, 0), (1, 20, 0), (1, 20, 100_000), (1000, 1, 0), (1000, 1, 100_000)],
+    ids=["one stamp", "several", "long before", "coarse clock", "coarse, before"],
+)
+def test_a_burst_is_set_aside_whatever_the_clock(
+    still: Trouble, tick_us: int, stamps: int, before_us: int
+) -> None:
+    source = still.recording.events
+    given = source.slice(0, len(source))
+    ticks = MemoryEvents(Events(given.x, given.y, given.t // tick_us * tick_us, given.p), *SIZE)
+    plain = replace(still, recording=replace(still.recording, events=ticks))
+    assert without_start_burst(plain.recording)[1] == ()
+    started = encoder_troubles.with_burst(plain, 6139, stamps, before_us).recording
+    used, (said,) = without_start_burst(started)
+    gone = len(started.events) - len(used.events)
+    assert 6139 <= gone < 6139 + 1500  # those of two milliseconds at most
+    assert f"{gone:,} events c" in said
+    assert used.events.t_first > started.events.t_first + stamps - 2
+
+
+def test_a_path_that_is_no_number_is_refused(
+    still: Trouble, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = object.__new__(PathFit)
+    fit._recording, fit._cost, fit._px = (
+        still.recording,
+        SimpleNamespace(set_scale=lambda scale: None),
+        10.0,
+    )
+    monkeypatch.setattr(PathFit, "_step", lambda _: (np.array([math.nan]), 0.0, 0.0))
+    with pytest.raises(AmiwarpError, match="do not determine the path of the prism's angle"):
+        fit._improve(0)
+
+
+def test_prisms_look_swapped_only_if_they_fit_the_other_way_round() -> None:
+    pair = Prism(0.02, second=Prism(0.016))
+    swapped = {"apex": 0.0161, "second_apex": 0.0199}
+    assert checks.look_swapped(swapped, pair)
+    assert checks.pair_is_far(swapped, pair)
+    for right in (
+        {"apex": 0.0199, "second_apex": 0.0161},
+        {"apex": 0.015, "second_apex": 0.015},
+        {"apex": 0.016},
+    ):
+        assert not checks.look_swapped(right, pair)
+    alike = Prism(0.02, second=Prism(0.018))
+    assert checks.look_swapped({"apex": 0.018, "second_apex": 0.02}, alike)
+    assert not checks.pair_is_far({"apex": 0.018, "second_apex": 0.02}, alike)
+    assert not checks.look_swapped({"apex": 0.019, "second_apex": 0.019}, alike)
+
+
+@pytest.mark.slow
+def test_swapped_encoders_of_a_pair_are_named() -> None:
+    swapped = encoder_troubles.pair(SIZE, swapped=True).recording
+    said = (
+        "the encoders of the two prisms seem to be swapped: as given, "
+        "the prisms have 80 and 12[56] % of their nominal"
+    )
+    with pytest.raises(AmiwarpError, match=said):
+        calibrate(swapped, photometric=COARSE)
+    assert not any(
+        "swapped" in w
+        for w in calibrate(encoder_troubles.pair(SIZE, swapped=False).recording).warnings
+    )
+
+
+def test_noise_is_not_taken_for_missing_events() -> None:
+    rng = np.random.default_rng(0)
+    right = rng.normal(0.05, 0.05, 1000)
+    noise = rng.uniform(0.5, 1.5, 800)
+    lost = rng.normal(-0.9, 0.1, 100)
+    assert step_if_missing(np.concatenate([right, noise])) == 0.0
+    assert step_if_missing(np.concatenate([right + 0.2, lost])) > limits.NOTABLE_STEP
+    assert step_if_missing(np.zeros(0)) == 0.0
+
+
+@pytest.mark.slow
+def test_a_noisy_recording_of_gravel_is_answered() -> None:
+    trouble = encoder_troubles.noisy(0.35, (120, 90), apex_deg=2.0, gravel=True, seconds=0.4)
+    found = found_in(trouble)
+    assert compensation_error(trouble, found)[0] < 0.02
+    assert not any("missing" in w for w in found.warnings)
+
+
+@pytest.mark.slow
+def test_half_of_the_events_of_gravel_are_missed() -> None:
+    trouble = recorded((120, 90), steady(), apex_deg=2.0, gravel=True, seconds=0.4)
+    events = trouble.recording.events[:]
+    kept = np.random.default_rng(0).uniform(size=len(events)) >= 0.5
+    lossy = replace(trouble.recording, events=MemoryEvents(events[kept], 120, 90), truth=None)
+    found = calibrate(lossy, model="exact", photometric=COARSE)
+    assert any("a fifth or more of the events are missing" in w for w in found.warnings)
+
+
+def counted(numbers: list[int], window_us: int = 2000) -> MemoryEvents:
+    """Return events of which each window of time has a number."""
+    t = np.concatenate(
+        [k * window_us + np.arange(n) * window_us // n for k, n in enumerate(numbers)]
+    )
+    x = np.arange(len(t)) % SIZE[0]
+    return MemoryEvents(Events.from_arrays(x, 0 * x, t, 0 * x), *SIZE)
+
+
+@pytest.mark.parametrize(("next_one", "is_burst"), [(1900, True), (3000, True), (4700, False)])
+def test_events_that_grow_fewer_slowly_are_no_burst(next_one: int, is_burst: bool) -> None:
+    """A third of what the first window has beyond the usual number is left in the second one."""
+    numbers = [10_000, next_one, *[1900] * 60]
+    assert burst_size(counted(numbers)) == (10_000 if is_burst else 0)
+
+
+@pytest.mark.slow
+def test_a_focal_length_that_drifts_is_no_turning_camera() -> None:
+    trouble = recorded(SIZE, steady(), seconds=0.6, growth=0.06)
+    found = found_in(trouble)
+    assert compensation_error(trouble, found)[0] < 0.02
+    assert not any("camera turned" in w for w in found.warnings)
+    [said] = [w for w in found.warnings if "the image grew by" in w]
+    assert float(said.split()[4]) == pytest.approx(6.0, abs=0.5)
+    assert "growth" not in found.parameters
+
+
+@pytest.mark.parametrize(("ratio", "said"), [(0.85, True), (0.97, False)])
+def test_a_path_between_pulses_that_explains_little_is_said(
+    still: Trouble, monkeypatch: pytest.MonkeyPatch, ratio: float, said: bool
+) -> None:
+    """Neither is it taken, unless the pulses confirm it."""
+    pulses = Encoder(np.arange(5) * 40_000, np.arange(5) * math.tau)
+    recording = replace(still.recording, encoder=pulses)
+    calibrator = Calibrator(recording, Settings(model="exact"), "cpu", None)
+    sized = SimpleNamespace(space=SimpleNamespace(sized=True))
+    tried: Any = SimpleNamespace(search=sized, cost=0.25)
+    again = SimpleNamespace(
+        accepted=True,
+        cost=ratio * 0.25,
+        unexplained=True,
+        camera_turned=False,
+        calibration=SimpleNamespace(),
+    )
+    other = SimpleNamespace(attempt=lambda: again)
+    monkeypatch.setattr(encoder_attempts, "confirmed_by", lambda *_: False)
+    monkeypatch.setattr(encoder_attempts, "between_pulses", lambda *_: other)
+    found, kept = encoder_attempts.with_mended_encoder(calibrator, tried)
+    assert kept is tried
+    assert found.mended is None
+    assert ("gives pulses only" in found.mended_words) == said
+    monkeypatch.setattr(
+        encoder_attempts, "confirmed_by", lambda by, given: by is other and given is pulses
+    )
+    found, kept = encoder_attempts.with_mended_encoder(calibrator, tried)
+    assert (found is other, kept is again) == (said, said)
+    again.camera_turned = True
+    assert encoder_attempts.with_mended_encoder(calibrator, tried)[1] is tried
+
+
+def test_a_path_that_is_not_determined_between_pulses_is_said(
+    still: Trouble, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pulses = Encoder(np.arange(5) * 40_000, np.arange(5) * math.tau)
+    calibrator = Calibrator(
+        replace(still.recording, encoder=pulses), Settings(model="exact"), "cpu", None
+    )
+    tried: Any = SimpleNamespace(search=SimpleNamespace(space=SimpleNamespace(sized=True)))
+
+    def undetermined(*_: Any) -> None:
+        raise AmiwarpError("undetermined")
+
+    monkeypatch.setattr(encoder_attempts, "between_pulses", undetermined)
+    found, kept = encoder_attempts.with_mended_encoder(calibrator, tried)
+    assert kept is tried
+    assert "gives pulses only" in found.mended_words
+
+
+@pytest.mark.parametrize("further_cost", [0.05, 0.2])
+def test_what_a_correction_of_the_angles_leaves_is_corrected_too(
+    still: Trouble, monkeypatch: pytest.MonkeyPatch, further_cost: float
+) -> None:
+    """A large error of one angle of two hides that of the other. A further correction must lower the cost."""
+    first, left = (0.02, 0.0, 0.0, 0.0), (0.001, 0.01, 0.0, 0.005)
+    tried_with: list[Any] = []
+
+    def attempt(self: Calibrator, **_: bool) -> Any:
+        tried_with.append(self.harmonics)
+        is_right = len(tried_with) == 2 and further_cost < 0.1
+        of_stage = SimpleNamespace(harmonics=() if is_right else left, parameters={})
+        cost = 0.1 if len(tried_with) == 1 else further_cost
+        return SimpleNamespace(
+            accepted=is_right, cost=cost, photometric=of_stage, calibration=SimpleNamespace()
+        )
+
+    monkeypatch.setattr(Calibrator, "attempt", attempt)
+    monkeypatch.setattr(encoder_attempts, "with_warnings", lambda found, *_: found)
+    calibrator = Calibrator(still.recording, Settings(model="exact"), "cpu", None)
+    tried: Any = SimpleNamespace(
+        photometric=SimpleNamespace(harmonics=first, parameters={}), cost=0.25
+    )
+    found, _ = encoder_attempts.with_straight_angles(calibrator, tried)
+    both = (0.021, 0.01, 0.0, 0.005)
+    assert tried_with == [first, pytest.approx(both)]
+    assert found.harmonics == pytest.approx(both if further_cost < 0.1 else first)
+
+
+def test_pulses_confirm_a_path_that_bends_between_them() -> None:
+    t = np.arange(8) * 100_000
+    pulses = Encoder(t, np.arange(8) * math.tau)
+    times = np.arange(0, t[-1] + 1, 1000)
+    steady_angle = times * (math.tau / 100_000)
+    between = Encoder(times, steady_angle + 0.03 * np.sin(times * (math.tau / 100_000)))
+    beside = Encoder(times, steady_angle + 0.03 * np.sin(times * (1.3 * math.tau / 100_000)))
+    shifted = replace(between, angle=between.angle + 0.5)  # a phase is no distance
+    assert [confirm(pulses, path, 0, int(t[-1])) for path in (between, shifted, beside)] == [
+        True,
+        True,
+        False,
+    ]
+    assert not confirm(pulses, between, 0, 250_000)  # three pulses tell nothing

@@ -1,0 +1,1 @@
+"""Tests of the rig's printable parts, bill and wires, in ``rig/``."""
