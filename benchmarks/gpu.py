@@ -22,7 +22,7 @@ PICTURE = "china.jpg"
 TESTS = (
     "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "compensator",
     "simulate", "translate", "benchmarks", "worlds", "sensor", "reconstruct", "auto", "arrays", "dataset",
-    "event_sensor", "corners", "edge_directions", "page_locked", "tensors",
+    "event_sensor", "corners", "edge_directions", "page_locked", "tensors", "device_picture",
 )  # fmt: skip
 """Names of the test files that use a device and need neither the packages of the command line nor video."""
 PLUGIN = () if importlib.util.find_spec("hdf5plugin") else ("test_file_keeps",)
@@ -50,6 +50,7 @@ def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
         "two_gpus": [*module, "benchmarks.two_gpus", "--out", str(out / "two_gpus_cuda.json")],
         "corners": [*module, "benchmarks.corners", *device, "--out", str(out / "corners_cuda.json")],
         "tensors": [*module, "benchmarks.tensors", *device, "--out", str(out / "tensors_cuda.json")],
+        "phase": [*module, "benchmarks.phase_cuda", *device, "--out", str(out / "phase_cuda.json")],
         **{
             what: [*calibration, what, str(folder), "--out", str(out / f"calibration_{what}_cuda.json"), *device,
                    "--limit-s", str(limit)]

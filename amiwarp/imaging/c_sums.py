@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from amiwarp._version import __version__
 from amiwarp.events.recording import Events
-from amiwarp.imaging import phase
+from amiwarp.imaging import phase, phase_tables
 from amiwarp.imaging.uploaded_events import TURNS, upload_events
 from amiwarp.io.output_formats import make_folder
 from amiwarp.io.outputs import NewFile
@@ -53,7 +53,7 @@ class CSums:
         whole(self.bins, "bins", 3, phase.MOST_BINS)
         most_harmonics = min(phase.MOST_HARMONICS, (self.bins - 1) // 2)
         whole(self.harmonics, "harmonics", 1, most_harmonics)
-        real(self.off_ratio, "off_ratio", phase.LEAST_RATIO, 1.0 / phase.LEAST_RATIO)
+        real(self.off_ratio, "off_ratio", phase_tables.LEAST_RATIO, 1.0 / phase_tables.LEAST_RATIO)
 
     @property
     def ram_bytes(self) -> int:
@@ -63,8 +63,8 @@ class CSums:
     @property
     def table(self) -> NDArray[np.int32]:
         """What events add to their pixels, and what they add beside extremes."""
-        table = phase.angle_table(self.bins, self.harmonics, self.off_ratio)
-        return np.concatenate([table, phase.extreme_table(table)])
+        table = phase_tables.angle_table(self.bins, self.harmonics, self.off_ratio)
+        return np.concatenate([table, phase_tables.extreme_table(table)])
 
     @property
     def rows(self) -> NDArray[np.signedinteger[Any]]:
@@ -109,7 +109,7 @@ def _values(settings: CSums, seed: int) -> dict[str, object]:
         "entry": f"{settings.rows.dtype}_t",
         "table": _braced(table, 4),
         "extremes": _braced(extremes, 4),
-        "extreme": phase.EXTREME,
+        "extreme": phase_tables.EXTREME,
         "events_count": len(events),
         "events": _braced(np.column_stack([events.x, events.y, turns, events.p]), 4),
         "pixels_count": len(x),

@@ -24,6 +24,16 @@ from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents, device_for
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
+from amiwarp.imaging.phase_device import DeviceSums
+from amiwarp.imaging.phase_tables import (
+    EXTREME,
+    LEAST_RATIO,
+    MOST_EVENTS,
+    angle_table,
+    extreme_table,
+    ratio_of_counts,
+    scales_of,
+)
 from amiwarp.imaging.uploaded_events import upload_events
 from amiwarp.kernels import phase as kernels
 from amiwarp.kernels.launch import launch
@@ -40,20 +50,12 @@ MOST_BINS = 1024
 MOST_HARMONICS = 64
 BLOCK_BYTES = 1 << 18
 """Size of the integers of a block of lines, which fit into a core's cache."""
-MOST_EVENTS = ((1 << 31) - 1) // (2 * kernels.UNIT)
-"""Largest number of events of one pixel, with OFF events in units of the ON threshold: more could overflow its sums, in
-which an event counts twice at most."""
-EXTREME = 0.4
-"""What an extreme of the brightness adds to the events before and after it [thresholds]. On average it lies half a
-threshold beyond them; a smooth extreme, in whose place a plateau between them is taken, adds a third."""
 RANDOM_CHANGE = 4.0 * EXTREME + 3.0 * EXTREME**2
 """What each change of polarity adds to the expected square of a sum of random events, relative to an event: half of
 these have another polarity than the event before, and half than the event after."""
 MOST_COUNT = (1 << 15) - 1
 """Largest number of events of a polarity that a microcontroller counts at a pixel: changes of polarity, up to twice as
 many, fit into 16 bits."""
-LEAST_RATIO = 0.1
-"""Smallest ratio of the OFF threshold to the ON threshold, and one over the largest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +141,7 @@ class PhaseSums:
         found = _checked_integers(integers, bins, off_ratio)
         off, on, changes = (np.ascontiguousarray(found[:, :, k]) for k in range(3))
         harmonics = (found.shape[2] - 3) // 2
-        scales = wp.array(_scales(harmonics, bins, turns, direction), dtype=float, device="cpu")
+        scales = wp.array(scales_of(harmonics, bins, turns, direction), dtype=float, device="cpu")
         values = np.empty((harmonics, *on.shape), np.complex64)
         sums = _shared(found[:, :, 3:].reshape(on.size, 2 * harmonics))
         outputs = [shared_pairs(values.reshape(harmonics, on.size))]
@@ -272,24 +274,47 @@ def phase_sums(
         turns = float(max(1, math.ceil(abs(swept) / math.tau - 1e-9)))
     turns = real(turns, "turns", 1e-3, 1e6)
     direction = whole(direction, "direction", -1, 1) or (1 if swept >= 0.0 else -1)
+    if off_ratio is not None:
+        off_ratio = real(off_ratio, "off_ratio", LEAST_RATIO, 1.0 / LEAST_RATIO)
+    if device.is_cuda:
+        there = DeviceSums(width, height, harmonics, bins, device, extremes=extremes)
+        there.sum(events, angles, turns=turns, direction=direction, off_ratio=off_ratio)
+        return copied_sums(there)
     if off_ratio is None:
         off_ratio = _ratio_of_counts(events)
-    off_ratio = real(off_ratio, "off_ratio", LEAST_RATIO, 1.0 / LEAST_RATIO)
 
     table = angle_table(bins, harmonics, off_ratio)
     further = extreme_table(table) if extremes else np.zeros_like(table)
     weights = _Weights(
         wp.array(np.concatenate([table, further]), dtype=int, device=device),
-        wp.array(_scales(harmonics, bins, turns, direction), dtype=float, device=device),
+        wp.array(scales_of(harmonics, bins, turns, direction), dtype=float, device=device),
     )
     uploaded = upload_events(events, angles, device)
-    order = _by_lines if device.is_cpu else _by_pixels
-    blocks = order(uploaded.arrays, len(events), width, height, weights)
+    blocks = _by_lines(uploaded.arrays, len(events), width, height, weights)
     counts, values = _summed(blocks, width * height, weights)
     off, on, changes = counts.reshape(3, height, width)
-    _check_room(on, off, off_ratio)
+    check_room(on, off, off_ratio)
     values = values.reshape(harmonics, height, width)
     return PhaseSums(values, on, off, turns, off_ratio, changes if extremes else None)
+
+
+def sum_turns(
+    there: DeviceSums, events: Events | DeviceEvents, encoder: Encoder, turns: float
+) -> None:
+    """Sum the events of whole turns on a device, as :func:`phase_sums` does, and with its checks."""
+    device_events.check_order(events)
+    device_events.check_inside(events, there.width, there.height)
+    direction = 1 if _swept(events, encoder) >= 0.0 else -1
+    there.sum(events, encoder, turns=turns, direction=direction)
+
+
+def copied_sums(sums: DeviceSums) -> PhaseSums:
+    """Return the sums that are on a device, copied. Raises :class:`AmiwarpError` as :func:`check_room`."""
+    off, on, changes = sums.counts.numpy()
+    off_ratio, _ = sums.notes()
+    check_room(on, off, off_ratio)
+    values = sums.values.numpy().view(np.complex64)[:, :, :, 0]
+    return PhaseSums(values, on, off, sums.turns, off_ratio, changes if sums.extremes else None)
 
 
 @dataclass(frozen=True)
@@ -351,44 +376,7 @@ def _ratio_of_counts(events: Events | DeviceEvents) -> float:
     """Return the number of ON events divided by the number of OFF events; 1 without either."""
     polarities = events.p.numpy() if isinstance(events, DeviceEvents) else events.p
     on = int(np.count_nonzero(polarities))
-    off = len(events) - on
-    if not on or not off:
-        return 1.0
-    return float(np.clip(on / off, LEAST_RATIO, 1.0 / LEAST_RATIO))
-
-
-def bin_attenuation(orders: NDArray[np.int64], bins: int) -> NDArray[np.float64]:
-    """Return by how much bins attenuate sums of some orders: an angle spreads evenly within its bin."""
-    return np.asarray(np.sinc(orders / bins))
-
-
-def _scales(harmonics: int, bins: int, turns: float, direction: int) -> NDArray[np.float64]:
-    """Return the factor of the integers of each harmonic."""
-    attenuation = bin_attenuation(np.arange(1, harmonics + 1), bins)
-    return direction / (math.tau * kernels.UNIT * turns * attenuation)
-
-
-def angle_table(bins: int, harmonics: int, off_ratio: float) -> NDArray[np.int32]:
-    """Return what an event of each polarity and bin adds to its pixel, shape (2 bins, 2 + 2 harmonics).
-
-    The first rows are for OFF events. The columns are the numbers of OFF and ON events, then cosine and sine of each
-    harmonic of the angle at the middle of the bin [1/UNIT], for OFF events times the negative ``off_ratio``.
-    """
-    middles = (np.arange(bins) + 0.5) * (math.tau / bins)
-    turned = np.outer(middles, np.arange(1, harmonics + 1))
-    pairs = np.stack([np.cos(turned), np.sin(turned)], axis=2).reshape(bins, 2 * harmonics)
-    counts = np.zeros((2 * bins, int(kernels.COUNTS)))
-    counts[:bins, 0] = 1.0
-    counts[bins:, 1] = 1.0
-    sums = kernels.UNIT * np.concatenate([-off_ratio * pairs, pairs])
-    return np.rint(np.hstack([counts, sums])).astype(np.int32)
-
-
-def extreme_table(table: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return what an event beside an extreme adds once more, shaped as the table that :func:`angle_table` gives."""
-    further = np.rint(EXTREME * table).astype(np.int32)
-    further[:, : int(kernels.COUNTS)] = 0
-    return further
+    return ratio_of_counts(on, len(events) - on)
 
 
 def _by_lines(arrays: Any, count: int, width: int, height: int, weights: _Weights) -> _Blocks:
@@ -415,22 +403,6 @@ def _by_lines(arrays: Any, count: int, width: int, height: int, weights: _Weight
     shares[0] = 0
     shares[-1] = blocks
     return _Blocks(_shared(words), _shared(starts), _shared(shares), lines * width)
-
-
-def _by_pixels(arrays: Any, count: int, width: int, height: int, weights: _Weights) -> _Blocks:
-    """Order events by pixels, each for one thread."""
-    device = weights.table.device
-    pixels = width * height
-    # The sort needs twice the room.
-    keys = wp.empty(2 * count, dtype=int, device=device)
-    words = wp.empty(2 * count, dtype=int, device=device)
-    launch(kernels.pixel_words, count, [arrays, width, weights.bins], [keys, words], device=device)
-    if count:
-        wp.utils.radix_sort_pairs(keys, words, count, end_bit=pixels.bit_length())
-    starts = wp.empty(pixels + 1, dtype=int, device=device)
-    launch(kernels.first_words, count + 1, [keys, count], [starts], device=device)
-    shares = wp.array(np.arange(pixels + 1, dtype=np.int32), device=device)
-    return _Blocks(words, starts, shares, 1)
 
 
 def _summed(
@@ -549,7 +521,7 @@ def shared_pairs(values: NDArray[np.complex64]) -> wp.array:
     return wp.array(pairs, dtype=wp.vec2, device="cpu", copy=False)
 
 
-def _check_room(on: NDArray[np.int32], off: NDArray[np.int32], off_ratio: float) -> None:
+def check_room(on: NDArray[np.int32], off: NDArray[np.int32], off_ratio: float) -> None:
     """Raise :class:`AmiwarpError` if the sums of a pixel may have overflowed."""
     # as the largest entries of the table weigh them
     weights = on.astype(np.int64) + np.ceil(off_ratio * off).astype(np.int64)

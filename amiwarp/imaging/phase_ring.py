@@ -28,7 +28,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
-from amiwarp.imaging.phase import BINS, HARMONICS, LEAST_RATIO, PhaseSums, bin_attenuation
+from amiwarp.imaging.phase import BINS, HARMONICS, PhaseSums
+from amiwarp.imaging.phase_tables import LEAST_RATIO, bin_attenuation
 from amiwarp.kernels import phase_ring as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.loading import load

@@ -5,8 +5,8 @@ its pixel, which are the numbers of OFF and ON events, then cosine and sine of e
 the polarity changes, the brightness had an extreme between the two events, on average half a threshold beyond each of
 them. For it both add a further row.
 
-The events are ordered by blocks of pixels, in a block by time. On a CPU a block is some lines, whose integers fit into
-a core's cache. On CUDA it is one pixel, for one thread.
+The events are ordered by blocks of pixels, in a block by time. A block is some lines, whose integers fit into a core's
+cache. :mod:`amiwarp.kernels.phase_pixels` sums on GPUs.
 """
 
 import warp as wp
@@ -81,35 +81,6 @@ def order_by_blocks(
 def first_of(part: int, parts: int, count: int) -> int:
     """Return the first of ``count`` elements that belongs to one of ``parts`` equal ranges."""
     return int((wp.int64(count) * wp.int64(part)) / wp.int64(parts))
-
-
-@wp.kernel
-def pixel_words(
-    events: EventArrays,
-    width: int,
-    bins: int,
-    start: int,
-    pixels: wp.array(dtype=int),
-    words: wp.array(dtype=int),
-):
-    """Write the pixel of an event, and its word in a block of one pixel."""
-    i = wp.tid() + start
-    pixels[i] = int(events.y[i]) * width + int(events.x[i])
-    words[i] = table_row(events.layer[i], events.turn[i], bins)
-
-
-@wp.kernel
-def first_words(pixels: wp.array(dtype=int), count: int, start: int, starts: wp.array(dtype=int)):
-    """Write the first of the ordered events of each pixel, and at last their number. Runs over count + 1 elements."""
-    i = wp.tid() + start
-    first = int(0)
-    last = starts.shape[0] - 1
-    if i > 0:
-        first = pixels[i - 1] + 1
-    if i < count:
-        last = pixels[i]
-    for pixel in range(first, last + 1):
-        starts[pixel] = i
 
 
 # For each pixel of a block, NOTES integers follow its sums: row of the first event, row of the last, and number of

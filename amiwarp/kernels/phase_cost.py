@@ -33,22 +33,34 @@ def tile_costs(
     tile = i % tiles
     a = orbits[candidate, tile, 0]
     b = orbits[candidate, tile, 1]
-    reach = wp.min(int(finest * float(side) / (2.0 * wp.pi)), (side - 1) / 2)
+    reach = reach_of(finest, side)
     left = wp.float64(0.0)
     total = wp.float64(0.0)
     # The scene is real, and so are the events: half of the waves say all.
     for column in range(reach + 1):
         for line in range(-reach, reach + 1):
-            row = (line + side) % side
-            kx = frequency(column, side)
-            ky = frequency(row, side)
-            size = wp.sqrt(kx * kx + ky * ky)
-            twin = column == 0 and line <= 0
-            if not twin and size >= coarsest and size <= finest:
+            if counts(line, column, side, coarsest, finest):
+                row = (line + side) % side
                 squares = wave_cost(spectra, tile, row, column, a, b, bessel, per_unit, damping)
                 left += wp.float64(squares[0])
                 total += wp.float64(squares[1])
     out[candidate, tile] = wp.vec2d(left, total)
+
+
+@wp.func
+def reach_of(finest: float, side: int) -> int:
+    """Return the largest row and column of the waves that count."""
+    return wp.min(int(finest * float(side) / (2.0 * wp.pi)), (side - 1) / 2)
+
+
+@wp.func
+def counts(line: int, column: int, side: int, coarsest: float, finest: float) -> bool:
+    """Return whether a wave counts: its size is within bounds [rad/px], and its opposite does not count already."""
+    kx = frequency(column, side)
+    ky = frequency((line + side) % side, side)
+    size = wp.sqrt(kx * kx + ky * ky)
+    twin = column == 0 and line <= 0
+    return not twin and size >= coarsest and size <= finest
 
 
 @wp.func

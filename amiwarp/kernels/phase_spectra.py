@@ -74,14 +74,29 @@ def scene_spectrum(
     that the other half of its spectrum are the conjugates.
     """
     i = wp.tid() + start
-    side = spectra.shape[1]
     row = i / out.shape[1]
     column = i % out.shape[1]
+    a = orbits[tile, 0]
+    b = orbits[tile, 1]
+    out[row, column] = scene_wave(spectra, row, column, a, b, bessel, per_unit, damping)
+
+
+@wp.func
+def scene_wave(
+    spectra: wp.array3d(dtype=wp.vec2),
+    row: int,
+    column: int,
+    a: wp.vec2,
+    b: wp.vec2,
+    bessel: wp.array2d(dtype=float),
+    per_unit: float,
+    damping: float,
+) -> wp.vec2:
+    """Return the spectrum of the scene at one wave of a tile with the orbit a exp(iθ) + b exp(-iθ) [px]."""
+    side = spectra.shape[1]
     opposite_row = (side - row) % side
     opposite_column = (side - column) % side
-    response = response_at(
-        row, column, side, orbits[tile, 0], orbits[tile, 1], per_unit, bessel.shape[1]
-    )
+    response = response_at(row, column, side, a, b, per_unit, bessel.shape[1])
     total = wp.vec2(0.0, 0.0)
     weight = float(damping)
     power = wp.vec2(0.0, 1.0)
@@ -96,7 +111,7 @@ def scene_spectrum(
         there = times(power, conjugate(spectra[k, opposite_row, opposite_column]))
         total += h * (here + sign * there)
         weight += 2.0 * h * h
-    out[row, column] = total / weight
+    return total / weight
 
 
 @wp.kernel

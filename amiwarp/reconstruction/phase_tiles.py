@@ -22,12 +22,11 @@ from amiwarp.imaging.phase import PhaseSums, shared_pairs
 from amiwarp.imaging.phase_costs import DAMPING
 from amiwarp.kernels import phase_spectra as kernels
 from amiwarp.kernels.launch import launch
+from amiwarp.kernels.phase_grid import SIDE
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.orbit import orbits_of
 from amiwarp.tasks import in_order
 
-SIDE = 128
-"""Side of a tile [px]. The orbit of a wedge prism varies by 7 % within a tile of 60 deg over 640 px."""
 LEAST_OVERLAP = 24
 """Smallest overlap of tiles beside each other [px]."""
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
@@ -15,10 +16,11 @@ from amiwarp.events.device_events import device_of, read_between
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_speed import turn_between
 from amiwarp.events.recording import EventSource, Recording
-from amiwarp.imaging.phase import PhaseSums, phase_sums
+from amiwarp.imaging.phase import PhaseSums, copied_sums, phase_sums, sum_turns
 from amiwarp.imaging.windows import turn_edges
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.orbit import image_grid, orbits_of
+from amiwarp.reconstruction.device_picture import DevicePictures
 from amiwarp.reconstruction.picture import Picture
 from amiwarp.reconstruction.picture_in_phase import phase_picture, pixel_motion
 from amiwarp.reconstruction.windows import window_count, window_span
@@ -46,7 +48,8 @@ class PhaseReconstruction:
     calibration : Calibration
         Calibration of the same sensor size. It provides model and encoder. An optic with one angle.
     device : str or warp.Device, optional
-        Device on which events are summed, by default the events' device or the CPU.
+        Device on which events are summed and pictures are made, by default the events' device or the CPU. On CUDA a
+        picture is copied to the host only when it is finished.
 
     Raises
     ------
@@ -90,6 +93,7 @@ class PhaseReconstruction:
         self.harmonics = harmonics_for(self.model)
         pixel_motion(self.model)  # refuses an optic that moves the image along a line
         self.device = device_of(recording.events, device)
+        self._on_device: DevicePictures | None = None
 
     def span(
         self, start_us: int | None = None, length_us: int | None = None, turns: float | None = None
@@ -145,10 +149,14 @@ class PhaseReconstruction:
             harmonics=self.harmonics,
             device=self.device,
         )
-        if not sums.events:
+        self._check_events(sums.events, start_us, stop_us)
+        return sums
+
+    def _check_events(self, count: int, start_us: int, stop_us: int) -> None:
+        """Raise :class:`AmiwarpError` if a window has no events."""
+        if not count:
             where = f"{start_us} .. {stop_us} us"
             raise AmiwarpError(f"{self.recording.name}: no events in {where}; give another window")
-        return sums
 
     def window(self, start_us: int, length_us: int) -> Picture:
         """Make the picture of the whole turns of a window.
@@ -172,21 +180,47 @@ class PhaseReconstruction:
             If the window is shorter than a turn, or has no events.
         """
         began = time.perf_counter()
-        sums = self.sums(start_us, length_us)
-        log = phase_picture(sums, self.model)
+        if self.device.is_cuda:
+            log, known, off_ratio = self._drawn_on_device(start_us, length_us)
+        else:
+            sums = self.sums(start_us, length_us)
+            log = phase_picture(sums, self.model)
+            known = (sums.on + sums.off) > 0
+            off_ratio = sums.off_ratio
         return Picture(
             log=log,
-            known=(sums.on + sums.off) > 0,
+            known=known,
             start_us=start_us,
             length_us=length_us,
             pairs=0,
-            off_excess=sums.off_ratio - 1.0,
+            off_excess=off_ratio - 1.0,
             smoothness=0.0,
             residual=0.0,
             hot=0,
             seconds=time.perf_counter() - began,
             unknowns=np.zeros(0, np.float32),
         )
+
+    def _drawn_on_device(
+        self, start_us: int, length_us: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], float]:
+        """Return the picture of a window, which pixels have events, and the OFF threshold over the ON threshold.
+
+        Nothing is copied before the picture is finished.
+        """
+        if self._on_device is None:
+            self._on_device = DevicePictures(self.model, self.harmonics, self.device)
+        pictures = self._on_device
+        stop_us, turns = whole_turns(self.encoder, start_us, length_us)
+        events = read_between(self.recording.events, start_us, stop_us)
+        self._check_events(len(events), start_us, stop_us)
+        sum_turns(pictures.sums, events, self.encoder, float(turns))
+        pictures.draw()
+        log = pictures.log()
+        off_ratio, full = pictures.sums.notes()
+        if full:
+            copied_sums(pictures.sums)  # names the pixel
+        return log, pictures.sums.known.numpy().astype(np.bool_), off_ratio
 
     def windows(self, start_us: int, length_us: int, *, step_us: float) -> Iterator[Picture]:
         """Yield pictures of sliding windows, up to the last complete one.

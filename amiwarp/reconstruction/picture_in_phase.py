@@ -13,11 +13,14 @@ from typing import Any
 
 import numpy as np
 import scipy.fft
+import warp as wp
 from numpy.typing import NDArray
 from scipy.special import jv
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.phase import PhaseSums
+from amiwarp.imaging.phase import PhaseSums, shared_pairs
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.phase_slopes import write_divergence, write_slopes
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.orbit import Orbits, image_grid, orbits_of
 from amiwarp.reconstruction.phase_lag import lag_of
@@ -125,16 +128,21 @@ class FirstSum:
                 "point, use the method 'solver'"
             )
         area = np.abs(a) ** 2 - np.abs(b) ** 2
-        return cls((a / area).astype(np.complex64), (b / area).astype(np.complex64), orbits.radius)
+        # In the order of rows, which they are not after the interpolation
+        forward = np.ascontiguousarray(a / area, np.complex64)
+        backward = np.ascontiguousarray(b / area, np.complex64)
+        return cls(forward, backward, orbits.radius)
 
     def gradient(self, first: NDArray[np.complex64], lag: float) -> NDArray[np.complex64]:
         """Return the gradient of the log intensity from the first sum [thresholds/px]: along x, and i times along y.
 
         For waves much longer than the orbit, A_1 = i/2 (conj(g) a + g conj(b)). ``lag`` is the lag of events [rad].
         """
-        # conj(g) a + g conj(b) = s, and its conjugate: two equations for g
-        s = np.complex64(-2j * np.exp(1j * lag)) * first
-        return np.conj(s) * self.forward - s * self.backward
+        turn = wp.array([[math.cos(lag), math.sin(lag)]], dtype=wp.vec2, device="cpu")
+        inputs = [shared_pairs(part.ravel()) for part in (first, self.forward, self.backward)]
+        found = np.empty(first.size, np.complex64)
+        launch(write_slopes, first.size, [*inputs, turn], [shared_pairs(found)], device="cpu")
+        return found.reshape(first.shape)
 
 
 @lru_cache(maxsize=4)
@@ -168,17 +176,19 @@ def _interpolated(rows: NDArray[Any], places: NDArray[np.float64]) -> NDArray[An
 
 
 @dataclass(frozen=True)
-class _Filters:
+class LongWaveFilters:
     """Filters over the cosine waves of an image, shape (height, width)."""
 
     by_divergence: NDArray[np.float32]
     """What the divergence of the gradient is multiplied with: Poisson's equation, and the share of a wave."""
+    share: NDArray[np.float32]
+    """Share of a wave that comes from the gradient."""
     of_detail: NDArray[np.float32]
     """What the detail is multiplied with: the rest of the share."""
 
 
 @lru_cache(maxsize=4)
-def _filters(height: int, width: int, radius: float) -> _Filters:
+def long_wave_filters(height: int, width: int, radius: float) -> LongWaveFilters:
     """Return the filters that take waves which are long beside an orbit from the gradient."""
     kx = math.pi * np.arange(width) / width
     ky = math.pi * np.arange(height) / height
@@ -193,7 +203,9 @@ def _filters(height: int, width: int, radius: float) -> _Filters:
     reach = np.maximum(np.sqrt(square) * radius, 1e-6)
     attenuation = np.maximum(2.0 * jv(1, reach) / reach, LEAST_ATTENUATION)
     by_divergence = share / (laplace * attenuation)
-    return _Filters(by_divergence.astype(np.float32), (1.0 - share).astype(np.float32))
+    of_detail = 1.0 - share
+    found = (by_divergence, share, of_detail)
+    return LongWaveFilters(*(values.astype(np.float32) for values in found))
 
 
 def with_long_waves(
@@ -201,18 +213,12 @@ def with_long_waves(
 ) -> NDArray[np.float32]:
     """Return the picture with its waves that are long beside the orbit replaced by the waves of its gradient."""
     height, width = detail.shape
+    # The cosine waves of the picture have no flow over the border, either.
+    flow = np.empty((height, width), np.float32)
+    outputs = [wp.array(flow, device="cpu", copy=False)]
+    launch(write_divergence, flow.size, [shared_pairs(slopes)], outputs, device="cpu")
 
-    # Divergence of the gradient between pixels, with no flow over the border: the cosine waves of the picture have
-    # none.
-    divergence = np.zeros((height, width), np.float32)
-    along_x = np.float32(0.5) * (slopes.real[:, 1:] + slopes.real[:, :-1])
-    along_y = np.float32(0.5) * (slopes.imag[1:] + slopes.imag[:-1])
-    divergence[:, :-1] += along_x
-    divergence[:, 1:] -= along_x
-    divergence[:-1] += along_y
-    divergence[1:] -= along_y
-
-    filters = _filters(height, width, radius)
-    waves = scipy.fft.dctn(divergence, workers=cpu_threads()) * filters.by_divergence
+    filters = long_wave_filters(height, width, radius)
+    waves = scipy.fft.dctn(flow, workers=cpu_threads()) * filters.by_divergence
     waves += scipy.fft.dctn(detail, workers=cpu_threads()) * filters.of_detail
     return scipy.fft.idctn(waves, workers=cpu_threads(), overwrite_x=True)

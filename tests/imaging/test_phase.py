@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp import (
@@ -17,7 +16,7 @@ from amiwarp import (
     weighted_sums,
 )
 from amiwarp.imaging import phase
-from amiwarp.imaging.uploaded_events import upload_events
+from amiwarp.imaging.phase_device import DeviceSums
 
 WIDTH = 12
 HEIGHT = 7
@@ -155,19 +154,26 @@ def test_counts_and_ratio_of_thresholds() -> None:
     assert np.isnan(found.threshold_ratio[0, 0])
 
 
-def test_both_orders_of_events_give_the_same() -> None:
-    """CUDA orders events by pixels; its kernels run on a CPU too."""
-    events, angles = some_events(5000, seed=2)
-    arrays = upload_events(events, angles, "cpu").arrays
-    table = phase.angle_table(64, 9, 1.25)
-    both = wp.array(np.concatenate([table, phase.extreme_table(table)]), dtype=int, device="cpu")
-    weights = phase._Weights(both, wp.array(np.linspace(0.5, 0.9, 9), dtype=float, device="cpu"))
-    given = (arrays, len(events), WIDTH, HEIGHT, weights)
-    counts, values = phase._summed(phase._by_lines(*given), WIDTH * HEIGHT, weights)
-    by_pixels = phase._summed(phase._by_pixels(*given), WIDTH * HEIGHT, weights)
-    assert values.any()
-    np.testing.assert_array_equal(counts, by_pixels[0])
-    np.testing.assert_array_equal(values, by_pixels[1])
+@pytest.mark.parametrize("extremes", [True, False])
+@pytest.mark.parametrize("off_ratio", [1.25, None])
+def test_sums_as_a_gpu_makes_them_are_the_same(off_ratio: float | None, *, extremes: bool) -> None:
+    """A GPU orders events by pixels and weights the table itself; its kernels run on a CPU too."""
+    there = DeviceSums(WIDTH, HEIGHT, 9, 64, "cpu", extremes=extremes)
+    for seed, turns, direction in ((2, 1.0, 1), (3, 2.0, -1), (4, 2.0, -1)):
+        events, angles = some_events(5000 - 1000 * seed, seed=seed)
+        options = {"turns": turns, "direction": direction, "off_ratio": off_ratio}
+        there.sum(events, angles, **options)
+        found = phase.copied_sums(there)
+        expected = phase_sums(events, angles, WIDTH, HEIGHT, extremes=extremes, **options)
+        np.testing.assert_array_equal(found.values, expected.values)
+        np.testing.assert_array_equal(found.on, expected.on)
+        np.testing.assert_array_equal(found.off, expected.off)
+        assert found.off_ratio == expected.off_ratio
+        assert found.turns == turns
+        if extremes:
+            np.testing.assert_array_equal(found.changes, expected.changes)
+        known = there.known.numpy()
+        np.testing.assert_array_equal(known, (expected.on + expected.off) > 0)
 
 
 def with_extremes(events: Events) -> NDArray[np.float64]:
