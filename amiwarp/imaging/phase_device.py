@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.events.device_events import DeviceEvents
+from amiwarp.events.device_events import DeviceEvents, time_span
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
 from amiwarp.imaging.phase_tables import (
@@ -24,6 +24,7 @@ from amiwarp.imaging.phase_tables import (
 )
 from amiwarp.imaging.uploaded_events import upload_events
 from amiwarp.kernels import phase_pixels as kernels
+from amiwarp.kernels.encoder_pieces import encoder_params
 from amiwarp.kernels.launch import RepeatedLaunches
 
 COUNTING_THREADS = 1 << 14
@@ -67,6 +68,8 @@ class DeviceSums:
         self._starts = wp.empty(pixels + 1, dtype=int, device=self.device)
         self._keys = wp.empty(0, dtype=int, device=self.device)
         self._rows = wp.empty(0, dtype=int, device=self.device)
+        self._encoder: Encoder | None = None
+        self._pieces: Any = None
         self._launch = RepeatedLaunches(self.device)
 
     @property
@@ -93,7 +96,10 @@ class DeviceSums:
         self.count = len(events)
         self._given_ratio = off_ratio
         self._scale(turns, direction)
-        uploaded = upload_events(events, angles, self.device).arrays
+        pieces = None
+        if self.count and isinstance(angles, Encoder):
+            pieces = self._pieces_of(angles, events)
+        uploaded = upload_events(events, angles, self.device, pieces=pieces).arrays
         self._marks.zero_()
         if off_ratio is None:
             self._count_on(uploaded.layer)
@@ -116,6 +122,17 @@ class DeviceSums:
             return self._given_ratio, full
         on = int(marks[kernels.ON])
         return ratio_of_counts(on, self.count - on), full
+
+    def _pieces_of(self, encoder: Encoder, events: Events | DeviceEvents) -> Any:
+        """Return the whole encoder on the device, which is made once. It covers the events, or raises."""
+        first_us, last_us = encoder.coverage
+        span = time_span(events)
+        if span[0] < first_us or span[1] > last_us:
+            encoder.angle_at(np.array(span))
+        if self._encoder is not encoder:
+            self._pieces = encoder_params(encoder, first_us, last_us, self.device)
+            self._encoder = encoder
+        return self._pieces
 
     def _scale(self, turns: float, direction: int) -> None:
         """Set the factors of the integers, if they are other ones than before."""

@@ -176,6 +176,23 @@ def test_sums_as_a_gpu_makes_them_are_the_same(off_ratio: float | None, *, extre
         np.testing.assert_array_equal(known, (expected.on + expected.off) > 0)
 
 
+def test_sums_on_a_device_follow_the_encoder() -> None:
+    """The encoder is copied once: a later part of it, another one, and events that it does not cover."""
+    there = DeviceSums(WIDTH, HEIGHT, 4, 64, "cpu", extremes=True)
+    times = np.arange(0, 100_001, 1000)
+    uneven = Encoder(times, 0.1 + 2e-4 * times + 0.3 * np.sin(times / 9000.0))
+    even = Encoder.constant_speed(720.0, 0, 100_000)
+    events, _ = some_events(4000, seed=5)
+    spread = Events(events.x, events.y, 25 * events.t, events.p)
+    for encoder, part in ((uneven, spread[:3000]), (uneven, spread[2500:]), (even, spread)):
+        there.sum(part, encoder, turns=1.0, direction=1)
+        expected = phase_sums(part, encoder, WIDTH, HEIGHT, turns=1.0, direction=1, harmonics=4)
+        np.testing.assert_array_equal(phase.copied_sums(there).values, expected.values)
+    late = Events(events.x, events.y, 26 * events.t, events.p)
+    with pytest.raises(AmiwarpError, match="102000"):
+        there.sum(late, even, turns=1.0, direction=1)
+
+
 def with_extremes(events: Events) -> NDArray[np.float64]:
     """Return the weight of each event: more for each neighbour in time of the other polarity, around the turn."""
     weights = np.ones(len(events))
