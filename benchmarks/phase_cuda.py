@@ -6,7 +6,7 @@ A camera with 60° sees scikit-image's astronaut through a prism of 1° (720 rpm
 is made on the device and on the CPU, from the same events; both are compared with the scene. Then the stages run, with
 the events on the device:
 
-``sums``: angles of the events, their order by pixels, and the sums.
+``sums``: angles of the events, their order by pixels, and the sums; ``angles`` and ``order`` alone, too.
 ``transform``, ``lag``, ``scenes``: from the sums to the detail of the picture. ``detail`` is all three.
 ``long waves``: long waves from the gradient, and the median.
 ``whole``: from the sums to the picture.
@@ -50,6 +50,7 @@ from amiwarp import (
     phase_picture,
 )
 from amiwarp.imaging.phase import copied_sums, sum_turns
+from amiwarp.imaging.uploaded_events import upload_events
 from amiwarp.reconstruction.device_picture import DevicePictures, captured
 from amiwarp.reconstruction.phase_lag import lag_of
 from amiwarp.reconstruction.phase_tiles import scene_of_tiles
@@ -119,6 +120,12 @@ class Comparison:
     def sum(self) -> None:
         """Sum the events on the device."""
         sum_turns(self.pictures.sums, self.events, self.work.encoder, self.turns)
+
+    def with_angles(self) -> Any:
+        """Return the events with their angles, as they are summed."""
+        encoder = self.work.encoder
+        pieces = self.pictures.sums._pieces_of(encoder, self.events)
+        return upload_events(self.events, encoder, self.device, pieces=pieces).arrays
 
     def result(self) -> dict[str, Any]:
         """Return how the pictures differ, and how they resemble the scene."""
@@ -212,6 +219,9 @@ def stages(comparison: Comparison, repeats: int) -> list[dict[str, Any]]:
         rows.append(row)
 
     measure("sums", comparison.sum, "launches")
+    arrays = comparison.with_angles()
+    measure("angles", comparison.with_angles, "launches")
+    measure("order", lambda: pictures.sums._order(arrays), "launches")
     graphs: dict[str, Callable[[], None]] = {}
     for name, run in from_sums.items():
         measure(name, run, "launches")
@@ -285,6 +295,8 @@ def main() -> int:
         "result": result,
         "stages": stages(comparison, args.repeats),
     }
+    if args.out is not None:
+        args.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     found["stream"] = stream(comparison)
     print(json.dumps(found["stream"]))
     if args.out is not None:
