@@ -25,10 +25,10 @@ from amiwarp.reconstruction.windows import window_count, window_span
 from amiwarp.results.calibration import Calibration
 from amiwarp.schema.calls import guarded
 
-HARMONICS_PER_PX = 1.15
+HARMONICS_PER_PX = 1.3
 """Number of harmonics for each pixel of the orbit's mean radius. Each takes its share of the time. With an orbit of
-7 px, 8 harmonics correlate with the scene by 0.991, and 11 by 0.993; if half of the events are noise, by 0.982 and
-0.989."""
+7 px, 9 harmonics correlate with the scene's detail by 0.989, and 11 by 0.991; if half of the events are noise, by 0.982
+and 0.986."""
 FEWEST_HARMONICS = 6
 MOST_HARMONICS = 31
 """Limits of the number of harmonics: small orbits need some, and 64 bins hold no more."""
