@@ -56,29 +56,138 @@ def strength_of(response: Response, bessel: wp.array2d(dtype=float), k: int) -> 
 
 
 @wp.kernel
-def scene_spectrum(
-    spectra: wp.array3d(dtype=wp.vec2),
+def response_tables(
     orbits: wp.array2d(dtype=wp.vec2),
-    tile: int,
     bessel: wp.array2d(dtype=float),
     per_unit: float,
     damping: float,
     start: int,
-    out: wp.array2d(dtype=wp.vec2),
+    steps: wp.array3d(dtype=wp.vec2),
+    strengths: wp.array4d(dtype=float),
 ):
-    """Write the spectrum of the scene at one wave of a tile, by least squares over the harmonics.
+    """Write the responses of the tiles to one wave each, for :func:`scene_spectrum`.
 
-    ``spectra`` are the Fourier transforms of the tile's sums in phase, shape (harmonics, side, side). ``orbits`` has
-    the motion of each tile's middle over a turn, a exp(iθ) + b exp(-iθ) [px], as (a, b). ``bessel`` holds the
-    functions J_1, J_2, ... in steps of 1 / ``per_unit``. ``out`` has shape (side, side / 2 + 1): the scene is real, so
-    that the other half of its spectrum are the conjugates.
+    ``orbits`` has the motion of each tile's middle over a turn, a exp(iθ) + b exp(-iθ) [px], as (a, b). ``bessel``
+    holds the functions J_1, J_2, ... in steps of 1 / ``per_unit``. ``steps``, shape (tiles, side, side / 2 + 1), are
+    the factors by which the harmonics differ; ``strengths``, shape (tiles, harmonics, side, side / 2 + 1), the sizes of
+    the responses over the sum of their squares.
     """
     i = wp.tid() + start
-    row = i / out.shape[1]
-    column = i % out.shape[1]
-    a = orbits[tile, 0]
-    b = orbits[tile, 1]
-    out[row, column] = scene_wave(spectra, row, column, a, b, bessel, per_unit, damping)
+    side = steps.shape[1]
+    half = steps.shape[2]
+    column = i % half
+    row = (i / half) % side
+    tile = i / (half * side)
+    response = response_at(
+        row, column, side, orbits[tile, 0], orbits[tile, 1], per_unit, bessel.shape[1]
+    )
+    weight = float(damping)
+    for k in range(bessel.shape[0]):
+        h = strength_of(response, bessel, k)
+        # A scene is real: harmonics m and -m respond equally.
+        weight += 2.0 * h * h
+    steps[tile, row, column] = response.step
+    for k in range(bessel.shape[0]):
+        strengths[tile, k, row, column] = strength_of(response, bessel, k) / weight
+
+
+# Columns lie side by side in memory, so that compilers vectorise the loops over them. The sums at the opposite waves
+# come in the opposite order, and are turned around first.
+@wp.func_native("""
+    const float* __restrict__ sums = (const float*)spectra.data;
+    const float* __restrict__ step = (const float*)steps.data + 2 * ((int64_t)tile * side + row) * half;
+    float* __restrict__ to = (float*)out.data + 2 * (int64_t)row * half;
+    const int opposite = (side - row) % side;
+    float step_x[256], step_y[256], power_x[256], power_y[256], total_x[256], total_y[256];
+    float there_x[256], there_y[256];
+    for (int c = 0; c < half; ++c) {
+        step_x[c] = step[2 * c] * turn[0] - step[2 * c + 1] * turn[1];
+        step_y[c] = step[2 * c] * turn[1] + step[2 * c + 1] * turn[0];
+        power_x[c] = 0.0f;
+        power_y[c] = 1.0f;
+        total_x[c] = 0.0f;
+        total_y[c] = 0.0f;
+    }
+    float sign = 1.0f;
+    for (int k = 0; k < harmonics; ++k) {
+        const float* __restrict__ here = sums + 2 * ((int64_t)k * side + row) * side;
+        const float* __restrict__ behind = sums + 2 * ((int64_t)k * side + opposite) * side;
+        const float* __restrict__ strength =
+            (const float*)strengths.data + (((int64_t)tile * harmonics + k) * side + row) * half;
+        there_x[0] = behind[0];
+        there_y[0] = behind[1];
+        for (int c = 1; c < half; ++c) {
+            there_x[c] = behind[2 * (side - c)];
+            there_y[c] = behind[2 * (side - c) + 1];
+        }
+        sign = -sign;
+        for (int c = 0; c < half; ++c) {
+            const float x = power_x[c] * step_x[c] - power_y[c] * step_y[c];
+            const float y = power_x[c] * step_y[c] + power_y[c] * step_x[c];
+            power_x[c] = x;
+            power_y[c] = y;
+            // (conjugate of the power) times (here), and (power) times (conjugate of there)
+            const float here_x = x * here[2 * c] + y * here[2 * c + 1];
+            const float here_y = x * here[2 * c + 1] - y * here[2 * c];
+            const float back_x = x * there_x[c] + y * there_y[c];
+            const float back_y = y * there_x[c] - x * there_y[c];
+            total_x[c] += strength[c] * (here_x + sign * back_x);
+            total_y[c] += strength[c] * (here_y + sign * back_y);
+        }
+    }
+    for (int c = 0; c < half; ++c) {
+        to[2 * c] = total_x[c];
+        to[2 * c + 1] = total_y[c];
+    }
+""")
+def scene_of_row(
+    spectra: wp.array3d(dtype=wp.vec2),
+    steps: wp.array3d(dtype=wp.vec2),
+    strengths: wp.array4d(dtype=float),
+    tile: int,
+    turn: wp.vec2,
+    row: int,
+    harmonics: int,
+    side: int,
+    half: int,
+    out: wp.array2d(dtype=wp.vec2),
+):
+    """Write a row of the spectrum of the scene."""
+
+
+@wp.kernel
+def scene_spectrum(
+    spectra: wp.array3d(dtype=wp.vec2),
+    steps: wp.array3d(dtype=wp.vec2),
+    strengths: wp.array4d(dtype=float),
+    tile: int,
+    turn: wp.vec2,
+    start: int,
+    out: wp.array2d(dtype=wp.vec2),
+):
+    """Write a row of the spectrum of the scene of a tile, by least squares over the harmonics.
+
+    ``spectra`` are the Fourier transforms of the tile's sums in phase, shape (harmonics, side, side). ``steps`` and
+    ``strengths`` are from :func:`response_tables`. ``turn`` is exp(-i lag), by which the orbit is behind. ``out`` has
+    shape (side, side / 2 + 1), at most 256 columns: the scene is real, so that the other half of its spectrum are the
+    conjugates.
+
+    The sum of harmonic -m at a wave is the conjugate of the sum of m at the opposite wave, with the response (-1)^m
+    times the conjugate.
+    """
+    row = wp.tid() + start
+    scene_of_row(
+        spectra,
+        steps,
+        strengths,
+        tile,
+        turn,
+        row,
+        strengths.shape[1],
+        out.shape[0],
+        out.shape[1],
+        out,
+    )
 
 
 @wp.func
@@ -92,7 +201,10 @@ def scene_wave(
     per_unit: float,
     damping: float,
 ) -> wp.vec2:
-    """Return the spectrum of the scene at one wave of a tile with the orbit a exp(iθ) + b exp(-iθ) [px]."""
+    """Return the spectrum of the scene at one wave of a tile with the orbit a exp(iθ) + b exp(-iθ) [px].
+
+    As :func:`scene_spectrum`, for one thread a wave.
+    """
     side = spectra.shape[1]
     opposite_row = (side - row) % side
     opposite_column = (side - column) % side

@@ -23,6 +23,9 @@ LAGS = np.radians(np.arange(-6.0, 25.0, 3.0))
 """Lags that are tried [rad]. At 720 rpm, 3 deg are 0.7 ms."""
 FINEST = 4.0
 """Finest waves that count: this divided by the radius of the orbit is their spatial frequency [rad]."""
+MOST_HARMONICS = 6
+"""Largest number of harmonics that count. To these waves, whose Bessel functions end at :data:`FINEST`, others respond
+by less than a tenth of the largest response."""
 LEAST_GAIN = 1e-3
 """Smallest share of the sums that a lag must explain beyond no lag."""
 
@@ -31,7 +34,8 @@ def lag_of(sums: PhaseSums, model: Model) -> float:
     """Return the lag of sums [rad], 0 if none explains them better than no lag."""
     plan = plan_of(model, sums.harmonics)
     chosen = _strongest(sums, plan)
-    cuts = np.stack([cut_out(sums.values, plan.places[tile], plan.window) for tile in chosen])
+    values = sums.values[:MOST_HARMONICS]
+    cuts = np.stack([cut_out(values, plan.places[tile], plan.window) for tile in chosen])
     spectra = scipy.fft.fft2(cuts, axes=(2, 3), workers=1, overwrite_x=True)
     costs = _costs(spectra, plan, chosen)
     best = int(np.argmin(costs))

@@ -92,12 +92,19 @@ class Plan:
     """Motion of each tile's middle, a exp(iθ) + b exp(-iθ), as (a, b) [px], shape (tiles, 2)."""
     bessel: wp.array
     """Bessel functions J_1, J_2, … in steps of :data:`BESSEL_STEP`, on the CPU."""
+    steps: wp.array
+    """Factors by which the responses of the harmonics differ, as ``response_tables`` writes them."""
+    strengths: wp.array
+    """Sizes of the responses over the sum of their squares, as ``response_tables`` writes them."""
 
     def responses(self, lag: float) -> Responses:
         """Return how a scene makes the sums of each tile, if events lag by an angle [rad]."""
         # The orbit's angle is behind.
         late = self.orbits * np.exp(np.array([-1j, 1j]) * lag).astype(np.complex64)
-        return Responses(wp.clone(shared_pairs(late)), self.bessel)
+        behind = wp.vec2(math.cos(lag), -math.sin(lag))
+        return Responses(
+            wp.clone(shared_pairs(late)), self.bessel, self.steps, self.strengths, behind
+        )
 
 
 @lru_cache(maxsize=8)
@@ -113,7 +120,29 @@ def plan_of(model: Model, harmonics: int) -> Plan:
     inside = np.clip(middles, 0.0, (width - 1.0, height - 1.0))
     found = orbits_of(model, inside)
     orbits = np.stack([found.forward, found.backward], axis=1).astype(np.complex64)
-    return Plan(places, window, orbits, bessel_of(orbits, harmonics))
+    return plan_of_orbits(places, window, orbits, harmonics)
+
+
+def plan_of_orbits(
+    places: list[tuple[int, int]],
+    window: NDArray[np.float32],
+    orbits: NDArray[np.complex64],
+    harmonics: int,
+) -> Plan:
+    """Return the plan of tiles with these places, weights and orbits, as :class:`Plan` has them."""
+    bessel = bessel_of(orbits, harmonics)
+    steps, strengths = _response_tables(orbits, bessel)
+    return Plan(places, window, orbits, bessel, steps, strengths)
+
+
+def _response_tables(orbits: NDArray[np.complex64], bessel: wp.array) -> tuple[wp.array, wp.array]:
+    """Return the steps and strengths of the responses of tiles with these orbits, on the CPU."""
+    half = SIDE // 2 + 1
+    steps = wp.empty((len(orbits), SIDE, half), dtype=wp.vec2, device="cpu")
+    strengths = wp.empty((len(orbits), len(bessel), SIDE, half), dtype=float, device="cpu")
+    inputs = [shared_pairs(orbits), bessel, 1.0 / BESSEL_STEP, DAMPING]
+    launch(kernels.response_tables, steps.size, inputs, [steps, strengths], device="cpu")
+    return steps, strengths
 
 
 def bessel_of(orbits: NDArray[np.complex64], harmonics: int) -> wp.array:
@@ -131,6 +160,12 @@ class Responses:
     """Motion of each tile's middle, as (a, b)."""
     bessel: wp.array
     """Bessel functions J_1, J_2, … in steps of :data:`BESSEL_STEP`."""
+    steps: wp.array
+    """Factors by which the responses of the harmonics differ, without lag."""
+    strengths: wp.array
+    """Sizes of the responses over the sum of their squares."""
+    behind: wp.vec2
+    """exp(-i lag), by which the steps turn."""
 
     def scene(self, spectra: NDArray[np.complex64], tile: int) -> NDArray[np.complex64]:
         """Return the spectrum of the scene of a tile by least squares, shape (side, side // 2 + 1).
@@ -139,8 +174,8 @@ class Responses:
         """
         side = spectra.shape[1]
         scene = np.empty((side, side // 2 + 1), np.complex64)
-        inputs = [shared_pairs(spectra), self.orbits, tile, self.bessel, 1.0 / BESSEL_STEP, DAMPING]
-        launch(kernels.scene_spectrum, scene.size, inputs, [shared_pairs(scene)], device="cpu")
+        inputs = [shared_pairs(spectra), self.steps, self.strengths, tile, self.behind]
+        launch(kernels.scene_spectrum, side, inputs, [shared_pairs(scene)], device="cpu")
         return scene
 
     def rest(

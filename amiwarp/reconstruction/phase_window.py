@@ -27,10 +27,11 @@ from amiwarp.reconstruction.windows import window_count, window_span
 from amiwarp.results.calibration import Calibration
 from amiwarp.schema.calls import guarded
 
-HARMONICS_PER_PX = 1.5
-"""Number of harmonics for each pixel of the orbit's mean radius. Finer waves have more, but hardly stand out of the
-noise: more of them change the picture of an orbit of 6 px by 0.0003 of its correlation."""
-FEWEST_HARMONICS = 5
+HARMONICS_PER_PX = 1.3
+"""Number of harmonics for each pixel of the orbit's mean radius. Each takes its share of the time. With an orbit of
+7 px, 9 harmonics correlate with the scene's detail by 0.989, and 11 by 0.991; if half of the events are noise, by 0.982
+and 0.986."""
+FEWEST_HARMONICS = 6
 MOST_HARMONICS = 31
 """Limits of the number of harmonics: small orbits need some, and 64 bins hold no more."""
 LEAST_TURN = 0.98
