@@ -6,12 +6,13 @@ A camera with 60° sees scikit-image's astronaut through a prism of 1° (720 rpm
 is made on the device and on the CPU, from the same events; both are compared with the scene. Then the stages run, with
 the events on the device:
 
-``sums``: angles of the events, their order by pixels, and the sums; ``angles`` and ``order`` alone, too.
+``sums``: angles of the events, their order by pixels, and the sums; ``order`` alone, too.
 ``transform``, ``lag``, ``scenes``: from the sums to the detail of the picture. ``detail`` is all three.
 ``long waves``: long waves from the gradient, and the median.
 ``whole``: from the sums to the picture.
 ``events to detail``, ``events to picture``: the same with the sums.
-``window``: ``PhaseReconstruction.window``, with the search for the events, and the picture copied to the host.
+``window``: ``PhaseReconstruction.window``, with the search for the events, and the picture copied to the host;
+``whole turns`` is the part of the host in it that finds where the turn ends.
 
 ``ms`` is the median duration of a run and the wait for it, ``device_ms`` the time between two events of the device's
 stream. The stages from the sums on are measured as launches and as a CUDA graph. ``stream`` are pictures of successive
@@ -50,7 +51,6 @@ from amiwarp import (
     phase_picture,
 )
 from amiwarp.imaging.phase import copied_sums, sum_turns
-from amiwarp.imaging.uploaded_events import upload_events
 from amiwarp.reconstruction.device_picture import DevicePictures, captured
 from amiwarp.reconstruction.phase_lag import lag_of
 from amiwarp.reconstruction.phase_tiles import scene_of_tiles
@@ -121,11 +121,9 @@ class Comparison:
         """Sum the events on the device."""
         sum_turns(self.pictures.sums, self.events, self.work.encoder, self.turns)
 
-    def with_angles(self) -> Any:
-        """Return the events with their angles, as they are summed."""
-        encoder = self.work.encoder
-        pieces = self.pictures.sums._pieces_of(encoder, self.events)
-        return upload_events(self.events, encoder, self.device, pieces=pieces).arrays
+    def order(self) -> None:
+        """Order the words of the events by pixels, again: the sort takes as long as the first time."""
+        self.pictures.sums._order()
 
     def result(self) -> dict[str, Any]:
         """Return how the pictures differ, and how they resemble the scene."""
@@ -219,9 +217,8 @@ def stages(comparison: Comparison, repeats: int) -> list[dict[str, Any]]:
         rows.append(row)
 
     measure("sums", comparison.sum, "launches")
-    arrays = comparison.with_angles()
-    measure("angles", comparison.with_angles, "launches")
-    measure("order", lambda: pictures.sums._order(arrays), "launches")
+    measure("order", comparison.order, "launches")
+    measure("whole turns", lambda: whole_turns(comparison.work.encoder, *comparison.span), "call")
     graphs: dict[str, Callable[[], None]] = {}
     for name, run in from_sums.items():
         measure(name, run, "launches")

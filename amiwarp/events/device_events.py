@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -29,7 +29,7 @@ from amiwarp.events.recording import (
 )
 from amiwarp.events.recording import check_order as check_events_order
 from amiwarp.kernels import events as kernels
-from amiwarp.kernels.event_times import find_times, take_times
+from amiwarp.kernels.event_times import find_ranges, find_times, take_times
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.schema.calls import guarded
@@ -232,6 +232,15 @@ class DeviceEvents:
             last = int(part(self.t, count - 1, count).numpy()[0])
             span = (first, last)
         return described("DeviceEvents", *facts, span=span, count=count)
+
+
+class EventRange(NamedTuple):
+    """Part of events on a device: where it begins, its number of events, and the times of its first and last event."""
+
+    first: int
+    number: int
+    first_us: int
+    last_us: int
 
 
 def part(values: wp.array, start: int, stop: int) -> wp.array:
@@ -471,9 +480,17 @@ class DeviceMemoryEvents(EventSource):
 
     def __getitem__(self, which: slice) -> DeviceEvents:  # type: ignore[override]
         """Return the events of a slice without steps where they are: as views on the device."""
-        found = self._events[which]
-        if len(found):
-            ends = times_at(found, np.array([0, len(found) - 1])).tolist()
+        start, stop = slice_bounds(which, len(self))
+        if start >= stop:
+            return self._part(EventRange(start, 0, 0, 0))
+        ends = times_at(self._events, np.array([start, stop - 1])).tolist()
+        return self._part(EventRange(start, stop - start, *ends))
+
+    def _part(self, which: EventRange) -> DeviceEvents:
+        """Return a part of the events where they are, with its limits."""
+        found = self._events[which.first : which.first + which.number]
+        if which.number:
+            ends = [which.first_us, which.last_us]
             found._limits.extend([*ends, *limits(self._events)[2:]])
         return found
 
@@ -526,8 +543,8 @@ class DeviceMemoryEvents(EventSource):
             If the end is before the start.
         """
         check_window(t_start, t_end)
-        start, stop = find_indices(self._events, np.array([t_start, t_end])).tolist()
-        return self[start:stop]
+        (found,) = ranges_between(self, [(t_start, t_end)])
+        return self._part(found)
 
     def blocks(
         self, *, count: int | None = None, duration_us: int | None = None
@@ -535,6 +552,30 @@ class DeviceMemoryEvents(EventSource):
         starts = range(0, len(self), DEFAULT_BLOCK)
         chunks = (self.slice(start, start + DEFAULT_BLOCK) for start in starts)
         return regroup(chunks, count=count, duration_us=duration_us)
+
+
+def all_events(source: DeviceMemoryEvents) -> DeviceEvents:
+    """Return all events of a source, the same object each time."""
+    return source._events
+
+
+def ranges_between(
+    source: DeviceMemoryEvents, windows: Sequence[tuple[int, int]]
+) -> list[EventRange]:
+    """Return the part of the events in each window, from its start to before its end [us]; waits for the device once.
+
+    It waits for the current stream only. Events do not change, so any stream may look them up.
+    """
+    t = source._events.t
+    count = len(windows)
+    shared = host_numbers(4 * count, wp.int64, t.device)
+    numbers = shared.numpy()[: 4 * count].reshape(count, 4)
+    numbers[:, :2] = windows
+    launch(find_ranges, count, [t, shared], [shared], device=t.device)
+    wait(t.device)
+    found = [EventRange(*row) for row in numbers.tolist()]
+    idle_numbers[t.device.is_cpu, wp.int64].append(shared)
+    return found
 
 
 class DeviceValues:

@@ -304,8 +304,7 @@ def sum_turns(
     """Sum the events of whole turns on a device, as :func:`phase_sums` does, and with its checks."""
     device_events.check_order(events)
     device_events.check_inside(events, there.width, there.height)
-    direction = 1 if _swept(events, encoder) >= 0.0 else -1
-    there.sum(events, encoder, turns=turns, direction=direction)
+    there.sum(events, encoder, turns=turns)
 
 
 def copied_sums(sums: DeviceSums) -> PhaseSums:

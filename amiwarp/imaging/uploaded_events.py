@@ -152,7 +152,6 @@ def upload_events(
     slope: NDArray[np.float64] | None = None,
     middle_us: int | None = None,
     fold: int = 0,
-    pieces: Any = None,
 ) -> UploadedEvents:
     """Copy events to ``device`` and attach a prism angle to each. Events on the device are not copied.
 
@@ -172,9 +171,6 @@ def upload_events(
     fold : int, optional
         Number of angle bins per turn, for a still scene; 0 disables folding. All events of one pixel, polarity and bin
         become one weighted point at the middle of the bin. Cannot be combined with ``slope`` and ``middle_us``.
-    pieces : EncoderParams, optional
-        The encoder on the device, as :func:`encoder_params` gives it for a span that holds the events. By default it is
-        made, which takes longer than to find the angles of a million events on a GPU.
 
     Returns
     -------
@@ -209,8 +205,7 @@ def upload_events(
         encoder = angles
         arrays.turn = wp.zeros(padded, dtype=wp.uint16, device=device)
         if count:
-            if pieces is None:
-                pieces = encoder_params(encoder, *device_events.time_span(events), device)
+            pieces = encoder_params(encoder, *device_events.time_span(events), device)
             inputs = [pieces, t]
             launch(event_kernels.turn_events, count, inputs, [arrays.turn], device=device)
             if encoder.second is not None:

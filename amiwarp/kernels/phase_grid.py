@@ -1,4 +1,4 @@
-"""Tiles of an image of sums in phase: where they lie, cut out all together, and joined again."""
+"""Tiles of an image of sums in phase: where they lie, and how they are joined again."""
 
 import warp as wp
 
@@ -21,31 +21,6 @@ class TileGrid:
     overlap_y: int
     """Overlap of the rows of tiles [px]."""
     overlap_x: int
-
-
-@wp.kernel
-def cut_tiles(
-    values: wp.array3d(dtype=wp.vec2),
-    window: wp.array2d(dtype=float),
-    grid: TileGrid,
-    start: int,
-    tiles: wp.array4d(dtype=wp.vec2),
-):
-    """Write one weighted value of a tile, 0 outside of the image.
-
-    ``values`` have the shape (harmonics, height, width), ``tiles`` (tiles, harmonics, side, side).
-    """
-    i = wp.tid() + start
-    column = i % TILE
-    row = i / TILE % TILE
-    k = i / (TILE * TILE) % values.shape[0]
-    tile = i / (TILE * TILE * values.shape[0])
-    y = tile / grid.columns * grid.step_y - grid.overlap_y + row
-    x = tile % grid.columns * grid.step_x - grid.overlap_x + column
-    value = wp.vec2(0.0, 0.0)
-    if x >= 0 and x < values.shape[2] and y >= 0 and y < values.shape[1]:
-        value = window[row, column] * values[k, y, x]
-    tiles[tile, k, row, column] = value
 
 
 @wp.kernel

@@ -1,13 +1,14 @@
 """Sums of each pixel's events in phase with the optic, from events ordered by pixels; for GPUs.
 
-The sums equal the sums of :mod:`amiwarp.kernels.phase`, bit for bit. A thread adds up one harmonic of one pixel, in its
-registers. Nothing waits for the host: the table of what an event adds is weighted on the device, too.
+The sums equal the sums of :mod:`amiwarp.kernels.phase`, bit for bit. A thread adds up three harmonics of one pixel, in
+its registers. Nothing waits for the host: the table of what an event adds is weighted on the device, too.
 """
 
 import warp as wp
 
 from amiwarp.kernels.phase import complex_sum, table_row
-from amiwarp.kernels.votes import EventArrays
+from amiwarp.kernels.prism_angle import EncoderParams
+from amiwarp.kernels.votes import EventArrays, theta_u16_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,16 +18,24 @@ FULL = wp.constant(1)
 """Place of the mark that a pixel has too many events."""
 MARKS = 2
 """Number of marks."""
+AT_ONCE = 3
+"""Number of harmonics of a thread that sums: it reads the events once for all of them."""
 
 
 @wp.kernel
 def count_on(
-    polarity: wp.array(dtype=wp.uint8), threads: int, count: int, marks: wp.array(dtype=int)
+    polarity: wp.array(dtype=wp.uint8),
+    first: int,
+    threads: int,
+    count: int,
+    start: int,
+    marks: wp.array(dtype=int),
 ):
-    """Add the number of ON events to its mark. Runs over ``threads`` threads, on a CPU one."""
+    """Add the number of ON events to its mark, of ``count`` from ``first`` on. Runs over ``threads`` threads, on a CPU
+    one."""
     total = int(0)
-    for i in range(wp.tid(), count, threads):
-        total += int(polarity[i])
+    for i in range(wp.tid() + start, count, threads):
+        total += int(polarity[first + i])
     wp.atomic_add(marks, ON, total)
 
 
@@ -93,6 +102,29 @@ def pixel_words(
 
 
 @wp.kernel
+def timed_words(
+    x: wp.array(dtype=wp.uint16),
+    y: wp.array(dtype=wp.uint16),
+    t: wp.array(dtype=wp.int64),
+    polarity: wp.array(dtype=wp.uint8),
+    encoder: EncoderParams,
+    first: int,
+    size: wp.vec2i,
+    start: int,
+    pixels: wp.array(dtype=int),
+    rows: wp.array(dtype=int),
+):
+    """Write the pixel of an event, and its row of the table by its time. ``size`` are width and number of bins.
+
+    The events begin at ``first``: a part of a recording needs no arrays of its own.
+    """
+    i = wp.tid() + start
+    event = first + i
+    pixels[i] = int(y[event]) * size[0] + int(x[event])
+    rows[i] = table_row(polarity[event], theta_u16_at(encoder, t[event]), size[1])
+
+
+@wp.kernel
 def first_words(pixels: wp.array(dtype=int), count: int, start: int, starts: wp.array(dtype=int)):
     """Write the first of the ordered events of a pixel. After the last pixel, it is their number."""
     pixel = wp.tid() + start
@@ -117,7 +149,7 @@ def sum_pixels(
     counts: wp.array2d(dtype=int),
     values: wp.array2d(dtype=wp.vec2),
 ):
-    """Write the sum of one harmonic of one pixel, and with the first harmonic the numbers of its events.
+    """Write the sums of ``AT_ONCE`` harmonics of one pixel, and with the first ones the numbers of its events.
 
     ``rows`` are rows of the table, in each pixel in the order of time, ``starts`` the first of each pixel. ``counts``
     has shape (3, pixels): OFF events, ON events, changes of polarity.
@@ -125,11 +157,16 @@ def sum_pixels(
     i = wp.tid() + start
     pixels = counts.shape[1]
     bins = table.shape[1] / 4
-    k = i / pixels
+    k = i / pixels * AT_ONCE
     pixel = i % pixels
+    # Beyond the last harmonic the last one is summed again
+    second = wp.min(k + 1, values.shape[0] - 1)
+    third = wp.min(k + 2, values.shape[0] - 1)
     first = starts[pixel]
     stop = starts[pixel + 1]
     total = wp.vec2i(0, 0)
+    of_second = wp.vec2i(0, 0)
+    of_third = wp.vec2i(0, 0)
     on = int(0)
     changes = int(0)
     before = int(0)
@@ -138,13 +175,21 @@ def sum_pixels(
     for at in range(first, stop):
         row = rows[at]
         total += table[k, row]
+        of_second += table[second, row]
+        of_third += table[third, row]
         if (before < bins) != (row < bins):
             total += table[k, 2 * bins + before] + table[k, 2 * bins + row]
+            of_second += table[second, 2 * bins + before] + table[second, 2 * bins + row]
+            of_third += table[third, 2 * bins + before] + table[third, 2 * bins + row]
             changes += 1
         if row >= bins:
             on += 1
         before = row
     values[k, pixel] = complex_sum(total[0], total[1], scales[k])
+    if k + 1 < values.shape[0]:
+        values[second, pixel] = complex_sum(of_second[0], of_second[1], scales[second])
+    if k + 2 < values.shape[0]:
+        values[third, pixel] = complex_sum(of_third[0], of_third[1], scales[third])
     if k == 0:
         counts[0, pixel] = stop - first - on
         counts[1, pixel] = on

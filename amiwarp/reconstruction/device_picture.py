@@ -20,7 +20,7 @@ from amiwarp.imaging.phase_costs import DAMPING, LONGEST_WAVES
 from amiwarp.imaging.phase_device import DeviceSums
 from amiwarp.kernels import long_waves, matrix_product, phase_lag, phase_lines
 from amiwarp.kernels.launch import launch
-from amiwarp.kernels.phase_grid import SIDE, TileGrid, cut_tiles, join_tiles
+from amiwarp.kernels.phase_grid import SIDE, TileGrid, join_tiles
 from amiwarp.kernels.phase_scene import write_scenes
 from amiwarp.kernels.phase_slopes import write_divergence, write_slopes
 from amiwarp.optics.models.base import Model
@@ -102,6 +102,9 @@ class DevicePictures:
         self._bessel = wp.array(plan.bessel.numpy(), dtype=float, device=self.device)
         self._spectra = self._empty((self._count, harmonics, SIDE, SIDE), wp.vec2)
         self._scenes = self._empty((self._count, SIDE, SIDE), wp.vec2)
+        self._turns = self._pairs(phase_lines.turns_of_places())
+        # On CUDA the blocks use shared memory
+        self._room = self._empty(phase_lines.ROOM if self.device.is_cpu else 1, wp.vec2)
 
     def _plan_lag(self) -> None:
         """Make the arrays for the lag."""
@@ -146,10 +149,11 @@ class DevicePictures:
 
     def transform(self) -> None:
         """Cut out the tiles of all sums, and transform them."""
-        inputs = [self.sums.values, self._window, self._grid]
-        self._launch(cut_tiles, self._spectra.size, inputs, [self._spectra])
         planes = self._spectra.reshape((-1, SIDE, SIDE))
-        self._transform(phase_lines.transform_lines, planes)
+        inputs = [self.sums.values, self._window, self._grid, self._turns, self._room]
+        self._transform(phase_lines.cut_lines, inputs, planes)
+        inputs = [planes, self._turns, self._room, 1.0]
+        self._transform(phase_lines.transform_columns, inputs)
 
     def find_lag(self) -> None:
         """Find the lag from the tiles with the largest first sums."""
@@ -171,7 +175,9 @@ class DevicePictures:
         inputs += [1.0 / BESSEL_STEP, DAMPING]
         waves = self._count * SIDE * (SIDE // 2 + 1)
         self._launch(write_scenes, waves, inputs, [self._scenes])
-        self._transform(phase_lines.invert_lines, self._scenes)
+        back = [self._scenes, self._turns, self._room, -1.0]
+        self._transform(phase_lines.transform_lines, back)
+        self._transform(phase_lines.transform_columns, back)
         inputs = [self._scenes, self._window, self._grid]
         self._launch(join_tiles, self.detail.size, inputs, [self.detail])
 
@@ -198,11 +204,12 @@ class DevicePictures:
         wp.utils.radix_sort_pairs(self._keys, self._idle, self.picture.size)
         self._launch(long_waves.take_median, self.picture.size, [self._keys], [self.picture])
 
-    def _transform(self, kernel: Any, planes: wp.array) -> None:
-        """Transform all lines of planes, and then all their columns."""
+    def _transform(self, kernel: Any, inputs: list[Any], *outputs: wp.array) -> None:
+        """Run a kernel that transforms lines or columns of planes, the first of its inputs or its output."""
+        planes = (*outputs, inputs[0])[0]
         groups = SIDE // phase_lines.LINES
-        for lines in (planes, planes.transpose((0, 2, 1))):
-            self._blocks(kernel, [len(planes), groups], [], [lines], phase_lines.THREADS)
+        shape = [len(planes), groups]
+        self._blocks(kernel, shape, inputs, list(outputs), phase_lines.THREADS)
 
     def _multiply(self, left: wp.array, right: wp.array, out: wp.array) -> None:
         """Compute the product of two matrices."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,11 @@ from amiwarp.events.device_events import device_of, read_between
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_speed import turn_between
 from amiwarp.events.recording import EventSource, Recording
-from amiwarp.imaging.phase import PhaseSums, copied_sums, phase_sums, sum_turns
-from amiwarp.imaging.windows import turn_edges
+from amiwarp.imaging.phase import PhaseSums, phase_sums
+from amiwarp.imaging.windows import turn_edges, turn_end
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.orbit import image_grid, orbits_of
-from amiwarp.reconstruction.device_picture import DevicePictures
+from amiwarp.reconstruction.device_windows import DeviceWindows, Drawing
 from amiwarp.reconstruction.picture import Picture
 from amiwarp.reconstruction.picture_in_phase import phase_picture, pixel_motion
 from amiwarp.reconstruction.windows import window_count, window_span
@@ -36,6 +36,40 @@ MOST_HARMONICS = 31
 """Limits of the number of harmonics: small orbits need some, and 64 bins hold no more."""
 LEAST_TURN = 0.98
 """Shortest window that counts as a whole turn [turns]. It is lengthened to a turn."""
+
+
+class _Started(NamedTuple):
+    """Picture of a window that a device makes."""
+
+    drawing: Drawing
+    start_us: int
+    length_us: int
+    began: float
+    """When its work began, by the clock of the host [s]."""
+
+
+def picture_of(
+    log: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    off_ratio: float,
+    start_us: int,
+    length_us: int,
+    began: float,
+) -> Picture:
+    """Return the picture of a window, which took the time since ``began``."""
+    return Picture(
+        log=log,
+        known=known,
+        start_us=start_us,
+        length_us=length_us,
+        pairs=0,
+        off_excess=off_ratio - 1.0,
+        smoothness=0.0,
+        residual=0.0,
+        hot=0,
+        seconds=time.perf_counter() - began,
+        unknowns=np.zeros(0, np.float32),
+    )
 
 
 @guarded
@@ -94,7 +128,7 @@ class PhaseReconstruction:
         self.harmonics = harmonics_for(self.model)
         pixel_motion(self.model)  # refuses an optic that moves the image along a line
         self.device = device_of(recording.events, device)
-        self._on_device: DevicePictures | None = None
+        self._on_device: DeviceWindows | None = None
 
     def span(
         self, start_us: int | None = None, length_us: int | None = None, turns: float | None = None
@@ -150,14 +184,14 @@ class PhaseReconstruction:
             harmonics=self.harmonics,
             device=self.device,
         )
-        self._check_events(sums.events, start_us, stop_us)
+        if not sums.events:
+            raise self._no_events(start_us, stop_us)
         return sums
 
-    def _check_events(self, count: int, start_us: int, stop_us: int) -> None:
-        """Raise :class:`AmiwarpError` if a window has no events."""
-        if not count:
-            where = f"{start_us} .. {stop_us} us"
-            raise AmiwarpError(f"{self.recording.name}: no events in {where}; give another window")
+    def _no_events(self, start_us: int, stop_us: int) -> AmiwarpError:
+        """Return the error for a window without events."""
+        where = f"{start_us} .. {stop_us} us"
+        return AmiwarpError(f"{self.recording.name}: no events in {where}; give another window")
 
     def window(self, start_us: int, length_us: int) -> Picture:
         """Make the picture of the whole turns of a window.
@@ -180,48 +214,58 @@ class PhaseReconstruction:
         AmiwarpError
             If the window is shorter than a turn, or has no events.
         """
-        began = time.perf_counter()
         if self.device.is_cuda:
-            log, known, off_ratio = self._drawn_on_device(start_us, length_us)
-        else:
-            sums = self.sums(start_us, length_us)
-            log = phase_picture(sums, self.model)
-            known = (sums.on + sums.off) > 0
-            off_ratio = sums.off_ratio
-        return Picture(
-            log=log,
-            known=known,
-            start_us=start_us,
-            length_us=length_us,
-            pairs=0,
-            off_excess=off_ratio - 1.0,
-            smoothness=0.0,
-            residual=0.0,
-            hot=0,
-            seconds=time.perf_counter() - began,
-            unknowns=np.zeros(0, np.float32),
+            return self._finished(self._started(start_us, length_us))
+        began = time.perf_counter()
+        sums = self.sums(start_us, length_us)
+        log = phase_picture(sums, self.model)
+        known = (sums.on + sums.off) > 0
+        return picture_of(log, known, sums.off_ratio, start_us, length_us, began)
+
+    def _started(self, start_us: int, length_us: int) -> _Started:
+        """Begin with the picture of a window on the device."""
+        began = time.perf_counter()
+        if self._on_device is None:
+            self._on_device = DeviceWindows(
+                self.recording.events, self.encoder, self.model, self.harmonics, self.device
+            )
+        stop_us, turns = whole_turns(self.encoder, start_us, length_us)
+        drawing = self._on_device.start(start_us, stop_us, turns)
+        if drawing is None:
+            raise self._no_events(start_us, stop_us)
+        return _Started(drawing, start_us, length_us, began)
+
+    def _finished(self, started: _Started) -> Picture:
+        """Return a picture when it is made."""
+        assert self._on_device is not None
+        drawn = self._on_device.finish(started.drawing)
+        if drawn.full:
+            self.sums(started.start_us, started.length_us)  # names the pixel
+        return picture_of(
+            drawn.log,
+            drawn.known,
+            drawn.off_ratio,
+            started.start_us,
+            started.length_us,
+            started.began,
         )
 
-    def _drawn_on_device(
-        self, start_us: int, length_us: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], float]:
-        """Return the picture of a window, which pixels have events, and the OFF threshold over the ON threshold.
-
-        Nothing is copied before the picture is finished.
-        """
-        if self._on_device is None:
-            self._on_device = DevicePictures(self.model, self.harmonics, self.device)
-        pictures = self._on_device
-        stop_us, turns = whole_turns(self.encoder, start_us, length_us)
-        events = read_between(self.recording.events, start_us, stop_us)
-        self._check_events(len(events), start_us, stop_us)
-        sum_turns(pictures.sums, events, self.encoder, float(turns))
-        pictures.draw()
-        log = pictures.log()
-        off_ratio, full = pictures.sums.notes()
-        if full:
-            copied_sums(pictures.sums)  # names the pixel
-        return log, pictures.sums.known.numpy().astype(np.bool_), off_ratio
+    def _streamed(self, starts: Iterable[int], length_us: int) -> Iterator[Picture]:
+        """Yield the pictures of windows on the device. The next one is begun before one is waited for."""
+        before: _Started | None = None
+        for start_us in starts:
+            try:
+                started = self._started(start_us, length_us)
+            except AmiwarpError:
+                # The pictures before it are good
+                if before is not None:
+                    yield self._finished(before)
+                raise
+            if before is not None:
+                yield self._finished(before)
+            before = started
+        if before is not None:
+            yield self._finished(before)
 
     def windows(self, start_us: int, length_us: int, *, step_us: float) -> Iterator[Picture]:
         """Yield pictures of sliding windows, up to the last complete one.
@@ -240,8 +284,13 @@ class PhaseReconstruction:
         Picture
             Picture of each window.
         """
-        for k in range(self.count(start_us, length_us, step_us=step_us)):
-            yield self.window(start_us + round(k * step_us), length_us)
+        count = self.count(start_us, length_us, step_us=step_us)
+        starts = [start_us + round(k * step_us) for k in range(count)]
+        if self.device.is_cuda:
+            yield from self._streamed(starts, length_us)
+            return
+        for first_us in starts:
+            yield self.window(first_us, length_us)
 
     def count(self, start_us: int, length_us: int, *, step_us: float) -> int:
         """Return the number of pictures that :meth:`windows` yields.
@@ -314,6 +363,9 @@ def whole_turns(encoder: Encoder, start_us: int, length_us: int) -> tuple[int, i
     # The last turn may end a little after the window does.
     longest_us = round(length_us * max(1.0, turns / swept) * (2.0 - LEAST_TURN))
     limit_us = min(encoder.coverage[1], start_us + longest_us)
+    end_us = turn_end(encoder, start_us, float(ends[0]), limit_us, turns)
+    if end_us is not None:
+        return end_us, turns
     edges = turn_edges(encoder, start_us, limit_us, 1.0, incomplete=False)
     if len(edges) <= turns:
         raise AmiwarpError(
