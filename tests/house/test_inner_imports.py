@@ -33,7 +33,7 @@ INNER = {
     "live": 98,
     "optics": 39,
     "plotting": 17,
-    "reconstruction": 18,
+    "reconstruction": 17,
     "results": 2,
     "rig": 1,
     "rig_world": 1,
