@@ -198,11 +198,11 @@ def slice_bounds(which: object, length: int, what: str = "events") -> tuple[int,
         if what == "events":
             remedy += " event, and iterate over a recording's events by blocks(count=...) or blocks(duration_us=...)"
         raise AmiwarpError(f"{what} are indexed by the number {which}; {remedy}")
-    found = instance(which, slice, f"index of {what}")
-    for end in (found.start, found.stop):
+    chosen = instance(which, slice, f"index of {what}")
+    for end in (chosen.start, chosen.stop):
         if end is not None:
             whole(end, f"index of {what}", *INT64)
-    start, stop, step = found.indices(length)
+    start, stop, step = chosen.indices(length)
     if step != 1:
         raise AmiwarpError(
             f"{what} are sliced in steps of {step}; slice without steps, then NumPy arrays with them"

@@ -73,8 +73,8 @@ class WindowBatch:
         if found_faults[kernels.DESCENDING] or found_faults[kernels.OUTSIDE]:
             _check_windows(self.events.to_host(), self.windows, self.size)
         idle_numbers[self.device.is_cpu, wp.int32].append(self.faults)
-        found = out.numpy() if self.on_host else out
-        return found[0] if self.single else found
+        result = out.numpy() if self.on_host else out
+        return result[0] if self.single else result
 
 
 def _check_windows(events: Events, cut: Windows, size: tuple[int, int]) -> None:
@@ -128,11 +128,11 @@ def batch_of(
         )
     width = whole(size[0], "width", 1, LARGEST_SIZE, " pixels")
     height = whole(size[1], "height", 1, LARGEST_SIZE, " pixels")
-    found = on_device(events, there)
+    events_there = on_device(events, there)
     if model is not None and encoder is not None:
-        found = _compensated(found, (width, height), cut, model, encoder)
+        events_there = _compensated(events_there, (width, height), cut, model, encoder)
     return WindowBatch(
-        found, cut, single, on_host, (width, height), host_numbers(2, wp.int32, there)
+        events_there, cut, single, on_host, (width, height), host_numbers(2, wp.int32, there)
     )
 
 

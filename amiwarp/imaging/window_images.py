@@ -48,10 +48,10 @@ class Grid(NamedTuple):
 @lru_cache(maxsize=256)
 def struct_of(kind: Any, *values: int) -> Any:
     """Return a struct of numbers, which must not be changed. To make one takes as long as a launch."""
-    found = kind()
+    struct = kind()
     for name, value in zip(kind.vars, values, strict=False):
-        setattr(found, name, value)
-    return found
+        setattr(struct, name, value)
+    return struct
 
 
 _zeros: list[wp.array] = []
@@ -61,9 +61,9 @@ _zeros: list[wp.array] = []
 def _take_zeros(n: int) -> wp.array:
     """Return at least ``n`` words on the CPU, all zero."""
     while _zeros:
-        found = _zeros.pop()
-        if len(found) >= n:
-            return found
+        words = _zeros.pop()
+        if len(words) >= n:
+            return words
     return wp.zeros(n, dtype=wp.int64, device="cpu")
 
 
@@ -234,7 +234,7 @@ def latest_images(
     """Find the latest times at the nearest pixels, see :func:`_images`. With ``carry``, also of earlier windows."""
     size = grid.layers * grid.height * grid.width
     before = None
-    found = _images(
+    image_groups = _images(
         batch,
         grid,
         tensors_cuda.keep_latest,
@@ -242,7 +242,7 @@ def latest_images(
         wp.int64,
         empty=int(NEVER),
     )
-    for first, number, images in found:
+    for first, number, images in image_groups:
         if carry:
             inputs = [images, number, size, before or images]
             launch(tensor_values.carry_latest, size, inputs, [], device=batch.device)
@@ -317,8 +317,8 @@ def _parts(batch: WindowBatch, grid: Grid) -> tuple[int, int]:
         edges = cut.t_start - -k * span // number  # rounded up
         at_edges = find_indices(batch.events, edges.ravel()).reshape(edges.shape)
         inside = np.clip(at_edges, cut.start, cut.stop)
-        found = np.stack([cut.start, *inside, cut.stop])
-        fullest = int(np.diff(found, axis=0).max())
+        indices = np.stack([cut.start, *inside, cut.stop])
+        fullest = int(np.diff(indices, axis=0).max())
         if fullest < CAPACITY:
             return parts, fullest
         parts *= 2

@@ -61,10 +61,10 @@ def read_encoder_triggers(
     return Encoder(pulse_t, angle, index_t=index_t)
 
 
-def _edges(path: Path, found: Format, topic: str | None) -> tuple[Any, Any, Any]:
+def _edges(path: Path, format: Format, topic: str | None) -> tuple[Any, Any, Any]:
     """Return channel, time [us] and whether it rises, of each edge."""
-    read = io_function(TRIGGERS[found])
-    source: Any = read(path, topic) if found is Format.ROSBAG else read(path)
+    read = io_function(TRIGGERS[format])
+    source: Any = read(path, topic) if format is Format.ROSBAG else read(path)
     nothing = np.zeros(0, np.int64)
     parts: list[tuple[Any, ...]] = [(nothing, nothing, np.zeros(0, np.bool_))]
     count = 0

@@ -234,14 +234,14 @@ class FileEvents(EventSource):
     def slice(self, start: int, stop: int) -> Events:
         """Return the events with ``start <= index < stop``."""
         check_slice(start, stop)
-        found: list[Events] = []
+        parts: list[Events] = []
         seen = 0
         for block in self._all():
             if seen >= stop:
                 break
-            found.append(block[max(start - seen, 0) : max(stop - seen, 0)])
+            parts.append(block[max(start - seen, 0) : max(stop - seen, 0)])
             seen += len(block)
-        return _copied([block for block in found if len(block)])
+        return _copied([block for block in parts if len(block)])
 
     def find(self, t: int) -> int:
         """Return the index of the first event at or after ``t`` [us]."""
@@ -255,14 +255,14 @@ class FileEvents(EventSource):
     def between(self, t_start: int, t_end: int) -> Events:
         """Return the events with ``t_start <= t < t_end`` [us]."""
         check_window(t_start, t_end)
-        found: list[Events] = []
+        parts: list[Events] = []
         for block in self._all():
             if block.t[0] >= t_end:
                 break
             start, stop = np.searchsorted(block.t, [t_start, t_end])
             if stop > start:
-                found.append(block[start:stop])
-        return _copied(found)
+                parts.append(block[start:stop])
+        return _copied(parts)
 
     def blocks(
         self, *, count: int | None = None, duration_us: int | None = None

@@ -231,19 +231,19 @@ def output_format(path: Path, given: OutputFormat | str | None) -> OutputFormat:
 
     Raises :class:`AmiwarpError` for an unknown extension, and for one that files of the given format do not have.
     """
-    found = EXTENSIONS.get(path.suffix.lower())
+    of_extension = EXTENSIONS.get(path.suffix.lower())
     if given is not None:
         chosen = choice(OutputFormat, given, f"{path}: format")
         check_ending(path, f"recordings in the format {chosen.value} are written", _endings(chosen))
         return chosen
-    if found is None:
+    if of_extension is None:
         known = ", ".join(EXTENSIONS)
         names = ", ".join(OutputFormat)
         raise AmiwarpError(
             f"{path}: the extension '{path.suffix}' is of no format that is written; "
             f"choose among {known}, which mean the formats {names}"
         )
-    return found
+    return of_extension
 
 
 def _endings(chosen: OutputFormat) -> list[str]:

@@ -24,8 +24,8 @@ def as_array(values: Any, device: Any, what: str) -> wp.array:
         if isinstance(values, wp.array) or (
             hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
         ):
-            found = values if isinstance(values, wp.array) else wp.from_dlpack(values)
-            return found.to(device).contiguous()
+            array = values if isinstance(values, wp.array) else wp.from_dlpack(values)
+            return array.to(device).contiguous()
         numbers = np.ascontiguousarray(values)
         return wp.array(numbers, dtype=wp.dtype_from_numpy(numbers.dtype), device=device)
     except Exception as error:  # libraries raise many kinds of errors
@@ -80,8 +80,8 @@ class TorchFile:
     def run(self, grid: wp.array, states: tuple[Any, ...]) -> tuple[wp.array, tuple[Any, ...]]:
         """Return the first output and the states after a window."""
         with self._torch.no_grad():
-            found = self._module(self._torch.from_dlpack(grid), *states)
-        outputs = found if isinstance(found, tuple | list) else (found,)
+            output = self._module(self._torch.from_dlpack(grid), *states)
+        outputs = output if isinstance(output, tuple | list) else (output,)
         instance(
             outputs[0] if outputs else None, self._torch.Tensor, f"{self.path}: the first output"
         )

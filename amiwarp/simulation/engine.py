@@ -334,10 +334,10 @@ class Engine:
         sort_keys(keys, total, int(lowest), top)
         if self._device.is_cpu:
             return int(np.searchsorted(keys.numpy()[:total], limit))
-        found = wp.empty(1, dtype=int, device=self._device)
+        below_limit = wp.empty(1, dtype=int, device=self._device)
         inputs = [keys, total, limit]
-        wp.launch(event_keys.find, dim=1, inputs=inputs, outputs=[found], device=self._device)
-        return int(found.numpy()[0])
+        wp.launch(event_keys.find, dim=1, inputs=inputs, outputs=[below_limit], device=self._device)
+        return int(below_limit.numpy()[0])
 
     def _unpack(self, keys: wp.array, steps: Any, first: int) -> DeviceBlock:
         """Convert sorted keys of events to a block of events with ground truth. ``first``: number of the first step."""

@@ -66,8 +66,8 @@ class Volume:
 
     def events_per_s(self, orbit: Orbit, rpm: float) -> float:
         """Return the event rate of the whole image [events/s]."""
-        found = self.yield_at(orbit.apex, rpm)
-        per_turn = found * 4.0 * orbit.radius * self.texture / self.contrast
+        relative_yield = self.yield_at(orbit.apex, rpm)
+        per_turn = relative_yield * 4.0 * orbit.radius * self.texture / self.contrast
         return self.of_image(per_turn * rpm / 60.0)
 
     def of_image(self, per_pixel: float) -> float:

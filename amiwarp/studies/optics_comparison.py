@@ -227,7 +227,7 @@ def compare(
     sensor = sensor or SensorModel()
     reference = reference_of(design)
     failed: dict[str, str] = {}
-    found = settings(
+    setting_list = settings(
         camera, design.glass, reference.orbit.apex, reference.rpm / 60.0, depths, failed
     )
 
@@ -241,14 +241,14 @@ def compare(
         seed=seed,
         device=device,
     )
-    wedge = found[0]
+    wedge = setting_list[0]
     change = change_of(_velocity(wedge, camera), slopes_of(template.log_view()), camera)
     mean_change = float(change.mean())
     scale = 4.0 * reference.orbit.radius * design.volume.texture * wedge.hz / mean_change
 
     results: list[Compared] = []
-    for done, setting in enumerate(found):
-        report(f"simulating {setting.name}", done / len(found))
+    for done, setting in enumerate(setting_list):
+        report(f"simulating {setting.name}", done / len(setting_list))
         with noted(failed, setting.name):
             results.append(_compared(design, reference, setting, template, scale))
     if not results:
@@ -350,7 +350,7 @@ def _event_rates(
     assert isinstance(scene, Scene)
     speed = float(np.nanmean(np.linalg.norm(velocity, axis=2)))
     apex = reference.orbit.apex * radius / reference.orbit.radius
-    found = volume.yield_at(apex, 60.0 * speed / (math.tau * radius))
+    relative_yield = volume.yield_at(apex, 60.0 * speed / (math.tau * radius))
 
     # One turn lets the pixels settle; then the motion is counted until it repeats.
     settling_s = 1.0 / setting.hz
@@ -375,6 +375,6 @@ def _event_rates(
     ratio, error = simulated_yield(case, parts, likely, start_us, volume.noise_hz * counted_s)
 
     mean_change = float(change.mean())
-    law = volume.of_image(scale * found * mean_change / volume.contrast)
+    law = volume.of_image(scale * relative_yield * mean_change / volume.contrast)
     checked = volume.of_image(ratio * mean_change / volume.contrast)
     return law, checked, error

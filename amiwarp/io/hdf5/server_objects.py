@@ -69,10 +69,10 @@ def member(file: h5py.File, name: str) -> Any:
 
 def group_of(find: Finder, name: str) -> Any:
     """Return the group of that name, or None. Raises :class:`AmiwarpError` for a dataset."""
-    found = find(name.strip("/"))
-    if found is not None and not isinstance(found, h5py.h5g.GroupID):
+    item = find(name.strip("/"))
+    if item is not None and not isinstance(item, h5py.h5g.GroupID):
         raise AmiwarpError(f"'{name}' is not a group; see docs/reference/recording-format.md")
-    return found
+    return item
 
 
 def attributes_of(group: Any, name: str, wanted: Sequence[str]) -> dict[str, Any]:
@@ -122,6 +122,6 @@ def _text(value: Any) -> str:
     return stored.decode("utf-8", "replace")
 
 
-def is_dataset(found: Any) -> bool:
+def is_dataset(item: Any) -> bool:
     """Return whether a member of a file is a dataset with rows."""
-    return isinstance(found, h5py.Dataset) and found.ndim > 0
+    return isinstance(item, h5py.Dataset) and item.ndim > 0

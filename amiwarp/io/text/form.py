@@ -243,8 +243,8 @@ def _columns_of(
 
 def _order_for(names: Sequence[str], numbers: NDArray[np.float64]) -> str:
     """Return an example of the option ``--columns`` for rows with more or fewer columns than names."""
-    found = roles_of(names)
-    roles = {places[0]: role for role, places in found.items() if places}
+    places_of_roles = roles_of(names)
+    roles = {places[0]: role for role, places in places_of_roles.items() if places}
     if len(roles) != len(ROLES):
         return "t,x,y,p (- for a column without use)"
     order = [roles.get(at, "-") for at in range(len(names))]

@@ -1,5 +1,6 @@
 """Evaluation of apex and speed: blur of edges for several bandwidths, timing errors and models, and event rate."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -669,10 +670,18 @@ def _surge_claims(rows: Sequence[dict[str, Any]], errors: Sequence[dict[str, Any
     return verdicts
 
 
-def _surges(text: str, rows: Sequence[dict[str, Any]], measure: str, **limit: float) -> Claim:
-    """Judge the surge of a measure of one apex against a limit, ``above`` or ``below``."""
+def _surges(
+    text: str,
+    rows: Sequence[dict[str, Any]],
+    measure: str,
+    *,
+    above: float = -math.inf,
+    below: float = math.inf,
+) -> Claim:
+    """Judge the surge of a measure of one apex against a limit."""
     surges = differences(surge_of(rows, measure), "surge", {}, by=("apex_name",))
-    return judge(None, text, surges, f"the {_growth_in_words(measure)}", **limit)
+    rule = f"the {_growth_in_words(measure)}"
+    return judge(None, text, surges, rule, above=above, below=below)
 
 
 def _cause_of_surge(

@@ -155,9 +155,9 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
 def _event_quality(
     streams: Streams, source: Stream, compared: Sequence[Stream], frames: Sequence[FrameTruth]
 ) -> list[dict[str, Any]]:
-    """Return the quality of the tracks of event corners, for each detector, stream, limit and gap; and that of chance.
+    """Return the quality of the tracks of event corners, for each detector, stream, limit and gap, and by chance.
 
-    The corners are those of the events of ``source``, at the places that the ``compared`` streams give these events.
+    The corners are found in the events of ``source``. They lie where the ``compared`` streams place these events.
     """
     span = streams.start_us, streams.end_us
     events, indices = streams.indexed_window(source, *span)

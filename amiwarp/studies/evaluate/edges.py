@@ -1,5 +1,6 @@
 """Evaluation of edges: event images against the Canny edges of the grey picture and the edges of the geometry."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypedDict
@@ -685,7 +686,12 @@ def _fading(rows: Sequence[dict[str, Any]]) -> list[Claim]:
 
 
 def _recall_along(
-    text: str, sides: Sequence[dict[str, Any]], stream: Stream, **limit: float
+    text: str,
+    sides: Sequence[dict[str, Any]],
+    stream: Stream,
+    *,
+    above: float = -math.inf,
+    below: float = math.inf,
 ) -> Claim:
     """Judge a stream's recall of edges along the motion, relative to edges across it."""
     along = {"stream": stream, "along": True}
@@ -696,5 +702,6 @@ def _recall_along(
         differences(sides, "recall", along, across, relative=True),
         f"the recall by '{stream}' of edges whose normal is over 60° from the motion, "
         "less the same of edges below 30°, relative to the latter,",
-        **limit,
+        above=above,
+        below=below,
     )

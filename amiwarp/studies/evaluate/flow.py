@@ -129,10 +129,10 @@ def _error(
     flow: NDArray[Any], truth: NDArray[Any], where: NDArray[np.bool_], window_us: int
 ) -> dict[str, Any]:
     """Return the errors of a flow [px/s] in a window, as values of a row."""
-    found = flow_error(flow * window_us * 1e-6, truth * window_us * 1e-6, where)
+    error = flow_error(flow * window_us * 1e-6, truth * window_us * 1e-6, where)
     return {
-        "epe": finite(found.epe),
-        "outliers": finite(found.outliers),
+        "epe": finite(error.epe),
+        "outliers": finite(error.outliers),
         "share": float(where.mean()),
     }
 
@@ -157,10 +157,10 @@ def _camera_estimate(
     streams: Streams, camera: Frames, middle: int
 ) -> list[tuple[str, NDArray[np.float32], NDArray[np.bool_]]]:
     """Return the flow between the two frames of a camera whose middle is nearest to a time; for all pixels."""
-    found = camera_flow(streams, camera, middle)
-    if found is None:
+    flow_and_time = camera_flow(streams, camera, middle)
+    if flow_and_time is None:
         return []
-    flow, _ = found
+    flow, _ = flow_and_time
     return [(METHODS[0], flow, np.ones(flow.shape[:2], np.bool_))]
 
 

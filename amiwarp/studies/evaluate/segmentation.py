@@ -130,9 +130,11 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     length = round(WINDOW_TURNS * 60e6 / streams.condition.rpm)
     count = QUICK_WINDOWS if settings.quick else FULL_WINDOWS
     starts = np.linspace(streams.start_us, streams.end_us - length, count + 2).astype(np.int64)
-    names = streams.names_with_own(settings)
-    if settings.quick:
-        names = [name for name in names if name in QUICK_STREAMS]
+    names = [
+        name
+        for name in streams.names_with_own(settings)
+        if name in QUICK_STREAMS or not settings.quick
+    ]
     rows = []
     # Windows do not begin at the ends of the recording.
     for start in starts[1:-1].tolist():
