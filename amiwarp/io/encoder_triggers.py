@@ -37,21 +37,21 @@ def read_encoder_triggers(
     whole(channel, "channel", 0, 255)
     whole(counts_per_turn, "counts_per_turn", 1, 1 << 40)
     check_direction(direction)
-    found = detect_format(path)
-    if found not in TRIGGERS:
-        formats = ", ".join(format.value for format in TRIGGERS)
+    format = detect_format(path)
+    if format not in TRIGGERS:
+        formats = ", ".join(known.value for known in TRIGGERS)
         raise AmiwarpError(
-            f"{path}: files of the format {found.value} store no triggers; expected one of {formats}"
+            f"{path}: files of the format {format.value} store no triggers; expected one of {formats}"
         )
-    check_topic(path, topic, found)
+    check_topic(path, topic, format)
     with errors_name(path, lambda: "reading the triggers"):
-        channels, t, rising = _edges(path, found, topic)
+        channels, t, rising = _edges(path, format, topic)
     pulse_t = np.unique(t[(channels == channel) & rising])
     if pulse_t.size < 2:
         counts = []
-        for each in np.unique(channels).tolist():
-            count = int(np.count_nonzero(channels[rising] == each))
-            counts.append(f"{count} of channel {each}")
+        for number in np.unique(channels).tolist():
+            count = int(np.count_nonzero(channels[rising] == number))
+            counts.append(f"{count} of channel {number}")
         given = f"{path}: has {pulse_t.size} rising trigger edges of channel {channel}"
         listed = ", ".join(counts) or "none"
         raise AmiwarpError(f"{given}; expected at least 2; the rising edges are: {listed}")

@@ -235,22 +235,22 @@ class FileEvents(EventSource):
         """Return the events with ``start <= index < stop``."""
         check_slice(start, stop)
         parts: list[Events] = []
-        seen = 0
+        passed = 0
         for block in self._all():
-            if seen >= stop:
+            if passed >= stop:
                 break
-            parts.append(block[max(start - seen, 0) : max(stop - seen, 0)])
-            seen += len(block)
+            parts.append(block[max(start - passed, 0) : max(stop - passed, 0)])
+            passed += len(block)
         return _copied([block for block in parts if len(block)])
 
     def find(self, t: int) -> int:
         """Return the index of the first event at or after ``t`` [us]."""
-        seen = 0
+        passed = 0
         for block in self._all():
             if block.t[-1] >= t:
-                return seen + int(np.searchsorted(block.t, t))
-            seen += len(block)
-        return seen
+                return passed + int(np.searchsorted(block.t, t))
+            passed += len(block)
+        return passed
 
     def between(self, t_start: int, t_end: int) -> Events:
         """Return the events with ``t_start <= t < t_end`` [us]."""

@@ -256,8 +256,10 @@ def check_native(path: Path) -> None:
     """Raise :class:`AmiwarpError` if the name of a native recording ends in another extension."""
     remedy = None
     if EXTENSIONS.get(path.suffix.lower(), OutputFormat.NATIVE) is not OutputFormat.NATIVE:
-        made = path.with_suffix(".h5")
-        remedy = f"write {made.name}, then run: amiwarp convert {made.name} {path.name}"
+        native_path = path.with_suffix(".h5")
+        remedy = (
+            f"write {native_path.name}, then run: amiwarp convert {native_path.name} {path.name}"
+        )
     check_ending(path, "recordings are written here", _endings(OutputFormat.NATIVE), remedy)
 
 

@@ -139,11 +139,11 @@ class OnnxFile:
     def _check_sizes(self, what: str, declared: Sequence[Any]) -> None:
         """Raise :class:`AmiwarpError` if inputs or outputs take too much memory. Sizes without a number count as 1."""
         size = 0
-        for one in declared:
-            item = wp.types.type_size_in_bytes(TYPES[one.type]) if one.type in TYPES else 1
-            size += item * math.prod(length for length in one.shape if isinstance(length, int))
+        for value in declared:
+            item = wp.types.type_size_in_bytes(TYPES[value.type]) if value.type in TYPES else 1
+            size += item * math.prod(length for length in value.shape if isinstance(length, int))
         if size > LARGEST_BYTES:
-            shapes = ", ".join(shown(one.shape) for one in declared[:4])
+            shapes = ", ".join(shown(value.shape) for value in declared[:4])
             raise AmiwarpError(
                 f"{self.path}: its {what} of shape {shapes} take {size / 2**30:.4g} GiB; expected at most "
                 f"{LARGEST_BYTES >> 30} GiB; the file is damaged, or export the network for smaller images",
@@ -167,8 +167,8 @@ class OnnxFile:
                     f"{self.path}: {wanted.name} has the shape {wanted.shape}; give its first value in states"
                 )
         return [
-            wp.zeros(one.shape, dtype=self._type(one.type), device=self._device)
-            for one in self._inputs[1:]
+            wp.zeros(state.shape, dtype=self._type(state.type), device=self._device)
+            for state in self._inputs[1:]
         ]
 
     def run(self, grid: wp.array, states: list[Any]) -> tuple[wp.array, list[Any]]:

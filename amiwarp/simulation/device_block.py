@@ -71,10 +71,10 @@ class DeviceBlock:
         by_name["points"] = self._points
         by_name["cause"] = self.arrays.cause
         if self.look is not None:
-            seen = self.look()
-            by_name["instance"] = seen.instance
-            by_name["depth"] = seen.depth
-            by_name["place"] = seen.place
+            surfaces = self.look()
+            by_name["instance"] = surfaces.instance
+            by_name["depth"] = surfaces.depth
+            by_name["place"] = surfaces.place
         return by_name
 
 

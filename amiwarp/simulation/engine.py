@@ -284,8 +284,8 @@ class Engine:
 
     def _start_pixels(self, steps: Any) -> None:
         """Set the initial state of every pixel."""
-        seen = self._seen(steps, 0, 1)
-        inputs = [seen, steps, self._sensor, self._simulation.seed, 0, *self._state]
+        light = self._seen(steps, 0, 1)
+        inputs = [light, steps, self._sensor, self._simulation.seed, 0, *self._state]
         kernel = pixels.start_pixels if self._maps is not None else world_pixels.start_world_pixels
         loading.load(kernel, self._device)
         wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
@@ -368,8 +368,8 @@ class Engine:
         look = partial(self._sight.look, self._view, steps, block, n, faces)
         if self._simulation.plate is not None:
             # The events' pixels without the plate depend on the surfaces, so that these are needed in any case.
-            seen = look()
-            return DeviceBlock(block, lambda: seen)
+            surfaces = look()
+            return DeviceBlock(block, lambda: surfaces)
         return DeviceBlock(block, look, at_rest)
 
 

@@ -106,12 +106,12 @@ def design_lines(design: Design, files: dict[str, str]) -> list[Any]:
         )
         rows.append(row)
     shown = cli.table(rows, "apex", "rpm", "events", "orbit", "error", "model", "window", "misses")
-    said = [tuple(line.split(": ", 1)) for line in reasons(design)]
+    reason_rows = [tuple(line.split(": ", 1)) for line in reasons(design)]
     return [
         shown,
         "",
         headline(design),
-        cli.table(said),
+        cli.table(reason_rows),
         "",
         *files.values(),
         *failed_names(design.failed),
@@ -218,5 +218,5 @@ def comparison_lines(comparison: Comparison) -> list[Any]:
         "depth",
         "misses",
     )
-    said = [tuple(line.split(": ", 1)) for line in reasons(comparison)]
-    return [cli.table(rows, *heads), "", cli.table(said)]
+    reason_rows = [tuple(line.split(": ", 1)) for line in reasons(comparison)]
+    return [cli.table(rows, *heads), "", cli.table(reason_rows)]

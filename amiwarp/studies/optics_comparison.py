@@ -252,7 +252,7 @@ def compare(
         with noted(failed, setting.name):
             results.append(_compared(design, reference, setting, template, scale))
     if not results:
-        raise AmiwarpError("; ".join(f"{name}: {said}" for name, said in failed.items()))
+        raise AmiwarpError("; ".join(f"{name}: {message}" for name, message in failed.items()))
     return Comparison(design, reference, tuple(results), failed)
 
 
@@ -296,7 +296,9 @@ def _compared(
     velocity = _velocity(setting, camera)
     valid = np.isfinite(velocity).all(axis=(1, 2))
     by_clock = np.mean(across_edges(velocity[valid], velocity[valid]))
-    by_angles = np.mean(sum(across_edges(one[valid], velocity[valid]) for one in flow))
+    by_angles = np.mean(
+        sum(across_edges(flow_of_angle[valid], velocity[valid]) for flow_of_angle in flow)
+    )
     # Nothing measures the angles of a vibration.
     per_radian = 0.0 if isinstance(setting.optic, Vibration) else math.sqrt(by_angles)
     clock, encoder = design.timing.scaled(math.sqrt(by_clock), per_radian)
@@ -355,12 +357,12 @@ def _event_rates(
     # One turn lets the pixels settle; then the motion is counted until it repeats.
     settling_s = 1.0 / setting.hz
     counted_s = setting.turns / setting.hz
-    shown: Scene | WorldScene = scene
+    filled_scene: Scene | WorldScene = scene
     if isinstance(setting.optic, Plate):
-        shown = wall(scene, 1.0 / setting.inverse_depth)
+        filled_scene = wall(scene, 1.0 / setting.inverse_depth)
     case = replace(
         template,
-        scene=shown,
+        scene=filled_scene,
         prism=setting.optic,
         motion=setting.motion,
         duration_s=settling_s + counted_s,

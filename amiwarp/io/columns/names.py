@@ -59,12 +59,12 @@ def role_of(name: str) -> tuple[str | None, str | None]:
         return None, None
     stem = match[1] or match[3] or match[5]
     suffix = match[2] or match[4] or match[6] or ""
-    found = next((role for role, names in NAMES.items() if stem in names), None)
+    own_role = next((role for role, names in NAMES.items() if stem in names), None)
     unit = unit_of(suffix)
-    if found == "t" and unit is not None:
-        return found, unit
-    if found in ("x", "y") and suffix in ("px", "pixel", "pixels"):
-        return found, None
+    if own_role == "t" and unit is not None:
+        return own_role, unit
+    if own_role in ("x", "y") and suffix in ("px", "pixel", "pixels"):
+        return own_role, None
     return None, None
 
 

@@ -37,13 +37,13 @@ def open_arrays(path: str) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
 def _datasets(file: h5py.File) -> Iterator[tuple[str, Any]]:
     """Yield the datasets of a file by name. Links and other files are left out."""
     waiting = [("", 0)]
-    seen = 0
+    examined = 0
     while waiting:
         group, depth = waiting.pop(0)
         for key in file[group or "/"]:
-            seen += 1
+            examined += 1
             name = f"{group}/{key}".lstrip("/")
-            if key.startswith("#") or seen > MOST_OBJECTS:
+            if key.startswith("#") or examined > MOST_OBJECTS:
                 continue
             try:
                 item = member(file, name)

@@ -62,9 +62,12 @@ class Finder:
 
 def member(file: h5py.File, name: str) -> Any:
     """Return a group or dataset of the file, or None, as :class:`Finder`."""
-    found = Finder(file.id)(name)
-    kinds = {h5py.h5d.DatasetID: h5py.Dataset, h5py.h5g.GroupID: h5py.Group}
-    return kinds[type(found)](found) if type(found) in kinds else None
+    opened = Finder(file.id)(name)
+    if isinstance(opened, h5py.h5d.DatasetID):
+        return h5py.Dataset(opened)
+    if isinstance(opened, h5py.h5g.GroupID):
+        return h5py.Group(opened)
+    return None
 
 
 def group_of(find: Finder, name: str) -> Any:
@@ -81,7 +84,7 @@ def attributes_of(group: Any, name: str, wanted: Sequence[str]) -> dict[str, Any
     ``name``: name of the group, for messages.
     """
     if not wanted:
-        wanted = [_text(found) for found in h5py.Group(group).attrs]
+        wanted = [_text(stored_name) for stored_name in h5py.Group(group).attrs]
     return {
         attribute: _value(group, name, attribute)
         for attribute in wanted

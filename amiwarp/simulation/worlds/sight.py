@@ -147,22 +147,22 @@ class WorldSight:
         batch = self._batch
         view = self._view
         rays = len(view.aperture)
-        seen = [self._world.params, view, steps]
-        self._launch_rays(world_rays.cast_centres, self._tiled, seen, [batch])
+        viewed = [self._world.params, view, steps]
+        self._launch_rays(world_rays.cast_centres, self._tiled, viewed, [batch])
         if rays == 1:
             return
 
         # Most pixels see one smooth surface, and need no further rays; the others are listed.
         n = self._tiled * batch.count
         marks = self._marks[:n]
-        launch(world_rays.smooth_insides, n, [*seen, batch], [marks], device=device)
+        launch(world_rays.smooth_insides, n, [*viewed, batch], [marks], device=device)
         wp.utils.array_scan(marks, marks, inclusive=True)
         launch(world_rays.list_marked, n, [marks], [self._listed], device=device)
         listed = int(marks[n - 1 :].numpy()[0])
 
         if len(self._cast) < listed * rays:
             self._cast = wp.empty(listed * rays * 5 // 4, dtype=float, device=device)
-        inputs = [*seen, batch, self._listed]
+        inputs = [*viewed, batch, self._listed]
         self._launch_rays(world_rays.cast_edges, listed * rays, inputs, [self._cast])
         inputs = [view, batch, self._listed, self._cast]
         launch(world_rays.add_edges, listed, inputs, [], device=device)

@@ -112,9 +112,9 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
                 found_flows = _camera_estimate(streams, stream, middle)
             else:
                 found_flows = _estimates(streams, stream, middle, window)
-            for method, flow, seen in found_flows:
+            for method, flow, has_events in found_flows:
                 known = {"stream": stream.value, "method": method, "turns": turns}
-                at_events = _error(flow, truth.flow, seen & still, window)
+                at_events = _error(flow, truth.flow, has_events & still, window)
                 at_edges = _error(flow, truth.flow, edges, window)
                 rows.append(known | {"pixels": "events"} | at_events)
                 rows.append(known | {"pixels": "edges"} | at_edges)
@@ -258,14 +258,14 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
 
     dis, contrast = METHODS
     grows = f"The endpoint error grows by no more than {PAPER_PX} px ({dis}, handheld camera)."
-    made = [
+    verdicts = [
         claim(10, grows, dis),
         claim(None, f"The same for {contrast}; the paper names no method.", contrast),
     ]
     for method in METHODS:
         text = f"The same with a fast camera, whose image moves further in a window ({method})."
-        made.append(claim(None, text, method, fast=True))
+        verdicts.append(claim(None, text, method, fast=True))
     for method in METHODS:
         text = f"The error is smaller than by predicting nothing ({method}, handheld camera)."
-        made.append(claim(None, text, method, ZERO, 0.0))
-    return made
+        verdicts.append(claim(None, text, method, ZERO, 0.0))
+    return verdicts

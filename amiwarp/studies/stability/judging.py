@@ -211,7 +211,7 @@ def judge(cell: Cell, method: Method, sample: SimulatedSample | OpticSample, dev
         limit = max(LIMIT_PX, BEST_FIT * best_fit(cell.condition, method.model))
     began = time.perf_counter()
     try:
-        found = method.run(sample, cell.condition, cell.seed, device)
+        calibration = method.run(sample, cell.condition, cell.seed, device)
     except AmiwarpError as error:
         seconds = time.perf_counter() - began
         return Result(Outcome.REFUSAL, None, limit, seconds, str(error))
@@ -223,13 +223,13 @@ def judge(cell: Cell, method: Method, sample: SimulatedSample | OpticSample, dev
     seconds = time.perf_counter() - began
 
     if isinstance(sample, OpticSample):
-        return judge_optic(cell.condition, sample, found, seconds)
-    error_px = compare(found, sample).rms
+        return judge_optic(cell.condition, sample, calibration, seconds)
+    error_px = compare(calibration, sample).rms
     outcome = Outcome.SUCCESS if error_px <= limit else Outcome.SILENT
     away = {}
     if method.model == "exact":
-        away = deviations(found, cell.condition, sample)
-    message = "; ".join(found.warnings)
+        away = deviations(calibration, cell.condition, sample)
+    message = "; ".join(calibration.warnings)
     stored_px = min(error_px, LARGEST_PX)
     return Result(outcome, stored_px, limit, seconds, message, deviations=away)
 
@@ -255,13 +255,13 @@ def judge_optic(
             stated_px = min(stage.deviation_px, LARGEST_PX)
 
     outcome = Outcome.SILENT
-    said = [*calibration.warnings, *could_hide]
+    messages = [*calibration.warnings, *could_hide]
     if error_px <= OPTIC_LIMIT_PX:
         outcome = Outcome.SUCCESS
-        said = [*calibration.warnings]
-    elif names_cause(said, troubles_of(condition)):
+        messages = [*calibration.warnings]
+    elif names_cause(messages, troubles_of(condition)):
         outcome = Outcome.NAMED
-    message = "; ".join(said)
+    message = "; ".join(messages)
     return Result(outcome, error_px, OPTIC_LIMIT_PX, seconds, message, stated_px=stated_px)
 
 

@@ -289,10 +289,10 @@ def rows_for(
             continue
         value = given[axis.field]
         near = [f"{label_of(axis, point.value)}: {point}" for point in axis.about(value)]
-        said = "; ".join(near)
+        text = "; ".join(near)
         if not axis.measured_at(value):
-            said = f"not measured there; nearest: {said}"
-        rows.append((axis_text(axis), f"{value:g}", said))
+            text = f"not measured there; nearest: {text}"
+        rows.append((axis_text(axis), f"{value:g}", text))
     return rows
 
 
@@ -306,10 +306,10 @@ def _answered_up_to(axis: MapAxis) -> str:
             good.append(label)
         if point.silent:
             bad.append(label)
-    said = f"all answered at {', '.join(good)}" if good else "nowhere all answered"
+    text = f"all answered at {', '.join(good)}" if good else "nowhere all answered"
     if bad:
-        said += f"; silent failures at {', '.join(bad)}"
-    return said
+        text += f"; silent failures at {', '.join(bad)}"
+    return text
 
 
 def label_of(axis: MapAxis, value: Any) -> str:
