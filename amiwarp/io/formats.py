@@ -147,7 +147,7 @@ def detect_format(path: Path) -> Format:
     folder = _folder_format(path)
     if folder is not None:
         return folder
-    if path.is_dir() and any(each.name.endswith(BAG_ENDS) for each in path.iterdir()):
+    if path.is_dir() and any(inner.name.endswith(BAG_ENDS) for inner in path.iterdir()):
         raise AmiwarpError(
             f"{path}: is the folder of a ROS 2 bag without its metadata.yaml; "
             "run ros2 bag reindex, or give one of its files"

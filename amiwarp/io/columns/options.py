@@ -28,7 +28,7 @@ class GivenLayout:
     @property
     def options(self) -> str:
         """Names of the options that are given."""
-        names = [each.name for each in fields(self) if getattr(self, each.name) is not None]
+        names = [option.name for option in fields(self) if getattr(self, option.name) is not None]
         return ", ".join("--" + name.replace("_", "-") for name in names)
 
     def check(self) -> None:

@@ -206,7 +206,9 @@ def find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLayo
     have_six_decimals = all(SECONDS.fullmatch(word) for word in t_words)
     are_seconds = have_six_decimals and _can_be_seconds(numbers[:, t_column])
     if given.time_unit is None and names is None and are_seconds:
-        others = tuple(each for each in layout.assumptions if each.what != "time unit")
+        others = tuple(
+            assumption for assumption in layout.assumptions if assumption.what != "time unit"
+        )
         layout = replace(
             layout,
             unit="s",
