@@ -357,12 +357,12 @@ def _event_rates(
     # One turn lets the pixels settle; then the motion is counted until it repeats.
     settling_s = 1.0 / setting.hz
     counted_s = setting.turns / setting.hz
-    filled_scene: Scene | WorldScene = scene
+    scene_at_depth: Scene | WorldScene = scene
     if isinstance(setting.optic, Plate):
-        filled_scene = wall(scene, 1.0 / setting.inverse_depth)
+        scene_at_depth = wall(scene, 1.0 / setting.inverse_depth)
     case = replace(
         template,
-        scene=filled_scene,
+        scene=scene_at_depth,
         prism=setting.optic,
         motion=setting.motion,
         duration_s=settling_s + counted_s,

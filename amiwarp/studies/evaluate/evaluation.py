@@ -151,8 +151,8 @@ def evaluate(
         store = Store(folder / "cells")
         with start_workers(
             "amiwarp evaluate", "evaluate", scheduler, count, device
-        ) as workers_there:
-            results, new, processor_s = _run(jobs, store, workers_there, progress or silent)
+        ) as started_workers:
+            results, new, processor_s = _run(jobs, store, started_workers, progress or silent)
 
         sections = []
         for name in EVALUATIONS:
