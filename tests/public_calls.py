@@ -379,7 +379,7 @@ OWN: dict[str, dict[str, Any]] = {
     "RecordingWriter.append_image": {"t_us": 0, "image": np.zeros((3, 4), np.uint8)},
     "RecordingWriter.append_imu": {"samples": IMU},
     "RecordingWriter.append_known": {"t_us": 0, "mask": np.zeros((3, 4), np.bool_)},
-    "RecordingWriter.fill": {"pieces": [], "count": 0},
+    "RecordingWriter.fill": {"pieces": [], "count": 1 << 18},
     "RecordedDataset": {"folder": "."},
     "save_flow_dsec": {"folder": _new(""), "frames": FRAMES},
     "save_flow_mvsec": {"path": _new(".npz"), "frames": FRAMES},

@@ -201,14 +201,14 @@ def deviation(
     """
     from scipy.interpolate import CubicSpline
 
-    seen = count > LEAST_COUNT
+    has_pairs = count > LEAST_COUNT
     samples = FINER * (len(tried) - 1) + 1
     fine = np.linspace(tried[0], tried[-1], samples)
     area = 4.0 * math.pi * WINDOW_PX**2
     std = np.full(count.shape, np.inf)
     # Row by row: of a whole image, the interpolated costs would take gigabytes.
     for row in range(len(count)):
-        some = seen[row]
+        some = has_pairs[row]
         if not some.any():
             continue
         pairs = count[row, some]

@@ -71,10 +71,10 @@ class EventTable:
         device = self.device
         table = self.arrays
         events = len(table.x)
-        flag = wp.empty(events, dtype=int, device=device)
+        is_inside = wp.empty(events, dtype=int, device=device)
         pixels = [table.x, table.y, self.tile_of]
-        launch(pair_kernels.mark_inside, events, pixels, [flag], device=device)
-        place, count = running_count(flag)
+        launch(pair_kernels.mark_inside, events, pixels, [is_inside], device=device)
+        place, count = running_count(is_inside)
         table.count = count
 
         # The sort needs twice the room.
@@ -139,45 +139,49 @@ class EventTable:
         if quiet is not None:
             edges, at_least = quiet
             spans = len(edges) - 1
-        flag = wp.empty(candidates + spans * self.arrays.places, dtype=int, device=device)
-        launch(pair_kernels.mark_pairs, events, [self.arrays, times], [flag], device=device)
+        is_pair = wp.empty(candidates + spans * self.arrays.places, dtype=int, device=device)
+        launch(pair_kernels.mark_pairs, events, [self.arrays, times], [is_pair], device=device)
         if window is not None:
-            launch(pair_kernels.mark_ends, events, [self.arrays], [flag], device=device)
+            launch(pair_kernels.mark_ends, events, [self.arrays], [is_pair], device=device)
         if spans:
             edges_on_device = wp.array(edges, dtype=wp.int64, device=device)
-            self._mark_quiet(edges_on_device, at_least, candidates, flag)
+            self._mark_quiet(edges_on_device, at_least, candidates, is_pair)
 
         # Count them.
-        place, count = running_count(flag)
-        if len(flag) == events:
+        place, count = running_count(is_pair)
+        if len(is_pair) == events:
             of_two_events = count
         elif events:
             of_two_events = int(place[events - 1 : events].numpy()[0])
         else:
             of_two_events = 0
-        out = empty_pairs(count, device, weak=weak)
+        pairs = empty_pairs(count, device, weak=weak)
         if not count:
-            return PairSet(out, device, 0)
+            return PairSet(pairs, device, 0)
 
         # Write them.
-        first, last = self.covers
+        t_first, t_last = self.covers
         if window is not None:
-            first = min(first, window[0])
-            last = max(last, window[1])
-        angles = encoder_params(encoder, first, last, device)
-        inputs = [self.arrays, times, angles, self.tile_of, flag, place, kinds]
-        launch(pair_kernels.write_pairs, events, inputs, [out], device=device)
+            window_start, window_stop = window
+            t_first = min(t_first, window_start)
+            t_last = max(t_last, window_stop)
+        angles = encoder_params(encoder, t_first, t_last, device)
+        inputs = [self.arrays, times, angles, self.tile_of, is_pair, place, kinds]
+        launch(pair_kernels.write_pairs, events, inputs, [pairs], device=device)
         if spans:
             of_spans = empty_pairs(spans, device)
             inputs = [edges_on_device, times, angles]
             launch(pair_kernels.write_spans, spans, inputs, [of_spans], device=device)
-            inputs = [of_spans, self.tile_of, candidates, flag, place]
+            inputs = [of_spans, self.tile_of, candidates, is_pair, place]
             quiet_candidates = spans * self.arrays.places
-            launch(pair_kernels.write_quiet, quiet_candidates, inputs, [out], device=device)
-        return PairSet(out, device, of_two_events)
+            launch(pair_kernels.write_quiet, quiet_candidates, inputs, [pairs], device=device)
+        return PairSet(pairs, device, of_two_events)
 
-    def _mark_quiet(self, edges: Any, at_least: int, first: int, flag: Any) -> None:
-        """Mark the time spans in which pixels are silent. Their candidates start at index ``first``."""
+    def _mark_quiet(self, edges: Any, at_least: int, first: int, is_pair: Any) -> None:
+        """Mark the time spans in which pixels are silent, whose candidates start at index ``first`` of ``is_pair``.
+
+        ``edges``: boundaries of the spans [us]; ``at_least``: number of successive spans from which silence counts.
+        """
         spans = len(edges) - 1
         fired = wp.zeros(spans * self.arrays.pixels, dtype=wp.uint8, device=self.device)
         launch(
@@ -191,7 +195,7 @@ class EventTable:
             pair_kernels.mark_quiet,
             self.arrays.places,
             [fired, self.tile_of, at_least, first],
-            [flag],
+            [is_pair],
             device=self.device,
         )
 

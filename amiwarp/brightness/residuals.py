@@ -188,10 +188,10 @@ class Residuals:
         pairs_of_square = np.diff(starts.numpy())
         used = np.flatnonzero(pairs_of_square)
         triangle = sums.numpy()[used]
-        found = np.empty((len(used), len(factors), len(factors)))
-        found[:, first, second] = triangle
-        found[:, second, first] = triangle
-        return found, used
+        products = np.empty((len(used), len(factors), len(factors)))
+        products[:, first, second] = triangle
+        products[:, second, first] = triangle
+        return products, used
 
     def median(self) -> float:
         """Return the median absolute residual; NaN if there is none."""
@@ -205,8 +205,8 @@ class Residuals:
         if self.device.is_cpu:
             values = np.abs(self.values.numpy()[:n])
             values = values[np.isfinite(values)]
-            found = float(np.median(values)) if len(values) else math.nan
-            return lambda: found
+            median = float(np.median(values)) if len(values) else math.nan
+            return lambda: median
         # The sort needs twice the room, and numbers beside the keys, which are not used.
         keys = wp.empty(2 * n, dtype=float, device=self.device)
         order = wp.empty(2 * n, dtype=int, device=self.device)

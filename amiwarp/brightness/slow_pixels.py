@@ -58,11 +58,11 @@ def darkness(
 
     def compute(every: int, columns: int) -> Any:
         """Compute a value for each of both events of every ``every``-th pair, as ``pixels`` says."""
-        found = wp.empty((2, columns), dtype=float, device=device)
+        values_of_pairs = wp.empty((2, columns), dtype=float, device=device)
         count = math.ceil(len(pairs) / every)
         inputs = [*brightness.path_arguments(model), pixels, every]
-        launch(slow_kernels.find_time_constants, count, inputs, [found], device=device)
-        return found
+        launch(slow_kernels.find_time_constants, count, inputs, [values_of_pairs], device=device)
+        return values_of_pairs
 
     # Without a threshold, the kernel returns the brightness itself.
     every = max(1, len(pairs) // SAMPLED)

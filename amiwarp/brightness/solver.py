@@ -16,6 +16,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from amiwarp.brightness.conjugate_gradients import (
+    FEW_CHUNKS,
+    ConjugateGradients,
+    NormalEquations,
+)
 from amiwarp.brightness.multigrid import GridHierarchy
 from amiwarp.brightness.pair_chains import FEW_BLOCKS
 from amiwarp.brightness.pairs import PairSet
@@ -30,9 +35,6 @@ from amiwarp.kernels.program import Program
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.models.base import Model, model_camera
 
-FEW_CHUNKS = 16
-"""Smallest number of chunks of the unknowns for which a second CPU thread is used. Fewer take less time than the
-hand-over to a thread."""
 DAMPING = 0.02
 """Weight of the squared map values relative to the equations. It determines unknowns that no equation does."""
 CONTRAST = 6.0
@@ -104,7 +106,7 @@ class BrightnessMap:
         # Sums over the equations in fixed point, a slice for each thread.
         shape = (slice_count(self.device), unknowns)
         self._sums = wp.zeros(shape, dtype=wp.int64, device=self.device)
-        self._slices = [self._sums[k] for k in range(len(self._sums))]
+        self._slices = [self._sums[row] for row in range(len(self._sums))]
         self._make_vectors(unknowns)
         self._make_prior(damping, unknowns)
         if off_excess is not None:
@@ -114,12 +116,12 @@ class BrightnessMap:
         self.residuals = Residuals(pairs, len(tiles.origin))
         self._scale = self._zeros(1)
         self._solved = False
-        self._at = PairPositions(pairs, self._atlas, middle_us)
-        self._equations = self._at.equations
+        self._positions = PairPositions(pairs, self._atlas, middle_us)
+        self._equations = self._positions.equations
         self._launch = RepeatedLaunches(self.device)
 
-    def _zeros(self, n: int) -> Any:
-        return wp.zeros(n, dtype=float, device=self.device)
+    def _zeros(self, count: int) -> Any:
+        return wp.zeros(count, dtype=float, device=self.device)
 
     def _make_vectors(self, unknowns: int) -> None:
         """Allocate the vectors of the conjugate-gradient method."""
@@ -169,7 +171,7 @@ class BrightnessMap:
         camera_rotation: CameraRotation | None = None,
     ) -> None:
         """Compute the positions of the pairs on the map, for a model and a camera rotation about ``middle_us``."""
-        self._at.place(model, drift, camera_rotation, self._at.geometry)
+        self._positions.place(model, drift, camera_rotation, self._positions.geometry)
         self._equations.take_positions()
 
     def path_arguments(self, model: Model) -> list[Any]:
@@ -190,14 +192,14 @@ class BrightnessMap:
         Both are keyword arguments of :meth:`place`. They may hold ``arrays`` too, the pairs with other columns, see
         :meth:`PairSet.with_columns`. The positions that :meth:`place` stored remain unchanged.
         """
-        return self._at.find_slope(plus, minus, width, self._image)
+        return self._positions.find_slope(plus, minus, width, self._image)
 
     def keep(self, nodes: wp.array) -> None:
         """Exclude pairs of two events, as noise, if either event is off the nodes for which ``nodes`` is 1.
 
         ``nodes`` is uint8, shape (nodes,), on the device.
         """
-        self._at.keep(nodes)
+        self._positions.keep(nodes)
 
     # -- solving
 
@@ -272,9 +274,9 @@ class BrightnessMap:
             wp.copy(self._projection.image, change)
             self._subtract(change, self._projection.residual)
         self._projection.run(steps)
-        rest = wp.clone(target)
-        self._subtract(self._projection.image, rest)
-        return rest
+        unexplained = wp.clone(target)
+        self._subtract(self._projection.image, unexplained)
+        return unexplained
 
     def explaining_change(self) -> Any:
         """Return a copy of the change of the map that explains the rest of the last target of :meth:`unexplained`."""
@@ -335,19 +337,37 @@ class BrightnessMap:
         """Program that computes the diagonals of the coarser grids for the current weights."""
         program = Program(self.device)
         if self._grids is not None:
-            equations = [self._atlas, self._at.geometry, self.residuals.weight]
+            equations = [self._atlas, self._positions.geometry, self.residuals.weight]
             self._grids.prepare(program, equations, self.count, self._sums, self._slices)
         return program
 
     @cached_property
-    def _descent(self) -> _ConjugateGradients:
-        return _ConjugateGradients(self, self._image, self.residuals.values)
+    def _descent(self) -> ConjugateGradients:
+        return ConjugateGradients(self._system, self._image, self.residuals.values)
 
     @cached_property
-    def _projection(self) -> _ConjugateGradients:
+    def _projection(self) -> ConjugateGradients:
         image = self._zeros(len(self._image))
         residual = self._zeros(self.pairs.arrays.stride)
-        return _ConjugateGradients(self, image, residual)
+        return ConjugateGradients(self._system, image, residual)
+
+    @cached_property
+    def _system(self) -> NormalEquations:
+        """Normal equations for the current weights, with the buffers that all solutions share."""
+        return NormalEquations(
+            equations=self._equations,
+            weight=self.residuals.weight,
+            prior=self._prior,
+            grids=self._grids,
+            sums=self._sums,
+            slices=self._slices,
+            vectors=self._vectors,
+            preconditioned=self._preconditioned,
+            dots=self._dots,
+            width=self._width,
+            threads=self._threads,
+            device=self.device,
+        )
 
     # -- results
 
@@ -406,72 +426,6 @@ class BrightnessMap:
         """Unknowns after the map: the leak [thresholds/s], and OFF threshold over ON threshold, minus 1."""
         values: NDArray[np.float32] = self._image[self.tiles.nodes :].numpy()
         return values.copy() if self.device.is_cpu else values
-
-
-class _ConjugateGradients:
-    """Conjugate gradients on the normal equations, preconditioned by the diagonal or by :class:`GridHierarchy`.
-
-    They change ``image`` to reduce ``residual``, which must be the residual of the initial ``image``.
-    """
-
-    def __init__(self, of: BrightnessMap, image: Any, residual: Any) -> None:
-        self.image = image
-        self.residual = residual
-        self._map = of
-        equations = of._equations
-        weight = of.residuals.weight
-        sums = of._sums
-        prior = of._prior
-        vectors = of._vectors
-        dots = of._dots
-
-        self._start = Program(of.device)
-        equations.add_transpose(self._start, weight, residual, of._slices)
-        self._add(self._start, cg.start_descent, [sums, prior, image], [vectors, dots])
-        self._add_preconditioner(self._start)
-
-        self._step = Program(of.device)
-        if of._grids is None:
-            self._add(self._step, cg.update_search_direction, [], [vectors, dots])
-        else:
-            inputs = [of._preconditioned]
-            self._add(self._step, cg.update_search_direction_with, inputs, [vectors, dots])
-        equations.add_product(self._step, weight, vectors.direction, of._slices)
-        self._add(self._step, cg.finish_product, [sums, prior], [vectors, dots])
-        self._add(self._step, cg.descend, [], [image, vectors, dots])
-        self._add_preconditioner(self._step)
-
-    def _add_preconditioner(self, program: Any) -> None:
-        """Add to ``program`` the preconditioned residual, and its product with the residual, if there are grids."""
-        grids = self._map._grids
-        if grids is None:
-            return
-        residual = self._map._vectors.residual
-        preconditioned = self._map._preconditioned
-        grids.correct(
-            program,
-            diagonal=self._map._vectors.diagonal,
-            prior=self._map._prior,
-            residual=residual,
-            out=preconditioned,
-        )
-        self._add(program, cg.dot, [residual, preconditioned], [self._map._dots.rz])
-
-    def run(self, steps: int) -> None:
-        """Start from the current ``image`` and run ``steps`` iterations."""
-        self._start.run()
-        self._step.run(steps)
-
-    def _add(
-        self,
-        program: Any,
-        kernel: Any,
-        inputs: list[Any],
-        outputs: list[Any],
-    ) -> None:
-        """Add to ``program`` a kernel over the unknowns."""
-        inputs = [*inputs, self._map._width]
-        program.add(kernel, self._map._threads, inputs, outputs, smallest=FEW_CHUNKS)
 
 
 def _interpolated(

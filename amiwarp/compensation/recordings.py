@@ -23,8 +23,8 @@ from amiwarp.io.conversion import bag_of, left_out, subtracted_us
 from amiwarp.io.export import export
 from amiwarp.io.hdf5.chunks import compile_checksums
 from amiwarp.io.native.copying import copy_records
+from amiwarp.io.native.event_writer import FlaggedEvents
 from amiwarp.io.native.events import NativeEvents
-from amiwarp.io.native.writer import FlaggedEvents
 from amiwarp.io.output_formats import (
     Codec,
     OutputFormat,

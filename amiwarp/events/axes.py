@@ -19,14 +19,14 @@ SAME_RAD = math.radians(1.0)
 
 def orientations() -> list[Matrix]:
     """Return the 24 rotations that map axes to axes, as matrices."""
-    found = []
+    matrices = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))
             matrix[range(3), order] = signs
             if np.linalg.det(matrix) > 0.0:
-                found.append(matrix)
-    return found
+                matrices.append(matrix)
+    return matrices
 
 
 def angle_between(a: Matrix, b: Matrix) -> float:

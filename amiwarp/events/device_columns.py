@@ -26,13 +26,13 @@ def event_column(name: str, values: Any, device: Any, t_unit: str) -> Any:
     ``device``: where to put it; None for where the values are. ``t_unit``: unit of times, in ``TIME_UNITS``.
     """
     if on_gpu(values):
-        found = converted(name, import_array(values, f"events' {name}"), t_unit)
+        column = converted(name, import_array(values, f"events' {name}"), t_unit)
     else:
         host = packed(_on_host(name, values, t_unit))
-        found = wp.array(host, dtype=wp.dtype_from_numpy(host.dtype), device="cpu", copy=False)
+        column = wp.array(host, dtype=wp.dtype_from_numpy(host.dtype), device="cpu", copy=False)
     if device is None:
-        return found
-    return found.to(device)
+        return column
+    return column.to(device)
 
 
 def _on_host(name: str, values: Any, t_unit: str) -> NDArray[Any]:
@@ -51,18 +51,18 @@ def import_array(values: Any, what: str) -> Any:
     current stream, as DLPack says. Raises :class:`AmiwarpError` if the values cannot be read so.
     """
     try:
-        found = values if isinstance(values, wp.array) else wp.from_dlpack(values)
+        array = values if isinstance(values, wp.array) else wp.from_dlpack(values)
     except Exception as error:  # every library has its own
         raise AmiwarpError(f"{what} cannot be read through DLPack: {error}") from error
-    if found.size and not found.is_contiguous:
-        found = found.contiguous()
-    if found.dtype is wp.bool:
-        found = found.view(wp.uint8)
-    if not wp.types.type_is_scalar(found.dtype):
+    if array.size and not array.is_contiguous:
+        array = array.contiguous()
+    if array.dtype is wp.bool:
+        array = array.view(wp.uint8)
+    if not wp.types.type_is_scalar(array.dtype):
         raise AmiwarpError(
-            f"{what} has values of type {wp.types.type_repr(found.dtype)}; expected numbers"
+            f"{what} has values of type {wp.types.type_repr(array.dtype)}; expected numbers"
         )
-    return found
+    return array
 
 
 def converted(name: str, values: Any, t_unit: str = "us") -> Any:
@@ -170,8 +170,8 @@ def first_beyond(values: Any, most: float) -> int:
     count = values.size
     if not count:
         return 0
-    found = wp.full(1, count, dtype=int, device=values.device)
+    first = wp.full(1, count, dtype=int, device=values.device)
     threads = min(count, THREADS) if values.device.is_cuda else 1
     inputs = [values, most, threads]
-    wp.launch(find_beyond, threads, inputs=inputs, outputs=[found], device=values.device)
-    return int(found.numpy()[0])
+    wp.launch(find_beyond, threads, inputs=inputs, outputs=[first], device=values.device)
+    return int(first.numpy()[0])

@@ -278,11 +278,11 @@ def limits(events: DeviceEvents) -> list[int]:
         return events._limits
     device = events.device
     none = np.array([2**63 - 1, -(2**63), 0, 0, 0, 0])
-    found = wp.array(none, dtype=wp.int64, device=device)
+    extremes = wp.array(none, dtype=wp.int64, device=device)
     threads = min(len(events), THREADS) if device.is_cuda else 1
     inputs = [events.x, events.y, events.t, events.p, threads]
-    wp.launch(kernels.find_limits, threads, inputs=inputs, outputs=[found], device=device)
-    events._limits.extend(found.numpy().tolist())
+    wp.launch(kernels.find_limits, threads, inputs=inputs, outputs=[extremes], device=device)
+    events._limits.extend(extremes.numpy().tolist())
     return events._limits
 
 
@@ -355,9 +355,9 @@ def _look_up(kernel: Any, t: wp.array, given: NDArray[np.int64]) -> NDArray[np.i
     shared.numpy()[: len(given)] = given
     launch(kernel, len(given), [t, shared], [shared], device=t.device)
     wait(t.device)
-    found = shared.numpy()[: len(given)].copy()
+    indices = shared.numpy()[: len(given)].copy()
     idle_numbers[t.device.is_cpu, wp.int64].append(shared)
-    return found
+    return indices
 
 
 idle_numbers: defaultdict[tuple[bool, Any], list[wp.array]] = defaultdict(list)
@@ -373,9 +373,9 @@ def host_numbers(n: int, dtype: Any, device: Any) -> wp.array:
     idle = idle_numbers[device.is_cpu, dtype]
     while idle:
         with contextlib.suppress(IndexError):  # another thread took it
-            found = idle.pop()
-            if len(found) >= n:
-                return found
+            numbers = idle.pop()
+            if len(numbers) >= n:
+                return numbers
     return wp.zeros(max(n, 64), dtype=dtype, device="cpu", pinned=device.is_cuda)
 
 

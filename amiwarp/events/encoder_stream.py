@@ -120,7 +120,7 @@ class EncoderStream:
     @property
     def _started(self) -> bool:
         """Whether each encoder has at least two samples."""
-        return all(len(each) >= 2 for each in self._encoders)
+        return all(len(encoder) >= 2 for encoder in self._encoders)
 
     @property
     def _first_event_time(self) -> int:
@@ -140,7 +140,7 @@ class EncoderStream:
         """
         if not self._started:
             return None
-        return max(each._first_event_time for each in self._encoders)
+        return max(encoder._first_event_time for encoder in self._encoders)
 
     @property
     def last(self) -> int | None:
@@ -150,7 +150,7 @@ class EncoderStream:
         """
         if not self._started:
             return None
-        return min(each._last_event_time for each in self._encoders)
+        return min(encoder._last_event_time for encoder in self._encoders)
 
     def clear(self) -> None:
         """Forget all samples, for example because their times turned out to be on another clock.
@@ -158,20 +158,20 @@ class EncoderStream:
         It applies to the second encoder too.
         """
         self.cleared += 1
-        for each in self._encoders:
-            each._stop = 0
-            each._gaps = []
-            each._restarted = False
-            each._commands = CommandAngles()
+        for encoder in self._encoders:
+            encoder._stop = 0
+            encoder._gaps = []
+            encoder._restarted = False
+            encoder._commands = CommandAngles()
 
     def restart(self) -> None:
         """Mark that later samples do not continue earlier samples, for example after a reset of the controller.
 
         It applies to the second encoder too.
         """
-        for each in self._encoders:
-            each._restarted = len(each) > 0
-            each._commands = CommandAngles()
+        for encoder in self._encoders:
+            encoder._restarted = len(encoder) > 0
+            encoder._commands = CommandAngles()
 
     def append(
         self, t_us: ArrayLike, angle: ArrayLike
@@ -387,11 +387,11 @@ class EncoderStream:
         offset = self.clock_offset_us
         if not self.sure:
             yield BEFORE_ALL, AFTER_ALL
-        for each in self._encoders:
-            yield BEFORE_ALL, math.ceil(int(each._t[0]) - offset)
-            for begin, end in each._gaps:
+        for encoder in self._encoders:
+            yield BEFORE_ALL, math.ceil(int(encoder._t[0]) - offset)
+            for begin, end in encoder._gaps:
                 yield math.floor(begin - offset), math.ceil(end - offset)
-            yield each._last_event_time, AFTER_ALL
+            yield encoder._last_event_time, AFTER_ALL
 
     def guessed(self, t: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which event times have an estimated angle.

@@ -193,16 +193,16 @@ def slice_bounds(which: object, length: int, what: str = "events") -> tuple[int,
     object with an index ends in this error, too. ``what`` is the name of other items than events.
     """
     if isinstance(which, int | np.integer):
-        one = "[-1:]" if which == -1 else f"[{which}:{which + 1}]"
-        remedy = f"give a slice, such as {one} for one"
+        single = "[-1:]" if which == -1 else f"[{which}:{which + 1}]"
+        remedy = f"give a slice, such as {single} for one"
         if what == "events":
             remedy += " event, and iterate over a recording's events by blocks(count=...) or blocks(duration_us=...)"
         raise AmiwarpError(f"{what} are indexed by the number {which}; {remedy}")
-    found = instance(which, slice, f"index of {what}")
-    for end in (found.start, found.stop):
+    chosen = instance(which, slice, f"index of {what}")
+    for end in (chosen.start, chosen.stop):
         if end is not None:
             whole(end, f"index of {what}", *INT64)
-    start, stop, step = found.indices(length)
+    start, stop, step = chosen.indices(length)
     if step != 1:
         raise AmiwarpError(
             f"{what} are sliced in steps of {step}; slice without steps, then NumPy arrays with them"
@@ -816,8 +816,8 @@ class Recording:
             events = MemoryEvents(events, camera.width, camera.height)
         metadata = {} if metadata is None else metadata
         values = (events, camera, encoder, prism, truth, metadata, name, imu, frames)
-        for one, value in zip(fields(self), values, strict=True):
-            object.__setattr__(self, one.name, value)
+        for own_field, value in zip(fields(self), values, strict=True):
+            object.__setattr__(self, own_field.name, value)
 
     def __repr__(self) -> str:
         others = ("camera", "encoder", "prism", "truth", "imu", "frames")

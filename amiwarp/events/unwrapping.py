@@ -122,7 +122,7 @@ class _Samples:
         """Whether each interval between samples is a gap."""
         return np.asarray(self.interval > GAP * np.median(self.interval))
 
-    def shown(self, value: float) -> str:
+    def in_words(self, value: float) -> str:
         """Format a value in the unit of error messages."""
         return f"{value * self.unit:,.6g}"
 
@@ -174,13 +174,12 @@ def unwrap_counts(
     if not _can_wrap(samples):
         return count
     if counter_bits is None:
-        found = _find(samples, _count_periods(samples))
-        return _accumulate(samples, found)
+        return _accumulate(samples, _find(samples, _count_periods(samples)))
     period = float(counts_per_turn if once_a_turn else 2**counter_bits)
     if not _fits(count, period, signed=not once_a_turn):
         low = int(np.argmin(count))
         high = int(np.argmax(count))
-        span = f"counts {samples.shown(count[low])} .. {samples.shown(count[high])}"
+        span = f"counts {samples.in_words(count[low])} .. {samples.in_words(count[high])}"
         what = f"{span} do not fit in {_period_name(samples, period)}"
         raise UnwrapError.at(max(low, high), f"{what}; {samples.remedy}")
     steps = _checked(samples, samples.steps(period))
@@ -243,8 +242,8 @@ def _can_wrap(samples: _Samples) -> bool:
         )
     finite = np.isfinite(values)
     if not finite.all():
-        at = int(np.argmin(finite))
-        raise AmiwarpError(f"encoder sample {at} is {values[at]}; expected a finite number")
+        index = int(np.argmin(finite))
+        raise AmiwarpError(f"encoder sample {index} is {values[index]}; expected a finite number")
     # Encoder checks the order of the samples itself.
     rises = (samples.interval > 0).all()
     return values.size > 1 and bool(rises)
@@ -285,13 +284,13 @@ def _find(samples: _Samples, periods: Iterable[float]) -> _Steps:
     plain = samples.steps(0.0)
     wrapped = []
     for period in sorted(set(periods)):
-        found = samples.steps(period)
-        if found.wraps.any():
-            wrapped.append(found)
-    best = min([plain, *wrapped], key=lambda found: found.cost)
+        steps = samples.steps(period)
+        if steps.wraps.any():
+            wrapped.append(steps)
+    best = min([plain, *wrapped], key=lambda steps: steps.cost)
     if best is not plain:
         _check_decisive(samples, best, plain)
-        _check_period(samples, best, [found.period for found in wrapped])
+        _check_period(samples, best, [steps.period for steps in wrapped])
         return _checked(samples, best)
     for rival in wrapped:
         if rival.cost <= DECISIVE_RATIO * plain.cost + samples.rounding:
@@ -321,21 +320,21 @@ def _check_no_jump(samples: _Samples, plain: _Steps) -> None:
     over_gaps = np.where(samples.gap, np.abs(plain.expected), 0.0)
     jump = np.abs(plain.residual) > np.maximum(largest, over_gaps)
     if jump.any():
-        at = int(np.argmax(jump))
-        what = f"{_jump(samples, plain, at)}, at no known period"
-        raise UnwrapError.at(at + 1, f"{what}; {samples.remedy}")
+        index = int(np.argmax(jump))
+        what = f"{_jump(samples, plain, index)}, at no known period"
+        raise UnwrapError.at(index + 1, f"{what}; {samples.remedy}")
 
 
-def _ambiguous(samples: _Samples, found: _Steps) -> str:
+def _ambiguous(samples: _Samples, steps: _Steps) -> str:
     """Return the problem, for an error message, of a wrap that is neither certain nor excluded."""
-    period = _period_name(samples, found.period)
+    period = _period_name(samples, steps.period)
     return f"the {samples.noun} may have wrapped here, at {period}, or not; {samples.remedy}"
 
 
-def _jump(samples: _Samples, found: _Steps, at: int) -> str:
+def _jump(samples: _Samples, steps: _Steps, index: int) -> str:
     """Return the problem, for an error message, of a step that differs from its prediction."""
-    step = samples.shown(float(found.step[at]))
-    expected = samples.shown(float(found.expected[at]))
+    step = samples.in_words(float(steps.step[index]))
+    expected = samples.in_words(float(steps.expected[index]))
     return f"the {samples.noun} changes by {step} where about {expected} was expected"
 
 
@@ -346,57 +345,57 @@ def _check_period(samples: _Samples, best: _Steps, periods: list[float]) -> None
     # By how much the period is wrong, from the residuals of the steps that wrap.
     weight = float((best.wraps**2).sum())
     error = float((best.wraps * best.residual).sum()) / weight
-    left = best.residual - error * best.wraps
-    scatter = float(np.sqrt(np.mean(left**2)))
+    unexplained = best.residual - error * best.wraps
+    scatter = float(np.sqrt(np.mean(unexplained**2)))
     # The rounding of the speed accumulates over a gap.
     relative_interval = samples.interval / np.median(samples.interval)
     rounding = samples.rounding * np.maximum(1.0, relative_interval)
     of_rounding = float((np.abs(best.wraps) * rounding).sum()) / weight
     tolerance = of_rounding + 3.0 * scatter / math.sqrt(weight)
 
-    at = best.first_wrap
-    seen = best.period - error
+    index = best.first_wrap
+    observed = best.period - error
     if abs(error) > tolerance or tolerance > LARGEST_RESIDUAL * best.period:
-        what = f"the {samples.noun} wraps by about {samples.shown(seen)}, which is no known period"
-        raise UnwrapError.at(at, f"{what}; {samples.remedy}")
+        what = f"the {samples.noun} wraps by about {samples.in_words(observed)}, which is no known period"
+        raise UnwrapError.at(index, f"{what}; {samples.remedy}")
     for other in periods:
-        if other != best.period and abs(other - seen) <= 2.0 * tolerance:
-            either = f"{samples.shown(best.period)} or at {samples.shown(other)}"
+        if other != best.period and abs(other - observed) <= 2.0 * tolerance:
+            either = f"{samples.in_words(best.period)} or at {samples.in_words(other)}"
             what = f"the {samples.noun} may wrap at {either}"
-            raise UnwrapError.at(at, f"{what}; {samples.remedy}")
+            raise UnwrapError.at(index, f"{what}; {samples.remedy}")
 
 
-def _checked(samples: _Samples, found: _Steps) -> _Steps:
+def _checked(samples: _Samples, steps: _Steps) -> _Steps:
     """Return the steps unchanged; raise :class:`UnwrapError` if a step fits another number of wraps as well.
 
     If the period is a whole number of turns, steps in gaps are not checked: additional turns in a gap change no angle
     outside it.
     """
-    whole_turns = found.period % samples.turn == 0.0 or samples.noun == "angle"
+    whole_turns = steps.period % samples.turn == 0.0 or samples.noun == "angle"
     checked = ~samples.gap if whole_turns else np.ones_like(samples.gap)
 
-    largest = max(LARGEST_RESIDUAL * found.period, min(1.0, samples.rounding))
-    distance = np.abs(found.residual)
-    bad = checked & ((distance > largest) | (distance >= 0.5 * found.period))
+    largest = max(LARGEST_RESIDUAL * steps.period, min(1.0, samples.rounding))
+    distance = np.abs(steps.residual)
+    bad = checked & ((distance > largest) | (distance >= 0.5 * steps.period))
     if bad.any():
-        at = int(np.argmax(bad))
-        what = f"{_jump(samples, found, at)}, wrapping at {_period_name(samples, found.period)}"
-        raise UnwrapError.at(at + 1, f"{what}; {samples.remedy}")
+        index = int(np.argmax(bad))
+        what = f"{_jump(samples, steps, index)}, wrapping at {_period_name(samples, steps.period)}"
+        raise UnwrapError.at(index + 1, f"{what}; {samples.remedy}")
 
-    fast = checked & (np.abs(found.expected) >= 0.5 * found.period)
+    fast = checked & (np.abs(steps.expected) >= 0.5 * steps.period)
     if fast.any() and not whole_turns:
-        at = int(np.argmax(fast))
-        counter = f"the counter of {_period_name(samples, found.period)}"
-        time = f"{samples.interval[at] / 1e3:.6g} ms since the sample before"
+        index = int(np.argmax(fast))
+        counter = f"the counter of {_period_name(samples, steps.period)}"
+        time = f"{samples.interval[index] / 1e3:.6g} ms since the sample before"
         what = f"{counter} may have wrapped more than once in the {time}"
-        raise UnwrapError.at(at + 1, f"{what}; sample it more often")
-    return found
+        raise UnwrapError.at(index + 1, f"{what}; sample it more often")
+    return steps
 
 
-def _accumulate(samples: _Samples, found: _Steps) -> Vector:
+def _accumulate(samples: _Samples, steps: _Steps) -> Vector:
     """Return the unwrapped values of all samples, summed from the wraps."""
-    if not found.wraps.any():
+    if not steps.wraps.any():
         return samples.value
     # Whole periods are added to the samples themselves, so that rounding does not accumulate.
-    periods = np.concatenate([[0.0], np.cumsum(found.wraps)])
-    return np.asarray(samples.value + found.period * periods)
+    periods = np.concatenate([[0.0], np.cumsum(steps.wraps)])
+    return np.asarray(samples.value + steps.period * periods)

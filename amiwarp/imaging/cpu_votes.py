@@ -53,7 +53,7 @@ class PixelVotes:
     def _clear_stale(self) -> None:
         """Clear the sums if they are to be cleared, so that they can be used."""
         if self._stale:
-            workers.run_together([one.zero_ for one in self._slices])
+            workers.run_together([sums.zero_ for sums in self._slices])
             self._stale = False
 
     def range_voter(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:

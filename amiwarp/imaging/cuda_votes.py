@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +22,7 @@ from amiwarp.kernels.word_votes import (
 
 FIRST_BATCH = 1 << 21
 LARGEST_BATCH = 1 << 27
-"""Sizes of the first and the largest batch of the fast voting kernel on CUDA [events].
+"""Sizes of the first and the largest batch of the fast voting kernel [events].
 
 The fast kernel does not check whether a 32-bit word of the image overflows; the words are added to the image and
 cleared after each batch. The first batch is small. Later batches have a size that fills the fullest word to about
@@ -31,6 +32,9 @@ which checks every addition.
 TARGET_FILL = 600
 """Number of events that the fullest word of the image should receive per batch of the fast voting kernel. A word holds
 up to 1,023."""
+MOST_UNVERIFIED = 1 << 26
+"""Number of unverified events at which the next call verifies them first. Their arrays, of 16 bytes per event and
+more, are held until then, so that they can be voted again."""
 
 
 class WordVotes:
@@ -53,13 +57,15 @@ class WordVotes:
             cells.words = wp.zeros(count + int(TRASH), dtype=wp.uint64, device=device)
             cells.totals = wp.zeros(count, dtype=wp.int64, device=device)
 
-        # Inputs, number of events and first event of what the fast kernel voted, and is not verified yet.
         self._batches: list[tuple[list[Any], int, int]] = []
-        self._batches_fit: bool | None = None  # None before the first batch
-        self._batch = FIRST_BATCH
-        # Inputs of the last fast vote, and its launch.
+        """Inputs, number of events and first event of each unverified batch of the fast kernel."""
+        self._batches_fit: bool | None = None
+        """Whether no word overflowed in the last batches that were verified; None before the first."""
+        self._batch_size = FIRST_BATCH
         self._recorded: tuple[list[Any], RecordedLaunch] | None = None
-        self._read: tuple[Image, RecordedLaunch] | None = None
+        """Inputs of the last fast vote, and its launch."""
+        self._reader: tuple[Image, RecordedLaunch] | None = None
+        """Image that was read last, and the recorded launch that reads it."""
         self._record_launches()
 
     def _record_launches(self) -> None:
@@ -100,39 +106,41 @@ class WordVotes:
         Many events are voted by the fast kernel, whose result is verified later. ``kernel`` votes all others exactly:
         it checks for overflow at every addition.
         """
+        if sum(size for _, size, _ in self._batches) >= MOST_UNVERIFIED:
+            self._verify_batches()
         start = 0
-        vote = None
-        fast = kernel is self.EVENTS and total == count
-        while fast and self._batches_fit is not False and count - start >= FIRST_BATCH:
-            batch = min(count - start, self._batch)
-            vote = vote or self._recorded_vote(inputs)
-            vote(start, batch)
+        vote_fast = None
+        may_be_fast = kernel is self.EVENTS and total == count
+        while may_be_fast and self._batches_fit is not False and count - start >= FIRST_BATCH:
+            size = min(count - start, self._batch_size)
+            vote_fast = vote_fast or self._recorded_vote(inputs)
+            vote_fast(start, size)
             self._clear_words.set(2, len(self._batches))
             self._clear_words.repeat()
             self._fast.words.zero_()
-            self._batches.append((inputs, batch, start))
+            self._batches.append((inputs, size, start))
             if self._batches_fit is None or len(self._batches) == len(self._counts):
                 self._verify_batches()
-            start += batch
+            start += size
         launch(kernel, count - start, inputs, [self._cells], device=self.device, first=start)
 
     def _recorded_vote(self, inputs: list[Any]) -> RecordedLaunch:
         """Return the recorded launch of the fast kernel, which takes a tenth of the time of a new launch."""
         if self._recorded is not None:
-            before, vote = self._recorded
-            same_kernel = type(inputs[0]) is type(before[0])
-            if same_kernel and all(
-                new is old for new, old in zip(inputs[1:], before[1:], strict=True)
-            ):
-                # Only the model's parameters are new.
-                vote.set(0, inputs[0])
-                self._recorded = inputs, vote
-                return vote
-        vote = RecordedLaunch(
+            last_inputs, vote_fast = self._recorded
+            model, *arrays = inputs
+            last_model, *last_arrays = last_inputs
+            same_kernel = type(model) is type(last_model)
+            same_arrays = all(map(operator.is_, arrays, last_arrays))
+            if same_kernel and same_arrays:
+                vote_fast.set(0, model)
+                self._recorded = inputs, vote_fast
+                return vote_fast
+        vote_fast = RecordedLaunch(
             vote_quickly, [*inputs, self._trash, 0], [self._fast], device=self.device
         )
-        self._recorded = inputs, vote
-        return vote
+        self._recorded = inputs, vote_fast
+        return vote_fast
 
     def _verify_batches(self) -> None:
         """Keep the votes of the fast kernel if no word overflowed; otherwise vote their events again exactly."""
@@ -142,14 +150,14 @@ class WordVotes:
         if self._batches_fit is None:
             fullest = max(int(self._fullest.numpy()[0]), 1)
             filling = FIRST_BATCH * TARGET_FILL // fullest
-            self._batch = min(max(filling, FIRST_BATCH), LARGEST_BATCH)
-        self._batches_fit = bool((counts == [count for _, count, _ in self._batches]).all())
+            self._batch_size = min(max(filling, FIRST_BATCH), LARGEST_BATCH)
+        self._batches_fit = bool((counts == [size for _, size, _ in self._batches]).all())
         if self._batches_fit:
             self._add_fast_totals.repeat()
             self._batches.clear()
             return
-        for inputs, count, first in self._batches:
-            launch(vote_events, count, inputs, [self._cells], device=self.device, first=first)
+        for inputs, size, first in self._batches:
+            launch(vote_events, size, inputs, [self._cells], device=self.device, first=first)
         self._discard_batches()
 
     def _discard_batches(self) -> None:
@@ -162,10 +170,11 @@ class WordVotes:
     def read(self, image: Image) -> None:
         """Write the current image [events] to ``image``; the votes are kept."""
         self._verify_batches()
-        if self._read is None or self._read[0] is not image:
+        last_image, read_image = self._reader or (None, None)
+        if read_image is None or last_image is not image:
             inputs = [self._cells, self._params, image.frame, 0]
-            reading = RecordedLaunch(
+            read_image = RecordedLaunch(
                 read_votes, inputs, [image.pixels], device=self.device, n=image.blocks
             )
-            self._read = image, reading
-        self._read[1].repeat()
+            self._reader = image, read_image
+        read_image.repeat()

@@ -74,16 +74,16 @@ def to_picture(
     Merged: no events is black, many are white. Signed: zero is grey, ON is white, OFF is black. Polarity: OFF is blue,
     ON is orange. ``top``: count that is shown brightest, see :func:`tone`.
     """
-    shown: NDArray[Any]
+    bright: NDArray[Any]
     layers = choice(Layers, layers, "layers")
     if layers is Layers.MERGED:
-        shown = tone(image, top)
+        bright = tone(image, top)
     elif layers is Layers.SIGNED:
-        shown = 0.5 + 0.5 * np.sign(image) * tone(np.abs(image), top)
+        bright = 0.5 + 0.5 * np.sign(image) * tone(np.abs(image), top)
     else:
         off, on = tone(image, top)
-        shown = in_two_colours(off, on)
-    levels = np.clip(shown, 0.0, 1.0) * 255.0
+        bright = in_two_colours(off, on)
+    levels = np.clip(bright, 0.0, 1.0) * 255.0
     return np.asarray(np.rint(levels), np.uint8)
 
 
@@ -234,9 +234,9 @@ class IweFiles:
             png = path.suffix.lower() == ".png"
             count = self._count if png else 1
             check_output(self._numbered(path, 0) if png else path)
-            there = set(os.listdir(path.parent)) if count > 1 else set()
+            names_present = set(os.listdir(path.parent)) if count > 1 else set()
             for name in (self._numbered(path, at) for at in range(count)):
-                if name.name in there:
+                if name.name in names_present:
                     check_output(name)
 
     def _begin_file(self, path: Path) -> Path:

@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
 from amiwarp.events.other_sensors import ImuSamples
-from amiwarp.events.recording import Events, EventSource, Recording, check_events
+from amiwarp.events.recording import (
+    Events,
+    EventSource,
+    MetadataValue,
+    Recording,
+    check_events,
+)
 from amiwarp.events.stores import StoredInstants
 from amiwarp.events.truth import EventTruth
 from amiwarp.io import output_formats
@@ -100,9 +106,8 @@ class EventFilter:
             object.__setattr__(self, "polarity", whole(self.polarity, "polarity", 0, 1))
         for name in ("refractory_us", "background_us"):
             object.__setattr__(self, name, whole(getattr(self, name), name, 0, TIME_LIMIT, " us"))
-        object.__setattr__(
-            self, "most_per_s", real(self.most_per_s, "most_per_s", 0.0, 1e12, " events/s")
-        )
+        rate = real(self.most_per_s, "most_per_s", 0.0, 1e12, " events/s")
+        object.__setattr__(self, "most_per_s", rate)
         object.__setattr__(self, "every", whole(self.every, "every", 1, 1 << 31))
 
     def apply(self, events: Events, size: tuple[int, int]) -> Events:
@@ -146,7 +151,7 @@ class RunningFilter:
     """Time of the last event [us]."""
     _hot_counts: NDArray[np.int64] = field(init=False)
     """Number of events of hot pixels that were removed, shape ``(height, width)``."""
-    _seen: int = 0
+    _reached_last: int = 0
     """Number of events so far that reached the last part, ``every``."""
 
     def __post_init__(self) -> None:
@@ -209,8 +214,9 @@ class RunningFilter:
         """Return column, row [px] and number of removed events of each hot pixel, the busiest first."""
         rows, columns = np.nonzero(self._hot_counts)
         counts = self._hot_counts[rows, columns]
-        found = zip(columns.tolist(), rows.tolist(), counts.tolist(), strict=True)
-        return tuple(sorted(found, key=lambda each: -each[2]))
+        busiest_first = np.argsort(-counts, kind="stable")
+        hot = np.stack([columns, rows, counts], axis=1)[busiest_first]
+        return tuple((column, row, count) for column, row, count in hot.tolist())
 
     def _refractory(self, events: Events) -> NDArray[np.bool_]:
         width, height = self.size
@@ -265,8 +271,8 @@ class RunningFilter:
         return max(1.0, self.chosen.most_per_s * CREDIT_S)
 
     def _every(self, events: Events) -> NDArray[np.bool_]:
-        numbers = self._seen + np.arange(len(events))
-        self._seen += len(events)
+        numbers = self._reached_last + np.arange(len(events))
+        self._reached_last += len(events)
         return np.asarray(numbers % self.chosen.every == 0, np.bool_)
 
 
@@ -474,70 +480,117 @@ def _write_kept(
 ) -> FilterSummary:
     """Write the kept events in amiwarp's format, with everything else that the recording holds."""
     source = recording.events
-    running = RunningFilter(chosen, source.size)
     truth = recording.truth
-    about = {name: value for name, value in recording.metadata.items() if name != "format"}
-    imu: ImuSamples | None = recording.imu
-    frames: StoredInstants[NDArray[Any]] | None = recording.frames
-    removed_records: dict[str, int] = {}
-    lost: tuple[str, ...] = ()
-    if chosen.window is not None:
-        imu = _imu_within(imu, chosen.window)
-        frames = _frames_within(frames, chosen.window)
-        held = (("imu_samples", recording.imu, imu), ("frames", recording.frames, frames))
-        for name, all_records, kept_records in held:
-            if all_records is not None:
-                removed_records[name] = len(all_records) - len(kept_records or ())
-        # The counts in the metadata are of the whole recording. How many triggers the window has is not known.
-        if about.get("triggers") and recording.encoder is None:
-            lost = ("triggers",)
-        about = {name: value for name, value in about.items() if name not in RECORDS}
-        about |= {name: len(part) for name, _, part in held if part is not None}
-    earlier = [str(about["filter"])] if "filter" in about else []
-    start = 0
-    kept_times: list[int] = []
+    records = _records_within(recording, chosen.window)
+    filters_before = [str(records.metadata["filter"])] if "filter" in records.metadata else []
+    filters = "; then ".join([*filters_before, described(chosen)])
+    running = RunningFilter(chosen, source.size)
+    width, height = source.size
     with RecordingWriter(
         path,
-        width=source.size[0],
-        height=source.size[1],
+        width=width,
+        height=height,
         camera=recording.camera,
         prism=recording.prism,
         encoder=recording.encoder,
-        metadata={**about, "filter": "; then ".join([*earlier, described(chosen)])},
+        metadata={**records.metadata, "filter": filters},
         overwrite=overwrite,
         truth_parameters=None if truth is None else truth.parameters,
         truth_labels=None if truth is None else truth.labels,
     ) as writer:
-        for block in source.blocks():
-            stop = start + len(block)
-            kept = running.keep(block)
-            known = None if truth is None else _part(truth.of_events(start, stop), kept)
-            kept_events = block[kept]
-            if len(kept_events):
-                writer.append(kept_events, truth=known)
-                kept_times = [*kept_times[:1], int(kept_events.t[0]), int(kept_events.t[-1])]
-            start = stop
-            if progress is not None:
-                progress("filtering events", start / len(source))
-        if not len(writer):
-            raise AmiwarpError(
-                f"{recording.name}: the filter keeps none of {len(source):,} events; choose less strict values"
-            )
-        copy_records(replace(recording, imu=imu), writer)
-        if frames is not None:
-            for t, image in zip(frames.t.tolist(), frames, strict=True):
+        kept_us = _write_kept_events(recording, running, writer, progress)
+        copy_records(replace(recording, imu=records.imu), writer)
+        if records.frames is not None:
+            for t, image in zip(records.frames.t.tolist(), records.frames, strict=True):
                 writer.append_image(t, image)
-        count = len(writer)
+        kept = len(writer)
     return FilterSummary(
         events=len(source),
-        kept=count,
+        kept=kept,
         removed=dict(running.removed),
         hot_pixels=running.hot_counts(),
         duration_us=source.t_last - source.t_first,
-        kept_us=kept_times[-1] - kept_times[0],
-        left_out=lost,
-        removed_records=removed_records,
+        kept_us=kept_us,
+        left_out=records.left_out,
+        removed_records=records.removed,
     )
+
+
+def _write_kept_events(
+    recording: Recording,
+    running: RunningFilter,
+    writer: RecordingWriter,
+    progress: Progress | None,
+) -> int:
+    """Write the kept events with their ground truth. Return the time from the first to the last of them [us].
+
+    Raises :class:`AmiwarpError` if there are none.
+    """
+    source = recording.events
+    truth = recording.truth
+    t_first: int | None = None
+    t_last = 0
+    start = 0
+    for block in source.blocks():
+        stop = start + len(block)
+        is_kept = running.keep(block)
+        kept = block[is_kept]
+        if len(kept):
+            of_block = None if truth is None else truth.of_events(start, stop)
+            of_kept = None if of_block is None else _truth_of_kept(of_block, is_kept)
+            writer.append(kept, truth=of_kept)
+            t_last = int(kept.t[-1])
+            if t_first is None:
+                t_first = int(kept.t[0])
+        start = stop
+        if progress is not None:
+            progress("filtering events", start / len(source))
+    if t_first is None:
+        raise AmiwarpError(
+            f"{recording.name}: the filter keeps none of {len(source):,} events; choose less strict values"
+        )
+    return t_last - t_first
+
+
+@dataclass(frozen=True)
+class _Records:
+    """Records of a recording beside its events that a filter keeps."""
+
+    imu: ImuSamples | None
+    """IMU samples."""
+    frames: StoredInstants[NDArray[Any]] | None
+    """Frames."""
+    metadata: dict[str, MetadataValue]
+    """Metadata, with the numbers of the kept records."""
+    removed: dict[str, int]
+    """Number of removed records by name; empty without a window."""
+    left_out: tuple[str, ...]
+    """What is lost, because it is not known which of it lie in the window."""
+
+
+def _records_within(recording: Recording, window: tuple[int, int] | None) -> _Records:
+    """Return the records of a recording within a time window [us], whose end is exclusive; all without a window."""
+    metadata = {name: value for name, value in recording.metadata.items() if name != "format"}
+    if window is None:
+        return _Records(recording.imu, recording.frames, metadata, {}, ())
+    imu = _imu_within(recording.imu, window)
+    frames = _frames_within(recording.frames, window)
+
+    # The counts in the metadata are of the whole recording. How many triggers the window has is not known.
+    left_out: tuple[str, ...] = ()
+    if metadata.get("triggers") and recording.encoder is None:
+        left_out = ("triggers",)
+    metadata = {name: value for name, value in metadata.items() if name not in RECORDS}
+    removed = {}
+    for name, before, kept in (
+        ("imu_samples", recording.imu, imu),
+        ("frames", recording.frames, frames),
+    ):
+        if before is not None:
+            removed[name] = len(before) - len(kept or ())
+        if kept is not None:
+            metadata[name] = len(kept)
+    return _Records(imu, frames, metadata, removed, left_out)
 
 
 def _imu_within(imu: ImuSamples | None, window: tuple[int, int]) -> ImuSamples | None:
@@ -565,9 +618,10 @@ def _frames_within(
     return frames[start:stop] if start < stop else None
 
 
-def _part(truth: EventTruth, kept: NDArray[np.bool_]) -> EventTruth:
+def _truth_of_kept(truth: EventTruth, is_kept: NDArray[np.bool_]) -> EventTruth:
     """Return the ground truth of the kept events."""
-    values = {each.name: getattr(truth, each.name) for each in fields(truth)}
-    return EventTruth(
-        **{name: None if value is None else value[kept] for name, value in values.items()}
-    )
+    kept = {}
+    for field_of_truth in fields(truth):
+        values = getattr(truth, field_of_truth.name)
+        kept[field_of_truth.name] = None if values is None else values[is_kept]
+    return EventTruth(**kept)

@@ -44,22 +44,22 @@ def pixel_frequencies(
     between them [us], shape ``(n,)``. Nothing is counted over a gap.
     """
     width, height = size
-    found = np.full(height * width, np.nan, np.float32)
+    frequency = np.full(height * width, np.nan, np.float32)
     pixel, periods = _periods(events, width, starts)
     counts = np.bincount(pixel, minlength=height * width)
     shortest_us = 1e6 / FASTEST_HZ
     longest_us = 1e6 / SLOWEST_HZ
     possible = (periods >= shortest_us) & (periods <= longest_us)
     if not possible.any():
-        return found.reshape(height, width)
+        return frequency.reshape(height, width)
 
     peaks = _fullest_peaks(pixel[possible], periods[possible])
     many = peaks.numbers >= FEWEST_PERIODS
     most = peaks.numbers >= LEAST_SHARE * counts[peaks.pixel]
     clear = many & most
     frequencies = 1e6 * peaks.numbers[clear] / peaks.sums[clear]
-    found[peaks.pixel[clear]] = frequencies
-    return found.reshape(height, width)
+    frequency[peaks.pixel[clear]] = frequencies
+    return frequency.reshape(height, width)
 
 
 def _periods(
@@ -139,13 +139,13 @@ def strongest(frequencies: NDArray[np.float32], most: int) -> list[tuple[float, 
     """
     known = np.isfinite(frequencies)
     left = frequencies[known].astype(np.float64)
-    found: list[tuple[float, int]] = []
-    while len(left) and len(found) < most:
+    strongest_first: list[tuple[float, int]] = []
+    while len(left) and len(strongest_first) < most:
         groups = np.floor(np.log(left) / BIN)
         numbers, counts = np.unique(groups, return_counts=True)
         fullest = numbers[np.argmax(counts)]
         hz = float(np.median(left[groups == fullest]))
         near = np.abs(np.log(left / hz)) <= BIN
-        found.append((hz, int(np.count_nonzero(near))))
+        strongest_first.append((hz, int(np.count_nonzero(near))))
         left = left[~near]
-    return sorted(found, key=lambda each: -each[1])
+    return sorted(strongest_first, key=lambda each: -each[1])

@@ -119,8 +119,8 @@ def suggest_region(before: Floats, after: Floats, *, margin: int = 0) -> Region:
     if before.size > MOST_SEARCHED:
         left, top, right, bottom = busiest(before)
         part = np.s_[top:bottom, left:right]
-        found = suggest_region(before[part], after[part], margin=margin)
-        found_left, found_top, found_right, found_bottom = found
+        region_of_part = suggest_region(before[part], after[part], margin=margin)
+        found_left, found_top, found_right, found_bottom = region_of_part
         return left + found_left, top + found_top, left + found_right, top + found_bottom
 
     # The wider, the better, but for regions of very many events.

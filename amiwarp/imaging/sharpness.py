@@ -313,12 +313,12 @@ def sharpness(
         device = image.device if on_device else "cpu"
     meter = SharpnessMeter(canvas, kind, smoothing=smoothing, device=device)
     meter.image.write(stack.to(meter.device) if on_device else stack)
-    found = meter.measure()
+    value = meter.measure()
     if not meter.finite:
         raise AmiwarpError(
             f"image of shape {image.shape} holds a value that is not finite; replace it"
         )
-    return found
+    return value
 
 
 EDGE_SMOOTHING_PX = 1.5

@@ -176,8 +176,8 @@ class TileVotes:
 
     def launch(self) -> None:
         """Compute the image of warped events of every candidate."""
-        for host, there in zip(self._host, self._on_device, strict=True):
-            wp.copy(there, host)
+        for host, on_device in zip(self._host, self._on_device, strict=True):
+            wp.copy(on_device, host)
         self.votes.zero_()
         threads = int(kernels.THREADS)
         passes = math.ceil(self.candidates / int(kernels.AT_ONCE))

@@ -90,8 +90,8 @@ class ToTensor:
             )
         if callable(options.get("windows")):
             options["windows"] = options["windows"](events)
-        found = self.representation(events, **options)
-        return found if labels is None else (found, labels)
+        tensor = self.representation(events, **options)
+        return tensor if labels is None else (tensor, labels)
 
     def __repr__(self) -> str:
         options = "".join(f", {name}={value!r}" for name, value in self.options.items())

@@ -227,10 +227,10 @@ def upload_events(
 
     turns_per_unit = (slope * TURNS_PER_RAD).astype(np.float32)
     slopes = _put(turns_per_unit, float, device)
-    found = UploadedEvents(arrays, count, count, wp.clone(arrays.turn), slopes)
+    uploaded = UploadedEvents(arrays, count, count, wp.clone(arrays.turn), slopes)
     if encoder is None or encoder.ratio is None:
-        return found
-    return replace(found, second_base=wp.clone(arrays.second), ratio=encoder.ratio)
+        return uploaded
+    return replace(uploaded, second_base=wp.clone(arrays.second), ratio=encoder.ratio)
 
 
 def _padded(n: int, device: Any) -> int:

@@ -73,8 +73,8 @@ class WindowBatch:
         if found_faults[kernels.DESCENDING] or found_faults[kernels.OUTSIDE]:
             _check_windows(self.events.to_host(), self.windows, self.size)
         idle_numbers[self.device.is_cpu, wp.int32].append(self.faults)
-        found = out.numpy() if self.on_host else out
-        return found[0] if self.single else found
+        result = out.numpy() if self.on_host else out
+        return result[0] if self.single else result
 
 
 def _check_windows(events: Events, cut: Windows, size: tuple[int, int]) -> None:
@@ -116,7 +116,7 @@ def batch_of(
             "t_start or t_end is given for several windows; the windows have times of their own"
         )
     count = len(events)
-    there = device_for(events, device)
+    target = device_for(events, device)
     if count > MOST_EVENTS:
         raise AmiwarpError(f"there are {count} events; give at most {MOST_EVENTS} at a time")
     if cut is None:
@@ -128,11 +128,11 @@ def batch_of(
         )
     width = whole(size[0], "width", 1, LARGEST_SIZE, " pixels")
     height = whole(size[1], "height", 1, LARGEST_SIZE, " pixels")
-    found = on_device(events, there)
+    events_on_target = on_device(events, target)
     if model is not None and encoder is not None:
-        found = _compensated(found, (width, height), cut, model, encoder)
+        events_on_target = _compensated(events_on_target, (width, height), cut, model, encoder)
     return WindowBatch(
-        found, cut, single, on_host, (width, height), host_numbers(2, wp.int32, there)
+        events_on_target, cut, single, on_host, (width, height), host_numbers(2, wp.int32, target)
     )
 
 

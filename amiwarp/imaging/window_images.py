@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -48,10 +48,10 @@ class Grid(NamedTuple):
 @lru_cache(maxsize=256)
 def struct_of(kind: Any, *values: int) -> Any:
     """Return a struct of numbers, which must not be changed. To make one takes as long as a launch."""
-    found = kind()
+    struct = kind()
     for name, value in zip(kind.vars, values, strict=False):
-        setattr(found, name, value)
-    return found
+        setattr(struct, name, value)
+    return struct
 
 
 _zeros: list[wp.array] = []
@@ -61,9 +61,9 @@ _zeros: list[wp.array] = []
 def _take_zeros(n: int) -> wp.array:
     """Return at least ``n`` words on the CPU, all zero."""
     while _zeros:
-        found = _zeros.pop()
-        if len(found) >= n:
-            return found
+        words = _zeros.pop()
+        if len(words) >= n:
+            return words
     return wp.zeros(n, dtype=wp.int64, device="cpu")
 
 
@@ -85,21 +85,17 @@ def _images(
     cut = batch.windows
     events = batch.events
     device = batch.device
-    if grid.rate and len(cut):
-        longest = int((cut.t_end - cut.t_start).max())
-        too_long = (1 << 53) // grid.rate
-        if longest >= too_long:
-            raise AmiwarpError(f"a window lasts {longest} us; give one below {too_long} us")
+    _check_lengths(cut, grid)
     # A window has a group of pixels for each part of its time intervals.
     rows_of_group = grid.height + 2 * grid.border
     columns_of_group = grid.width + 2 * grid.border
     group = grid.layers * rows_of_group * columns_of_group
     groups = grid.steps * grid.parts
-    bytes_each = groups * group * sums * wp.types.type_size_in_bytes(dtype)
-    fitting = MOST_BYTES["cpu" if device.is_cpu else "cuda"] // bytes_each
+    bytes_of_window = groups * group * sums * wp.types.type_size_in_bytes(dtype)
+    fitting = MOST_BYTES["cpu" if device.is_cpu else "cuda"] // bytes_of_window
     most = min(max(fitting, 1), len(cut))
 
-    # behind the images there are the spare groups of the slices, and places for the events outside the image
+    # Behind the images there are the spare groups of the slices, and places for the events outside the image.
     threads = cpu_threads() if device.is_cpu else 1
     spare = most * groups
     trash = (spare + threads - 1) * group
@@ -115,8 +111,8 @@ def _images(
         number = min(most, len(cut) - first)
         if not in_words:
             images.fill_(empty)
-        some = cut if number == len(cut) else cut[first : first + number]
-        rows, blocks = _rows(some, device)
+        together = cut if number == len(cut) else cut[first : first + number]
+        rows, blocks = _rows(together, device)
         columns = [events.x, events.y, events.t, events.p]
         inputs = [*columns, rows, struct_of(kernels.Grid, *grid)]
         outputs = [batch.faults, images]
@@ -131,6 +127,15 @@ def _images(
         images.numpy()[trash:size] = 0
         if images.size * 8 <= 6 * MOST_BYTES["cpu"]:
             _zeros[:] = [images]
+
+
+def _check_lengths(cut: Windows, grid: Grid) -> None:
+    """Raise :class:`AmiwarpError` if the time in a window, in the units of the grid, may not be exact."""
+    if grid.rate and len(cut):
+        longest = int((cut.t_end - cut.t_start).max())
+        too_long = (1 << 53) // grid.rate
+        if longest >= too_long:
+            raise AmiwarpError(f"a window lasts {longest} us; give one below {too_long} us")
 
 
 def _rows(cut: Windows, device: Any) -> tuple[wp.array, int]:
@@ -169,9 +174,9 @@ def _add_on_cpu(
     # The first slice adds to the images themselves, each other one to a spare group.
     run_of = int(RUN) if kernel is tensors_cpu.add_event_word_blocks else 1
     parts = []
-    for k, (first, stop) in enumerate(slices(blocks, cpu_threads(), SMALLEST)):
-        spare_group = spare + k - 1 if k else -1
-        outside = trash + k * 2 * (grid.width + 16)
+    for number, (first, stop) in enumerate(slices(blocks, cpu_threads(), SMALLEST)):
+        spare_group = spare + number - 1 if number else -1
+        outside = trash + number * 2 * (grid.width + 16)
         part = struct_of(kernels.Part, first, spare_group, outside, stop)
         runs = -(-(stop - first) // run_of)  # rounded up
         parts.append((part, runs))
@@ -180,35 +185,38 @@ def _add_on_cpu(
         wp.launch(kernel, n, [*inputs, part], outputs, device=images.device)
 
     run_together([partial(run, *part) for part in parts])
-    if len(parts) == 1:
+    combine = np.maximum if kernel is tensors_cpu.keep_latest_blocks else np.add
+    _add_spare_groups([part for part, _ in parts[1:]], inputs, images, group, combine)
+
+
+def _add_spare_groups(
+    parts: Sequence[Any], inputs: list[Any], images: wp.array, group: int, combine: np.ufunc
+) -> None:
+    """Add the spare groups of slices to the images by ``combine``, and clear them.
+
+    ``parts``: the slices, as structs. ``inputs``: inputs of the kernel that filled them. ``group``: numbers in a group.
+    """
+    if not parts:
         return
     # Each spare group belongs to the group of pixels in which its slice begins.
     own = wp.zeros(1, dtype=int, device=images.device)
     values = images.numpy()
     pairs = []
     _, _, t, _, *others = inputs
-    for part, _ in parts[1:]:
-        wp.launch(
-            tensors_cpu.find_own,
-            1,
-            [t, *others, part],
-            [own],
-            device=images.device,
-        )
+    for part in parts:
+        wp.launch(tensors_cpu.find_own, 1, [t, *others, part], [own], device=images.device)
         first_of_target = int(own.numpy()[0]) * group
         first_of_spare = part.spare * group
         target = values[first_of_target : first_of_target + group]
-        added = values[first_of_spare : first_of_spare + group]
-        pairs.append((target, added))
-
-    combine = np.maximum if kernel is tensors_cpu.keep_latest_blocks else np.add
+        spare = values[first_of_spare : first_of_spare + group]
+        pairs.append((target, spare))
 
     def add(first: int, stop: int) -> None:
         for whole_target, whole_spare in pairs:
             target = whole_target[first:stop]
-            added = whole_spare[first:stop]
-            combine(target, added, out=target)
-            added[:] = 0
+            spare = whole_spare[first:stop]
+            combine(target, spare, out=target)
+            spare[:] = 0
 
     ranges = slices(group, cpu_threads(), LEAST_ADDED)
     run_together([partial(add, first, stop) for first, stop in ranges])
@@ -234,7 +242,7 @@ def latest_images(
     """Find the latest times at the nearest pixels, see :func:`_images`. With ``carry``, also of earlier windows."""
     size = grid.layers * grid.height * grid.width
     before = None
-    found = _images(
+    image_groups = _images(
         batch,
         grid,
         tensors_cuda.keep_latest,
@@ -242,7 +250,7 @@ def latest_images(
         wp.int64,
         empty=int(NEVER),
     )
-    for first, number, images in found:
+    for first, number, images in image_groups:
         if carry:
             inputs = [images, number, size, before or images]
             launch(tensor_values.carry_latest, size, inputs, [], device=batch.device)
@@ -317,8 +325,8 @@ def _parts(batch: WindowBatch, grid: Grid) -> tuple[int, int]:
         edges = cut.t_start - -k * span // number  # rounded up
         at_edges = find_indices(batch.events, edges.ravel()).reshape(edges.shape)
         inside = np.clip(at_edges, cut.start, cut.stop)
-        found = np.stack([cut.start, *inside, cut.stop])
-        fullest = int(np.diff(found, axis=0).max())
+        indices = np.stack([cut.start, *inside, cut.stop])
+        fullest = int(np.diff(indices, axis=0).max())
         if fullest < CAPACITY:
             return parts, fullest
         parts *= 2

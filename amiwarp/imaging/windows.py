@@ -231,14 +231,14 @@ def _of_duration(
 
     edges = start_us + np.arange(number + 1, dtype=np.int64) * duration_us
     if not len(events):
-        found = np.zeros_like(edges)
+        indices = np.zeros_like(edges)
     else:
         # The last window may reach beyond t_end, but holds no events after it.
         limits_us = edges if t_end is None else np.minimum(edges, end_us)
-        found = find_indices(events, limits_us)
-    if incomplete and t_end is None and len(found) > 1:
-        found[-1] = len(events)
-    return Windows(found[:-1], found[1:], edges[:-1], edges[1:])
+        indices = find_indices(events, limits_us)
+    if incomplete and t_end is None and len(indices) > 1:
+        indices[-1] = len(events)
+    return Windows(indices[:-1], indices[1:], edges[:-1], edges[1:])
 
 
 MOST_WINDOWS = 1 << 27
@@ -255,10 +255,10 @@ def _of_turns(
     """Return windows of ``turns`` of the prism. There must be an event."""
     first_us, last_us = _first_and_last(events)
     edges = turn_edges(encoder, first_us, last_us, turns, incomplete)
-    found = find_indices(events, edges)
-    if incomplete and len(found) > 1:
-        found[-1] = len(events)
-    return Windows(found[:-1], found[1:], edges[:-1], edges[1:])
+    indices = find_indices(events, edges)
+    if incomplete and len(indices) > 1:
+        indices[-1] = len(events)
+    return Windows(indices[:-1], indices[1:], edges[:-1], edges[1:])
 
 
 def _first_and_last(events: Events | DeviceEvents) -> tuple[Any, Any]:
@@ -314,10 +314,10 @@ def turn_edges(
         reached = slope * (wanted - ahead[before]) + t[before]
         edges.append(first + np.rint(reached).astype(np.int64))
 
-    found = np.concatenate(edges)
-    if incomplete and (found[-1] < last or len(found) == 1):
-        found = np.append(found, last)
-    return found
+    all_edges = np.concatenate(edges)
+    if incomplete and (all_edges[-1] < last or len(all_edges) == 1):
+        all_edges = np.append(all_edges, last)
+    return all_edges
 
 
 def turn_end(encoder: Encoder, first: int, start: float, last: int, turns: int) -> int | None:
@@ -444,11 +444,11 @@ def collate(
     joined = kinds.pop().concatenate(blocks)
     if isinstance(joined, DeviceEvents):
         device_for(joined, device)
-    found = _at_indices(joined, ends[:-1], ends[1:])
+    joined_windows = _at_indices(joined, ends[:-1], ends[1:])
     if isinstance(joined, Events) and device is not None:
         joined = on_device(joined, wp.get_device(device))
         wait(joined.device)
-    return joined, found
+    return joined, joined_windows
 
 
 def on_device(events: Events | DeviceEvents, device: Any) -> DeviceEvents:

@@ -68,15 +68,15 @@ def assumed_texts(metadata: Mapping[str, MetadataValue]) -> list[str]:
 
 def assumptions_of(metadata: Mapping[str, MetadataValue]) -> list[Assumption]:
     """Return the assumptions in the metadata of a recording."""
-    found = []
+    assumptions = []
     for name, text in metadata.items():
         if name.startswith(ASSUMED):
             value, _, rest = str(text).partition(": ")
             why, _, option = rest.rpartition("; ")
-            found.append(
+            assumptions.append(
                 Assumption(name.removeprefix(ASSUMED).replace("_", " "), value, why, option)
             )
-    return found
+    return assumptions
 
 
 def assumed_size(size: tuple[int, int], sensors: Iterable[tuple[int, int]] = SENSORS) -> Assumption:

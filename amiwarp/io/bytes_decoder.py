@@ -154,12 +154,12 @@ class BytesDecoder:
         from amiwarp.kernels.records import Span
 
         packets = self._listed(data, kernels.list_packets, Span)
-        found = aedat4_events.decode_packets(packets, self._device)
-        damaged = np.flatnonzero(found.counts < 0)
+        decoded = aedat4_events.decode_packets(packets, self._device)
+        damaged = np.flatnonzero(decoded.counts < 0)
         if damaged.size:
             address = packets["address"][damaged[0]]
             raise self._damaged(int(address) - int(data.ptr))
-        return found.events
+        return decoded.events
 
     def _listed(self, data: Any, kernel: Any, kind: Any) -> NDArray[Any]:
         """Return the packets in some bytes, as a kernel lists them."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import EventSource, Recording
+from amiwarp.events.recording import EventSource, MetadataValue, Recording
 from amiwarp.io.assumptions import ASSUMED, ASSUMED_SIZE, assumed_texts
 from amiwarp.io.export import export
 from amiwarp.io.file_scan import RECORDS, FileEvents
@@ -214,26 +214,19 @@ def convert(
         camera=camera or opened.camera,
         prism=prism or opened.prism,
     )
-    frame = recording.events.size
+    size_of_image = recording.events.size
     if recording.camera is not None and not getattr(recording.events, "size_is_known", True):
         # The camera states the size. Nothing is assumed any more.
-        frame = recording.camera.width, recording.camera.height
-        known = {name: value for name, value in recording.metadata.items() if name != ASSUMED_SIZE}
-        recording = replace(recording, metadata=known)
+        size_of_image = recording.camera.width, recording.camera.height
+        stated = {name: value for name, value in recording.metadata.items() if name != ASSUMED_SIZE}
+        recording = replace(recording, metadata=stated)
 
     dropped = 0
     if chosen is OutputFormat.NATIVE:
-        # The metadata of an earlier conversion win: they name the original.
-        others = {name: value for name, value in recording.metadata.items() if name != "format"}
-        metadata = {
-            "source_name": recording.name,
-            "source_format": recording.metadata["format"],
-            **others,
-        }
         write_recording(
             out_path,
-            replace(recording, metadata=metadata),
-            frame,
+            replace(recording, metadata=_metadata_with_source(recording)),
+            size_of_image,
             codec=codec,
             progress=progress,
             overwrite=overwrite,
@@ -243,7 +236,7 @@ def convert(
             recording.events,
             out_path,
             chosen,
-            frame,
+            size_of_image,
             codec=codec,
             progress=progress,
             overwrite=overwrite,
@@ -251,7 +244,18 @@ def convert(
             seed=seed,
             bag=bag_of(recording, chosen),
         )
-    return _summary(recording, frame, chosen, rounding, dropped)
+    return _summary(recording, size_of_image, chosen, rounding, dropped)
+
+
+def _metadata_with_source(recording: Recording) -> dict[str, MetadataValue]:
+    """Return the metadata of a recording with the name and the format of its source."""
+    # The metadata of an earlier conversion win: they name the original.
+    others = {name: value for name, value in recording.metadata.items() if name != "format"}
+    return {
+        "source_name": recording.name,
+        "source_format": recording.metadata["format"],
+        **others,
+    }
 
 
 def _summary(

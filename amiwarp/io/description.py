@@ -176,14 +176,14 @@ def _glass(glass: NominalPrism) -> dict[str, Any]:
             "index": glass.index,
         }
     apex = math.degrees(glass.apex) if isinstance(glass, Prism) else None
-    found: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "apex_deg": apex,
         "index": glass.index,
         "flat_side": glass.flat_side.value,
     }
     if isinstance(glass, Prism) and glass.second is not None:
-        found["second"] = _glass(glass.second)
-    return found
+        fields["second"] = _glass(glass.second)
+    return fields
 
 
 def _imu(imu: ImuSamples) -> dict[str, Any]:
@@ -262,10 +262,10 @@ def _in_degrees(parameters: dict[str, float]) -> dict[str, float]:
     angles = {*ANGLES}
     for pair in ANGLE_PAIRS:
         angles |= {f"{pair}_x", f"{pair}_y"}
-    found = {}
+    in_degrees = {}
     for name, value in parameters.items():
         if name in angles:
-            found[f"{name}_deg"] = math.degrees(value)
+            in_degrees[f"{name}_deg"] = math.degrees(value)
         else:
-            found[name] = value
-    return found
+            in_degrees[name] = value
+    return in_degrees

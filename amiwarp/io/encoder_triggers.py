@@ -37,21 +37,21 @@ def read_encoder_triggers(
     whole(channel, "channel", 0, 255)
     whole(counts_per_turn, "counts_per_turn", 1, 1 << 40)
     check_direction(direction)
-    found = detect_format(path)
-    if found not in TRIGGERS:
-        formats = ", ".join(format.value for format in TRIGGERS)
+    format = detect_format(path)
+    if format not in TRIGGERS:
+        formats = ", ".join(known.value for known in TRIGGERS)
         raise AmiwarpError(
-            f"{path}: files of the format {found.value} store no triggers; expected one of {formats}"
+            f"{path}: files of the format {format.value} store no triggers; expected one of {formats}"
         )
-    check_topic(path, topic, found)
+    check_topic(path, topic, format)
     with errors_name(path, lambda: "reading the triggers"):
-        channels, t, rising = _edges(path, found, topic)
+        channels, t, rising = _edges(path, format, topic)
     pulse_t = np.unique(t[(channels == channel) & rising])
     if pulse_t.size < 2:
         counts = []
-        for each in np.unique(channels).tolist():
-            count = int(np.count_nonzero(channels[rising] == each))
-            counts.append(f"{count} of channel {each}")
+        for number in np.unique(channels).tolist():
+            count = int(np.count_nonzero(channels[rising] == number))
+            counts.append(f"{count} of channel {number}")
         given = f"{path}: has {pulse_t.size} rising trigger edges of channel {channel}"
         listed = ", ".join(counts) or "none"
         raise AmiwarpError(f"{given}; expected at least 2; the rising edges are: {listed}")
@@ -61,10 +61,10 @@ def read_encoder_triggers(
     return Encoder(pulse_t, angle, index_t=index_t)
 
 
-def _edges(path: Path, found: Format, topic: str | None) -> tuple[Any, Any, Any]:
+def _edges(path: Path, format: Format, topic: str | None) -> tuple[Any, Any, Any]:
     """Return channel, time [us] and whether it rises, of each edge."""
-    read = io_function(TRIGGERS[found])
-    source: Any = read(path, topic) if found is Format.ROSBAG else read(path)
+    read = io_function(TRIGGERS[format])
+    source: Any = read(path, topic) if format is Format.ROSBAG else read(path)
     nothing = np.zeros(0, np.int64)
     parts: list[tuple[Any, ...]] = [(nothing, nothing, np.zeros(0, np.bool_))]
     count = 0

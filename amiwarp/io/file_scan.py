@@ -234,35 +234,35 @@ class FileEvents(EventSource):
     def slice(self, start: int, stop: int) -> Events:
         """Return the events with ``start <= index < stop``."""
         check_slice(start, stop)
-        found: list[Events] = []
-        seen = 0
+        parts: list[Events] = []
+        passed = 0
         for block in self._all():
-            if seen >= stop:
+            if passed >= stop:
                 break
-            found.append(block[max(start - seen, 0) : max(stop - seen, 0)])
-            seen += len(block)
-        return _copied([block for block in found if len(block)])
+            parts.append(block[max(start - passed, 0) : max(stop - passed, 0)])
+            passed += len(block)
+        return _copied([block for block in parts if len(block)])
 
     def find(self, t: int) -> int:
         """Return the index of the first event at or after ``t`` [us]."""
-        seen = 0
+        passed = 0
         for block in self._all():
             if block.t[-1] >= t:
-                return seen + int(np.searchsorted(block.t, t))
-            seen += len(block)
-        return seen
+                return passed + int(np.searchsorted(block.t, t))
+            passed += len(block)
+        return passed
 
     def between(self, t_start: int, t_end: int) -> Events:
         """Return the events with ``t_start <= t < t_end`` [us]."""
         check_window(t_start, t_end)
-        found: list[Events] = []
+        parts: list[Events] = []
         for block in self._all():
             if block.t[0] >= t_end:
                 break
             start, stop = np.searchsorted(block.t, [t_start, t_end])
             if stop > start:
-                found.append(block[start:stop])
-        return _copied(found)
+                parts.append(block[start:stop])
+        return _copied(parts)
 
     def blocks(
         self, *, count: int | None = None, duration_us: int | None = None

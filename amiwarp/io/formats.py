@@ -139,7 +139,7 @@ def _folder_format(path: Path) -> Format | None:
     """Return the format of a folder, or None if the path is a file or an unknown folder."""
     if not path.is_dir():
         return None
-    return next((found for name, found in FOLDERS if (path / name).is_file()), None)
+    return next((format for name, format in FOLDERS if (path / name).is_file()), None)
 
 
 def detect_format(path: Path) -> Format:
@@ -147,7 +147,7 @@ def detect_format(path: Path) -> Format:
     folder = _folder_format(path)
     if folder is not None:
         return folder
-    if path.is_dir() and any(each.name.endswith(BAG_ENDS) for each in path.iterdir()):
+    if path.is_dir() and any(inner.name.endswith(BAG_ENDS) for inner in path.iterdir()):
         raise AmiwarpError(
             f"{path}: is the folder of a ROS 2 bag without its metadata.yaml; "
             "run ros2 bag reindex, or give one of its files"
@@ -163,9 +163,9 @@ def detect_format(path: Path) -> Format:
             )
         raise AmiwarpError(f"{path}: is empty; give a recording", ErrorCode.CONTENT_MISSING)
 
-    for magic, found in SIGNATURES:
+    for magic, format in SIGNATURES:
         if head.startswith(magic):
-            return found
+            return format
     if head.startswith(b"#!AER-DAT"):
         raise AmiwarpError(
             f"{path}: is AEDAT {head[9:12].decode('ascii', 'replace')}; only 2.0, 3.1 and 4 are read",
@@ -311,9 +311,9 @@ def _checked_size(size: Any) -> tuple[int, int]:
     return width, height
 
 
-def check_topic(path: Path, topic: str | None, found: Format) -> None:
+def check_topic(path: Path, topic: str | None, format: Format) -> None:
     """Raise :class:`AmiwarpError` if a topic is given for a file of a format without topics."""
-    if topic is not None and found not in TOPICS:
+    if topic is not None and format not in TOPICS:
         raise AmiwarpError(
             f"{path}: holds one stream of events, no topics; leave the topic out", ErrorCode.OPTIONS
         )

@@ -231,19 +231,19 @@ def output_format(path: Path, given: OutputFormat | str | None) -> OutputFormat:
 
     Raises :class:`AmiwarpError` for an unknown extension, and for one that files of the given format do not have.
     """
-    found = EXTENSIONS.get(path.suffix.lower())
+    of_extension = EXTENSIONS.get(path.suffix.lower())
     if given is not None:
         chosen = choice(OutputFormat, given, f"{path}: format")
         check_ending(path, f"recordings in the format {chosen.value} are written", _endings(chosen))
         return chosen
-    if found is None:
+    if of_extension is None:
         known = ", ".join(EXTENSIONS)
         names = ", ".join(OutputFormat)
         raise AmiwarpError(
             f"{path}: the extension '{path.suffix}' is of no format that is written; "
             f"choose among {known}, which mean the formats {names}"
         )
-    return found
+    return of_extension
 
 
 def _endings(chosen: OutputFormat) -> list[str]:
@@ -256,8 +256,10 @@ def check_native(path: Path) -> None:
     """Raise :class:`AmiwarpError` if the name of a native recording ends in another extension."""
     remedy = None
     if EXTENSIONS.get(path.suffix.lower(), OutputFormat.NATIVE) is not OutputFormat.NATIVE:
-        made = path.with_suffix(".h5")
-        remedy = f"write {made.name}, then run: amiwarp convert {made.name} {path.name}"
+        native_path = path.with_suffix(".h5")
+        remedy = (
+            f"write {native_path.name}, then run: amiwarp convert {native_path.name} {path.name}"
+        )
     check_ending(path, "recordings are written here", _endings(OutputFormat.NATIVE), remedy)
 
 

@@ -86,13 +86,13 @@ def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Event
         for start in starts:
             yield source.slice(start, start + length)
         return
-    seen = 0
+    passed = 0
     for block in source.blocks():
         for start in starts:
-            if start < seen + len(block):
-                yield block[max(start - seen, 0) : max(start + length - seen, 0)]
-        seen += len(block)
-        starts = [start for start in starts if start + length > seen]
+            if start < passed + len(block):
+                yield block[max(start - passed, 0) : max(start + length - passed, 0)]
+        passed += len(block)
+        starts = [start for start in starts if start + length > passed]
         if not starts:
             return
 

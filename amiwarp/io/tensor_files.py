@@ -27,7 +27,7 @@ def save_tensors(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
     """Read the arrays that :func:`save_tensors` wrote. Raises :class:`AmiwarpError` if there is no ``tensor``."""
-    found = {}
+    arrays = {}
     with errors_name(path, lambda: "reading tensors"), zipfile.ZipFile(input_path(path)) as archive:
         names = [name.removesuffix(".npy") for name in archive.namelist()]
         if "tensor" not in names:
@@ -37,5 +37,5 @@ def read_tensors(path: Path) -> dict[str, NDArray[Any]]:
             )
         for name in names:
             with open_array(archive, name, "iuf") as (stream, shape, dtype):
-                found[name] = np.frombuffer(bytearray(stream.read()), dtype).reshape(shape)
-    return found
+                arrays[name] = np.frombuffer(bytearray(stream.read()), dtype).reshape(shape)
+    return arrays

@@ -144,13 +144,13 @@ def remove_abandoned(folder: Path) -> None:
     Done once per process. Files are kept if it is not certain that their process has ended: files of other systems,
     without a lock file, or on file systems without locks.
     """
-    found: dict[str, list[Path]] = defaultdict(list)
+    abandoned: dict[str, list[Path]] = defaultdict(list)
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             match = UNFINISHED.fullmatch(entry.name)
             if match and match["system"] == _system():
-                found[match["owner"]].append(folder / entry.name)
-    for owner, paths in found.items():
+                abandoned[match["owner"]].append(folder / entry.name)
+    for owner, paths in abandoned.items():
         path = _lock_path(folder, owner)
         with contextlib.suppress(OSError), open(path, "r+b") as file:
             if _lock(file):

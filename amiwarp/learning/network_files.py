@@ -24,8 +24,8 @@ def as_array(values: Any, device: Any, what: str) -> wp.array:
         if isinstance(values, wp.array) or (
             hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
         ):
-            found = values if isinstance(values, wp.array) else wp.from_dlpack(values)
-            return found.to(device).contiguous()
+            array = values if isinstance(values, wp.array) else wp.from_dlpack(values)
+            return array.to(device).contiguous()
         numbers = np.ascontiguousarray(values)
         return wp.array(numbers, dtype=wp.dtype_from_numpy(numbers.dtype), device=device)
     except Exception as error:  # libraries raise many kinds of errors
@@ -80,8 +80,8 @@ class TorchFile:
     def run(self, grid: wp.array, states: tuple[Any, ...]) -> tuple[wp.array, tuple[Any, ...]]:
         """Return the first output and the states after a window."""
         with self._torch.no_grad():
-            found = self._module(self._torch.from_dlpack(grid), *states)
-        outputs = found if isinstance(found, tuple | list) else (found,)
+            output = self._module(self._torch.from_dlpack(grid), *states)
+        outputs = output if isinstance(output, tuple | list) else (output,)
         instance(
             outputs[0] if outputs else None, self._torch.Tensor, f"{self.path}: the first output"
         )
@@ -139,11 +139,11 @@ class OnnxFile:
     def _check_sizes(self, what: str, declared: Sequence[Any]) -> None:
         """Raise :class:`AmiwarpError` if inputs or outputs take too much memory. Sizes without a number count as 1."""
         size = 0
-        for one in declared:
-            item = wp.types.type_size_in_bytes(TYPES[one.type]) if one.type in TYPES else 1
-            size += item * math.prod(length for length in one.shape if isinstance(length, int))
+        for value in declared:
+            item = wp.types.type_size_in_bytes(TYPES[value.type]) if value.type in TYPES else 1
+            size += item * math.prod(length for length in value.shape if isinstance(length, int))
         if size > LARGEST_BYTES:
-            shapes = ", ".join(shown(one.shape) for one in declared[:4])
+            shapes = ", ".join(shown(value.shape) for value in declared[:4])
             raise AmiwarpError(
                 f"{self.path}: its {what} of shape {shapes} take {size / 2**30:.4g} GiB; expected at most "
                 f"{LARGEST_BYTES >> 30} GiB; the file is damaged, or export the network for smaller images",
@@ -167,8 +167,8 @@ class OnnxFile:
                     f"{self.path}: {wanted.name} has the shape {wanted.shape}; give its first value in states"
                 )
         return [
-            wp.zeros(one.shape, dtype=self._type(one.type), device=self._device)
-            for one in self._inputs[1:]
+            wp.zeros(state.shape, dtype=self._type(state.type), device=self._device)
+            for state in self._inputs[1:]
         ]
 
     def run(self, grid: wp.array, states: list[Any]) -> tuple[wp.array, list[Any]]:

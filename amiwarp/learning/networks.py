@@ -262,9 +262,9 @@ class Network:
         self, events: Any, width: int, height: int, states: Any, options: dict[str, Any]
     ) -> tuple[Any, Any]:
         """Return the result for a window and the states after it. ``states``: those before it, None for the first."""
-        known = {name: value for name, value in options.items() if value is not None}
-        found = self._input(self._on_own_device(events), width=width, height=height, **known)
-        grid = as_array(found, self._device, "the input function's result")
+        given = {name: value for name, value in options.items() if value is not None}
+        values = self._input(self._on_own_device(events), width=width, height=height, **given)
+        grid = as_array(values, self._device, "the input function's result")
         if grid.ndim != 3 or grid.shape[1:] != (height, width):
             raise AmiwarpError(
                 f"the input function gives shape {grid.shape}; expected (channels, {height}, {width}), one window"

@@ -83,10 +83,10 @@ def sums_of_windows(
         t_start=ends[:, :-1].ravel(),
         t_end=ends[:, 1:].ravel(),
     )
-    found = polarity_histogram(
+    histograms = polarity_histogram(
         events, width, height, windows=parts, model=model, encoder=encoder, device=events.device
     )
-    counts = torch.from_dlpack(found).reshape(len(windows), BINS, 2, height, width)
+    counts = torch.from_dlpack(histograms).reshape(len(windows), BINS, 2, height, width)
     return sums_of_parts(counts, chords_of(model, encoder, ends))
 
 

@@ -67,15 +67,15 @@ class DeviceBlock:
 
         In a world, call this method before the engine simulates the next chunk.
         """
-        found = {name: getattr(self.arrays, name) for name in NAMES}
-        found["points"] = self._points
-        found["cause"] = self.arrays.cause
+        by_name = {name: getattr(self.arrays, name) for name in NAMES}
+        by_name["points"] = self._points
+        by_name["cause"] = self.arrays.cause
         if self.look is not None:
-            seen = self.look()
-            found["instance"] = seen.instance
-            found["depth"] = seen.depth
-            found["place"] = seen.place
-        return found
+            surfaces = self.look()
+            by_name["instance"] = surfaces.instance
+            by_name["depth"] = surfaces.depth
+            by_name["place"] = surfaces.place
+        return by_name
 
 
 class CollectedEvents:
@@ -97,10 +97,10 @@ class CollectedEvents:
         The blocks of a column are released once they are joined, so that only one column is held twice.
         """
         unite = join if self._on_device else np.concatenate
-        found = {name: unite(self._parts.pop(name)) for name in list(self._parts)}
-        events = [found.pop(name) for name in NAMES]
+        by_name = {name: unite(self._parts.pop(name)) for name in list(self._parts)}
+        events = [by_name.pop(name) for name in NAMES]
         if not self._on_device:
-            return MemoryEvents(Events(*events), width, height), found
+            return MemoryEvents(Events(*events), width, height), by_name
         source = DeviceMemoryEvents(DeviceEvents(*events), width, height)
         wait(source.device)
-        return source, {name: DeviceValues(values) for name, values in found.items()}
+        return source, {name: DeviceValues(values) for name, values in by_name.items()}

@@ -284,8 +284,8 @@ class Engine:
 
     def _start_pixels(self, steps: Any) -> None:
         """Set the initial state of every pixel."""
-        seen = self._seen(steps, 0, 1)
-        inputs = [seen, steps, self._sensor, self._simulation.seed, 0, *self._state]
+        light = self._seen(steps, 0, 1)
+        inputs = [light, steps, self._sensor, self._simulation.seed, 0, *self._state]
         kernel = pixels.start_pixels if self._maps is not None else world_pixels.start_world_pixels
         loading.load(kernel, self._device)
         wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
@@ -334,18 +334,18 @@ class Engine:
         sort_keys(keys, total, int(lowest), top)
         if self._device.is_cpu:
             return int(np.searchsorted(keys.numpy()[:total], limit))
-        found = wp.empty(1, dtype=int, device=self._device)
+        below_limit = wp.empty(1, dtype=int, device=self._device)
         inputs = [keys, total, limit]
-        wp.launch(event_keys.find, dim=1, inputs=inputs, outputs=[found], device=self._device)
-        return int(found.numpy()[0])
+        wp.launch(event_keys.find, dim=1, inputs=inputs, outputs=[below_limit], device=self._device)
+        return int(below_limit.numpy()[0])
 
     def _unpack(self, keys: wp.array, steps: Any, first: int) -> DeviceBlock:
         """Convert sorted keys of events to a block of events with ground truth. ``first``: number of the first step."""
         keys, stamps = self._readout.read(keys, steps.shift, first * self._step)
-        n = len(keys)
-        block = empty_block(n, self._device)
+        count = len(keys)
+        block = empty_block(count, self._device)
         inputs = [self._view, steps, keys, first * self._step]
-        launch.launch(event_keys.unpack, n, inputs, [block], device=self._device)
+        launch.launch(event_keys.unpack, count, inputs, [block], device=self._device)
         if stamps is not None:
             block.t = stamps
 
@@ -354,7 +354,9 @@ class Engine:
             at_rest = wp.empty_like(block.points)
             model = self._simulation.moving_model
             inputs = [model.params(self._device), model_camera(model, self._device), steps, block]
-            launch.launch(event_keys.find_points_at_rest, n, inputs, [at_rest], device=self._device)
+            launch.launch(
+                event_keys.find_points_at_rest, count, inputs, [at_rest], device=self._device
+            )
         if self._sight is None:
             return DeviceBlock(block, at_rest=at_rest)
         if isinstance(self._simulation.prism, Steerer):
@@ -365,24 +367,24 @@ class Engine:
             faces = self._maps.faces
         else:
             faces = wp.empty(0, dtype=int, device=self._device)
-        look = partial(self._sight.look, self._view, steps, block, n, faces)
+        look = partial(self._sight.look, self._view, steps, block, count, faces)
         if self._simulation.plate is not None:
             # The events' pixels without the plate depend on the surfaces, so that these are needed in any case.
-            seen = look()
-            return DeviceBlock(block, lambda: seen)
+            surfaces = look()
+            return DeviceBlock(block, lambda: surfaces)
         return DeviceBlock(block, look, at_rest)
 
 
-def empty_block(n: int, device: Any) -> Any:
-    """Return the kernels' columns of ``n`` events, to be filled."""
+def empty_block(count: int, device: Any) -> Any:
+    """Return the kernels' columns of ``count`` events, to be filled."""
     block = event_keys.Block()
-    block.x = wp.empty(n, dtype=wp.uint16, device=device)
-    block.y = wp.empty(n, dtype=wp.uint16, device=device)
-    block.t = wp.empty(n, dtype=wp.int64, device=device)
-    block.p = wp.empty(n, dtype=wp.uint8, device=device)
-    block.cause = wp.empty(n, dtype=wp.uint8, device=device)
-    block.points = wp.empty(n, dtype=wp.vec2, device=device)
-    block.ticks = wp.empty(n, dtype=int, device=device)
+    block.x = wp.empty(count, dtype=wp.uint16, device=device)
+    block.y = wp.empty(count, dtype=wp.uint16, device=device)
+    block.t = wp.empty(count, dtype=wp.int64, device=device)
+    block.p = wp.empty(count, dtype=wp.uint8, device=device)
+    block.cause = wp.empty(count, dtype=wp.uint8, device=device)
+    block.points = wp.empty(count, dtype=wp.vec2, device=device)
+    block.ticks = wp.empty(count, dtype=int, device=device)
     return block
 
 

@@ -55,7 +55,9 @@ def step_us(
     motion = image_motion(simulation, inverse_depth)
     rates = simulation.camera_motion.largest_rates
     both_prisms = (simulation.prism_motion, simulation.prism_motion.second)
-    turning = np.array([each.largest_speed for each in both_prisms if each])
+    turning = np.array(
+        [motion_of_prism.largest_speed for motion_of_prism in both_prisms if motion_of_prism]
+    )
 
     speed = float(motion.prisms @ turning) + float(motion.camera @ rates) + world_speed
     # [px/s²]: the distance from the chord, per squared step

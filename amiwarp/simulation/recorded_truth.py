@@ -45,13 +45,13 @@ def chosen_instants(
         raise AmiwarpError(
             f"truth_times_us is {shown(times)}; give finite times within 0 .. {duration_us} us"
         )
-    found = np.rint(times).astype(np.int64)
-    outside = (found < 0).any() or (found > duration_us).any()
-    if found.ndim != 1 or outside or (np.diff(found) <= 0).any():
+    instants = np.rint(times).astype(np.int64)
+    outside = (instants < 0).any() or (instants > duration_us).any()
+    if instants.ndim != 1 or outside or (np.diff(instants) <= 0).any():
         raise AmiwarpError(
             f"truth_times_us must increase and lie within 0 .. {duration_us} us; sort the times"
         )
-    return found
+    return instants
 
 
 class RecordedTruth:

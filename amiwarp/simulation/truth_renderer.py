@@ -187,15 +187,15 @@ class TruthRenderer:
         return rotation @ mirrored(self._simulation), position
 
     def _flow(
-        self, seen: SurfaceView, pixels: NDArray[np.float64], t: float
+        self, surfaces: SurfaceView, pixels: NDArray[np.float64], t: float
     ) -> NDArray[np.float64]:
         """Return the optical flow [px/s] of the points that pixels see at time ``t`` [s], shape (n, 2).
 
-        ``seen``: surfaces that appear at ``pixels`` [px] in the image without the prism.
+        ``surfaces``: surfaces that appear at ``pixels`` [px] in the image without the prism.
         """
 
         def ray_at(later: float) -> NDArray[np.float64]:
-            rays, _ = self._ray_at(seen, pixels, t, later)
+            rays, _ = self._ray_at(surfaces, pixels, t, later)
             return rays
 
         change = rate_of_change(ray_at, t, self._simulation.duration_s)
@@ -210,7 +210,7 @@ class TruthRenderer:
         return np.asarray((after - before) / (2.0 * ANGLE) * rate)
 
     def _ray_at(
-        self, seen: SurfaceView, pixels: NDArray[np.float64], t: float, later: float
+        self, surfaces: SurfaceView, pixels: NDArray[np.float64], t: float, later: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return unit rays from the camera at time ``later`` [s] to the points that pixels see at time ``t`` [s].
 
@@ -218,14 +218,14 @@ class TruthRenderer:
         """
         (rotation, later_rotation), (position, later_position) = self._poses([t, later])
         rays = self._simulation.camera.pixels_to_rays(pixels).astype(np.float64)
-        distance = seen.depth.astype(np.float64) / rays[:, 2]
+        distance = surfaces.depth.astype(np.float64) / rays[:, 2]
         sky = ~np.isfinite(distance)
         reach = np.where(sky, 1.0, distance)[:, None]
         points = position + reach * (rays @ rotation.T)
 
         # Points on moving bodies move with these.
         for k, body in enumerate(self._world.movers):
-            on_body = (seen.mover == k) & ~sky
+            on_body = (surfaces.mover == k) & ~sky
             if body.trajectory is not None and on_body.any():
                 (turn, later_turn), (place, later_place) = body.trajectory.poses([t, later])
                 in_body = (points[on_body] - place) @ turn
@@ -245,7 +245,7 @@ class TruthRenderer:
 
     def _moved(
         self,
-        seen: SurfaceView,
+        surfaces: SurfaceView,
         places: NDArray[np.float64],
         t_us: int,
         next_us: int | None,
@@ -254,8 +254,8 @@ class TruthRenderer:
     ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """Return the displacement of what the pixels see until ``next_us`` [px], shape (n, 2), and its occlusion, (n,).
 
-        ``seen``: surfaces that appear at ``places`` [px] in the image without the prism; ``prism``: whether the pixels
-        see them through the prism.
+        ``surfaces``: surfaces that appear at ``places`` [px] in the image without the prism; ``prism``: whether the
+        pixels see them through the prism.
         """
         n = len(self._rays)
         if next_us is None:
@@ -266,7 +266,7 @@ class TruthRenderer:
 
         # Pixels that will see the points, and the rays that will lead there.
         centres = None
-        rays, depth = self._ray_at(seen, places, t_us * 1e-6, later)
+        rays, depth = self._ray_at(surfaces, places, t_us * 1e-6, later)
         ends = camera.rays_to_pixels(rays)
         if plate is not None:
             ends = self._plate_pixels(plate, rays, depth, later)
@@ -326,12 +326,12 @@ class TruthRenderer:
         """Return the surfaces that the pixels see through the turning plate at time ``t`` [s], and where they appear
         without it [px], shape (n, 2)."""
         centres, rays = self._behind_plate(self._rays, t)
-        seen = surfaces_at(self._world, rays, rotation, position, centres=centres)
+        surfaces = surfaces_at(self._world, rays, rotation, position, centres=centres)
         # The sky appears where the rays point to.
-        is_surface = np.isfinite(seen.depth)[:, None]
-        from_camera = (seen.place - position) @ rotation
+        is_surface = np.isfinite(surfaces.depth)[:, None]
+        from_camera = (surfaces.place - position) @ rotation
         directions = np.where(is_surface, from_camera, rays)
-        return seen, self._simulation.camera.rays_to_pixels(directions)
+        return surfaces, self._simulation.camera.rays_to_pixels(directions)
 
     def _behind_plate(
         self, rays: NDArray[np.float64], t: float
@@ -362,15 +362,15 @@ class TruthRenderer:
         return observed
 
     def _plate_flow(
-        self, model: PlateModel, seen: SurfaceView, places: NDArray[np.float64], t: float
+        self, model: PlateModel, surfaces: SurfaceView, places: NDArray[np.float64], t: float
     ) -> NDArray[np.float64]:
         """Return the optical flow [px/s] that the pixels see through the turning plate at time ``t`` [s], (n, 2).
 
-        ``seen``, ``places``: from :meth:`_through_plate`.
+        ``surfaces``, ``places``: from :meth:`_through_plate`.
         """
 
         def pixels_at(later: float) -> NDArray[np.float64]:
-            rays, depth = self._ray_at(seen, places, t, later)
+            rays, depth = self._ray_at(surfaces, places, t, later)
             return self._plate_pixels(model, rays, depth, later)
 
         return rate_of_change(pixels_at, t, self._simulation.duration_s)

@@ -79,9 +79,9 @@ def _border(camera: Camera) -> NDArray[np.float64]:
     bottom = camera.height - 1.0
     along = np.linspace(0.0, 1.0, 33)
     zero = np.zeros(33)
-    one = np.ones(33)
+    ones = np.ones(33)
     edges = []
-    for x, y in ((along, zero), (along, one), (zero, along), (one, along)):
+    for x, y in ((along, zero), (along, ones), (zero, along), (ones, along)):
         edges.append(np.stack([x * right, y * bottom], 1))
     return np.asarray(np.round(np.concatenate(edges)), np.float64)
 

@@ -29,6 +29,7 @@ from amiwarp.studies.design_results import (
 from amiwarp.tasks import part
 
 if TYPE_CHECKING:
+    from amiwarp.studies.optics_comparison import Comparison
     from amiwarp.studies.stability.optic_map import RigOnMap
 
 
@@ -69,38 +70,38 @@ def run_demo(
     cli.report(common, data, demo_lines(data))
 
 
-def demo_lines(d: dict[str, Any]) -> list[Any]:
+def demo_lines(data: dict[str, Any]) -> list[Any]:
     """Return the results of the demo as lines of text."""
     rows = [
-        ("apex", f"{d['apex_deg']:.4f} deg found, {d['apex_true_deg']:.4f} deg true"),
+        ("apex", f"{data['apex_deg']:.4f} deg found, {data['apex_true_deg']:.4f} deg true"),
         (
             "model error",
-            f"{d['model_error_px']:.4f} px rms over image and turn, "
-            f"{d['sharpness_model_error_px']:.4f} px by sharpness alone",
+            f"{data['model_error_px']:.4f} px rms over image and turn, "
+            f"{data['sharpness_model_error_px']:.4f} px by sharpness alone",
         ),
-        ("phase error", f"{d['phase_error_deg']:+.3f} deg"),
+        ("phase error", f"{data['phase_error_deg']:+.3f} deg"),
         (
             "blur",
-            f"{d['blur_before_px']:.2f} px before, {d['blur_after_px']:.2f} px after, "
-            f"{d['blur_with_truth_px']:.2f} px with the true prism",
+            f"{data['blur_before_px']:.2f} px before, {data['blur_after_px']:.2f} px after, "
+            f"{data['blur_with_truth_px']:.2f} px with the true prism",
         ),
         (
             "picture",
-            f"correlation {d['picture_correlation']:.3f} with the original, "
-            f"PSNR {d['picture_psnr_db']:.1f} dB, from one turn",
+            f"correlation {data['picture_correlation']:.3f} with the original, "
+            f"PSNR {data['picture_psnr_db']:.1f} dB, from one turn",
         ),
         (
             "speed",
-            f"simulated in {d['simulate_s']:.1f} s, calibrated in {d['calibrate_s']:.1f} s, "
-            f"reconstructed in {d['reconstruct_s']:.1f} s, compensated at {d['compensate_mev_per_s']:.1f} Mev/s",
+            f"simulated in {data['simulate_s']:.1f} s, calibrated in {data['calibrate_s']:.1f} s, "
+            f"reconstructed in {data['reconstruct_s']:.1f} s, compensated at {data['compensate_mev_per_s']:.1f} Mev/s",
         ),
-        *((f"{name} file", path) for name, path in d["files"].items()),
+        *((f"{name} file", path) for name, path in data["files"].items()),
     ]
-    notes = [f"note: {note}" for note in d["notes"]]
+    notes = [f"note: {note}" for note in data["notes"]]
     return [
         cli.table(rows),
         *notes,
-        f"{d['events']:,} events, {d['seconds']:.1f} s in all on {d['device']}",
+        f"{data['events']:,} events, {data['seconds']:.1f} s in all on {data['device']}",
     ]
 
 
@@ -115,13 +116,12 @@ def run_warm_up(*, common: cli.Common) -> None:
     with cli.progress("starting", average_s=60.0) as advance:
         from amiwarp.studies.warm_up import warm_up
 
-        done = warm_up(devices, advance)
-    what = f"compiled {done.compiled} modules of kernels in {done.seconds:.1f} s for {' and '.join(devices)}"
-    cli.report(
-        common,
-        asdict(done) | {"devices": devices},
-        [what, f"cache: {done.cache}, {done.cached} modules"],
-    )
+        result = warm_up(devices, advance)
+    lines = [
+        f"compiled {result.compiled} modules of kernels in {result.seconds:.1f} s for {' and '.join(devices)}",
+        f"cache: {result.cache}, {result.cached} modules",
+    ]
+    cli.report(common, asdict(result) | {"devices": devices}, lines)
 
 
 FOV_DEG = 60.0
@@ -160,8 +160,8 @@ def run_design(
     your rig are listed and drawn.
     """
     optics.check()
-    seen = _camera_of_design(camera, size)
-    calibrated = _calibrations(optics, seen, faults.contrast)
+    viewer = _camera_of_design(camera, size)
+    measured = _calibrations(optics, viewer, faults.contrast)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = cli.choose_device(common.device)
     from amiwarp.plotting.figures import save_png_and_svg
@@ -172,16 +172,16 @@ def run_design(
     from amiwarp.studies.design_chart import chart
 
     make_folder(out)
-    files = _files_of_design(out, compare=optics.compare, calibrated=calibrated is not None)
+    files = _files_of_design(out, compare=optics.compare, calibrated=measured is not None)
     for path in files.values():
         check_output(Path(path))
 
     sensor = SensorModel(contrast_on=faults.contrast, contrast_off=faults.contrast)
     scene = Scene.from_picture(picture or earth())
-    compared = None
+    comparison = None
     with cli.progress("starting") as advance:
-        made = design(
-            seen,
+        recommended = design(
+            viewer,
             scene,
             glass,
             apexes=grid.apexes,
@@ -196,8 +196,8 @@ def run_design(
         if optics.compare:
             from amiwarp.studies.optics_comparison import compare
 
-            compared = compare(
-                made,
+            comparison = compare(
+                recommended,
                 scene,
                 depths=optics.depths,
                 sensor=sensor,
@@ -206,32 +206,49 @@ def run_design(
                 progress=part(advance, DESIGN_SHARE, 1.0),
             )
 
-    data = design_summary(made)
+    data = design_summary(recommended)
     _write_json(files["json"], data)
     _write_csv(files["csv"], data["choices"])
-    save_png_and_svg(chart(made), out / "design")
+    save_png_and_svg(chart(recommended), out / "design")
+    lines_of_rig: list[Any] = []
+    if measured is not None:
+        data["calibration"] = _write_calibrations(measured, out, files)
+        lines_of_rig = ["", *calibration_lines(measured)]
+    if comparison is None:
+        lines = [*design_lines(recommended, files), *lines_of_rig]
+    else:
+        data["comparison"] = _write_comparison(comparison, out, files)
+        lines = [
+            *design_lines(recommended, {}),
+            *comparison_lines(comparison),
+            *lines_of_rig,
+            "",
+            *files.values(),
+            *failed_names({**recommended.failed, **comparison.failed}),
+        ]
+    cli.report(common, {**data, "files": files, "device": device}, lines)
 
-    known: list[Any] = []
-    if calibrated is not None:
-        data["calibration"] = calibrated.summary()
-        _write_json(files["calibration_json"], data["calibration"])
-        save_png_and_svg(calibrated.chart(), out / "calibration")
-        known = ["", *calibration_lines(calibrated)]
 
-    if compared is None:
-        lines = [*design_lines(made, files), *known]
-        cli.report(common, {**data, "files": files, "device": device}, lines)
-        return
+def _write_calibrations(measured: RigOnMap, out: Path, files: dict[str, str]) -> dict[str, Any]:
+    """Write what was measured about a rig as JSON and as a chart. Return the JSON data."""
+    from amiwarp.plotting.figures import save_png_and_svg
 
+    data = measured.summary()
+    _write_json(files["calibration_json"], data)
+    save_png_and_svg(measured.chart(), out / "calibration")
+    return data
+
+
+def _write_comparison(comparison: Comparison, out: Path, files: dict[str, str]) -> dict[str, Any]:
+    """Write a comparison of optics as JSON, as a table and as a chart. Return the JSON data."""
+    from amiwarp.plotting.figures import save_png_and_svg
     from amiwarp.studies import optics_comparison_chart
 
-    optics_data = comparison_summary(compared)
-    _write_json(files["optics_json"], optics_data)
-    _write_csv(files["optics_csv"], optics_data["optics"])
-    save_png_and_svg(optics_comparison_chart.chart(compared), out / "optics")
-    lines = [*design_lines(made, {}), *comparison_lines(compared), *known, "", *files.values()]
-    lines += failed_names({**made.failed, **compared.failed})
-    cli.report(common, {**data, "comparison": optics_data, "files": files, "device": device}, lines)
+    data = comparison_summary(comparison)
+    _write_json(files["optics_json"], data)
+    _write_csv(files["optics_csv"], data["optics"])
+    save_png_and_svg(optics_comparison_chart.chart(comparison), out / "optics")
+    return data
 
 
 def _files_of_design(out: Path, *, compare: bool, calibrated: bool) -> dict[str, str]:
@@ -255,15 +272,14 @@ def _calibrations(options: OpticsOptions, camera: Camera, contrast: float) -> Ri
         return None
     from amiwarp.studies.stability.optic_map import RigOnMap, load_map
 
-    known = load_map()
-    view = 2.0 * math.degrees(math.atan(camera.width / 2.0 / camera.fx))
-    measured = {axis.field for axis in known.of(options.optic)}
+    optic_map = load_map()
+    measured = {axis.field for axis in optic_map.of(options.optic)}
     troubles = {}
     if "fov_deg" in measured:
-        troubles["fov_deg"] = view
+        troubles["fov_deg"] = 2.0 * math.degrees(math.atan(camera.width / 2.0 / camera.fx))
     if "contrast" in measured:
         troubles["contrast"] = contrast
-    return RigOnMap(known, options.optic, {**troubles, **options.troubles})
+    return RigOnMap(optic_map, options.optic, {**troubles, **options.troubles})
 
 
 def _camera_of_design(options: cli.CameraOptions, size: str | None) -> Camera:

@@ -141,7 +141,7 @@ def _run(
     simulated_s = time.perf_counter() - began
 
     recording = open_recording(files["recording"])
-    found = calibrate(
+    calibration = calibrate(
         recording,
         model=ExactModel.NAME,
         seed=demo.seed,
@@ -149,16 +149,16 @@ def _run(
         photometric=BRIEF,
         progress=report,
     )
-    found.save(files["calibration"])
+    calibration.save(files["calibration"])
 
     compensated = compensate(
-        recording, found, files["compensated"], device=demo.device, progress=report
+        recording, calibration, files["compensated"], device=demo.device, progress=report
     )
-    views = aside.submit(EventViews.of, recording, found, demo.device)
-    accuracy = aside.submit(_accuracy, recording, found, demo.device)
+    views = aside.submit(EventViews.of, recording, calibration, demo.device)
+    accuracy = aside.submit(_accuracy, recording, calibration, demo.device)
 
     report("reconstructing", 0.0)
-    picture = middle_turn(recording, found, demo.device)
+    picture = middle_turn(recording, calibration, demo.device)
     save_picture(picture, files["picture"], contrast=simulated.sensor.contrast_on)
 
     report("measuring and drawing", 0.0)
@@ -170,7 +170,7 @@ def _run(
     draw_demo(
         files["figure"],
         grid.result(),
-        found,
+        calibration,
         views.result(),
         Reconstructed(picture, original, quality),
         headline=headline(values),
@@ -181,26 +181,28 @@ def _run(
         picture_correlation=quality.correlation,
         picture_psnr_db=quality.psnr_db,
         simulate_s=simulated_s,
-        calibrate_s=found.seconds,
+        calibrate_s=calibration.seconds,
         reconstruct_s=picture.seconds,
         compensate_mev_per_s=compensated.mev_per_s,
         files={name: str(path) for name, path in files.items()},
-        notes=found.warnings,
+        notes=calibration.warnings,
     )
 
 
-def _accuracy(recording: Recording, found: Calibration, device: Any) -> dict[str, Any]:
+def _accuracy(recording: Recording, calibration: Calibration, device: Any) -> dict[str, Any]:
     """Return the fields of :class:`DemoResult` that compare the calibration with the ground truth."""
     assert recording.camera is not None
     assert recording.truth is not None
-    truth = metrics.truth_model(recording.camera, recording.truth, as_wedge(found.prism).flat_side)
-    before, after, with_truth = blurs(recording, found, truth, device)
-    phase_error = math.remainder(found.parameters["phase"] - truth.phase, 2.0 * math.pi)
+    truth = metrics.truth_model(
+        recording.camera, recording.truth, as_wedge(calibration.prism).flat_side
+    )
+    before, after, with_truth = blurs(recording, calibration, truth, device)
+    phase_error = math.remainder(calibration.parameters["phase"] - truth.phase, 2.0 * math.pi)
     return {
-        "apex_deg": math.degrees(found.exact.parameters["apex"]),
+        "apex_deg": math.degrees(calibration.exact.parameters["apex"]),
         "apex_true_deg": math.degrees(truth.prism.apex),
-        "sharpness_model_error_px": metrics.model_error(sharpest(found).model, truth).rms,
-        "model_error_px": metrics.model_error(found.model, truth).rms,
+        "sharpness_model_error_px": metrics.model_error(sharpest(calibration).model, truth).rms,
+        "model_error_px": metrics.model_error(calibration.model, truth).rms,
         "phase_error_deg": math.degrees(phase_error),
         "blur_before_px": before,
         "blur_after_px": after,
@@ -208,12 +210,12 @@ def _accuracy(recording: Recording, found: Calibration, device: Any) -> dict[str
     }
 
 
-def middle_turn(recording: Recording, found: Calibration, device: Any) -> Picture:
+def middle_turn(recording: Recording, calibration: Calibration, device: Any) -> Picture:
     """Return the picture reconstructed from the turn in the middle of the recording.
 
     By then the pixels have forgotten their initial reference levels.
     """
-    work = Reconstruction(recording, found, device=device)
+    work = Reconstruction(recording, calibration, device=device)
     _, turn_us = work.span()
     first_us = recording.events.t_first
     last_us = recording.events.t_last
@@ -221,9 +223,9 @@ def middle_turn(recording: Recording, found: Calibration, device: Any) -> Pictur
     return work.window(start_us, turn_us)
 
 
-def sharpest(found: Calibration) -> Calibration:
+def sharpest(calibration: Calibration) -> Calibration:
     """Return the calibration after the first stage, which uses sharpness alone."""
-    exact = found.exact
+    exact = calibration.exact
     if exact.photometric is None:
         return exact
     return replace(exact, parameters=exact.photometric.sharpness_parameters)
@@ -261,24 +263,26 @@ def earth() -> Path:
 
     Raises :class:`ModuleNotFoundError` if it is not installed.
     """
-    found = importlib.util.find_spec("pyvista")
-    if found is None or found.origin is None:
+    package = importlib.util.find_spec("pyvista")
+    if package is None or package.origin is None:
         raise ModuleNotFoundError("PyVista is not installed", name="pyvista")
-    return Path(found.origin).parent / "examples" / "2k_earth_daymap.jpg"
+    return Path(package.origin).parent / "examples" / "2k_earth_daymap.jpg"
 
 
 def blurs(
-    recording: Recording, found: Calibration, truth: ExactModel, device: Any
+    recording: Recording, calibration: Calibration, truth: ExactModel, device: Any
 ) -> tuple[float, float, float]:
     """Return three standard deviations of events across edges [px].
 
     They are measured before compensation, after compensation as calibrated, and after compensation with the true model.
     """
     events = thin(recording, MEASURED)
-    encoder = found.encoder_for(
+    encoder = calibration.encoder_for(
         recording.encoder, recording.events.t_first, recording.events.t_last
     )
-    after: NDArray[np.float32] = compensate_events(events, found.model, encoder, device=device)
+    after: NDArray[np.float32] = compensate_events(
+        events, calibration.model, encoder, device=device
+    )
     ideal = compensate_events(events, truth, encoder, device=device)
     raw = np.stack([events.x, events.y], axis=1).astype(np.float32)
 

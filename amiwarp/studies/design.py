@@ -234,7 +234,7 @@ def design(
         with noted(lost, f"apex {degrees(prism.apex)}"):
             orbits.append(orbit_of(camera, prism, device))
     if not orbits:
-        raise AmiwarpError("; ".join(f"{name}: {said}" for name, said in lost.items()))
+        raise AmiwarpError("; ".join(f"{name}: {message}" for name, message in lost.items()))
 
     largest = replace(glass, apex=orbits[-1].apex)
     whole_scene = filled(scene, camera, largest)

@@ -106,12 +106,12 @@ def design_lines(design: Design, files: dict[str, str]) -> list[Any]:
         )
         rows.append(row)
     shown = cli.table(rows, "apex", "rpm", "events", "orbit", "error", "model", "window", "misses")
-    said = [tuple(line.split(": ", 1)) for line in reasons(design)]
+    reason_rows = [tuple(line.split(": ", 1)) for line in reasons(design)]
     return [
         shown,
         "",
         headline(design),
-        cli.table(said),
+        cli.table(reason_rows),
         "",
         *files.values(),
         *failed_names(design.failed),
@@ -147,34 +147,34 @@ def comparison_summary(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _optic_fields(r: Compared) -> dict[str, Any]:
-    glass, drive, state = r.setting.NEEDS[r.setting.kind]
-    covered = r.coverage
+def _optic_fields(compared: Compared) -> dict[str, Any]:
+    glass, drive, state = compared.setting.NEEDS[compared.setting.kind]
+    covered = compared.coverage
     return {
-        "optic": r.setting.name,
-        "size": r.setting.size,
-        "turns_per_s": r.setting.hz,
-        "radius_px": r.radius,
-        "smallest_radius_px": r.smallest,
+        "optic": compared.setting.name,
+        "size": compared.setting.size,
+        "turns_per_s": compared.setting.hz,
+        "radius_px": compared.radius,
+        "smallest_radius_px": compared.smallest,
         "swing_px": covered.swing,
-        "complete_ms": r.complete_ms,
+        "complete_ms": compared.complete_ms,
         "left_out_share": covered.left_out,
         "least_moved_edges_deg": math.degrees(covered.blind),
-        "clock_px": r.clock_px,
-        "angle_px": r.encoder_px,
-        "blur_px": r.blur_px,
-        "events_per_s": r.events_per_s,
-        "simulated_events_per_s": r.simulated_per_s,
-        "simulation_uncertainty": r.uncertainty,
-        "law_deviation": r.deviation,
-        "events_per_s_px": r.events_per_s_px,
-        "depth_m": 1.0 / r.setting.inverse_depth if r.setting.inverse_depth else None,
-        "depth_determined": r.depth_deviation is not None,
-        "depth_deviation": r.depth_deviation,
+        "clock_px": compared.clock_px,
+        "angle_px": compared.encoder_px,
+        "blur_px": compared.blur_px,
+        "events_per_s": compared.events_per_s,
+        "simulated_events_per_s": compared.simulated_per_s,
+        "simulation_uncertainty": compared.uncertainty,
+        "law_deviation": compared.deviation,
+        "events_per_s_px": compared.events_per_s_px,
+        "depth_m": 1.0 / compared.setting.inverse_depth if compared.setting.inverse_depth else None,
+        "depth_determined": compared.depth_deviation is not None,
+        "depth_deviation": compared.depth_deviation,
         "glass": glass,
         "drive": drive,
         "state_from": state,
-        "misses": list(r.misses),
+        "misses": list(compared.misses),
     }
 
 
@@ -218,5 +218,5 @@ def comparison_lines(comparison: Comparison) -> list[Any]:
         "depth",
         "misses",
     )
-    said = [tuple(line.split(": ", 1)) for line in reasons(comparison)]
-    return [cli.table(rows, *heads), "", cli.table(said)]
+    reason_rows = [tuple(line.split(": ", 1)) for line in reasons(comparison)]
+    return [cli.table(rows, *heads), "", cli.table(reason_rows)]

@@ -72,7 +72,7 @@ def reasons(design: Design) -> list[str]:
 
 def _failures(design: Design) -> list[str]:
     """Return a line of text for each part of the study that failed."""
-    return [f"failed: {name}: {said}" for name, said in design.failed.items()]
+    return [f"failed: {name}: {message}" for name, message in design.failed.items()]
 
 
 def _refusals(design: Design) -> list[str]:

@@ -66,8 +66,8 @@ class Volume:
 
     def events_per_s(self, orbit: Orbit, rpm: float) -> float:
         """Return the event rate of the whole image [events/s]."""
-        found = self.yield_at(orbit.apex, rpm)
-        per_turn = found * 4.0 * orbit.radius * self.texture / self.contrast
+        relative_yield = self.yield_at(orbit.apex, rpm)
+        per_turn = relative_yield * 4.0 * orbit.radius * self.texture / self.contrast
         return self.of_image(per_turn * rpm / 60.0)
 
     def of_image(self, per_pixel: float) -> float:
@@ -158,11 +158,11 @@ def measure(
             yields[i, j], errors[i, j] = simulated_yield(case, cameras, likely, half_us, by_noise)
             simulated[i, j] = True
 
-    kept = _complete(simulated)
-    if kept is None:
-        name, said = next(iter(failed.items()))
-        raise AmiwarpError(f"too few simulations succeeded for the event volume; {name}: {said}")
-    rows, columns = kept
+    complete = _complete(simulated)
+    if complete is None:
+        name, message = next(iter(failed.items()))
+        raise AmiwarpError(f"too few simulations succeeded for the event volume; {name}: {message}")
+    rows, columns = complete
     return Volume(
         apexes=nodes[rows],
         rpms=speeds[columns],
@@ -177,16 +177,16 @@ def measure(
     )
 
 
-def _complete(there: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
+def _complete(simulated: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
     """Return the rows and columns of a table that leave out what is missing and keep most; None if nothing remains."""
-    height, width = there.shape
+    height, width = simulated.shape
     options = [
-        (np.flatnonzero(there.all(axis=1)), np.arange(width)),
-        (np.arange(height), np.flatnonzero(there.all(axis=0))),
+        (np.flatnonzero(simulated.all(axis=1)), np.arange(width)),
+        (np.arange(height), np.flatnonzero(simulated.all(axis=0))),
     ]
     # One speed may have failed everywhere and the other for some apexes.
     for column in range(width):
-        options.append((np.flatnonzero(there[:, column]), np.array([column])))
+        options.append((np.flatnonzero(simulated[:, column]), np.array([column])))
 
     rows, columns = max(options, key=lambda option: len(option[0]) * len(option[1]))
     if not len(rows) or not len(columns):

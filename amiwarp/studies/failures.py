@@ -17,14 +17,14 @@ def failure_text(error: BaseException) -> str:
     The place is the innermost function of amiwarp that the error passed. The class is stated too, if the error is not
     an :class:`AmiwarpError`.
     """
-    said = str(error) if isinstance(error, AmiwarpError) else f"{type(error).__name__}: {error}"
+    message = str(error) if isinstance(error, AmiwarpError) else f"{type(error).__name__}: {error}"
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         file = Path(frame.filename).resolve()
         if file.is_relative_to(PACKAGE):
             place = f"{file.relative_to(PACKAGE).as_posix()}:{frame.lineno}"
-            said += f" (in {frame.name}, {place})"
+            message += f" (in {frame.name}, {place})"
             break
-    return shortened(printable(" ".join(said.split())))
+    return shortened(printable(" ".join(message.split())))
 
 
 @contextlib.contextmanager

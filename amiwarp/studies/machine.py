@@ -14,9 +14,9 @@ def processor() -> str:
     """Return the name of this machine's CPU."""
     info = Path("/proc/cpuinfo")
     if info.exists():
-        found = re.search(r"^model name\s*: (.*)$", info.read_text(encoding="utf-8"), re.M)
-        if found:
-            return found.group(1).strip()
+        match = re.search(r"^model name\s*: (.*)$", info.read_text(encoding="utf-8"), re.M)
+        if match:
+            return match.group(1).strip()
     return (platform.processor() or platform.machine()).strip()
 
 

@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -96,6 +97,57 @@ class Setting:
         return np.array(relative[: model.ANGLES]) * math.tau * self.hz
 
 
+@dataclass(frozen=True)
+class _Optics:
+    """Optics of one glass and speed, each made by its size."""
+
+    glass: Prism
+    """Index and flat side."""
+    hz: float
+    """Speed of the first angle [turns/s]."""
+
+    def wedge(self, apex: float) -> Setting:
+        """Return a wedge of an apex angle [rad]."""
+        optic = replace(self.glass, apex=apex)
+        return Setting("wedge", optic, self.hz, degrees(apex))
+
+    def pair(self, apex: float, *, name: str, ratio: Fraction) -> Setting:
+        """Return two wedges of an apex angle [rad]."""
+        second = Prism(apex, self.glass.index, self.glass.flat_side)
+        optic = replace(self.glass, apex=apex, second=second)
+        return Setting(name, optic, self.hz, f"2 × {degrees(apex)}", ratio)
+
+    def mirror(self, tilt: float, *, name: str, ratio: Fraction) -> Setting:
+        """Return a mirror that tilts by up to ``tilt`` [rad] about both axes, a quarter period apart."""
+        rates_hz = (self.hz, self.hz * float(ratio))
+        optic = Mirror(rates_hz, (tilt, tilt), (0.0, 0.5 * math.pi))
+        return Setting(name, optic, self.hz, f"± {degrees(tilt)}", ratio)
+
+    def vibration(self, radius: float) -> Setting:
+        """Return a vibration whose forward circle has a radius [rad]."""
+        hz = max(self.hz, SLOWEST_VIBRATION)
+        optic = Vibration(hz, radius, 0.0, (ELLIPSE * radius, 0.0))
+        longer = degrees(radius * (1.0 + ELLIPSE))
+        shorter = degrees(radius * (1.0 - ELLIPSE))
+        return Setting("vibration", optic, hz, f"{longer} × {shorter}")
+
+    def plate(self, thickness: float, *, depth: float) -> Setting:
+        """Return a plate of a thickness [m] in front of a scene at a depth [m]."""
+        if thickness > LARGEST_THICKNESS:
+            raise AmiwarpError(
+                f"to move a scene at {depth:g} m as far as the wedge, the plate would have to be "
+                f"{1e3 * thickness:.0f} mm thick; the limit is {1e3 * LARGEST_THICKNESS:.0f} mm; give a nearer "
+                "depth (--depth-m), or a smaller apex"
+            )
+        return Setting(
+            f"plate, {depth:g} m",
+            Plate(thickness, PLATE_TILT, self.glass.index),
+            self.hz,
+            f"{1e3 * thickness:.1f} mm, 45°",
+            inverse_depth=1.0 / depth,
+        )
+
+
 def settings(
     camera: Camera,
     glass: Prism,
@@ -110,79 +162,45 @@ def settings(
     depths of the scene for the plate [m]. The plate moves the scene at the nearest of them as far as the wedge.
     Optics of which no size does so are noted in ``failed``. Raises :class:`AmiwarpError` if no plate does so.
     """
-
-    def wedges(*apexes: float) -> Prism:
-        first_apex, *other_apexes = apexes
-        others = [Prism(apex, glass.index, glass.flat_side) for apex in other_apexes]
-        return Prism(first_apex, glass.index, glass.flat_side, *others)
-
-    def pair(name: str, ratio: Fraction) -> Callable[[float], Setting]:
-        def made(size: float) -> Setting:
-            optic = wedges(size, size)
-            return Setting(f"pair, {name}", optic, hz, f"2 × {degrees(size)}", ratio)
-
-        return made
-
-    def mirror(name: str, ratio: Fraction, phase: float) -> Callable[[float], Setting]:
-        def made(size: float) -> Setting:
-            optic = Mirror((hz, hz * float(ratio)), (size, size), (0.0, phase))
-            return Setting(f"mirror, {name}", optic, hz, f"± {degrees(size)}", ratio)
-
-        return made
-
-    def vibration(size: float) -> Setting:
-        often = max(hz, SLOWEST_VIBRATION)
-        optic = Vibration(often, size, 0.0, (ELLIPSE * size, 0.0))
-        longer = degrees(size * (1.0 + ELLIPSE))
-        shorter = degrees(size * (1.0 - ELLIPSE))
-        return Setting("vibration", optic, often, f"{longer} × {shorter}")
-
-    def plate(depth: float) -> Callable[[float], Setting]:
-        def made(thickness: float) -> Setting:
-            if thickness > LARGEST_THICKNESS:
-                raise AmiwarpError(
-                    f"to move a scene at {depth:g} m as far as the wedge, the plate would have to be "
-                    f"{1e3 * thickness:.0f} mm thick; the limit is {1e3 * LARGEST_THICKNESS:.0f} mm; give a nearer "
-                    "depth (--depth-m), or a smaller apex"
-                )
-            return Setting(
-                f"plate, {depth:g} m",
-                Plate(thickness, PLATE_TILT, glass.index),
-                hz,
-                f"{1e3 * thickness:.1f} mm, 45°",
-                inverse_depth=1.0 / depth,
-            )
-
-        return made
-
-    wedge = Setting("wedge", wedges(apex), hz, degrees(apex))
+    optics = _Optics(glass, hz)
+    wedge = optics.wedge(apex)
     radius = _rms(wedge, camera)
     angle = radius / camera.fx
 
-    quarter = 0.5 * math.pi
-    lissajous = f"{LISSAJOUS.denominator}:{LISSAJOUS.numerator}"
-    # Name, how the optic of a size is made, and a size near the one that is looked for
-    wanted = (
-        ("pair, opposite", pair("opposite", Fraction(-1)), apex / math.sqrt(2.0)),
-        ("pair, unequal", pair("unequal", UNEQUAL), apex / math.sqrt(2.0)),
-        ("mirror, circle", mirror("circle", Fraction(1), quarter), 0.5 * angle),
-        (f"mirror, {lissajous}", mirror(lissajous, LISSAJOUS, quarter), 0.5 * angle),
-        ("vibration", vibration, angle),
-    )
-    found = [wedge]
-    for name, make, start in wanted:
+    made = [wedge]
+    for name, make, likely_size in _sizable(optics, apex, angle):
         with noted(failed, name):
-            found.append(_sized(make, start, camera, radius))
+            made.append(_sized(make, likely_size, camera, radius))
 
     # One plate, sized for the nearest depth, in front of all of them
     nearest = min(depths)
     shift_per_thickness = Plate(1e-3, PLATE_TILT, glass.index).shift * 1e3
-    start = angle * nearest / shift_per_thickness
-    glass_plate = _sized(plate(nearest), start, camera, radius).optic
-    assert isinstance(glass_plate, Plate)
+    likely_thickness = angle * nearest / shift_per_thickness
+    plate = _sized(partial(optics.plate, depth=nearest), likely_thickness, camera, radius).optic
+    assert isinstance(plate, Plate)
     for depth in sorted(depths):
-        found.append(plate(depth)(glass_plate.thickness))
-    return found
+        made.append(optics.plate(plate.thickness, depth=depth))
+    return made
+
+
+def _sizable(
+    optics: _Optics, apex: float, angle: float
+) -> list[tuple[str, Callable[[float], Setting], float]]:
+    """Return the optics that move as the wedge does: name, how it is made of its size, and a size near the right one.
+
+    ``apex``: apex angle of the wedge [rad]; ``angle``: angle by which it moves the image [rad rms].
+    """
+    lissajous = f"mirror, {LISSAJOUS.denominator}:{LISSAJOUS.numerator}"
+    motions = [
+        ("pair, opposite", optics.pair, Fraction(-1), apex / math.sqrt(2.0)),
+        ("pair, unequal", optics.pair, UNEQUAL, apex / math.sqrt(2.0)),
+        ("mirror, circle", optics.mirror, Fraction(1), 0.5 * angle),
+        (lissajous, optics.mirror, LISSAJOUS, 0.5 * angle),
+    ]
+    sizable: list[tuple[str, Callable[[float], Setting], float]] = []
+    for name, make, ratio, size in motions:
+        sizable.append((name, partial(make, name=name, ratio=ratio), size))
+    return [*sizable, ("vibration", optics.vibration, angle)]
 
 
 def _sized(make: Callable[[float], Setting], size: float, camera: Camera, radius: float) -> Setting:

@@ -227,7 +227,7 @@ def compare(
     sensor = sensor or SensorModel()
     reference = reference_of(design)
     failed: dict[str, str] = {}
-    found = settings(
+    setting_list = settings(
         camera, design.glass, reference.orbit.apex, reference.rpm / 60.0, depths, failed
     )
 
@@ -241,18 +241,18 @@ def compare(
         seed=seed,
         device=device,
     )
-    wedge = found[0]
+    wedge = setting_list[0]
     change = change_of(_velocity(wedge, camera), slopes_of(template.log_view()), camera)
     mean_change = float(change.mean())
     scale = 4.0 * reference.orbit.radius * design.volume.texture * wedge.hz / mean_change
 
     results: list[Compared] = []
-    for done, setting in enumerate(found):
-        report(f"simulating {setting.name}", done / len(found))
+    for done, setting in enumerate(setting_list):
+        report(f"simulating {setting.name}", done / len(setting_list))
         with noted(failed, setting.name):
             results.append(_compared(design, reference, setting, template, scale))
     if not results:
-        raise AmiwarpError("; ".join(f"{name}: {said}" for name, said in failed.items()))
+        raise AmiwarpError("; ".join(f"{name}: {message}" for name, message in failed.items()))
     return Comparison(design, reference, tuple(results), failed)
 
 
@@ -296,7 +296,9 @@ def _compared(
     velocity = _velocity(setting, camera)
     valid = np.isfinite(velocity).all(axis=(1, 2))
     by_clock = np.mean(across_edges(velocity[valid], velocity[valid]))
-    by_angles = np.mean(sum(across_edges(one[valid], velocity[valid]) for one in flow))
+    by_angles = np.mean(
+        sum(across_edges(flow_of_angle[valid], velocity[valid]) for flow_of_angle in flow)
+    )
     # Nothing measures the angles of a vibration.
     per_radian = 0.0 if isinstance(setting.optic, Vibration) else math.sqrt(by_angles)
     clock, encoder = design.timing.scaled(math.sqrt(by_clock), per_radian)
@@ -350,17 +352,17 @@ def _event_rates(
     assert isinstance(scene, Scene)
     speed = float(np.nanmean(np.linalg.norm(velocity, axis=2)))
     apex = reference.orbit.apex * radius / reference.orbit.radius
-    found = volume.yield_at(apex, 60.0 * speed / (math.tau * radius))
+    relative_yield = volume.yield_at(apex, 60.0 * speed / (math.tau * radius))
 
     # One turn lets the pixels settle; then the motion is counted until it repeats.
     settling_s = 1.0 / setting.hz
     counted_s = setting.turns / setting.hz
-    shown: Scene | WorldScene = scene
+    scene_at_depth: Scene | WorldScene = scene
     if isinstance(setting.optic, Plate):
-        shown = wall(scene, 1.0 / setting.inverse_depth)
+        scene_at_depth = wall(scene, 1.0 / setting.inverse_depth)
     case = replace(
         template,
-        scene=shown,
+        scene=scene_at_depth,
         prism=setting.optic,
         motion=setting.motion,
         duration_s=settling_s + counted_s,
@@ -375,6 +377,6 @@ def _event_rates(
     ratio, error = simulated_yield(case, parts, likely, start_us, volume.noise_hz * counted_s)
 
     mean_change = float(change.mean())
-    law = volume.of_image(scale * found * mean_change / volume.contrast)
+    law = volume.of_image(scale * relative_yield * mean_change / volume.contrast)
     checked = volume.of_image(ratio * mean_change / volume.contrast)
     return law, checked, error

@@ -142,8 +142,8 @@ def _sized(kind: type[Model], exact: ExactModel) -> Model:
     size = start[kind.SIZE]
     bounds = (0.5 * size, 4.0 * size)
     tolerance = 1e-3 * size
-    found = minimize_scalar(error, bounds=bounds, method="bounded", options={"xatol": tolerance})
-    return sized(float(found.x))
+    optimum = minimize_scalar(error, bounds=bounds, method="bounded", options={"xatol": tolerance})
+    return sized(float(optimum.x))
 
 
 LEAST_SWING = 1.0

@@ -317,8 +317,8 @@ def test_single_precision_is_enough(recording: Recording, device: str) -> None:
     brightness.place(ExactModel(recording.camera, TRUE_PRISM, TRUE_PHASE))
     brightness.solve(1e6, steps=300)  # all weights are 1
     residual = brightness.residuals.values.numpy()
-    cell = brightness._at.geometry.cell.numpy().reshape(2, -1)
-    part = brightness._at.geometry.part.numpy().reshape(2, 2, -1)
+    cell = brightness._positions.geometry.cell.numpy().reshape(2, -1)
+    part = brightness._positions.geometry.part.numpy().reshape(2, 2, -1)
     on = np.flatnonzero(cell[0, : len(pairs)] >= 0)
     rows, columns, values = [], [], []
     for side, sign in ((1, 1.0), (0, -1.0)):

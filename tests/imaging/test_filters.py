@@ -294,6 +294,8 @@ def test_a_window_cuts_other_records(tmp_path: Path) -> None:
         MemoryEvents(some_events(), WIDTH, HEIGHT), metadata=counts, **sensors(times)
     )
     summary = filter_recording(recording, tmp_path / "out.h5", EventFilter(window=(20_000, 30_000)))
+    in_window = recording.events.between(20_000, 30_000).t
+    assert summary.kept_us == in_window[-1] - in_window[0] < summary.duration_us
     assert (summary.removed_records, summary.left_out) == (
         {"imu_samples": 4, "frames": 4},
         ("triggers",),
@@ -314,6 +316,21 @@ def test_a_window_cuts_other_records(tmp_path: Path) -> None:
     assert found.imu is not None
     assert found.imu.t.tolist() == times
     assert found.metadata["triggers"] == 5
+
+
+class _InBlocks(MemoryEvents):
+    """Events that are read in blocks of a hundred."""
+
+    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Any:
+        return super().blocks(count=100)
+
+
+def test_the_kept_time_spans_all_blocks(tmp_path: Path) -> None:
+    events = some_events()
+    recording = Recording(_InBlocks(events, WIDTH, HEIGHT))
+    summary = filter_recording(recording, tmp_path / "out.h5", EventFilter(window=(20_000, 30_000)))
+    t = events.t[(events.t >= 20_000) & (events.t < 30_000)]
+    assert (summary.kept, summary.kept_us) == (len(t), t[-1] - t[0])
 
 
 def test_a_window_without_other_records(tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_the_speed_of_threads_does_not_change_a_file(tmp_path, monkeypatch):
 
     def write(path, delays):
         monkeypatch.setattr(
-            "amiwarp.io.native.writer.encode_parts",
+            "amiwarp.io.native.event_writer.encode_parts",
             lambda *a: (time.sleep(next(delays)), encode_parts(*a))[1],
         )
         monkeypatch.setattr("amiwarp.tasks.cpu_threads", lambda: 4)

@@ -681,6 +681,28 @@ def test_filled_files_are_those_of_append(tmp_path):
             np.testing.assert_array_equal(filled[name][()], appended[name][()], strict=True)
 
 
+@pytest.mark.parametrize("full", [0, 2])
+def test_the_last_piece_may_be_empty(tmp_path, full):
+    events = make(full * CHUNK)
+    flags = np.ones(len(events), np.uint8)
+    cuts = [slice(index * CHUNK, (index + 1) * CHUNK) for index in range(full + 1)]
+    with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        pieces = [lambda cut=cut: (events[cut], flags[cut], {}) for cut in cuts]
+        t_first = int(events.t[0]) if full else 0
+        lengths = [len(piece) for piece, _, _ in writer.fill(pieces, count=CHUNK, t_first=t_first)]
+    assert lengths == [CHUNK] * full + [0]
+    stored = open_recording(tmp_path / "a.h5").events
+    np.testing.assert_array_equal(stored.slice(0, len(stored)).t, events.t, strict=True)
+
+
+@pytest.mark.parametrize("count", [0, -CHUNK, CHUNK + 1])
+def test_pieces_of_whole_chunks(tmp_path, count):
+    with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        with pytest.raises(AmiwarpError, match=f"for pieces of {count}; .* multiple of {CHUNK}"):
+            writer.fill([], count=count, t_first=0)
+        writer.append(make(3))
+
+
 def test_events_out_of_order_within_a_piece_are_refused(tmp_path):
     sensor = make(50)
     t = sensor.t - sensor.t[0]
@@ -739,6 +761,8 @@ def test_an_infinite_position_outside_the_image_is_refused(tmp_path):
     [
         ([slice(0, CHUNK), slice(0, CHUNK)], f"event {CHUNK} .* earlier than the one before"),
         ([slice(0, 10), slice(10, 20)], "ends within a chunk"),
+        ([slice(0, 0), slice(0, 20)], "is empty; give"),
+        ([slice(0, CHUNK), slice(0, 0), slice(CHUNK, 2 * CHUNK)], "is empty; give"),
     ],
 )
 def test_pieces_that_do_not_follow_leave_nothing(tmp_path, order, message):
@@ -766,4 +790,4 @@ def test_only_native_chunks_are_copied_as_they_are(tmp_path):
 def test_full_chunks_do_not_wait_in_memory(tmp_path):
     with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
         writer.append(make(2 * CHUNK + 9))
-        assert writer._pending_count == 9
+        assert writer._events._pending_count == 9

@@ -60,7 +60,7 @@ def test_sums_over_blocks_of_pairs(
     }[name]
     for equations in (
         placed._equations,
-        PairEnds(placed.pairs, placed._atlas, placed._at.geometry),
+        PairEnds(placed.pairs, placed._atlas, placed._positions.geometry),
     ):
         out, program = wp.zeros(len(placed.unknowns), dtype=wp.int64, device="cpu"), Program("cpu")
         equations.take_positions()
@@ -72,7 +72,7 @@ def test_sums_over_blocks_of_pairs(
 
 
 def test_residuals_over_blocks_of_pairs(placed: BrightnessMap) -> None:
-    at, stride = placed._at, placed.pairs.arrays.stride
+    at, stride = placed._positions, placed.pairs.arrays.stride
     weight, values, rest = (wp.zeros(stride, dtype=float, device="cpu") for _ in "wvr")
     given = [placed.pairs.arrays, placed._atlas, at.geometry]
     wp.launch(equations_cuda.weigh, placed.count, [*given, placed._image, placed._scale, 0], [weight, values],
@@ -92,7 +92,7 @@ def test_residuals_over_blocks_of_pairs(placed: BrightnessMap) -> None:
 
 
 def test_slopes_over_blocks_of_pairs(placed: BrightnessMap, recording: Recording) -> None:
-    at, n = placed._at, placed.count
+    at, n = placed._positions, placed.count
     assert recording.camera is not None
     sides = [
         {
@@ -313,7 +313,7 @@ def test_positions_of_blocks_of_pairs(
         brightness.place(
             ExactModel(camera, TRUE_PRISM, TRUE_PHASE), drift=drift, camera_rotation=rotation
         )
-        g, n = brightness._at.geometry, len(pairs)
+        g, n = brightness._positions.geometry, len(pairs)
         cell = g.cell.numpy().reshape(2, -1)[:, :n]
         part = g.part.numpy().reshape(2, 2, -1)[:, :, :n]
         at = np.stack([cell % tiles.columns, cell // tiles.columns], axis=1) + part

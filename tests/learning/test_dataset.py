@@ -1130,8 +1130,8 @@ def test_a_pattern_visits_a_limited_number_of_entries(
         expected = {
             f for f in glob(pattern, root_dir=place, recursive=True) if "again" not in Path(f).parts
         }
-        assert sources._matches(place, pattern) == sorted(expected) != []
-    monkeypatch.setattr(sources, "MOST_VISITED", 100)
+        assert sources.matches(place, pattern) == sorted(expected) != []
+    monkeypatch.setitem(sources.matches.__globals__, "MOST_VISITED", 100)
     for k in range(100):
         (place / "pictures" / f"{k}.txt").touch()
     (place / "spec.toml").write_text(BASE + '[[sources]]\npictures = "/**/*.png"\n')

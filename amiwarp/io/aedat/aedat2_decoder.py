@@ -61,18 +61,18 @@ class Aedat2Decoder:
         inputs = [words, length, self._camera, self._last]
         counts = wp.empty(blocks, dtype=aedat2.Counts, device=device)
         launch(aedat2.survey_aedat2, blocks, inputs, [counts], device=device, smallest=1)
-        found = counts.numpy()
+        totals = counts.numpy()
 
         # Where the output of each block begins.
         starts = new_rows(blocks, aedat2.Start)
-        starts["event"] = sums_before(found["events"])
-        starts["edge"] = sums_before(found["edges"])
-        starts["imu"] = sums_before(found["imu"])
-        starts["wraps"] = self._wraps + sums_before(found["wraps"])
+        starts["event"] = sums_before(totals["events"])
+        starts["edge"] = sums_before(totals["edges"])
+        starts["imu"] = sums_before(totals["imu"])
+        starts["wraps"] = self._wraps + sums_before(totals["wraps"])
 
-        events = int(found["events"].sum())
-        edges = int(found["edges"].sum())
-        imu = int(found["imu"].sum())
+        events = int(totals["events"].sum())
+        edges = int(totals["edges"].sum())
+        imu = int(totals["imu"].sum())
         arrays = new_event_arrays(events, device)
         others = aedat2.OtherArrays()
         others.edge_t = wp.empty(edges, dtype=wp.int64, device=device)
@@ -87,11 +87,11 @@ class Aedat2Decoder:
             smallest=1,
         )
         if blocks:
-            self._last = int(found["last"][-1])
-            self._wraps += int(found["wraps"].sum())
+            self._last = int(totals["last"][-1])
+            self._wraps += int(totals["wraps"].sum())
         return DeviceEvents(arrays.x, arrays.y, arrays.t, arrays.p), Others(
             edge_t=others.edge_t.numpy(),
             imu_t=others.imu_t.numpy(),
             imu_words=others.imu_words.numpy().astype(np.int64),
-            frames=int(found["frames"].sum()),
+            frames=int(totals["frames"].sum()),
         )

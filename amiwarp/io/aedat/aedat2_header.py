@@ -67,9 +67,9 @@ def read_aedat2_header(path: Path, given: str | None = None) -> tuple[Chip, int,
         )
     name = ""
     for line in lines:
-        found = re.match(rb"#\s*AEChip:\s*(\S+)", line)
-        if found is not None:
-            name = found[1].decode("ascii", "replace")
+        match = re.match(rb"#\s*AEChip:\s*(\S+)", line)
+        if match is not None:
+            name = match[1].decode("ascii", "replace")
     if given is not None:
         if given.lower() not in CHIPS:
             raise AmiwarpError(f"chip is '{given[:60]}'; expected one of {', '.join(CHIPS)}")
@@ -98,8 +98,8 @@ def _header_lines(head: bytes, file_bytes: int) -> tuple[list[bytes], int]:
     start = 0
     first_newline = b""
     newline = b""
-    while found := LINE.match(head, start):
-        line, newline = found.groups()
+    while match := LINE.match(head, start):
+        line, newline = match.groups()
         if CONTROL.search(line):
             break
         first_newline = first_newline or newline

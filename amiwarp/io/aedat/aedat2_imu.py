@@ -47,7 +47,7 @@ def read_ranges(path: Path, offset: int) -> tuple[int, int] | None:
     chip = re.search(rb"#\s*AEChip:\s*(\S+)", header)
     if chip is not None:
         _, _, camera = chip[1].rpartition(b".")
-    found = []
+    ranges = []
     for name, old_name, value, known in SETTINGS:
         # Settings of other cameras may be there too. In new versions of jAER, the settings of this camera begin with
         # its name.
@@ -60,8 +60,8 @@ def read_ranges(path: Path, offset: int) -> tuple[int, int] | None:
                 break
         if stated not in known:
             return None
-        found.append(stated)
-    range_g, range_deg_s = found
+        ranges.append(stated)
+    range_g, range_deg_s = ranges
     return range_g, range_deg_s
 
 

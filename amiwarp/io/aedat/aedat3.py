@@ -279,9 +279,9 @@ def decode_packets(
 
     valid = wp.empty(blocks.size, dtype=int, device=device)
     launch(aedat3.count_valid, blocks.size, [on_device], [valid], device=device, smallest=1)
-    found = valid.numpy()
-    arrays = new_event_arrays(int(found.sum()), device)
-    places = wp.array(sums_before(found), dtype=int, device=device)
+    is_valid = valid.numpy()
+    arrays = new_event_arrays(int(is_valid.sum()), device)
+    places = wp.array(sums_before(is_valid), dtype=int, device=device)
     inputs = [on_device, places]
     launch(aedat3.decode_polarity, blocks.size, inputs, [arrays], device=device, smallest=1)
     return DeviceEvents(arrays.x, arrays.y, arrays.t, arrays.p)

@@ -96,20 +96,22 @@ def _event_packets(
             notes["read"] = batch.end
             _count_records(batch.contents, number, notes)
             contents = [content for content in batch.contents if content.stream == number]
-            found = decode_packets(packets_in_memory([content.data for content in contents]), "cpu")
+            decoded = decode_packets(
+                packets_in_memory([content.data for content in contents]), "cpu"
+            )
 
             # Damaged packets give no events.
-            is_sound = found.counts >= 0
+            is_sound = decoded.counts >= 0
             for index in np.flatnonzero(~is_sound):
                 damaged["dropped_damaged_bytes"] += contents[index].size
-            starts = sums_before(found.counts[is_sound])
+            starts = sums_before(decoded.counts[is_sound])
             places = [contents[index].at for index in np.flatnonzero(is_sound)]
 
             # Events with impossible times are dropped.
-            events = found.events.to_host()
-            packet = Surveyed(events, found.surveys)
-            earliest = found.earliest.min(initial=0)
-            latest = found.surveys["latest"].max(initial=0)
+            events = decoded.events.to_host()
+            packet = Surveyed(events, decoded.surveys)
+            earliest = decoded.earliest.min(initial=0)
+            latest = decoded.surveys["latest"].max(initial=0)
             if earliest <= -TIME_LIMIT or latest >= TIME_LIMIT:
                 has_time = (events.t > -TIME_LIMIT) & (events.t < TIME_LIMIT)
                 dropped = np.flatnonzero(~has_time)
@@ -138,12 +140,12 @@ def _count_records(contents: list[Content], number: int | None, notes: dict[str,
     events = find_events(packets_in_memory(data["EVTS"]), "cpu")
     samples = tables_of(data["IMUS"], {0: "<i8"})
     edges = tables_of(data["TRIG"], TRIGGER_FIELDS)
-    found = {
+    counts = {
         "frames": len(data["FRME"]),
         "imu_samples": samples.packet.size,
         "triggers": int(np.count_nonzero(np.isin(edges.values[1], EDGES))),
         "events_of_other_sources": int(np.maximum(events["count"], 0).sum()),
         "dropped_damaged_records": samples.damaged + edges.damaged,
     }
-    for name, count in found.items():
+    for name, count in counts.items():
         notes[name] = notes.get(name, 0) + count

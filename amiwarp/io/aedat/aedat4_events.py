@@ -47,16 +47,16 @@ def find_events(packets: NDArray[Any], device: Any) -> NDArray[Any]:
     from amiwarp.kernels.launch import launch
     from amiwarp.kernels.records import Span
 
-    found = wp.empty(packets.size, dtype=aedat4.Found, device=device)
+    places = wp.empty(packets.size, dtype=aedat4.Found, device=device)
     launch(
         aedat4.find_events,
         packets.size,
         [wp.array(packets, dtype=Span, device=device)],
-        [found],
+        [places],
         device=device,
         smallest=64,
     )
-    return np.asarray(found.numpy())
+    return np.asarray(places.numpy())
 
 
 def decode_packets(packets: NDArray[Any], device: Any) -> PacketEvents:

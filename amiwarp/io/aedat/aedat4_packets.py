@@ -202,9 +202,9 @@ class Packets:
         while start + self._lead < self._about.end:
             self._fill(file, start, start + self._lead + MARK_BYTES)
             stop = self._base + self._held
-            found = self._find(start, stop)
-            if found is not None or stop >= self._about.end:
-                return found
+            place = self._find(start, stop)
+            if place is not None or stop >= self._about.end:
+                return place
             # What the pattern finds may lie across the end of the window.
             start = max(stop - self._lead - MARK_BYTES + 1, start + 1)
         return None

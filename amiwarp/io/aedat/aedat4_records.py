@@ -45,9 +45,9 @@ def edge_packets(about: Aedat4File, restarts: list[tuple[int, int]]) -> Iterator
     with contextlib.closing(read_batches(about, "TRIG")) as batches:
         for batch in batches:
             contents = [content for content in batch.contents if content.kind == "TRIG"]
-            found = tables_of([content.data for content in contents], TRIGGER_FIELDS)
-            t = clock.shift_all(contents, found)
-            kind = found.values[1]
+            fields = tables_of([content.data for content in contents], TRIGGER_FIELDS)
+            t = clock.shift_all(contents, fields)
+            kind = fields.values[1]
             is_edge = np.isin(kind, EDGES)
             channel = np.zeros(np.count_nonzero(is_edge), np.uint8)
             yield channel, channel, t[is_edge], kind[is_edge] != FALLING

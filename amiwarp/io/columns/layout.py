@@ -194,10 +194,10 @@ class Layout:
         known = np.zeros(p.shape, np.bool_)
         for value, is_on in self.coding.items():
             if _fits(value, p.dtype):
-                here = p == value
-                known |= here
+                has_value = p == value
+                known |= has_value
                 if is_on:
-                    on |= here
+                    on |= has_value
         if not known.all():
             raise AmiwarpError(
                 f"a polarity is {p[~known][0]}; expected {listed(self.coding)}; say what it means with --polarity, "

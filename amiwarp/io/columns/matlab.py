@@ -10,7 +10,7 @@ def matlab_arrays(path: str) -> dict[str, NDArray[Any]]:
     """Return the numeric arrays of a MATLAB file, with the fields of structures by ``structure/field``."""
     from scipy.io import loadmat
 
-    found: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, NDArray[Any]] = {}
 
     def collect(name: str, value: Any) -> None:
         if isinstance(value, dict):
@@ -18,10 +18,10 @@ def matlab_arrays(path: str) -> dict[str, NDArray[Any]]:
                 if not key.startswith("__"):
                     collect(f"{name}/{key}".lstrip("/"), inner)
         elif isinstance(value, np.ndarray) and _may_hold_events(value):
-            found[name] = value
+            arrays[name] = value
 
     collect("", loadmat(path, simplify_cells=True))
-    return found
+    return arrays
 
 
 def _may_hold_events(array: NDArray[Any]) -> bool:

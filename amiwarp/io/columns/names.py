@@ -59,12 +59,12 @@ def role_of(name: str) -> tuple[str | None, str | None]:
         return None, None
     stem = match[1] or match[3] or match[5]
     suffix = match[2] or match[4] or match[6] or ""
-    found = next((role for role, names in NAMES.items() if stem in names), None)
+    own_role = next((role for role, names in NAMES.items() if stem in names), None)
     unit = unit_of(suffix)
-    if found == "t" and unit is not None:
-        return found, unit
-    if found in ("x", "y") and suffix in ("px", "pixel", "pixels"):
-        return found, None
+    if own_role == "t" and unit is not None:
+        return own_role, unit
+    if own_role in ("x", "y") and suffix in ("px", "pixel", "pixels"):
+        return own_role, None
     return None, None
 
 
@@ -212,27 +212,27 @@ def roles_of(names: Sequence[str]) -> dict[str, list[int]]:
     Columns with :data:`RARE_NAMES` count only for a role that no other column has, and for x and y only together: next
     to x, v is a speed. But a time in whole seconds may have its fractions in another column.
     """
-    found: dict[str, list[int]] = {role: [] for role in ROLES}
+    places: dict[str, list[int]] = {role: [] for role in ROLES}
     rarely: dict[str, list[int]] = {role: [] for role in ROLES}
     units: list[str | None] = []
     for at, name in enumerate(names):
         role, unit = role_of(name)
         if role is not None:
-            found[role].append(at)
+            places[role].append(at)
         else:
             role, unit = _rare_role_of(name)
             if role is not None:
                 rarely[role].append(at)
         units.append(unit)
 
-    if [units[at] for at in found["t"]] == ["s"]:
-        found["t"] += [at for at in rarely["t"] if units[at] not in (None, "s")]
-    found["t"] = found["t"] or rarely["t"]
-    found["p"] = found["p"] or rarely["p"]
-    if not found["x"] and not found["y"]:
-        found["x"] = rarely["x"]
-        found["y"] = rarely["y"]
-    return found
+    if [units[at] for at in places["t"]] == ["s"]:
+        places["t"] += [at for at in rarely["t"] if units[at] not in (None, "s")]
+    places["t"] = places["t"] or rarely["t"]
+    places["p"] = places["p"] or rarely["p"]
+    if not places["x"] and not places["y"]:
+        places["x"] = rarely["x"]
+        places["y"] = rarely["y"]
+    return places
 
 
 def names_roles(names: Iterable[str]) -> bool:

@@ -28,7 +28,7 @@ class GivenLayout:
     @property
     def options(self) -> str:
         """Names of the options that are given."""
-        names = [each.name for each in fields(self) if getattr(self, each.name) is not None]
+        names = [option.name for option in fields(self) if getattr(self, option.name) is not None]
         return ", ".join("--" + name.replace("_", "-") for name in names)
 
     def check(self) -> None:
@@ -67,12 +67,12 @@ def given_roles(text: str) -> dict[str, str]:
 
 def given_polarity(text: str) -> dict[int, bool]:
     """Return for each value in the option ``--polarity`` whether it is ON."""
-    found: dict[int, bool] = {}
+    is_on: dict[int, bool] = {}
     for word in text.split(","):
         value, _, meaning = (part.strip().lower() for part in word.partition("="))
         if not re.fullmatch(r"-?\d{1,20}", value) or meaning not in ("on", "off"):
             raise AmiwarpError(
                 f"--polarity {text!r} is not a list of values; write it like 1=on,2=off"
             )
-        found[int(value)] = meaning == "on"
-    return found
+        is_on[int(value)] = meaning == "on"
+    return is_on

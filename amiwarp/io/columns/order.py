@@ -89,9 +89,9 @@ def _is_rare(count: int, total: int) -> bool:
 
 def common_values(values: NDArray[Any]) -> list[Any]:
     """Return the different values, without those that at most 1 % of all have."""
-    found, counts = np.unique(values, return_counts=True)
+    distinct, counts = np.unique(values, return_counts=True)
     is_common = counts * 100 > len(values)
-    return list(found[is_common].tolist())
+    return list(distinct[is_common].tolist())
 
 
 def order_by_values(values: Sequence[NDArray[Any]], hints: Hints) -> tuple[str, ...]:

@@ -67,7 +67,7 @@ def parquet_arrays(path: str) -> dict[str, Any]:
     for group in range(table.metadata.num_row_groups):
         lengths.append(table.metadata.row_group(group).num_rows)
     bounds = np.cumsum(lengths, dtype=np.int64)
-    found = {}
+    columns = {}
     for field in table.schema_arrow:
         name = field.name
         try:
@@ -79,5 +79,5 @@ def parquet_arrays(path: str) -> dict[str, Any]:
             name = f"{field.name} [ns]"
             dtype = np.dtype(np.int64)
         if dtype.kind in "iufb":
-            found[name] = _ParquetColumn(table, bounds, field.name, dtype)
-    return found
+            columns[name] = _ParquetColumn(table, bounds, field.name, dtype)
+    return columns

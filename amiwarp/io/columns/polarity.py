@@ -34,18 +34,18 @@ def find_coding(p: NDArray[Any], given: GivenLayout) -> tuple[Coding, list[Assum
             "give --polarity, such as 1=on,2=off",
             ErrorCode.AMBIGUOUS,
         )
-    found = set(values)
-    if len(found) == 1 and found <= {-1, 0, 1}:
+    distinct = set(values)
+    if len(distinct) == 1 and distinct <= {-1, 0, 1}:
         (value,) = values
         meaning = "ON" if value == 1 else "OFF"
         why = f"the first {p.size:,} events all have the polarity {value}"
         return SIGNED, [Assumption("polarity", f"{value} is {meaning}", why, "--polarity")]
-    if found in ({0, 1}, {-1, 1}):
+    if distinct in ({0, 1}, {-1, 1}):
         return SIGNED, []
-    large = found - {0, 1}
-    if 1 in found and len(large) == 1 and large <= set(UNSIGNED_MINUS_ONE):
+    large = distinct - {0, 1}
+    if 1 in distinct and len(large) == 1 and large <= set(UNSIGNED_MINUS_ONE):
         (value,) = large
-        why = f"it is -1 in an unsigned integer, and the values are {listed(found)}"
+        why = f"it is -1 in an unsigned integer, and the values are {listed(distinct)}"
         assumption = Assumption("polarity", f"{value} is OFF", why, "--polarity")
         return {**ZERO_OR_ONE, value: False}, [assumption]
     raise AmiwarpError(

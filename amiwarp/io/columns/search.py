@@ -114,30 +114,29 @@ def _given_columns(columns: Sequence[Column], text: str) -> dict[str, int]:
     for role in ROLES:
         wanted = given[role]
         # The whole name counts first, then the name without its groups, then the number.
-        found = [at for at, name in enumerate(names) if name == wanted]
-        if not found:
-            found = [
-                at for at, name in enumerate(names) if name and name.rpartition("/")[2] == wanted
-            ]
-        if not found and wanted.isdecimal() and 1 <= int(wanted) <= len(columns):
-            found = [int(wanted) - 1]
-        if len(found) != 1:
+        matches = [index for index, name in enumerate(names) if name == wanted]
+        if not matches:
+            last_parts = [name.rpartition("/")[2] if name else None for name in names]
+            matches = [index for index, part in enumerate(last_parts) if part == wanted]
+        if not matches and wanted.isdecimal() and 1 <= int(wanted) <= len(columns):
+            matches = [int(wanted) - 1]
+        if len(matches) != 1:
             known = ", ".join(name for name in names if name)[:300]
             if not known:
                 known = f"the numbers 1 to {len(columns)}"
             raise AmiwarpError(
                 f"has no column {wanted!r}, which --columns gives for {role}; it has {known}"
             )
-        roles[role] = found[0]
+        (roles[role],) = matches
     return roles
 
 
 def _named_columns(columns: Sequence[Column]) -> dict[str, int]:
     """Return the columns with the names of the roles."""
     names = [column.name or "" for column in columns]
-    found = roles_of(names)
+    places_of_roles = roles_of(names)
     known = ", ".join(name for name in names if name)[:300]
-    for role, places in found.items():
+    for role, places in places_of_roles.items():
         if len(places) > 1:
             several = " and ".join(names[place] for place in places)
             both = "both" if len(places) == 2 else "all"
@@ -150,14 +149,14 @@ def _named_columns(columns: Sequence[Column]) -> dict[str, int]:
                 f"{example_of_columns(names)}{remedy}",
                 ErrorCode.AMBIGUOUS,
             )
-    missing = [role for role, places in found.items() if not places]
+    missing = [role for role, places in places_of_roles.items() if not places]
     if missing:
         raise AmiwarpError(
             f"no column is named as {', '.join(missing)}; the columns are {known}; choose with --columns, such as "
             f"{example_of_columns(names)}",
             ErrorCode.AMBIGUOUS,
         )
-    return {role: places[0] for role, places in found.items()}
+    return {role: places[0] for role, places in places_of_roles.items()}
 
 
 LARGEST_SENSOR = 2048

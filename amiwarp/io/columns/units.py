@@ -164,11 +164,11 @@ def rounded_times_note(words: Sequence[bytes], unit: str) -> str | None:
 
     Only numbers with exponents show it. Steps of a microsecond are no loss.
     """
-    found = [match for match in map(EXPONENT.fullmatch, words) if match is not None]
-    if 2 * len(found) <= len(words):
+    matches = [match for match in map(EXPONENT.fullmatch, words) if match is not None]
+    if 2 * len(matches) <= len(words):
         return None
-    digits = 1 + max(len(match[2] or b"") for match in found)
-    largest_exponent = max(int(match[3]) for match in found)
+    digits = 1 + max(len(match[2] or b"") for match in matches)
+    largest_exponent = max(int(match[3]) for match in matches)
     step = 10.0 ** (largest_exponent + 1 - digits)
     # The step is a power of ten: 1 us or less, or else 10 us.
     if step * TIME_UNITS[unit] < 2.0:

@@ -37,24 +37,24 @@ def open_arrays(path: str) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
 def _datasets(file: h5py.File) -> Iterator[tuple[str, Any]]:
     """Yield the datasets of a file by name. Links and other files are left out."""
     waiting = [("", 0)]
-    seen = 0
+    examined = 0
     while waiting:
         group, depth = waiting.pop(0)
         for key in file[group or "/"]:
-            seen += 1
+            examined += 1
             name = f"{group}/{key}".lstrip("/")
-            if key.startswith("#") or seen > MOST_OBJECTS:
+            if key.startswith("#") or examined > MOST_OBJECTS:
                 continue
             try:
-                found = member(file, name)
+                item = member(file, name)
             except AmiwarpError:
                 # It is a link, or its values are in another file.
                 continue
-            if is_dataset(found):
-                if found.dtype.kind in "iufbV" and math.prod(found.shape):
-                    check_stored(found, name, file.filename)
-                    yield name, found
-            elif isinstance(found, h5py.Group) and depth < DEEPEST:
+            if is_dataset(item):
+                if item.dtype.kind in "iufbV" and math.prod(item.shape):
+                    check_stored(item, name, file.filename)
+                    yield name, item
+            elif isinstance(item, h5py.Group) and depth < DEEPEST:
                 waiting.append((name, depth + 1))
 
 

@@ -133,12 +133,12 @@ class _Dataset(NamedTuple):
     filters: list[Any]
 
 
-def describe(found: Any, name: str, kinds: str, about: FileFacts) -> dict[str, Any]:
+def describe(stored: Any, name: str, kinds: str, about: FileFacts) -> dict[str, Any]:
     """Return type, length and filters of a dataset.
 
     If the chunks are read without HDF5, their positions in the file are returned too.
     """
-    dataset = _opened(found, name)
+    dataset = _opened(stored, name)
     if dataset.dtype.kind not in kinds or dataset.dtype.fields is not None:
         raise AmiwarpError(
             f"dataset '{name}' is {dataset.dtype}; see docs/reference/recording-format.md"
@@ -179,21 +179,21 @@ def describe(found: Any, name: str, kinds: str, about: FileFacts) -> dict[str, A
     }
 
 
-def _opened(found: Any, name: str) -> _Dataset:
+def _opened(stored: Any, name: str) -> _Dataset:
     """Return a dataset with its properties, after checking its number of dimensions."""
     dimensions = DIMENSIONS.get(name, 1)
-    shape = found.shape if isinstance(found, h5py.h5d.DatasetID) else None
+    shape = stored.shape if isinstance(stored, h5py.h5d.DatasetID) else None
     if shape is None or len(shape) != dimensions:
         wanted = "one-dimensional" if dimensions == 1 else f"{dimensions}-dimensional"
         raise AmiwarpError(
             f"no {wanted} dataset '{name}'; the file is incomplete", ErrorCode.FILE_DAMAGED
         )
-    creation = found.get_create_plist()
+    creation = stored.get_create_plist()
     is_chunked = creation.get_layout() == h5py.h5d.CHUNKED
     return _Dataset(
-        id=found,
+        id=stored,
         shape=shape,
-        dtype=found.dtype,
+        dtype=stored.dtype,
         chunks=creation.get_chunk() if is_chunked else None,
         filters=[creation.get_filter(at) for at in range(creation.get_nfilters())],
     )

@@ -39,16 +39,16 @@ def find_layout(topic: str | None, find: Finder) -> tuple[str, str]:
 
 def _layouts_by_group(find: Finder) -> dict[str, str]:
     """Return the groups of other programs' files that hold events, with their layouts."""
-    found = {}
+    layouts = {}
     for side in SIDES:
         if find(f"prophesee/{side}/t") is not None:
-            found[f"prophesee/{side}"] = "m3ed"
+            layouts[f"prophesee/{side}"] = "m3ed"
     for side in SIDES:
         if find(f"davis/{side}/events") is not None:
-            found[f"davis/{side}"] = "mvsec"
+            layouts[f"davis/{side}"] = "mvsec"
     if find("CD/events") is not None:
-        found["CD"] = "ecf"
-    return found
+        layouts["CD"] = "ecf"
+    return layouts
 
 
 def _own_or_columns(find: Finder) -> str:

@@ -62,17 +62,20 @@ class Finder:
 
 def member(file: h5py.File, name: str) -> Any:
     """Return a group or dataset of the file, or None, as :class:`Finder`."""
-    found = Finder(file.id)(name)
-    kinds = {h5py.h5d.DatasetID: h5py.Dataset, h5py.h5g.GroupID: h5py.Group}
-    return kinds[type(found)](found) if type(found) in kinds else None
+    opened = Finder(file.id)(name)
+    if isinstance(opened, h5py.h5d.DatasetID):
+        return h5py.Dataset(opened)
+    if isinstance(opened, h5py.h5g.GroupID):
+        return h5py.Group(opened)
+    return None
 
 
 def group_of(find: Finder, name: str) -> Any:
     """Return the group of that name, or None. Raises :class:`AmiwarpError` for a dataset."""
-    found = find(name.strip("/"))
-    if found is not None and not isinstance(found, h5py.h5g.GroupID):
+    item = find(name.strip("/"))
+    if item is not None and not isinstance(item, h5py.h5g.GroupID):
         raise AmiwarpError(f"'{name}' is not a group; see docs/reference/recording-format.md")
-    return found
+    return item
 
 
 def attributes_of(group: Any, name: str, wanted: Sequence[str]) -> dict[str, Any]:
@@ -81,7 +84,7 @@ def attributes_of(group: Any, name: str, wanted: Sequence[str]) -> dict[str, Any
     ``name``: name of the group, for messages.
     """
     if not wanted:
-        wanted = [_text(found) for found in h5py.Group(group).attrs]
+        wanted = [_text(stored_name) for stored_name in h5py.Group(group).attrs]
     return {
         attribute: _value(group, name, attribute)
         for attribute in wanted
@@ -122,6 +125,6 @@ def _text(value: Any) -> str:
     return stored.decode("utf-8", "replace")
 
 
-def is_dataset(found: Any) -> bool:
+def is_dataset(item: Any) -> bool:
     """Return whether a member of a file is a dataset with rows."""
-    return isinstance(found, h5py.Dataset) and found.ndim > 0
+    return isinstance(item, h5py.Dataset) and item.ndim > 0

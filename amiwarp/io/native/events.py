@@ -173,8 +173,8 @@ class NativeEvents(EventSource):
         low, high = self._bracket(t)
         at = low + int(np.searchsorted(self._times(low, high), t))
         if 0 < at < self._count:
-            before, found = self._times(at - 1, at + 1)
-            if before < t <= found:
+            t_before, t_at = self._times(at - 1, at + 1)
+            if t_before < t <= t_at:
                 return at
         raise AmiwarpError(
             f"{self.path}: events/t is not sorted near {t} us, or ms_to_idx disagrees with it; the file is damaged",
@@ -212,13 +212,13 @@ class NativeEvents(EventSource):
         root = self._file.attributes.get("/", {})
         if root.get("format") != FORMAT or self._file.unfinished or self._offset != self.t_first:
             return {}
-        found: dict[str, list[bytes]] = {}
+        chunks_by_name: dict[str, list[bytes]] = {}
         for name in ("t", "p"):
             column = self._columns[name]
             chunks = column.encoded(start, min(stop, self._count))
             if chunks is not None and column.dtype == EVENTS[name]:
-                found[f"events/{name}"] = chunks
-        return found
+                chunks_by_name[f"events/{name}"] = chunks
+        return chunks_by_name
 
     def _pieces_in_order(self) -> Iterator[Events]:
         start = 0

@@ -124,10 +124,10 @@ class Records:
 
     def _check_same(self, given: Mapping[str, tuple[str, ...]]) -> None:
         """Raise :class:`AmiwarpError` if other datasets, bodies or joints are given than before."""
-        for where, found in given.items():
-            before = self._given.get(where, found)
-            if found != before:
-                change = f"{where} comes with {shown(found)}, before with {shown(before)}"
+        for where, now in given.items():
+            before = self._given.get(where, now)
+            if now != before:
+                change = f"{where} comes with {shown(now)}, before with {shown(before)}"
                 raise AmiwarpError(f"{self._path}: {change}; append the same in each call")
 
     def _check_values(self, columns: Columns) -> None:

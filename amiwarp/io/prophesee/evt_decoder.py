@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,7 +127,6 @@ class EvtDecoder:
         from amiwarp.kernels import evt, evt2, evt3
         from amiwarp.kernels.event_arrays import new_event_arrays
         from amiwarp.kernels.launch import launch
-        from amiwarp.kernels.loading import load
 
         device = self._device
         word = np.dtype(WORD_TYPES[self._version])
@@ -139,56 +138,83 @@ class EvtDecoder:
             version=f"EVT {self._version}",
             record=word.itemsize,
         )
-        length = CPU_WORDS if device.is_cpu else CUDA_WORDS
-        blocks = math.ceil(words.shape[0] / length)
+        block_words = CPU_WORDS if device.is_cpu else CUDA_WORDS
+        blocks = math.ceil(words.shape[0] / block_words)
         if self._version == "3.0":
             survey = evt3.survey_evt3
             decode = evt3.decode_evt3
-            layout = [words, length]
-            bits = 12
+            layout = [words, block_words]
+            clock_bits = 12
         else:
             survey = evt2.survey_evt2
             decode = evt2.decode_evt2
-            layout = [words, length, int(self._swapped)]
-            bits = 28
+            layout = [words, block_words, int(self._swapped)]
+            clock_bits = 28
 
-        # First pass: what each block changes, then the state at its start and the place of its first event.
+        # First pass: what each block changes. So its state at the start and the place of its first event are known.
         changes = wp.empty(blocks, dtype=evt.Change, device=device)
         launch(survey, blocks, layout, [changes], device=device, smallest=1)
+        links = self._link(changes, clock_bits)
+        self._untimed += int(links.totals["untimed"])
+        self._unknown += int(links.totals["unknown"])
+
+        # Second pass: the events.
+        events = new_event_arrays(int(links.totals["event"]), device)
+        edge_count = int(links.totals["trigger"])
+        edges = evt.TriggerArrays()
+        edges.channel = wp.empty(edge_count, dtype=wp.uint8, device=device)
+        edges.t = wp.empty(edge_count, dtype=wp.int64, device=device)
+        edges.rising = wp.empty(edge_count, dtype=wp.uint8, device=device)
+        inputs = [*layout, links.states, links.places]
+        launch(decode, blocks, inputs, [events, edges], device=device, smallest=1)
+        self._state = wp.clone(links.end)
+        triggers = Triggers(
+            channel=edges.channel.numpy(), t=edges.t.numpy(), rising=edges.rising.numpy()
+        )
+        return DeviceEvents(events.x, events.y, events.t, events.p), triggers
+
+    def _link(self, changes: Any, clock_bits: int) -> _Links:
+        """Link blocks of words, in groups, so that many threads work.
+
+        ``changes``: what each block changes, as a Warp array; ``clock_bits``: number of bits of a time word.
+        """
+        import warp as wp
+
+        from amiwarp.kernels import evt
+        from amiwarp.kernels.launch import launch
+        from amiwarp.kernels.loading import load
+
+        device = self._device
+        blocks = changes.shape[0]
         groups = math.ceil(blocks / GROUP_BLOCKS)
         group_changes = wp.empty(groups, dtype=evt.Change, device=device)
-        inputs = [changes, GROUP_BLOCKS, bits]
+        inputs = [changes, GROUP_BLOCKS, clock_bits]
         launch(evt.merge_blocks, groups, inputs, [group_changes], device=device, smallest=1)
+
         group_states = wp.zeros(groups + 1, dtype=evt.State, device=device)
         if self._state is not None:
             wp.copy(group_states, self._state, count=1)
         group_places = wp.empty(groups + 1, dtype=evt.Place, device=device)
         load(evt.link_groups, device)
         outputs = [group_states, group_places]
-        wp.launch(evt.link_groups, 1, [group_changes, bits], outputs, device=device)
+        wp.launch(evt.link_groups, 1, [group_changes, clock_bits], outputs, device=device)
+
         states = wp.empty(blocks, dtype=evt.State, device=device)
         places = wp.empty(blocks, dtype=evt.Place, device=device)
-        inputs = [changes, GROUP_BLOCKS, bits, group_states, group_places]
+        inputs = [changes, GROUP_BLOCKS, clock_bits, group_states, group_places]
         launch(evt.link_blocks, groups, inputs, [states, places], device=device, smallest=1)
+        totals = group_places[groups:].numpy()[0]
+        return _Links(states, places, group_states[groups:], totals)
 
-        # Second pass: the events.
-        total = group_places[groups:].numpy()[0]
-        events = int(total["event"])
-        edges = int(total["trigger"])
-        self._untimed += int(total["untimed"])
-        self._unknown += int(total["unknown"])
-        event_arrays = new_event_arrays(events, device)
-        trigger_arrays = evt.TriggerArrays()
-        trigger_arrays.channel = wp.empty(edges, dtype=wp.uint8, device=device)
-        trigger_arrays.t = wp.empty(edges, dtype=wp.int64, device=device)
-        trigger_arrays.rising = wp.empty(edges, dtype=wp.uint8, device=device)
-        inputs = [*layout, states, places]
-        launch(decode, blocks, inputs, [event_arrays, trigger_arrays], device=device, smallest=1)
-        self._state = wp.clone(group_states[groups:])
-        found = DeviceEvents(event_arrays.x, event_arrays.y, event_arrays.t, event_arrays.p)
-        triggers = Triggers(
-            channel=trigger_arrays.channel.numpy(),
-            t=trigger_arrays.t.numpy(),
-            rising=trigger_arrays.rising.numpy(),
-        )
-        return found, triggers
+
+class _Links(NamedTuple):
+    """What the words of blocks mean for the blocks after them, as Warp arrays."""
+
+    states: Any
+    """State at the start of each block."""
+    places: Any
+    """Numbers of the first event and edge of each block."""
+    end: Any
+    """State after the last block, one element."""
+    totals: Any
+    """Numbers of events, of edges, and of words that were dropped or passed over, as a NumPy record."""

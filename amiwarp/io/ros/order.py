@@ -45,7 +45,7 @@ TAIL_BYTES = 64
 class Numbered(NamedTuple):
     """Message and its number."""
 
-    one: Message
+    stored: Message
     """The message in the bag."""
     message: Any
     """The message as an object; None for arrays, which are decoded without."""
@@ -55,17 +55,17 @@ class Numbered(NamedTuple):
     """Time in its header [ns]."""
 
 
-def numbered(one: Message, *, ros1: bool) -> Numbered:
+def with_number(stored: Message, *, ros1: bool) -> Numbered:
     """Return a message with its number. Arrays have their header's number, which only ROS 1 counts."""
-    if one.connection.msgtype not in ARRAYS:
-        message = deserialised(one.connection, one.raw, ros1=ros1)
+    if stored.connection.msgtype not in ARRAYS:
+        message = deserialised(stored.connection, stored.raw, ros1=ros1)
         stamp = message.header.stamp
         stamp_ns = int(stamp.sec) * 10**9 + int(stamp.nanosec)
-        return Numbered(one, message, number_of(message), stamp_ns)
+        return Numbered(stored, message, number_of(message), stamp_ns)
     if not ros1:
-        return Numbered(one, None, None, 0)
-    number, seconds, nanoseconds = struct.unpack_from("<III", one.raw)
-    return Numbered(one, None, number, seconds * 10**9 + nanoseconds)
+        return Numbered(stored, None, None, 0)
+    number, seconds, nanoseconds = struct.unpack_from("<III", stored.raw)
+    return Numbered(stored, None, number, seconds * 10**9 + nanoseconds)
 
 
 def number_of(message: Any) -> int:
@@ -77,7 +77,7 @@ def number_of(message: Any) -> int:
 class Placed(NamedTuple):
     """Message in its place."""
 
-    one: Message
+    stored: Message
     """The message in the bag."""
     message: Any
     """The message as an object; None for arrays."""
@@ -97,13 +97,13 @@ def in_order(messages: Iterable[Numbered], notes: dict[str, int]) -> Iterator[Pl
     numbers = MessageNumbers(notes)
     waiting: list[Numbered] = []
     size = 0
-    for each in messages:
-        waiting.append(each)
-        size += len(each.one.raw)
+    for numbered in messages:
+        waiting.append(numbered)
+        size += len(numbered.stored.raw)
         while len(waiting) > AHEAD or size > AHEAD_BYTES:
-            taken = waiting.pop(numbers.earliest(waiting))
-            size -= len(taken.one.raw)
-            yield from numbers.place(taken)
+            first = waiting.pop(numbers.earliest(waiting))
+            size -= len(first.stored.raw)
+            yield from numbers.place(first)
     while waiting:
         yield from numbers.place(waiting.pop(numbers.earliest(waiting)))
 
@@ -121,18 +121,18 @@ class Publisher:
     seen: dict[int, tuple[int, int, bytes]] = field(default_factory=dict)
     """What tells each of the last messages from others, by number."""
 
-    def note(self, each: Numbered, number: int) -> None:
+    def note(self, numbered: Numbered, number: int) -> None:
         """Note a message that is in its place."""
         self.before = number
-        self.seen[number] = _mark(each)
+        self.seen[number] = _mark(numbered)
         if len(self.seen) > REMEMBERED:
             del self.seen[next(iter(self.seen))]
 
 
-def _mark(each: Numbered) -> tuple[int, int, bytes]:
+def _mark(numbered: Numbered) -> tuple[int, int, bytes]:
     """Return what a message has in common only with one that repeats it."""
-    raw = each.one.raw
-    return each.stamp, len(raw), bytes(raw[-TAIL_BYTES:])
+    raw = numbered.stored.raw
+    return numbered.stamp, len(raw), bytes(raw[-TAIL_BYTES:])
 
 
 class MessageNumbers:
@@ -146,49 +146,57 @@ class MessageNumbers:
     def earliest(self, waiting: list[Numbered]) -> int:
         """Return the index of the message that is next: the first one, or a late one that belongs before it."""
         head = waiting[0]
-        publisher = self._publishers.get(head.one.connection.id)
+        publisher = self._publishers.get(head.stored.connection.id)
         last = -1 if publisher is None else _number(publisher.latest)
         if head.number is None or head.number <= last:
             return 0
-        found = 0
+        earliest_index = 0
         lowest = head.number
-        for at, each in enumerate(waiting):
+        for index, numbered in enumerate(waiting):
             # This comes first, because it leaves out nearly all.
-            if each.number is None or not last < each.number < lowest:
+            if numbered.number is None or not last < numbered.number < lowest:
                 continue
-            if each.one.connection.id == head.one.connection.id and _is_late(each, head):
-                found = at
-                lowest = each.number
-        if found:
+            if numbered.stored.connection.id == head.stored.connection.id and _is_late(
+                numbered, head
+            ):
+                earliest_index = index
+                lowest = numbered.number
+        if earliest_index:
             self._count("late_packets")
-        return found
+        return earliest_index
 
-    def place(self, each: Numbered) -> Iterator[Placed]:
+    def place(self, numbered: Numbered) -> Iterator[Placed]:
         """Yield a message with what its number tells, unless it is repeated."""
-        if each.number is None:
-            yield Placed(each.one, each.message, each.stamp, 0, True)
+        if numbered.number is None:
+            yield Placed(numbered.stored, numbered.message, numbered.stamp, 0, True)
             return
         publisher = self._publishers.setdefault(
-            each.one.connection.id, Publisher(each, each.number)
+            numbered.stored.connection.id, Publisher(numbered, numbered.number)
         )
-        if publisher.seen.get(each.number) == _mark(each):
+        if publisher.seen.get(numbered.number) == _mark(numbered):
             self._count("repeated_packets")
             return
         # Publishers that do not count give all messages the same number.
-        follows = each.number - publisher.before in (0, 1)
-        missing = self._missing(publisher, each, each.number)
-        publisher.note(each, each.number)
-        yield Placed(each.one, each.message, each.stamp, missing, follows and missing != RESTART)
+        follows = numbered.number - publisher.before in (0, 1)
+        missing = self._missing(publisher, numbered, numbered.number)
+        publisher.note(numbered, numbered.number)
+        yield Placed(
+            numbered.stored,
+            numbered.message,
+            numbered.stamp,
+            missing,
+            follows and missing != RESTART,
+        )
 
-    def _missing(self, publisher: Publisher, each: Numbered, number: int) -> int:
+    def _missing(self, publisher: Publisher, numbered: Numbered, number: int) -> int:
         """Return how many messages are missing before the one with a number, or :data:`RESTART` or :data:`LATE`."""
         # More late messages in a row than a driver counts soon after its start: the largest number was wrong.
-        if _is_late(each, publisher.latest) and publisher.late_in_a_row < FIRST_NUMBERS:
+        if _is_late(numbered, publisher.latest) and publisher.late_in_a_row < FIRST_NUMBERS:
             publisher.late_in_a_row += 1
             self._count("late_packets")
             return LATE
         step = number - _number(publisher.latest)
-        publisher.latest = each
+        publisher.latest = numbered
         publisher.late_in_a_row = 0
         if step in (0, 1):
             return 0
@@ -202,23 +210,23 @@ class MessageNumbers:
         self._notes[name] = self._notes.get(name, 0) + count
 
 
-def _number(each: Numbered) -> int:
+def _number(numbered: Numbered) -> int:
     """Return the number of a message that has one."""
-    assert each.number is not None
-    return each.number
+    assert numbered.number is not None
+    return numbered.number
 
 
-def _is_late(each: Numbered, other: Numbered) -> bool:
+def _is_late(numbered: Numbered, before: Numbered) -> bool:
     """Return whether a message belongs before another one of its publisher that came before it.
 
     Otherwise a smaller number is the first of a new start. This takes a while, in which the stamps go on. If the stamps
     tell nothing, because they stand still or were set back, the number falls far, and to one of the first.
     """
-    fall = _number(other) - _number(each)
-    step = each.stamp - other.stamp
+    fall = _number(before) - _number(numbered)
+    step = numbered.stamp - before.stamp
     if fall <= 0 or step >= NEW_START_NS:
         return False
-    return -LATEST_NS < step < 0 or fall <= FIRST_NUMBERS or _number(each) > FIRST_NUMBERS
+    return -LATEST_NS < step < 0 or fall <= FIRST_NUMBERS or _number(numbered) > FIRST_NUMBERS
 
 
 def note_largest_gap(notes: dict[str, int], missing: int, t: int) -> None:

@@ -37,7 +37,7 @@ from amiwarp.io.ros.bags import (
 )
 from amiwarp.io.ros.events import edge_packets, event_packets, stamp_packets
 from amiwarp.io.ros.messages import Columns, decode_array, decode_packet, truncated_bytes
-from amiwarp.io.ros.order import Placed, in_order, note_largest_gap, numbered
+from amiwarp.io.ros.order import Placed, in_order, note_largest_gap, with_number
 from amiwarp.io.ros.packed import unpacked
 from amiwarp.io.ros.words import EVT, Layout, layout_of
 
@@ -225,7 +225,9 @@ def _topic_messages(
     with opened_bag(path) as (bag, ros1):
         connections = [found for found in bag.connections if found.topic == topic]
         notes["total"] = max(sum(found.msgcount for found in connections), 1)
-        read = (numbered(each, ros1=ros1) for each in messages_of(bag, connections, ros1=ros1))
+        read = (
+            with_number(stored, ros1=ros1) for stored in messages_of(bag, connections, ros1=ros1)
+        )
         for placed in in_order(read, notes):
             yield placed, ros1
 
@@ -234,8 +236,8 @@ def _decoded(placed: Placed, *, ros1: bool) -> tuple[Columns, Columns]:
     """Return the events of a message, and its triggers."""
     if placed.message is not None:
         return decode_packet(placed.message)
-    typestore(placed.one.connection, ros1=ros1)
-    _, _, events = decode_array(placed.one.raw, ros1=ros1)
+    typestore(placed.stored.connection, ros1=ros1)
+    _, _, events = decode_array(placed.stored.raw, ros1=ros1)
     x, y, t, p = (column[:0] for column in events)
     return events, (x, y, t, p)
 
@@ -249,9 +251,9 @@ def read_stamps(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[
         if len(t):
             # All types of messages with events begin so, in ROS 1 after a number, in ROS 2 after the encapsulation.
             form = "<II" if ros1 else "<iI"
-            seconds, nanoseconds = struct.unpack_from(form, placed.one.raw, 4)
+            seconds, nanoseconds = struct.unpack_from(form, placed.stored.raw, 4)
             stamp = seconds * 10**9 + nanoseconds
-            times = (t[0], placed.one.recorded, stamp)
+            times = (t[0], placed.stored.recorded, stamp)
             yield tuple(np.array([time], np.int64) for time in times)
 
 

@@ -25,7 +25,7 @@ from amiwarp.evt_types import (
 )
 from amiwarp.io.file_pieces import unwrapped
 from amiwarp.io.ros.bags import messages_of, note_unread, opened_bag
-from amiwarp.io.ros.order import RESTART, in_order, numbered
+from amiwarp.io.ros.order import RESTART, in_order, with_number
 from amiwarp.io.ros.words import Layout, checked_words
 
 NO_EVENT = {"3.0": 0xF000, "2.0": 0xF0000000, "2.1": 0xF0000000_F0000000}
@@ -193,7 +193,9 @@ def read_words(
     with opened_bag(path) as (bag, ros1):
         connections = [found for found in bag.connections if found.topic == topic]
         notes["total"] = max(sum(found.msgcount for found in connections), 1)
-        read = (numbered(each, ros1=ros1) for each in messages_of(bag, connections, ros1=ros1))
+        read = (
+            with_number(stored, ros1=ros1) for stored in messages_of(bag, connections, ros1=ros1)
+        )
         for placed, following in _with_next(in_order(read, notes)):
             words = checked_words(placed.message, encoding)
             next_stamp = placed.stamp if following is None else following.stamp
@@ -214,7 +216,7 @@ def read_words(
                 len(words),
                 shift,
                 placed.missing,
-                placed.one.recorded,
+                placed.stored.recorded,
                 placed.stamp,
             ]
             yield words, *(np.array([number], np.int64) for number in numbers)

@@ -90,9 +90,9 @@ def _sensor_messages(path: str, topic: str, kind: str) -> Iterator[Any]:
 def _topic_near(bag: Any, topic: str, kind: str) -> str:
     """Return the one topic with messages of a type, or the one that lies next to ``topic``."""
     topics = set()
-    for each in bag.connections:
-        if each.msgtype == kind and each.msgcount:
-            topics.add(each.topic)
+    for connection in bag.connections:
+        if connection.msgtype == kind and connection.msgcount:
+            topics.add(connection.topic)
     namespace, _, _ = topic.rpartition("/")
     near = {name for name in topics if name.rpartition("/")[0] == namespace}
     chosen = near if len(near) == 1 else topics

@@ -58,21 +58,21 @@ def why_no_rows(head: bytes) -> str | None:
     # The line to show: the first one of numbers and other words, or else the line with most numbers.
     counts = [_count_of_numbers(line) for _, line in lines]
     wrong_words = [wrong_word(TextRow.of(line).words(line)) for _, line in lines]
-    shown_at = counts.index(max(counts))
-    for at, wrong in enumerate(wrong_words):
-        if counts[at] and wrong is not None:
-            shown_at = at
+    example = counts.index(max(counts))
+    for index, wrong in enumerate(wrong_words):
+        if counts[index] and wrong is not None:
+            example = index
             break
-    number, line = lines[shown_at]
-    wrong = wrong_words[shown_at]
+    number, line = lines[example]
+    wrong = wrong_words[example]
 
     if len(lines) == 1 and names_roles(TextRow.of(line).names(line)):
         return f"holds no events, only names of columns in line {number}; give another recording"
-    if not counts[shown_at]:
+    if not counts[example]:
         return (
             f"is text, but {_quoted(number, line)} holds no numbers; expected rows of t, x, y and p"
         )
-    if wrong is None and shown_at > 1:
+    if wrong is None and example > 1:
         # Two lines of words are above it.
         return (
             f"is text, but {_quoted(*lines[1])} holds neither numbers nor only units; leave it out"

@@ -170,32 +170,14 @@ def _commented_size(comments: Sequence[str]) -> tuple[int, int] | None:
 
 def find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLayout) -> Layout:
     """Return the layout of the columns of a file that begins with ``head``, whose last line may go on."""
-    rows: list[list[bytes]] = []
-    values: list[list[float]] = []
-    lines = head[form.start :].split(b"\n")
-    for line in lines[:-1] if is_cut else lines:
-        words = form.row.words(line) if holds_values(line) else []
-        if len(words) == form.width:
-            # The reader names a line that holds no numbers.
-            with contextlib.suppress(ValueError):
-                values.append([number_of(word) for word in words])
-                rows.append(words)
-    numbers = np.array(values).reshape(-1, form.width)
-    names_fit = form.names is not None and len(form.names) == form.width
-    if form.names is not None and not names_fit and given.columns is None:
-        raise AmiwarpError(
-            f"names {len(form.names)} columns ({', '.join(form.names)[:200]}), and its rows have {form.width}; give "
-            f"the order with --columns, such as {_order_for(form.names, numbers)}",
-            ErrorCode.AMBIGUOUS,
-        )
-    names = form.names if names_fit else None
-    columns = _columns_of(form, names, numbers)
+    rows, numbers = _rows_of_numbers(head, is_cut, form)
+    names = _fitting_names(form, numbers, given)
     hints = Hints(is_text=True)
     if form.own is not None:
         hints = replace(hints, unit=form.own.unit, is_own=True)
     if names is None:
         hints = replace(hints, order=ROLES, fractions="s")
-    layout = find_layout(columns, given, hints)
+    layout = find_layout(_columns_of(form, names, numbers), given, hints)
     t_column = layout.columns["t"]
     if t_column in form.stamped and given.time_unit is not None:
         raise AmiwarpError(f"times are dates, but --time-unit is {given.time_unit}; leave it out")
@@ -206,14 +188,7 @@ def find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLayo
     have_six_decimals = all(SECONDS.fullmatch(word) for word in t_words)
     are_seconds = have_six_decimals and _can_be_seconds(numbers[:, t_column])
     if given.time_unit is None and names is None and are_seconds:
-        others = tuple(each for each in layout.assumptions if each.what != "time unit")
-        layout = replace(
-            layout,
-            unit="s",
-            unit_is_assumed=False,
-            assumptions=others,
-            is_promised=given == GivenLayout() and not others,
-        )
+        layout = _in_seconds(layout, given)
 
     if form.own is not None and form.own.compensated is not None:
         return replace(layout, compensated=form.own.compensated)
@@ -221,6 +196,57 @@ def find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLayo
     places = numbers[:, x_and_y]
     has_fraction = (places != np.floor(places)).any(axis=1)
     return replace(layout, compensated=bool(has_fraction.mean() > 0.5))
+
+
+def _rows_of_numbers(
+    head: bytes, is_cut: bool, form: TextForm
+) -> tuple[list[list[bytes]], NDArray[np.float64]]:
+    """Return the words of the rows in ``head``, and their numbers, shape (rows, columns).
+
+    Lines that hold no numbers are left out: the reader of all lines names them.
+    """
+    rows: list[list[bytes]] = []
+    values: list[list[float]] = []
+    lines = head[form.start :].split(b"\n")
+    for line in lines[:-1] if is_cut else lines:
+        words = form.row.words(line) if holds_values(line) else []
+        if len(words) == form.width:
+            with contextlib.suppress(ValueError):
+                values.append([number_of(word) for word in words])
+                rows.append(words)
+    return rows, np.array(values).reshape(-1, form.width)
+
+
+def _fitting_names(
+    form: TextForm, numbers: NDArray[np.float64], given: GivenLayout
+) -> Names | None:
+    """Return the names of the columns if there is one for each, or None.
+
+    Raises :class:`AmiwarpError` for more or fewer names, unless the option ``--columns`` gives the columns.
+    """
+    if form.names is None or len(form.names) == form.width:
+        return form.names
+    if given.columns is None:
+        raise AmiwarpError(
+            f"names {len(form.names)} columns ({', '.join(form.names)[:200]}), and its rows have {form.width}; give "
+            f"the order with --columns, such as {_order_for(form.names, numbers)}",
+            ErrorCode.AMBIGUOUS,
+        )
+    return None
+
+
+def _in_seconds(layout: Layout, given: GivenLayout) -> Layout:
+    """Return a layout whose times are in seconds, which is certain."""
+    assumptions = tuple(
+        assumption for assumption in layout.assumptions if assumption.what != "time unit"
+    )
+    return replace(
+        layout,
+        unit="s",
+        unit_is_assumed=False,
+        assumptions=assumptions,
+        is_promised=given == GivenLayout() and not assumptions,
+    )
 
 
 def _columns_of(
@@ -231,28 +257,28 @@ def _columns_of(
     """Return the columns of rows of numbers, with their names and units."""
     has_names = names is not None and any(names)
     columns = []
-    for at, values in enumerate(numbers.T):
+    for index, values in enumerate(numbers.T):
         # The units of the last columns may be left out.
-        unit = form.units[at] if at < len(form.units) else None
-        if at in form.stamped:
+        unit = form.units[index] if index < len(form.units) else None
+        if index in form.stamped:
             unit = "us"
-        name = names[at] if names is not None and has_names else None
+        name = names[index] if names is not None and has_names else None
         columns.append(Column(name, _whole_if_possible(values), unit))
     return columns
 
 
 def _order_for(names: Sequence[str], numbers: NDArray[np.float64]) -> str:
     """Return an example of the option ``--columns`` for rows with more or fewer columns than names."""
-    found = roles_of(names)
-    roles = {places[0]: role for role, places in found.items() if places}
+    places_of_roles = roles_of(names)
+    roles = {places[0]: role for role, places in places_of_roles.items() if places}
     if len(roles) != len(ROLES):
         return "t,x,y,p (- for a column without use)"
-    order = [roles.get(at, "-") for at in range(len(names))]
+    order = [roles.get(index, "-") for index in range(len(names))]
     steps = np.diff(numbers[:, 0])
     if len(steps) and (steps == 1).all():
         # It is the number of the row, whose column has no name.
         order = ["-", *order]
-    last = max(at for at, role in enumerate(order) if role != "-")
+    last = max(index for index, role in enumerate(order) if role != "-")
     return ",".join(order[: last + 1])
 
 

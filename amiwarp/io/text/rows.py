@@ -144,13 +144,13 @@ class TextRow:
             # It is for example the µ of a unit, as Windows writes it.
             text = line.decode("latin-1").strip("\r\n")
         if self.separator != b" ":
-            found = text.split(self.separator.decode())
+            names_of_columns = text.split(self.separator.decode())
         elif "\t" in text:
-            found = text.split("\t")
+            names_of_columns = text.split("\t")
         else:
             # A unit in brackets belongs to the name before it.
-            found = re.sub(r"\s+(?=[\[({])", "", text).split()
-        return tuple(name.strip().strip("\"'") for name in found)
+            names_of_columns = re.sub(r"\s+(?=[\[({])", "", text).split()
+        return tuple(name.strip().strip("\"'") for name in names_of_columns)
 
     def is_row(self, line: bytes) -> bool:
         """Return whether a line consists of numbers."""

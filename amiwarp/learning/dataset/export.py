@@ -29,6 +29,8 @@ from amiwarp.validation import choice, real
 
 INDEX = "export.json"
 """Name of the file that lists the files of an export. Its field ``complete`` is false while they are put in place."""
+README = "README.md"
+"""Name of the card of a data set in Parquet."""
 FORMAT = "amiwarp-export"
 """Value of the index's field ``format``."""
 
@@ -149,6 +151,51 @@ def _export(
     began: float,
 ) -> ExportSummary:
     """Write the export to an existing folder, first to a scratch folder in it."""
+    name, items = _exportable(folder, chosen)
+    earlier = _files_of_earlier(out, overwrite)
+    splits = Counter(item.split for item in items)
+    with scratch_folder(out) as scratch:
+        written = _write_files(folder, scratch, chosen, name, items, limit, report)
+        size = sum((scratch / file).stat().st_size for file in written)
+        files = list(written)
+        if chosen is ExportFormat.PARQUET:
+            files.append(README)
+        index = {
+            "format": FORMAT,
+            "version": 1,
+            "to": chosen.value,
+            "amiwarp": __version__,
+            "name": name,
+            "splits": dict(splits),
+            "complete": True,
+            "files": files,
+        }
+        # If this process is killed meanwhile, the index says so, and the next export removes all these files.
+        unfinished = index | {"complete": False, "files": sorted(earlier | set(files))}
+        _write_index(out, unfinished, overwrite=overwrite)
+        for inner in {Path(file).parent for file in files}:
+            output_formats.make_folder(out / inner)
+        for file in files:
+            put_in_place(scratch / file, out / file, overwrite=overwrite)
+    for file in earlier - set(files):
+        (out / file).unlink(missing_ok=True)
+    _write_index(out, index, overwrite=True)
+    return ExportSummary(
+        splits=dict(splits),
+        files=tuple(written),
+        events=sum(item.events for item in items),
+        size_bytes=size,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _exportable(
+    folder: Path, chosen: ExportFormat
+) -> tuple[str, list[recorded_dataset.ManifestItem]]:
+    """Return the name of a data set, and its recordings in the order of the export.
+
+    Raises :class:`AmiwarpError` if there are none, or if they do not fit the layout.
+    """
     head, items = recorded_dataset.read_manifest(folder / recorded_dataset.MANIFEST)
     if not items:
         raise AmiwarpError(
@@ -159,63 +206,49 @@ def _export(
         raise AmiwarpError(
             f"{folder}: holds tensors ({tensors[0].representation}), the columns are for events; export to webdataset"
         )
-    old = _files_of_earlier(out, overwrite)
+    # Random, but the same every time
     items.sort(key=lambda item: hashlib.sha256(item.file.encode()).digest())
-    splits = Counter(item.split for item in items)
-    count = 0
+    return head.get("name", ""), items
+
+
+def _write_files(
+    folder: Path,
+    scratch: Path,
+    chosen: ExportFormat,
+    name: str,
+    items: Sequence[recorded_dataset.ManifestItem],
+    limit: int,
+    report: Progress,
+) -> list[str]:
+    """Write the files of an export to a scratch folder, and return the names of those with events.
+
+    ``limit``: size at which the next file begins [bytes].
+    """
+    finished = 0
 
     def opened(split: str) -> Iterator[tuple[recorded_dataset.ManifestItem, Any]]:
-        nonlocal count
+        """Yield the items of a split with their open recordings, or with None for tensors."""
+        nonlocal finished
         for item in items:
             if item.split == split:
                 recording = None
                 if item.representation is None:
                     recording = recorded_dataset.open_item(folder, item)
                 yield item, recording
-                count += 1
-                report(f"{count:,} of {len(items):,} recordings", count / len(items))
+                finished += 1
+                report(f"{finished:,} of {len(items):,} recordings", finished / len(items))
 
-    with scratch_folder(out) as scratch:
-        if chosen is ExportFormat.WEBDATASET:
-            keys = _names(items)
-            names: list[str] = []
-            for split in splits:
-                names += write_tars(folder, scratch, split, opened(split), keys, limit)
-        else:
-            names = write_parquet(scratch, list(splits), opened, items, limit)
-            (scratch / "README.md").write_text(
-                dataset_card(head.get("name") or "Events", items), encoding="utf-8"
-            )
-        size = sum((scratch / name).stat().st_size for name in names)
-        files = [*names, *(["README.md"] if chosen is ExportFormat.PARQUET else [])]
-        index = {
-            "format": FORMAT,
-            "version": 1,
-            "to": chosen.value,
-            "amiwarp": __version__,
-            "name": head.get("name", ""),
-            "splits": dict(splits),
-            "complete": True,
-            "files": files,
-        }
-        # If this process is killed meanwhile, the index says so, and the next export removes all these files.
-        _write_index(
-            out, index | {"complete": False, "files": sorted(old | set(files))}, overwrite=overwrite
-        )
-        for inner in {Path(name).parent for name in files}:
-            output_formats.make_folder(out / inner)
-        for name in files:
-            put_in_place(scratch / name, out / name, overwrite=overwrite)
-    for name in old - set(files):
-        (out / name).unlink(missing_ok=True)
-    _write_index(out, index, overwrite=True)
-    return ExportSummary(
-        dict(splits),
-        tuple(names),
-        sum(item.events for item in items),
-        size,
-        time.perf_counter() - began,
-    )
+    splits = list(dict.fromkeys(item.split for item in items))
+    if chosen is ExportFormat.PARQUET:
+        files = write_parquet(scratch, splits, opened, items, limit)
+        card = dataset_card(name or "Events", items)
+        (scratch / README).write_text(card, encoding="utf-8")
+        return files
+    names = _names(items)
+    files = []
+    for split in splits:
+        files += write_tars(folder, scratch, split, opened(split), names, limit)
+    return files
 
 
 def _write_index(out: Path, index: Mapping[str, Any], *, overwrite: bool) -> None:
@@ -245,10 +278,10 @@ def _files_of_earlier(out: Path, overwrite: bool) -> set[str]:
         return set()
     index = out / INDEX
     if not index.is_file():
-        other = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
-        if other:
+        present = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
+        if present:
             raise AmiwarpError(
-                f"{out}: holds other files, such as {other[0]}; give a new folder",
+                f"{out}: holds other files, such as {present[0]}; give a new folder",
                 ErrorCode.OUTPUT_EXISTS,
             )
         return set()
@@ -258,8 +291,9 @@ def _files_of_earlier(out: Path, overwrite: bool) -> set[str]:
         open_input(index, noted=False) as file,
     ):
         files = dict(parse_json(file.read(recorded_dataset.MOST_BYTES))).get("files")
-    known = r"(data/)?[A-Za-z0-9_-]+[.](tar|parquet)|README[.]md"
-    return {name for name in files or () if isinstance(name, str) and re.fullmatch(known, name)}
+    # Only names that an export can have are removed, whatever the index says.
+    own = r"(data/)?[A-Za-z0-9_-]+[.](tar|parquet)|README[.]md"
+    return {name for name in files or () if isinstance(name, str) and re.fullmatch(own, name)}
 
 
 def _names(items: Sequence[recorded_dataset.ManifestItem]) -> dict[str, str]:

@@ -83,18 +83,20 @@ def list_items(specification: spec.Specification) -> list[Item]:
 
     Raises :class:`AmiwarpError` for sources not found, and for more than :data:`MOST_RECORDINGS` recordings.
     """
-    found = [(source, _axes(specification, source)) for source in find_sources(specification)]
-    count = sum(math.prod(map(len, axes)) for _, axes in found)
+    axes_of_sources = [
+        (source, _axes(specification, source)) for source in find_sources(specification)
+    ]
+    count = sum(math.prod(map(len, axes)) for _, axes in axes_of_sources)
     if count > spec.MOST_RECORDINGS:
         raise AmiwarpError(
             f"{specification.path}: describes {count:,} recordings; divide it among specifications of at most "
             f"{spec.MOST_RECORDINGS:,} recordings each"
         )
-    sources = [source for source, _ in found]
+    sources = [source for source, _ in axes_of_sources]
     divide = _drawn if specification.stratify is None else _stratified
     splits = divide(specification, sources)
     items = []
-    for source, axes in found:
+    for source, axes in axes_of_sources:
         for recipe in _recipes(specification, source, axes):
             split = splits[_identity(source, recipe.get("seed"))]
             licence = source.entry.licence

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -171,60 +171,78 @@ def _make_missing(
     journal = Journal(out)
     journal.create()
     todo = missing(journal, items, report)
-    made: list[Made] = []
-    failed: list[Failed] = []
-    events = 0
-    most_workers = 0
+    run = _Run(len(todo), journal, report)
     try:
         if todo:
             target = out.resolve()
             threads = cluster.threads_of_worker(device, count)
+            name = "amiwarp dataset"
             with (
                 scratch_folder(target) as scratch,
-                cluster.start_workers(
-                    "amiwarp dataset", "dataset", scheduler, count or 0, device
-                ) as running,
-                contextlib.closing(
-                    cluster.run_jobs(
-                        running,
-                        make,
-                        (Job(item, target, scratch, device, threads) for item in todo),
-                    )
-                ) as results,
+                cluster.start_workers(name, "dataset", scheduler, count or 0, device) as workers,
             ):
-                first = time.perf_counter()
-                report(f"0 of {len(todo):,} recordings", 0.0)
-                for done, (job, future) in enumerate(results, 1):
-                    result = _result(job, future)
-                    if isinstance(result, Failed):
-                        failed.append(result)
-                    else:
-                        made.append(result)
-                        events += result.events
-                        journal.add(result)
-                    most_workers = max(most_workers, running.count())
-                    report(
-                        _line(done, len(failed), len(todo), events, time.perf_counter() - first),
-                        done / len(todo),
-                    )
+                jobs = (Job(item, target, scratch, device, threads) for item in todo)
+                run.wait_for(jobs, workers)
     finally:
-        write_manifest(out, loaded, items, journal, failed)
+        write_manifest(out, loaded, items, journal, run.failed)
     files = {item.key: item.file for item in items}
     return DatasetSummary(
         recordings=len(items),
-        made=len(made),
+        made=len(run.made),
         kept=len(items) - len(todo),
-        failed={files[one.key]: one.error for one in failed},
+        failed={files[failed.key]: failed.error for failed in run.failed},
         not_in_specification=tuple(journal.others(items)),
         splits=dict(Counter(item.split for item in items if item.key in journal.made)),
-        events=events,
-        size_bytes=sum(one.bytes for one in made),
+        events=run.events,
+        size_bytes=sum(made.bytes for made in run.made),
         seconds=time.perf_counter() - began,
-        worker_seconds=sum(one.seconds for one in made),
-        processor_seconds=sum(one.processor_s for one in made),
-        workers=most_workers,
+        worker_seconds=sum(made.seconds for made in run.made),
+        processor_seconds=sum(made.processor_s for made in run.made),
+        workers=run.most_workers,
         damaged=tuple(journal.damaged),
     )
+
+
+class _Run:
+    """Recordings that are being made, and what became of them."""
+
+    def __init__(self, total: int, journal: Journal, report: Progress) -> None:
+        self._total = total
+        self._journal = journal
+        self._report = report
+        self.made: list[Made] = []
+        self.failed: list[Failed] = []
+        self.events = 0
+        """Number of events in the recordings that were made."""
+        self.most_workers = 0
+        """Largest number of workers so far."""
+
+    def wait_for(self, jobs: Iterator[Job], workers: cluster.Workers) -> None:
+        """Give jobs to workers, and enter their results into the journal as they come."""
+        with contextlib.closing(cluster.run_jobs(workers, make, jobs)) as results:
+            began = time.perf_counter()
+            self._report(f"0 of {self._total:,} recordings", 0.0)
+            for job, future in results:
+                result = _result(job, future)
+                if isinstance(result, Failed):
+                    self.failed.append(result)
+                else:
+                    self.made.append(result)
+                    self.events += result.events
+                    self._journal.add(result)
+                self.most_workers = max(self.most_workers, workers.count())
+                self._report_state(time.perf_counter() - began)
+
+    def _report_state(self, seconds: float) -> None:
+        """Report how many recordings are finished, and the time that is left at the mean speed so far."""
+        finished = len(self.made) + len(self.failed)
+        left_s = (self._total - finished) * seconds / finished
+        failures = f", {len(self.failed):,} failed" if self.failed else ""
+        speed = self.events / seconds / 1e6
+        self._report(
+            f"{finished:,} of {self._total:,} recordings{failures}, {speed:.3g} Mev/s, {duration_text(left_s)} left",
+            finished / self._total,
+        )
 
 
 def missing(journal: Journal, items: Sequence[Item], progress: Progress) -> list[Item]:
@@ -234,17 +252,17 @@ def missing(journal: Journal, items: Sequence[Item], progress: Progress) -> list
     The order mixes long and short recordings, so that the speed so far predicts the rest. The files are read by several
     threads, to compare their checksums.
     """
-    there = [item for item in items if journal.is_there(item)]
+    present = [item for item in items if journal.is_there(item)]
     intact: set[str] = set()
     with ThreadPoolExecutor(min(cpu_threads(), MOST_READERS)) as pool:
-        for first in range(0, len(there), CHECKED):
-            block = there[first : first + CHECKED]
+        for start in range(0, len(present), CHECKED):
+            block = present[start : start + CHECKED]
             are_intact = pool.map(journal.is_intact, block)
             for item, is_intact in zip(block, are_intact, strict=True):
                 if is_intact:
                     intact.add(item.key)
-            progress("checking finished recordings", (first + len(block)) / len(there))
-    for item in there:
+            progress("checking finished recordings", (start + len(block)) / len(present))
+    for item in present:
         if item.key in intact:
             journal.move(item)
     todo = [item for item in items if item.key not in intact]
@@ -282,13 +300,6 @@ def _result(job: Job, future: Future[Made | Failed]) -> Made | Failed:
     if not message or isinstance(future.exception(), AmiwarpError):
         return future.result()
     return Failed(job.item.key, message)
-
-
-def _line(done: int, failed: int, total: int, events: int, seconds: float) -> str:
-    """Return the state of a run as text, with the time left at the mean speed so far."""
-    left = (total - done) * seconds / done
-    lost = f", {failed:,} failed" if failed else ""
-    return f"{done:,} of {total:,} recordings{lost}, {events / seconds / 1e6:.3g} Mev/s, {duration_text(left)} left"
 
 
 def duration_text(seconds: float) -> str:

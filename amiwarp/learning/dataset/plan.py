@@ -196,12 +196,12 @@ def _sample_all(
     with scratch_folder(near) as scratch:
         for group in groups:
             one_device = "cuda:0" if device == cluster.ANY_GPU else device
-            found = _sample(group, scratch, one_device, threads, progress, failed)
-            for cost in found:
-                total = total.plus(cost, len(group) / len(found))
-            samples += len(found)
+            sample = _sample(group, scratch, one_device, threads, progress, failed)
+            for cost in sample:
+                total = total.plus(cost, len(group) / len(sample))
+            samples += len(sample)
             variance += len(group) ** 2 * _variance_of_mean(
-                [cost.seconds for cost in found], len(group)
+                [cost.seconds for cost in sample], len(group)
             )
     return total, samples, variance
 

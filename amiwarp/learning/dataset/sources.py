@@ -1,12 +1,8 @@
 """Sources of a data set: files found by their patterns, named worlds, and the labels that they carry."""
 
-import contextlib
 import csv
-import fnmatch
-import glob
 import hashlib
 import io
-import itertools
 import os
 import re
 from collections import Counter
@@ -19,13 +15,12 @@ from typing import Any
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.inputs import errors_name, open_input
 from amiwarp.io.json_files import read_json, read_toml
+from amiwarp.learning.dataset.patterns import matches
 from amiwarp.learning.dataset.specification import SourceEntry, Specification
 from amiwarp.simulation.worlds.mesh_reader import mesh_files
 from amiwarp.simulation.worlds.named.catalogue import WORLDS
 from amiwarp.validation import one_of, shown
 
-MOST_VISITED = 2_000_000
-"""Largest number of files and folders that one pattern leads through."""
 MOST_TABLE_BYTES = 256 << 20
 """Largest table of labels that is read [bytes]."""
 
@@ -48,20 +43,20 @@ class Source:
 
 def find_sources(specification: Specification) -> list[Source]:
     """Return all sources. Raises :class:`AmiwarpError` for a pattern without files and for a file found twice."""
-    found: dict[str, tuple[int, Source]] = {}
+    by_name: dict[str, tuple[int, Source]] = {}
     kinds: dict[str, tuple[type, int]] = {}
     for k, entry in enumerate(specification.sources):
         with errors_name(specification.path, lambda k=k: f"field sources[{k}]"):  # type: ignore[misc]
             for source in _of_entry(specification.folder, entry, f"sources[{k}]"):
-                if source.name in found:
+                if source.name in by_name:
                     raise AmiwarpError(
-                        f"field sources[{k}] names {source.name}, as does sources[{found[source.name][0]}]; "
+                        f"field sources[{k}] names {source.name}, as does sources[{by_name[source.name][0]}]; "
                         "change one of them, so that each recording is made once",
                         ErrorCode.FIELD,
                     )
-                found[source.name] = (k, source)
+                by_name[source.name] = (k, source)
                 _check_label_types(source.labels, kinds, k)
-    return [source for _, source in found.values()]
+    return [source for _, source in by_name.values()]
 
 
 def _check_label_types(
@@ -86,7 +81,7 @@ def _of_entry(folder: Path, entry: SourceEntry, where: str) -> Iterator[Source]:
             yield Source(entry, name, None, "", dict(entry.labels))
         return
     pattern = getattr(entry, entry.kind)
-    names = _matches(folder, pattern)
+    names = matches(folder, pattern)
     if not names:
         raise AmiwarpError(
             f"field {where}.{entry.kind} is {shown(pattern)}, which matches no file in {folder}; change it",
@@ -101,73 +96,6 @@ def _of_entry(folder: Path, entry: SourceEntry, where: str) -> Iterator[Source]:
         yield Source(entry, Path(name).as_posix(), path, digest(path), _labels(entry, path, table))
 
 
-def _matches(folder: Path, pattern: str) -> list[str]:
-    """Return the paths that match a pattern as in the module glob, sorted and relative to ``folder``.
-
-    Raises :class:`AmiwarpError` after :data:`MOST_VISITED` entries of folders.
-    """
-    visited = itertools.count(1)
-
-    def entries(name: str) -> Iterator[os.DirEntry[str]]:
-        with contextlib.suppress(OSError, ValueError), os.scandir(folder / name) as listed:
-            for entry in listed:  # without entries: no folder, or an unreadable one
-                if next(visited) > MOST_VISITED:
-                    raise _TooMany
-                yield entry
-
-    def below(name: str) -> Iterator[str]:
-        waiting: list[tuple[str, frozenset[tuple[int, int]]]] = [(name, frozenset())]
-        while waiting:
-            here, above = waiting.pop()
-            with contextlib.suppress(OSError, ValueError):
-                state = os.stat(folder / here)
-                if (
-                    same := (state.st_dev, state.st_ino)
-                ) not in above:  # a link to a folder above it has no end
-                    yield here
-                    deeper = [
-                        e.name
-                        for e in entries(here)
-                        if not e.name.startswith(".") and _is_folder(e)
-                    ]
-                    waiting += [(os.path.join(here, inner), above | {same}) for inner in deeper]
-
-    def step(name: str, segment: str) -> Iterator[str]:
-        if segment == "**":
-            yield from below(name)
-        elif glob.has_magic(segment):
-            names = (
-                e.name
-                for e in entries(name)
-                if segment.startswith(".") or not e.name.startswith(".")
-            )
-            yield from (os.path.join(name, found) for found in fnmatch.filter(names, segment))
-        elif os.path.lexists(folder / name / segment):
-            yield os.path.join(name, segment)
-
-    names = ["/" if pattern.startswith("/") else ""]
-    segments = [segment for segment in pattern.split("/") if segment]
-    try:
-        for segment in (*segments, "*") if pattern.endswith("**") else segments:
-            names = list(dict.fromkeys(found for name in names for found in step(name, segment)))
-    except _TooMany:
-        raise AmiwarpError(
-            f"pattern {shown(pattern)} leads through more than {MOST_VISITED:,} files and folders; name the folders"
-        ) from None
-    return sorted(name for name in names if name)
-
-
-def _is_folder(entry: os.DirEntry[str]) -> bool:
-    """Return whether an entry is a folder or a link to one."""
-    with contextlib.suppress(OSError):  # a link to itself
-        return entry.is_dir()
-    return False
-
-
-class _TooMany(Exception):
-    """The limit of :func:`_matches`."""
-
-
 def _labels(
     entry: SourceEntry, path: Path, table: tuple[Path, dict[Path, dict[str, Any]]] | None
 ) -> dict[str, Any]:
@@ -176,10 +104,11 @@ def _labels(
     if entry.label_from_folder is not None:
         labels[entry.label_from_folder] = path.absolute().parent.name
     if table is not None:
-        row = table[1].get(path.resolve())
+        table_path, rows = table
+        row = rows.get(path.resolve())
         if row is None:
             raise AmiwarpError(
-                f"{table[0]}: has no row for {path}; add it, or change the pattern of the source"
+                f"{table_path}: has no row for {path}; add it, or change the pattern of the source"
             )
         labels |= row
     return labels
@@ -205,17 +134,18 @@ def _read_labels(path: Path) -> tuple[Path, dict[Path, dict[str, Any]]]:
             )
         _check_once(reader.fieldnames or (), "column", "give each label one column")
         rows = list(reader)
-        for k, row in enumerate(rows):
+        for number, row in enumerate(rows, 1):
             if None in row or None in row.values():
                 raise AmiwarpError(
-                    f"row {k + 1} has more or fewer cells than the header; correct it"
+                    f"row {number} has more or fewer cells than the header; correct it"
                 )
         columns = {name: _column([row[name] for row in rows]) for name in names}
         files = [(path.parent / row["file"]).resolve() for row in rows]
         _check_once(files, "file", "keep one row of it")
-        return path, {
-            file: {name: columns[name][k] for name in names} for k, file in enumerate(files)
-        }
+        labels = {}
+        for index, labelled in enumerate(files):
+            labels[labelled] = {name: columns[name][index] for name in names}
+        return path, labels
 
 
 def _check_once(values: Sequence[object], what: str, remedy: str) -> None:
@@ -242,7 +172,7 @@ def content_digest(path: Path, *, noted: bool = True) -> str:
     with errors_name(path, lambda: "cannot be read"):
         if path.is_dir():
             total = hashlib.sha256()
-            for file in sorted(p for p in path.iterdir() if p.is_file()):
+            for file in sorted(inner for inner in path.iterdir() if inner.is_file()):
                 total.update(f"{file.name}\0{content_digest(file)}\n".encode())
             return total.hexdigest()
         with open_input(path, noted=noted) as opened:
@@ -260,7 +190,7 @@ def _world_digest(known: dict[Path, str], path: Path) -> str:
     named = {file for file in candidates if os.path.isfile(file)}
     for file in named - known.keys():
         its_files = [file, *sorted(set(mesh_files(file)))]
-        known[file] = "\n".join(content_digest(each) for each in its_files)
+        known[file] = "\n".join(map(content_digest, its_files))
     digests = [content_digest(path), *(known[file] for file in sorted(named))]
     return hashlib.sha256("\n".join(digests).encode()).hexdigest()
 

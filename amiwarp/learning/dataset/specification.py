@@ -84,7 +84,7 @@ def _sensors(value: Any, name: str) -> dict[str, SensorModel]:
             f"{name} is {shown(value)}; expected a list of at least one entry", ErrorCode.FIELD
         )
     known = tuple(f.name for f in fields(SensorModel))
-    found: dict[str, SensorModel] = {}
+    sensors: dict[str, SensorModel] = {}
     for k, entry in enumerate(value):
         where = f"sensors[{k}]"
         table = {"name": entry, "preset": entry} if isinstance(entry, str) else entry
@@ -96,14 +96,14 @@ def _sensors(value: Any, name: str) -> dict[str, SensorModel]:
                 raise AmiwarpError(
                     f"field {where}.{key} is {shown(text)}; expected text", ErrorCode.FIELD
                 )
-        if own in found:
+        if own in sensors:
             raise AmiwarpError(
                 f"field {where} has the name {own!r} of another sensor; give it its own name",
                 ErrorCode.FIELD,
             )
         base = at_field(where, partial(_sensor, preset))
-        found[own] = with_fields(base, given, where)
-    return found
+        sensors[own] = with_fields(base, given, where)
+    return sensors
 
 
 def _sensor(preset: str) -> SensorModel:
@@ -208,10 +208,13 @@ class OutputEntry:
     @property
     def windows(self) -> dict[str, Any]:
         """Arguments of :func:`amiwarp.windows`; none for one tensor of all events."""
-        found: dict[str, int | None] = {"duration_us": self.window_us, "count": self.window_events}
+        arguments: dict[str, int | None] = {
+            "duration_us": self.window_us,
+            "count": self.window_events,
+        }
         if self.window_us is not None:
-            found |= {"t_start": self.t_start, "t_end": self.t_end}
-        return {name: value for name, value in found.items() if value is not None}
+            arguments |= {"t_start": self.t_start, "t_end": self.t_end}
+        return {name: value for name, value in arguments.items() if value is not None}
 
 
 @dataclass(frozen=True)

@@ -148,10 +148,10 @@ def _make(job: Job) -> Made:
         path.stat().st_size,
         digest,
         *written,
-        round(time.perf_counter() - began, 6),
-        round(time.process_time() - began_processor, 6),
-        device,
-        __version__,
+        seconds=round(time.perf_counter() - began, 6),
+        processor_s=round(time.process_time() - began_processor, 6),
+        device=device,
+        amiwarp=__version__,
     )
 
 
@@ -179,18 +179,17 @@ def _write_existing(item: Item, path: Path, device: str) -> tuple[int, float, in
     """Write what a source of the kind ``recordings`` gives, as :func:`write_recording` does."""
     source = item.folder / item.source
     if item.output is None:
-        done = convert(source, path, overwrite=True)
-        count = done.events
-        first = done.t_first
-        last = done.t_last
-        size = (done.width, done.height)
-    else:
-        events = open_recording(source).events
-        count = len(events)
-        size = events.size
-        first, last = (events.t_first, events.t_last) if count else (None, None)
-        save_tensors(path, _tensors(events.slice(0, count), size, item.output, device=device))
-    return count, 0.0 if first is None or last is None else (last - first) * 1e-6, *size
+        converted = convert(source, path, overwrite=True)
+        duration_s = 0.0
+        if converted.t_first is not None and converted.t_last is not None:
+            duration_s = (converted.t_last - converted.t_first) * 1e-6
+        return converted.events, duration_s, converted.width, converted.height
+    events = open_recording(source).events
+    count = len(events)
+    duration_s = (events.t_last - events.t_first) * 1e-6 if count else 0.0
+    tensors = _tensors(events.slice(0, count), events.size, item.output, device=device)
+    save_tensors(path, tensors)
+    return count, duration_s, *events.size
 
 
 def _write_simulated_tensors(
@@ -220,10 +219,14 @@ def _tensors(
     events: Events | DeviceEvents, size: tuple[int, int], output: spec.OutputEntry, **options: Any
 ) -> dict[str, NDArray[Any]]:
     """Return the tensors of a recording by name: ``tensor``, and the times of its windows if there are several."""
-    found = windows(events, **output.windows) if output.windows else None
-    tensor = output.function(events, *size, windows=found, **output.options, **options)
-    times = {} if found is None else {"t_start": found.t_start, "t_end": found.t_end}
-    return {"tensor": tensor if isinstance(tensor, np.ndarray) else tensor.numpy(), **times}
+    cut = windows(events, **output.windows) if output.windows else None
+    tensor = output.function(events, *size, windows=cut, **output.options, **options)
+    if not isinstance(tensor, np.ndarray):
+        tensor = tensor.numpy()
+    arrays = {"tensor": tensor}
+    if cut is not None:
+        arrays |= {"t_start": cut.t_start, "t_end": cut.t_end}
+    return arrays
 
 
 def simulation_of(item: Item, device: str, duration_s: float | None = None) -> Simulation:
@@ -243,46 +246,23 @@ def _seen_through(
     camera = spec.CameraEntry(**recipe["camera"])
     source = os.fspath(item.folder / item.source)
     length = recipe["duration_s"] if duration_s is None else duration_s
-    sensor = SensorModel(
-        **{name: value for name, value in recipe["sensor"].items() if name != "name"}
-    )
+    sensor_values = {name: value for name, value in recipe["sensor"].items() if name != "name"}
+    common: dict[str, Any] = {
+        "prism": prism,
+        "duration_s": length,
+        "motion": motion,
+        "sensor": SensorModel(**sensor_values),
+        "seed": item.seed,
+        "device": device,
+    }
     if item.kind == "translated":
-        return translation(
-            open_recording(source),
-            prism,
-            duration_s=length,
-            motion=motion,
-            sensor=sensor,
-            seed=item.seed,
-            device=device,
-        )
+        return translation(open_recording(source), **common)
     if item.kind == "videos":
-        return _of_video(
-            item,
-            source,
-            camera,
-            duration_s=length,
-            prism=prism,
-            motion=motion,
-            sensor=sensor,
-            seed=item.seed,
-            device=device,
-        )
+        return _of_video(item, source, camera, **common)
     scene = Scene.from_picture(source) if item.kind == "pictures" else _world(item, source)
-    turning = CameraMotion(
-        [math.radians(rate) for rate in recipe.get("rotate_deg_s", (0.0, 0.0, 0.0))]
-    )
-    return Simulation(
-        scene,
-        camera.build(),
-        prism,
-        length,
-        motion,
-        turning,
-        sensor=sensor,
-        seed=item.seed,
-        device=device,
-    )
+    rates_deg = recipe.get("rotate_deg_s", (0.0, 0.0, 0.0))
+    camera_motion = CameraMotion([math.radians(rate) for rate in rates_deg])
+    return Simulation(scene, camera.build(), camera_motion=camera_motion, **common)
 
 
 def _of_video(item: Item, source: str, entry: spec.CameraEntry, **settings: Any) -> Simulation:

@@ -28,33 +28,36 @@ def interpolate_maps(
     ``before``, ``after``, ``to``: indices of the first texels of the three maps; ``weight``: weight of ``after``.
     """
     i = start + wp.tid()
-    a = maps[before + i]
-    maps[to + i] = a + weight * (maps[after + i] - a)
+    value = maps[before + i]
+    maps[to + i] = value + weight * (maps[after + i] - value)
     faces[to + i] = faces[wp.where(weight < 0.5, before, after) + i]
 
 
 @wp.func
 def meets_ball(origin: wp.vec3, direction: wp.vec3, centre: wp.vec3, radius: float) -> bool:
     """Return whether a ray along a unit vector hits a ball or starts inside the ball."""
-    to = centre - origin
-    along = wp.max(wp.dot(to, direction), 0.0)
-    return wp.length_sq(to - along * direction) <= radius * radius
+    to_centre = centre - origin
+    along = wp.max(wp.dot(to_centre, direction), 0.0)
+    return wp.length_sq(to_centre - along * direction) <= radius * radius
 
 
 @wp.func
-def meets_box(o: wp.vec3, d: wp.vec3, lower: wp.vec3, upper: wp.vec3, slack: float) -> bool:
+def meets_box(
+    origin: wp.vec3, direction: wp.vec3, lower: wp.vec3, upper: wp.vec3, slack: float
+) -> bool:
     """Return whether a ray hits a box, enlarged by ``slack`` [m] on all sides, or starts inside the box.
 
-    ``o``, ``d``: origin and direction of the ray in the frame of the box.
+    ``origin``, ``direction``: the ray in the frame of the box; ``lower``, ``upper``: opposite corners of the box [m].
     """
     enters = float(0.0)
     leaves = float(FAR)
-    for k in range(3):
-        step = wp.where(wp.abs(d[k]) > 1.0e-9, d[k], 1.0e-9)
-        a = (lower[k] - slack - o[k]) / step
-        b = (upper[k] + slack - o[k]) / step
-        enters = wp.max(enters, wp.min(a, b))
-        leaves = wp.min(leaves, wp.max(a, b))
+    for axis in range(3):
+        # A ray along the sides counts as slightly inclined.
+        step = wp.where(wp.abs(direction[axis]) > 1.0e-9, direction[axis], 1.0e-9)
+        to_lower = (lower[axis] - slack - origin[axis]) / step
+        to_upper = (upper[axis] + slack - origin[axis]) / step
+        enters = wp.max(enters, wp.min(to_lower, to_upper))
+        leaves = wp.min(leaves, wp.max(to_lower, to_upper))
     return enters <= leaves
 
 
@@ -72,10 +75,9 @@ def passes_mover(
             margin = slack + spread * wp.length(world.centres[k, m] - origin)
             if meets_ball(origin, direction, world.centres[k, m], mover.radius + margin):
                 pose = world.poses[k, m]
-                o = wp.transpose(pose.rotation) * (origin - pose.position)
-                if meets_box(
-                    o, wp.transpose(pose.rotation) * direction, mover.lower, mover.upper, margin
-                ):
+                to_body = wp.transpose(pose.rotation)
+                from_body = to_body * (origin - pose.position)
+                if meets_box(from_body, to_body * direction, mover.lower, mover.upper, margin):
                     return True
     return False
 
@@ -92,21 +94,22 @@ def shadow_passes_mover(world: World, instants: int, place: wp.vec3, slack: floa
     for k in range(world.lamps.shape[0]):
         lamp = world.lamps[k]
         if lamp.shadows == 1:
-            if passes_mover(
-                world, instants, place, wp.normalize(lamp.position - place), slack, 0.0
-            ):
+            to_lamp = wp.normalize(lamp.position - place)
+            if passes_mover(world, instants, place, to_lamp, slack, 0.0):
                 return True
     return False
 
 
 @wp.func
-def mover_changes(world: World, f: MapFrame, instants: int, face: int, direction: wp.vec3) -> bool:
+def mover_changes(
+    world: World, frame: MapFrame, instants: int, face: int, direction: wp.vec3
+) -> bool:
     """Return whether a moving body or its shadow is seen near a direction at any of the first ``instants`` instants.
 
     ``face``: number of the face that is seen in this direction; -1 for the sky.
     """
-    origin = f.pose.position
-    spread = float(TILE) * f.cone
+    origin = frame.pose.position
+    spread = float(TILE) * frame.cone
     if passes_mover(world, instants, origin, direction, 0.0, spread):
         return True
     if face < 0:
@@ -114,10 +117,10 @@ def mover_changes(world: World, f: MapFrame, instants: int, face: int, direction
     distance = meet_face(world, 0, face, origin, direction)[0]
     if distance == FAR:
         return False
-    a = world.corners[3 * face]
-    normal = wp.normalize(
-        wp.cross(world.corners[3 * face + 1] - a, world.corners[3 * face + 2] - a)
-    )
+    corner = world.corners[3 * face]
+    side = world.corners[3 * face + 1] - corner
+    other_side = world.corners[3 * face + 2] - corner
+    normal = wp.normalize(wp.cross(side, other_side))
     slack = distance * spread / wp.max(wp.abs(wp.dot(normal, direction)), LEAST_SLANT)
     return shadow_passes_mover(world, instants, origin + distance * direction, slack)
 
@@ -125,7 +128,7 @@ def mover_changes(world: World, f: MapFrame, instants: int, face: int, direction
 @wp.kernel
 def mark_tiles(
     world: World,
-    f: MapFrame,
+    frame: MapFrame,
     faces: wp.array(dtype=int),
     instants: int,
     start: int,
@@ -133,14 +136,14 @@ def mark_tiles(
 ):
     """Mark the tiles that a moving body or its shadow may touch at any of the first ``instants`` instants.
 
-    Each tile is tested at its centre, with the faces of the map at ``f.first`` and margins of the width of a tile.
+    Each tile is tested at its centre, with the faces of the map at ``frame.first`` and margins of the width of a tile.
     """
     tile = start + wp.tid()
-    across = (f.width + TILE - 1) / TILE
-    row = wp.min(tile / across * TILE + TILE / 2, f.height - 1)
-    col = wp.min(tile % across * TILE + TILE / 2, f.width - 1)
-    face = faces[f.first + row * f.width + col]
-    direction = map_direction(f, float(col), float(row))
+    across = (frame.width + TILE - 1) / TILE
+    row = wp.min(tile / across * TILE + TILE / 2, frame.height - 1)
+    col = wp.min(tile % across * TILE + TILE / 2, frame.width - 1)
+    face = faces[frame.first + row * frame.width + col]
+    direction = map_direction(frame, float(col), float(row))
     marks[tile] = wp.where(
-        mover_changes(world, f, instants, face, direction), wp.uint8(1), wp.uint8(0)
+        mover_changes(world, frame, instants, face, direction), wp.uint8(1), wp.uint8(0)
     )

@@ -35,65 +35,69 @@ class MapFrame:
 
 
 @wp.func
-def texel_of_tile(f: MapFrame, k: int) -> int:
-    """Return the index of the texel that thread ``k`` computes; -1 if the texel lies outside of the map."""
-    tile = f.tiles[k / (TILE * TILE)]
-    texel = k % (TILE * TILE)
-    return place_in_tile(f.width, f.height, tile * TILE * TILE + texel)
+def texel_of_tile(frame: MapFrame, thread: int) -> int:
+    """Return the index of the texel that a thread computes; -1 if the texel lies outside of the map."""
+    tile = frame.tiles[thread / (TILE * TILE)]
+    texel = thread % (TILE * TILE)
+    return place_in_tile(frame.width, frame.height, tile * TILE * TILE + texel)
 
 
 @wp.func
-def map_direction(f: MapFrame, x: float, y: float) -> wp.vec3:
+def map_direction(frame: MapFrame, x: float, y: float) -> wp.vec3:
     """Return the unit vector in the world's frame through texel coordinates; whole numbers are texel centres."""
-    plane = wp.vec3(f.left + (x + 0.5) / f.pitch_x, f.top + (y + 0.5) / f.pitch_y, 1.0)
-    return f.pose.rotation * wp.normalize(plane)
+    plane = wp.vec3(
+        frame.left + (x + 0.5) / frame.pitch_x, frame.top + (y + 0.5) / frame.pitch_y, 1.0
+    )
+    return frame.pose.rotation * wp.normalize(plane)
 
 
 @wp.kernel
-def render_map(world: World, f: MapFrame, start: int, faces: wp.array(dtype=int), out: FirstHits):
+def render_map(
+    world: World, frame: MapFrame, start: int, faces: wp.array(dtype=int), out: FirstHits
+):
     """Cast one ray through the centre of each texel of the tiles, and store the result and the face."""
-    i = texel_of_tile(f, start + wp.tid())
+    i = texel_of_tile(frame, start + wp.tid())
     if i < 0:
         return
-    row = i / f.width
-    direction = map_direction(f, float(i - row * f.width), float(row))
-    hit = cast(world, f.instant, f.pose.position, direction, FAR)
-    white = illumination(world, f.instant, f.pose.position, direction, hit)
+    row = i / frame.width
+    direction = map_direction(frame, float(i - row * frame.width), float(row))
+    hit = cast(world, frame.instant, frame.pose.position, direction, FAR)
+    white = illumination(world, frame.instant, frame.pose.position, direction, hit)
     out.white[i] = white
-    out.light[i] = luminance(world, direction, hit, f.cone, white)
+    out.light[i] = luminance(world, direction, hit, frame.cone, white)
     out.normal[i] = hit.normal
     out.face[i] = hit.face
-    faces[f.first + i] = hit.face
+    faces[frame.first + i] = hit.face
 
 
 @wp.kernel
 def smooth_edges(
-    world: World, f: MapFrame, hits: FirstHits, start: int, out: wp.array(dtype=float)
+    world: World, frame: MapFrame, hits: FirstHits, start: int, out: wp.array(dtype=float)
 ):
     """Replace the luminance of texels on edges by the mean of several rays.
 
     Textures need no further rays, because each ray averages the texture over the ray's angular width.
     """
-    i = texel_of_tile(f, start + wp.tid())
+    i = texel_of_tile(frame, start + wp.tid())
     if i < 0:
         return
     value = float(hits.light[i])
-    if on_edge(world, hits, 0, f.width, f.height, 1, i):
-        row = i / f.width
-        col = i - row * f.width
+    if on_edge(world, hits, 0, frame.width, frame.height, 1, i):
+        row = i / frame.width
+        col = i - row * frame.width
         value = float(0.0)
-        rays = f.offsets.shape[0]
+        rays = frame.offsets.shape[0]
         for k in range(rays):
-            offset = f.offsets[k]
-            direction = map_direction(f, float(col) + offset[0], float(row) + offset[1])
-            light = radiance(world, f.instant, f.pose.position, direction, f.cone)
+            offset = frame.offsets[k]
+            direction = map_direction(frame, float(col) + offset[0], float(row) + offset[1])
+            light = radiance(world, frame.instant, frame.pose.position, direction, frame.cone)
             value += light / float(rays)
     out[i] = value
 
 
 @wp.kernel
 def blur_lines(
-    f: MapFrame,
+    frame: MapFrame,
     image: wp.array(dtype=float),
     weights: wp.array(dtype=float),
     across: int,
@@ -104,43 +108,50 @@ def blur_lines(
 
     Texels on the border are repeated.
     """
-    i = texel_of_tile(f, start + wp.tid())
+    i = texel_of_tile(frame, start + wp.tid())
     if i < 0:
         return
-    row = i / f.width
-    col = i - row * f.width
+    row = i / frame.width
+    col = i - row * frame.width
     half = weights.shape[0] / 2
     total = float(0.0)
     for k in range(weights.shape[0]):
-        c = wp.clamp(col + wp.where(across == 0, k - half, 0), 0, f.width - 1)
-        r = wp.clamp(row + wp.where(across == 1, k - half, 0), 0, f.height - 1)
-        total += weights[k] * image[r * f.width + c]
+        near_col = wp.clamp(col + wp.where(across == 0, k - half, 0), 0, frame.width - 1)
+        near_row = wp.clamp(row + wp.where(across == 1, k - half, 0), 0, frame.height - 1)
+        total += weights[k] * image[near_row * frame.width + near_col]
     out[i] = total
 
 
 @wp.func
-def log_texel(f: MapFrame, light: wp.array(dtype=float), col: int, row: int, dark: float) -> float:
+def log_texel(
+    frame: MapFrame, light: wp.array(dtype=float), col: int, row: int, dark: float
+) -> float:
     """Return the log intensity of a texel; texels on the right and lower border are repeated."""
-    c = wp.min(col, f.width - 1)
-    r = wp.min(row, f.height - 1)
-    return wp.log(light[r * f.width + c] + dark)
+    inside_col = wp.min(col, frame.width - 1)
+    inside_row = wp.min(row, frame.height - 1)
+    return wp.log(light[inside_row * frame.width + inside_col] + dark)
 
 
 @wp.kernel
 def log_pieces(
-    f: MapFrame, light: wp.array(dtype=float), dark: float, start: int, out: wp.array(dtype=wp.vec4)
+    frame: MapFrame,
+    light: wp.array(dtype=float),
+    dark: float,
+    start: int,
+    out: wp.array(dtype=wp.vec4),
 ):
     """Compute the four coefficients of bilinear interpolation of the log intensity at each texel.
 
     The coefficients are the factors of 1, x, y and xy between the texel and its right and lower neighbours.
     """
-    i = texel_of_tile(f, start + wp.tid())
+    i = texel_of_tile(frame, start + wp.tid())
     if i < 0:
         return
-    row = i / f.width
-    col = i - row * f.width
-    a = log_texel(f, light, col, row, dark)
-    b = log_texel(f, light, col + 1, row, dark) - a
-    c = log_texel(f, light, col, row + 1, dark) - a
-    d = log_texel(f, light, col + 1, row + 1, dark) - a - b - c
-    out[f.first + i] = wp.vec4(a, b, c, d)
+    row = i / frame.width
+    col = i - row * frame.width
+    constant = log_texel(frame, light, col, row, dark)
+    along_x = log_texel(frame, light, col + 1, row, dark) - constant
+    along_y = log_texel(frame, light, col, row + 1, dark) - constant
+    diagonal = log_texel(frame, light, col + 1, row + 1, dark)
+    mixed = diagonal - constant - along_x - along_y
+    out[frame.first + i] = wp.vec4(constant, along_x, along_y, mixed)

@@ -87,7 +87,7 @@ class SeenSurfaces:
 
 
 @wp.struct
-class Met:
+class FaceHit:
     """Face that a ray hits, and the distance to this face."""
 
     face: int  # number of the face; -1 for the sky
@@ -95,19 +95,21 @@ class Met:
 
 
 @wp.func
-def between(a: Pose, b: Pose, share: float) -> Pose:
+def pose_between(before: Pose, after: Pose, share: float) -> Pose:
     """Interpolate between two poses that differ little.
 
-    ``share``: fraction of the way from ``a`` to ``b``. The error of the rotation is of third order in the angle.
+    ``share``: fraction of the way from ``before`` to ``after``. The error of the rotation is of third order in the
+    angle.
     """
-    p = Pose()
-    p.position = a.position + share * (b.position - a.position)
-    r = a.rotation + share * (b.rotation - a.rotation)
-    x = wp.normalize(wp.vec3(r[0, 0], r[1, 0], r[2, 0]))
-    y = wp.vec3(r[0, 1], r[1, 1], r[2, 1])
+    pose = Pose()
+    pose.position = before.position + share * (after.position - before.position)
+    mean = before.rotation + share * (after.rotation - before.rotation)
+    # Its columns are made unit vectors again, at right angles to each other.
+    x = wp.normalize(wp.vec3(mean[0, 0], mean[1, 0], mean[2, 0]))
+    y = wp.vec3(mean[0, 1], mean[1, 1], mean[2, 1])
     y = wp.normalize(y - wp.dot(x, y) * x)
-    p.rotation = wp.matrix_from_cols(x, y, wp.cross(x, y))
-    return p
+    pose.rotation = wp.matrix_from_cols(x, y, wp.cross(x, y))
+    return pose
 
 
 @wp.func
@@ -116,11 +118,12 @@ def texel_near(view: View, steps: Steps, k: int, ray: wp.vec3) -> int:
 
     The texel belongs to the map nearest in time to instant ``k``. ``ray``: direction in the camera's frame.
     """
-    at = steps.at[k]
-    h = at.to_texel * (wp.transpose(view.prism.axis) * ray)
-    col = wp.clamp(int(h[0] / h[2] + 0.5), 1, view.width - 2)
-    row = wp.clamp(int(h[1] / h[2] + 0.5), 1, view.height - 2)
-    slot = wp.where(at.weight > 0.5, at.after, at.before)
+    step = steps.at[k]
+    # Homogeneous coordinates of the texel
+    texel = step.to_texel * (wp.transpose(view.prism.axis) * ray)
+    col = wp.clamp(int(texel[0] / texel[2] + 0.5), 1, view.width - 2)
+    row = wp.clamp(int(texel[1] / texel[2] + 0.5), 1, view.height - 2)
+    slot = wp.where(step.weight > 0.5, step.after, step.before)
     return (slot * view.height + row) * view.width + col
 
 
@@ -133,39 +136,39 @@ def meet_near(
     width: int,
     origin: wp.vec3,
     direction: wp.vec3,
-) -> Met:
+) -> FaceHit:
     """Return the nearest face that a ray hits among the faces of a texel and its eight neighbours.
 
     The distance is FAR if the ray hits none of these faces, or if the texels see several bodies: the ray may then hit
     a face that lies between texels. ``width``: width of a map [texels].
     """
-    met = Met()
-    met.face = -1
-    met.distance = FAR
+    hit = FaceHit()
+    hit.face = -1
+    hit.distance = FAR
     body = body_of(world, faces[texel])
     last = int(-1)
     for k in range(9):
         face = faces[texel + (k / 3 - 1) * width + k % 3 - 1]
         if face != last:
             if body_of(world, face) != body or body < 0:
-                met.distance = FAR
-                return met
+                hit.distance = FAR
+                return hit
             last = face
             distance = meet_face(world, instant, face, origin, direction)[0]
-            if distance < met.distance:
-                met.face = face
-                met.distance = distance
-    return met
+            if distance < hit.distance:
+                hit.face = face
+                hit.distance = distance
+    return hit
 
 
 @wp.func
-def meet_anywhere(world: World, instant: int, origin: wp.vec3, direction: wp.vec3) -> Met:
+def meet_anywhere(world: World, instant: int, origin: wp.vec3, direction: wp.vec3) -> FaceHit:
     """Return the nearest face of the whole world that a ray hits."""
-    hit = cast(world, instant, origin, direction, FAR)
-    met = Met()
-    met.face = hit.face
-    met.distance = hit.distance
-    return met
+    nearest = cast(world, instant, origin, direction, FAR)
+    hit = FaceHit()
+    hit.face = nearest.face
+    hit.distance = nearest.distance
+    return hit
 
 
 @wp.kernel
@@ -190,20 +193,20 @@ def find_seen_surfaces(
     k = wp.clamp(ticks[i] / steps.ticks, 0, steps.margin + steps.count - 1)
     share = wp.clamp(float(ticks[i] - k * steps.ticks) / float(steps.ticks), 0.0, 1.0)
     ray = pixel_to_ray(view.camera, points[i])
-    pose = between(poses[k], poses[k + 1], share)
+    pose = pose_between(poses[k], poses[k + 1], share)
     direction = pose.rotation * ray
     nearest = k + int(share + 0.5)
-    met = Met()
-    met.distance = FAR
+    hit = FaceHit()
+    hit.distance = FAR
     if faces.shape[0] > 0:
         texel = texel_near(view, steps, nearest, ray)
-        met = meet_near(world, nearest, faces, texel, view.width, pose.position, direction)
-    if met.distance == FAR:
-        met = meet_anywhere(world, nearest, pose.position, direction)
-    out.instance[i] = wp.uint16(instance_of(world, met.face))
-    out.depth[i] = wp.where(met.face < 0, wp.inf, met.distance * ray[2])
+        hit = meet_near(world, nearest, faces, texel, view.width, pose.position, direction)
+    if hit.distance == FAR:
+        hit = meet_anywhere(world, nearest, pose.position, direction)
+    out.instance[i] = wp.uint16(instance_of(world, hit.face))
+    out.depth[i] = wp.where(hit.face < 0, wp.inf, hit.distance * ray[2])
     out.place[i] = wp.where(
-        met.face < 0, wp.vec3(NAN, NAN, NAN), pose.position + met.distance * direction
+        hit.face < 0, wp.vec3(NAN, NAN, NAN), pose.position + hit.distance * direction
     )
 
 
@@ -226,18 +229,18 @@ def find_surfaces_through_plate(
     share = wp.clamp(float(ticks[i] - k * steps.ticks) / float(steps.ticks), 0.0, 1.0)
     angle = steps.angle[k] + steps.turn[k] * share
     ray = pixel_to_ray(view.camera, points[i])
-    pose = between(view.poses[k], view.poses[k + 1], share)
+    pose = pose_between(view.poses[k], view.poses[k + 1], share)
     azimuth = wp.vec2(wp.cos(angle), wp.sin(angle))
     centre = seen_from(view.plate, ray[0], ray[1], ray[2], azimuth)
     ray = bent_by_wedge(view.plate, ray[0], ray[1], ray[2], azimuth)
-    met = meet_anywhere(
+    hit = meet_anywhere(
         world, k + int(share + 0.5), pose.position + pose.rotation * centre, pose.rotation * ray
     )
-    place = centre + met.distance * ray
-    out.instance[i] = wp.uint16(instance_of(world, met.face))
-    out.depth[i] = wp.where(met.face < 0, wp.inf, place[2])
+    place = centre + hit.distance * ray
+    out.instance[i] = wp.uint16(instance_of(world, hit.face))
+    out.depth[i] = wp.where(hit.face < 0, wp.inf, place[2])
     out.place[i] = wp.where(
-        met.face < 0, wp.vec3(NAN, NAN, NAN), pose.position + pose.rotation * place
+        hit.face < 0, wp.vec3(NAN, NAN, NAN), pose.position + pose.rotation * place
     )
-    if met.face >= 0:
+    if hit.face >= 0:
         points[i] = ray_to_pixel(view.camera, place)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,10 @@ PAD = 16
 """Border of the image of warped events [px]."""
 
 
+Rates: TypeAlias = tuple[float, float, float]
+"""Angular velocity about the camera's axes [rad/s], or its change [rad/s²]."""
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
     """A time window and the camera's angular velocity in it."""
@@ -59,9 +64,9 @@ class Window:
     """Start [us]."""
     length_us: int
     """Length [us]."""
-    rates: tuple[float, float, float]
+    rates: Rates
     """Angular velocity of the camera at the middle [rad/s]."""
-    acceleration: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    acceleration: Rates = (0.0, 0.0, 0.0)
     """Angular acceleration of the camera [rad/s²]."""
 
     @property
@@ -69,7 +74,7 @@ class Window:
         """Rotation of the camera about the middle."""
         return CameraRotation(self.rates, self.acceleration, self.middle_us)
 
-    def moves_px(self, camera: Camera) -> float:
+    def motion_px(self, camera: Camera) -> float:
         """Return the motion of the image in the window [px]."""
         x, y, z = self.rates
         speed = math.hypot(camera.fy * x, camera.fx * y) + 0.25 * camera.width * abs(z)
@@ -94,32 +99,35 @@ def find_motion(
     The windows are as long as the image takes to move by :data:`MOTION_PX`. An angular velocity of 0 means that none
     was found.
     """
-    first = recording.events.t_first
-    last = recording.events.t_last
+    t_first = recording.events.t_first
+    t_last = recording.events.t_last
+    duration_us = t_last - t_first
     search = _Search(camera, device)
     windows: list[Window] = []
-    start = first
-    length = min(FIRST_US, max(last - first, 1))
-    while not windows or start < last - windows[-1].length_us // 2:
-        events = recording.events.between(start, start + length)
+    start_us = t_first
+    length_us = min(FIRST_US, max(duration_us, 1))
+    while not windows or start_us < t_last - windows[-1].length_us // 2:
+        events = recording.events.between(start_us, start_us + length_us)
         # The motion of the window before is a good start, if there was any.
-        last_rates = None
-        if windows and windows[-1].moves_px(camera) > LEAST_PX:
-            last_rates = windows[-1].rates
-        window = Window(start, length, search.run(events, start, length, last_rates))
+        rates_before = None
+        if windows and windows[-1].motion_px(camera) > LEAST_PX:
+            rates_before = windows[-1].rates
+        rates = search.run(events, start_us, length_us, rates_before)
+        window = Window(start_us, length_us, rates)
 
-        speed = window.moves_px(camera) / length  # px per microsecond
-        length = round(float(np.clip(MOTION_PX / max(speed, 1e-9), *WINDOW_US)))
+        px_per_us = window.motion_px(camera) / length_us
+        length_us = round(float(np.clip(MOTION_PX / max(px_per_us, 1e-9), *WINDOW_US)))
 
         # If the first window was too short to find a motion, try once more with a longer one.
-        small = window.moves_px(camera) < 2.0 * LEAST_PX
-        longer = length >= 2 * window.length_us and last - first > window.length_us
-        if not windows and small and longer:
+        hardly_moves = window.motion_px(camera) < 2.0 * LEAST_PX
+        can_be_longer = length_us >= 2 * window.length_us and duration_us > window.length_us
+        if not windows and hardly_moves and can_be_longer:
             continue
         windows.append(window)
-        start += window.length_us // 2
+        start_us += window.length_us // 2
         if progress is not None:
-            progress("finding the motion", min(1.0, (start - first) / max(last - first, 1)))
+            share = (start_us - t_first) / max(duration_us, 1)
+            progress("finding the motion", min(1.0, share))
     return _with_acceleration(windows)
 
 
@@ -164,49 +172,61 @@ class _Search:
             )
 
     def run(
-        self, events: Events, start: int, length: int, last: tuple[float, float, float] | None
-    ) -> tuple[float, float, float]:
-        """Return the angular velocity [rad/s] for which the image of warped events is sharpest."""
-        from scipy.optimize import minimize
+        self, events: Events, start_us: int, length_us: int, rates_before: Rates | None
+    ) -> Rates:
+        """Return the angular velocity for which the image of warped events of a window is sharpest.
 
+        ``rates_before``: the angular velocity in the window before, or None if that is no good start.
+        """
         if len(events) < LEAST_EVENTS:
             return (0.0, 0.0, 0.0)
-        middle = start + length // 2
+        middle_us = start_us + length_us // 2
         stride = math.ceil(len(events) / MOST_EVENTS)
-        encoder = still_encoder(start, start + length)
-        arrays = upload_events(events[::stride], encoder, self._device, middle_us=middle)
-        unit = 1e6 / (self._camera.fx * length)  # moves the image by one pixel in the window
+        encoder = still_encoder(start_us, start_us + length_us)
+        arrays = upload_events(events[::stride], encoder, self._device, middle_us=middle_us)
+        # Rates are searched in units that move the image by one pixel in the window.
+        unit = 1e6 / (self._camera.fx * length_us)
 
-        def cost(rates: NDArray[np.float64], smoothing: float = FINE_PX) -> float:
-            x, y, z = (unit * rates).tolist()
-            rotation = CameraRotation((x, y, z), middle_us=middle)
+        def cost(rates_px: NDArray[np.float64], smoothing: float = FINE_PX) -> float:
+            x, y, z = (unit * rates_px).tolist()
+            rotation = CameraRotation((x, y, z), middle_us=middle_us)
             meter = self._meters[smoothing]
             self._votes.clear()
             self._votes.add_events(self._model, arrays, camera_rotation=rotation)
             self._votes.read(meter.image)
             return -meter.measure()
 
-        starts = self._starts() if last is None else []
-        starts.append(np.zeros(3))
-        if last is not None:
-            starts.append(np.array(last) / unit)
-        starts.sort(key=lambda rates: cost(rates, COARSE_PX))
+        starts = [np.zeros(3)]
+        if rates_before is None:
+            starts = [*_starts(), *starts]
+        else:
+            starts.append(np.array(rates_before) / unit)
+        starts.sort(key=lambda rates_px: cost(rates_px, COARSE_PX))
 
-        simplex = np.vstack([np.zeros(3), 1.5 * np.eye(3)])
-        runs: list[Any] = []
-        for at in starts[:BEST]:
-            options: Any = {
-                "initial_simplex": at + simplex,
-                "xatol": TOLERANCE_PX,
-                "fatol": 0.0,
-                "maxfev": EVALUATIONS,
-            }
-            runs.append(minimize(cost, at, method="Nelder-Mead", options=options))
-        best = min(runs, key=lambda run: float(run.fun))
+        optima = [_refined(cost, start) for start in starts[:BEST]]
+        best = min(optima, key=lambda optimum: float(optimum.fun))
         x, y, z = (unit * best.x).tolist()
         return x, y, z
 
-    @staticmethod
-    def _starts() -> list[NDArray[np.float64]]:
-        angles = np.arange(8) * (math.tau / 8)
-        return [size * np.array([np.cos(a), np.sin(a), 0.0]) for size in STARTS_PX for a in angles]
+
+def _starts() -> list[NDArray[np.float64]]:
+    """Return the starts of a search without a known motion, in eight directions [px in the window]."""
+    starts = []
+    for size in STARTS_PX:
+        for angle in np.arange(8) * (math.tau / 8):
+            starts.append(size * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    return starts
+
+
+def _refined(cost: Callable[..., float], start: NDArray[np.float64]) -> Any:
+    """Return SciPy's result of a search for the lowest cost from a start [px in the window]."""
+    from scipy.optimize import minimize
+
+    simplex = np.vstack([np.zeros(3), 1.5 * np.eye(3)])
+    options: Any = {
+        "initial_simplex": start + simplex,
+        "xatol": TOLERANCE_PX,
+        "fatol": 0.0,
+        "maxfev": EVALUATIONS,
+    }
+    return minimize(cost, start, method="Nelder-Mead", options=options)

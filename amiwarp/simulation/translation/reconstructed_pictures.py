@@ -114,7 +114,7 @@ class ReconstructedPictures(KnownPictures):
         width, height = self.size
         grey = np.full((height, width), np.log(MEDIAN_LIGHT), np.float32)
         nothing = (t, grey, np.zeros((height, width), np.bool_))
-        if window.moves_px(self._source) < LEAST_PX:
+        if window.motion_px(self._source) < LEAST_PX:
             return nothing
         self._work.camera_rotation = window.rotation
         try:

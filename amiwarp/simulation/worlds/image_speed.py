@@ -70,8 +70,8 @@ def parallax_speed(
     velocity = (position_after - position) / MOMENT_S
     if not velocity.any():
         return 0.0
-    seen = surfaces_at(world, pixel_rays(small_camera(camera)), rotation, position, instant)
-    near = seen.place[np.isfinite(seen.depth)].astype(np.float64) - position
+    surfaces = surfaces_at(world, pixel_rays(small_camera(camera)), rotation, position, instant)
+    near = surfaces.place[np.isfinite(surfaces.depth)].astype(np.float64) - position
     if not len(near):
         return 0.0
     distance = np.maximum(np.linalg.norm(near, axis=1), NEAREST_M)
@@ -92,8 +92,8 @@ def largest_inverse_depth(
     rotations, positions = trajectory.poses(times)
     nearest = math.inf
     for k, (rotation, position) in enumerate(zip(rotations, positions, strict=True)):
-        seen = surfaces_at(world, rays, rotation, position, k)
-        nearest = min(nearest, float(seen.depth.min()))
+        surfaces = surfaces_at(world, rays, rotation, position, k)
+        nearest = min(nearest, float(surfaces.depth.min()))
     return SAFETY / max(nearest, NEAREST_M)
 
 

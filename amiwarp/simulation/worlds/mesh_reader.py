@@ -108,8 +108,8 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
     turn = real(scale, "mesh scale", 1e-9, 1e9) * rotation
     _check_trimesh(path)
     with errors_name(path, lambda: "cannot be read as a mesh"):
-        found, arrays = _called(path, kind, turn)
-        parts = [_received(about, arrays) for about in found["parts"]]
+        answer, arrays = _called(path, kind, turn)
+        parts = [_received(about, arrays) for about in answer["parts"]]
     if not parts:
         raise AmiwarpError(
             f"{path}: holds no faces; give a file with triangles, not points or lines alone"
@@ -125,10 +125,10 @@ def mesh_files(path: Path) -> list[Path]:
     _check_trimesh(path)
     try:
         with errors_name(path, lambda: "cannot be read as a mesh"):
-            found, _ = _called(path, kind, np.eye(3))
+            answer, _ = _called(path, kind, np.eye(3))
     except AmiwarpError:
         return []
-    return [Path(file) for file in found["files"]]
+    return [Path(file) for file in answer["files"]]
 
 
 def _check_trimesh(path: Path) -> None:
@@ -148,14 +148,14 @@ def _called(
     allowance = Allowance(path, path.parent) if kind == "gltf" else Allowance(path)
     process = borrow()
     try:
-        found, arrays = process.call(
+        answer, arrays = process.call(
             f"{__name__}:read_parts", path, kind, turn.tolist(), allowance=allowance
         )
     finally:
         give_back(process)
-    for file in found["files"]:
+    for file in answer["files"]:
         note_input(Path(file))
-    return found, arrays
+    return answer, arrays
 
 
 def _received(about: dict[str, Any], arrays: list[NDArray[Any]]) -> LoadedMesh:

@@ -93,10 +93,10 @@ class WorldSight:
         Places [m] and directions have the shape (n, 3).
         """
         device = self._world.device
-        given = wp.array(rays.astype(np.float32), dtype=wp.vec3, device=device)
-        places = wp.empty_like(given)
-        directions = wp.empty_like(given)
-        inputs = [self._view, wp.vec2(math.cos(angle), math.sin(angle)), given]
+        rays_on_device = wp.array(rays.astype(np.float32), dtype=wp.vec3, device=device)
+        places = wp.empty_like(rays_on_device)
+        directions = wp.empty_like(rays_on_device)
+        inputs = [self._view, wp.vec2(math.cos(angle), math.sin(angle)), rays_on_device]
         launch(find_centres, len(rays), inputs, [places, directions], device=device)
         return places.numpy(), directions.numpy()
 
@@ -121,17 +121,17 @@ class WorldSight:
 
         The shape of the array is (count, pixels). The array is valid until the next call.
         """
-        n = self._pixels
-        if len(self._light) < count * n:
-            self._light = wp.empty(count * n, dtype=float, device=self._world.device)
+        pixels = self._pixels
+        if len(self._light) < count * pixels:
+            self._light = wp.empty(count * pixels, dtype=float, device=self._world.device)
         self._reserve(min(count, INSTANTS_TOGETHER))
         for start in range(0, count, INSTANTS_TOGETHER):
             stop = min(start + INSTANTS_TOGETHER, count)
             self._batch.first = first + start
             self._batch.count = stop - start
-            self._batch.hits.light = self._light[start * n : stop * n]
+            self._batch.hits.light = self._light[start * pixels : stop * pixels]
             self._cast_batch(steps)
-        return self._light[: count * n].reshape((count, n))
+        return self._light[: count * pixels].reshape((count, pixels))
 
     def _reserve(self, count: int) -> None:
         """Allocate the arrays of a batch of ``count`` instants."""
@@ -147,22 +147,22 @@ class WorldSight:
         batch = self._batch
         view = self._view
         rays = len(view.aperture)
-        seen = [self._world.params, view, steps]
-        self._launch_rays(world_rays.cast_centres, self._tiled, seen, [batch])
+        scene = [self._world.params, view, steps]
+        self._launch_rays(world_rays.cast_centres, self._tiled, scene, [batch])
         if rays == 1:
             return
 
         # Most pixels see one smooth surface, and need no further rays; the others are listed.
-        n = self._tiled * batch.count
-        marks = self._marks[:n]
-        launch(world_rays.smooth_insides, n, [*seen, batch], [marks], device=device)
+        tiled = self._tiled * batch.count
+        marks = self._marks[:tiled]
+        launch(world_rays.smooth_insides, tiled, [*scene, batch], [marks], device=device)
         wp.utils.array_scan(marks, marks, inclusive=True)
-        launch(world_rays.list_marked, n, [marks], [self._listed], device=device)
-        listed = int(marks[n - 1 :].numpy()[0])
+        launch(world_rays.list_marked, tiled, [marks], [self._listed], device=device)
+        listed = int(marks[tiled - 1 :].numpy()[0])
 
         if len(self._cast) < listed * rays:
             self._cast = wp.empty(listed * rays * 5 // 4, dtype=float, device=device)
-        inputs = [*seen, batch, self._listed]
+        inputs = [*scene, batch, self._listed]
         self._launch_rays(world_rays.cast_edges, listed * rays, inputs, [self._cast])
         inputs = [view, batch, self._listed, self._cast]
         launch(world_rays.add_edges, listed, inputs, [], device=device)
@@ -172,25 +172,24 @@ class WorldSight:
         device = self._world.device
         launch(kernel, count, inputs, outputs, device=device, smallest=SMALLEST_LAUNCH)
 
-    def look(self, view: Any, steps: Any, block: Any, n: int, faces: Any) -> Any:
-        """Return the surfaces that ``n`` events saw, as a :class:`SeenSurfaces`.
+    def look(self, view: Any, steps: Any, block: Any, count: int, faces: Any) -> Any:
+        """Return the surfaces that ``count`` events saw, as a :class:`SeenSurfaces`.
 
         With a plate, this also finds the events' pixels without the plate, so that it can be called only once.
-
         ``view``, ``steps``: camera and instants of the chunk; ``block``: events; ``faces``: face of each texel of the
         maps, or an empty array without maps.
         """
         device = self._world.device
         world = self._world.params
-        out = visible_surfaces.SeenSurfaces()
-        out.instance = wp.empty(n, dtype=wp.uint16, device=device)
-        out.depth = wp.empty(n, dtype=float, device=device)
-        out.place = wp.empty(n, dtype=wp.vec3, device=device)
+        surfaces = visible_surfaces.SeenSurfaces()
+        surfaces.instance = wp.empty(count, dtype=wp.uint16, device=device)
+        surfaces.depth = wp.empty(count, dtype=float, device=device)
+        surfaces.place = wp.empty(count, dtype=wp.vec3, device=device)
         if self._view.plate.thickness:
             inputs = [world, self._view, steps, block.ticks]
-            outputs = [block.points, out]
-            self._launch_rays(find_surfaces_through_plate, n, inputs, outputs)
-            return out
+            outputs = [block.points, surfaces]
+            self._launch_rays(find_surfaces_through_plate, count, inputs, outputs)
+            return surfaces
         inputs = [world, view, steps, self._view.poses, faces, block.points, block.ticks]
-        self._launch_rays(find_seen_surfaces, n, inputs, [out])
-        return out
+        self._launch_rays(find_seen_surfaces, count, inputs, [surfaces])
+        return surfaces

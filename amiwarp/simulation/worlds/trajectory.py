@@ -108,13 +108,13 @@ class Trajectory:
         self._check_speed("moves", speed, LARGEST_SPEED, "m/s")
         self._check_speed("turns", rate, LARGEST_TURN_RATE, "rad/s")
 
-    def _check_speed(self, what: str, found: NDArray[np.float64], limit: float, unit: str) -> None:
+    def _check_speed(self, what: str, speeds: NDArray[np.float64], limit: float, unit: str) -> None:
         """Raise :class:`AmiwarpError` if any speed between two poses is above a limit."""
-        if found.max() > limit:
+        if speeds.max() > limit:
             t, _ = self._table()
-            at = float(t[int(np.argmax(found))])
+            at = float(t[int(np.argmax(speeds))])
             raise AmiwarpError(
-                f"trajectory {what} at {found.max():.3g} {unit} after {at:.6g} s, faster than {limit:g} {unit}; "
+                f"trajectory {what} at {speeds.max():.3g} {unit} after {at:.6g} s, faster than {limit:g} {unit}; "
                 "check the units of the times (s) and positions (m), or split the trajectory at the jump"
             )
 

@@ -195,7 +195,7 @@ def calibration_rows(
 
     Settings that fail are noted in ``failed`` by their labels, with the error.
     """
-    ways = calibration_settings(known, quick=quick)
+    all_settings = calibration_settings(known, quick=quick)
 
     def run(settings: Settings) -> Calibration | AmiwarpError:
         try:
@@ -204,15 +204,15 @@ def calibration_rows(
             return error
 
     def row(timed: Timed) -> Row | None:
-        found: Calibration | AmiwarpError | None = timed.result
-        if found is None or isinstance(found, AmiwarpError):
+        calibration: Calibration | AmiwarpError | None = timed.result
+        if calibration is None or isinstance(calibration, AmiwarpError):
             return None
         return measured_row(
-            timed, failed, lambda: (model_error(found.model, known.model).rms, None)
+            timed, failed, lambda: (model_error(calibration.model, known.model).rms, None)
         )
 
     progress("calibrating", 0.0)
-    for settings in _kinds(ways):
+    for settings in _kinds(all_settings):
         # What fails here fails in its measurement too, and is noted there.
         with contextlib.suppress(Exception):
             short = run(_shortened(settings))
@@ -221,8 +221,10 @@ def calibration_rows(
                 run(settings)
 
     tasks = []
-    for way in ways:
-        tasks.append(Task(partial(run, way.settings), len(known.events), way.fields(device)))
+    for setting in all_settings:
+        tasks.append(
+            Task(partial(run, setting.settings), len(known.events), setting.fields(device))
+        )
     timed = measure(
         tasks,
         repeats,
@@ -230,37 +232,40 @@ def calibration_rows(
         "calibrating",
         warm_up=False,
         release=True,
-        again=lambda once: near_front([row(each) for each in once]),
+        again=lambda once: near_front([row(timed_setting) for timed_setting in once]),
     )
 
     notes = []
-    for each, way in zip(timed, ways, strict=True):
-        if each.failure:
-            failed[way.label] = each.failure
-        elif isinstance(each.result, AmiwarpError):
-            notes.append(f"{way.label}: refused, {each.result}")
-        elif _lacks_photometric(each.result, way.settings, accepted=True):
-            notes.append(f"{way.label}: the photometric stage kept the result of sharpness")
-    return [found for found in map(row, timed) if found is not None], notes
+    for timed_setting, setting in zip(timed, all_settings, strict=True):
+        if timed_setting.failure:
+            failed[setting.label] = timed_setting.failure
+        elif isinstance(timed_setting.result, AmiwarpError):
+            notes.append(f"{setting.label}: refused, {timed_setting.result}")
+        elif _lacks_photometric(timed_setting.result, setting.settings, accepted=True):
+            notes.append(f"{setting.label}: the photometric stage kept the result of sharpness")
+    rows = [measured for measured in map(row, timed) if measured is not None]
+    return rows, notes
 
 
-def _lacks_photometric(found: Calibration, settings: Settings, *, accepted: bool = False) -> bool:
+def _lacks_photometric(
+    calibration: Calibration, settings: Settings, *, accepted: bool = False
+) -> bool:
     """Return whether a calibration lacks the photometric stage that its settings ask for.
 
     ``accepted``: whether the stage's result must have been accepted, too.
     """
     if settings.stages != STAGES:
         return False
-    if found.photometric is None:
+    if calibration.photometric is None:
         return True
-    return accepted and not found.photometric.accepted
+    return accepted and not calibration.photometric.accepted
 
 
-def _kinds(ways: list[CalibrationSetting]) -> list[Settings]:
+def _kinds(all_settings: list[CalibrationSetting]) -> list[Settings]:
     """Return one setting of each kind. They run before the measurement, so that their kernels are compiled."""
     by_kind = {}
-    for way in ways:
-        settings = way.settings
+    for setting in all_settings:
+        settings = setting.settings
         kind = (
             settings.model,
             settings.stages,

@@ -111,8 +111,8 @@ class Charts:
 
     def rows(self, chart: str) -> tuple[Row, ...]:
         """Return the measured settings of a chart."""
-        found: tuple[Row, ...] = getattr(self, chart)
-        return found
+        measured: tuple[Row, ...] = getattr(self, chart)
+        return measured
 
     def _draw(self, chart: str, out: Path) -> dict[str, Path]:
         """Draw one figure, and return the paths of its files."""
@@ -149,12 +149,12 @@ class Charts:
 def _as_files(rows: Sequence[Row]) -> list[Row]:
     """Return the rows of images of events that use all events, all angles and bilinear votes."""
     whole = {"vote": "bilinear", "angles": TURNS, "share": 1.0}
-    found = []
+    of_files = []
     for row in rows:
         settings = row.settings
         if "library" not in settings and all(settings[name] == whole[name] for name in whole):
-            found.append(row)
-    return found
+            of_files.append(row)
+    return of_files
 
 
 def _preset(kind: str, row: Row) -> Preset:

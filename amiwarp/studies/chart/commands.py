@@ -132,34 +132,34 @@ def chart_lines(charts: Charts, answers: dict[str, Row | None], out: Path) -> li
     """Return the results as tables and lines of text."""
     from amiwarp.studies.chart.rows import beaten_by, fronts, told_apart
 
-    shown: list[Any] = []
+    lines: list[Any] = []
     for rows in (charts.compensation, charts.calibration):
         for job, chosen in fronts(rows):
             defaults = [row for row in rows if row.default and row.job == job]
             listed = told_apart(chosen) + [row for row in defaults if row not in chosen]
             cells = [(_setting(row), *_setting_speed(row)) for row in listed]
-            shown += [cli.table(cells, f"front, {job}", "speed", "error"), ""]
+            lines += [cli.table(cells, f"front, {job}", "speed", "error"), ""]
             for default in defaults:
                 better = beaten_by(default, rows)
                 if better:
                     labels = ", ".join(row.label for row in better)
-                    shown.append(f"faster or more accurate than the default: {labels}")
-    shown += [f"note: {note}" for note in charts.notes]
+                    lines.append(f"faster or more accurate than the default: {labels}")
+    lines += [f"note: {note}" for note in charts.notes]
     for kind, row in answers.items():
         if row is None:
-            shown.append(f"{kind}: no measured setting is within the budget; see the front above")
+            lines.append(f"{kind}: no measured setting is within the budget; see the front above")
         else:
             speed, error = _setting_speed(row)
             file = out / f"preset_{kind}.json"
-            shown.append(
+            lines.append(
                 f"{kind} within the budget: {row.label}, {speed}, {error} measured; use it with --preset {file}"
             )
-    shown += failed_lines(charts.failed, charts.files["data"])
-    shown += [f"{name}: {path}" for name, path in charts.files.items()]
+    lines += failed_lines(charts.failed, charts.files["data"])
+    lines += [f"{name}: {path}" for name, path in charts.files.items()]
     measured = len(charts.compensation) + len(charts.calibration)
     if charts.failed:
-        shown.append(f"{measured:,} settings measured; {len(charts.failed):,} failed")
-    return shown
+        lines.append(f"{measured:,} settings measured; {len(charts.failed):,} failed")
+    return lines
 
 
 def _setting(row: Row) -> str:

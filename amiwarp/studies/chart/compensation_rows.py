@@ -265,36 +265,43 @@ def _image_rows(
     truth = exact_image(known)
     models = {name: simplified(known.calibration(), name).model for name in rungs()}
     uploads = Uploads(known, device)
-    ways = compensation_settings(quick=quick)
-    others: list[LibraryTask] = []
+    all_settings = compensation_settings(quick=quick)
+    library_tasks: list[LibraryTask] = []
     notes: list[str] = []
     if libraries is not None:
-        others, notes = libraries(sample, uploads, device)
-    tasks = [*_image_tasks(ways, models, uploads, device), *(other.task for other in others)]
+        library_tasks, notes = libraries(sample, uploads, device)
+    tasks = [
+        *_image_tasks(all_settings, models, uploads, device),
+        *(library_task.task for library_task in library_tasks),
+    ]
     timed = measure(tasks, repeats, progress, "measuring images of events", rest_s=REST_S)
 
-    def error(each: Timed, way: ImageSetting) -> tuple[float, float]:
-        places = _places(models[way.model], sample, way.angles, device)
-        image_error = _image_error(each.result, truth, uploads.copies / way.share)
-        return sample.error(places, way.vote), image_error
+    def error(timed_image: Timed, setting: ImageSetting) -> tuple[float, float]:
+        places = _places(models[setting.model], sample, setting.angles, device)
+        image_error = _image_error(timed_image.result, truth, uploads.copies / setting.share)
+        return sample.error(places, setting.vote), image_error
 
-    def error_of_other(each: Timed, other: LibraryTask) -> tuple[float, float]:
-        places = other.places(slice(0, len(known.events), sample.step)).astype(np.float64)
-        image_error = _image_error(each.result, truth, each.task.events / len(known.events))
+    def error_of_other(timed_image: Timed, task: LibraryTask) -> tuple[float, float]:
+        places = task.places(slice(0, len(known.events), sample.step)).astype(np.float64)
+        image_error = _image_error(
+            timed_image.result, truth, timed_image.task.events / len(known.events)
+        )
         return sample.error(places, Vote.BILINEAR), image_error
 
-    found = []
-    for each, way in zip(timed[: len(ways)], ways, strict=True):
-        found.append(measured_row(each, failed, partial(error, each, way)))
-    for each, other in zip(timed[len(ways) :], others, strict=True):
-        found.append(measured_row(each, failed, partial(error_of_other, each, other)))
-    rows = [row for row in found if row is not None]
+    measured = []
+    own = timed[: len(all_settings)]
+    for result, setting in zip(own, all_settings, strict=True):
+        measured.append(measured_row(result, failed, partial(error, result, setting)))
+    of_libraries = timed[len(all_settings) :]
+    for result, task in zip(of_libraries, library_tasks, strict=True):
+        measured.append(measured_row(result, failed, partial(error_of_other, result, task)))
+    rows = [row for row in measured if row is not None]
     _check(rows)
     return rows, notes
 
 
 def _image_tasks(
-    ways: list[ImageSetting], models: dict[str, Model], uploads: Uploads, device: str
+    settings: list[ImageSetting], models: dict[str, Model], uploads: Uploads, device: str
 ) -> Iterator[Task]:
     """Yield the measurements of the images of events."""
     camera = uploads.known.camera
@@ -303,19 +310,19 @@ def _image_tasks(
         canvas = CanvasShape(camera.width, camera.height, vote=vote)
         buffers[vote] = Votes(canvas, device), Image(canvas, 1, device)
 
-    def run(way: ImageSetting) -> Image:
-        votes, image = buffers[way.vote]
+    def run(setting: ImageSetting) -> Image:
+        votes, image = buffers[setting.vote]
         votes.clear()
-        votes.add_events(models[way.model], uploads.get(way.angles, way.share))
+        votes.add_events(models[setting.model], uploads.get(setting.angles, setting.share))
         votes.read(image)
         wp.synchronize_device(device)
         return image
 
-    for way in ways:
+    for setting in settings:
         yield Task(
-            partial(run, way),
+            partial(run, setting),
             len(uploads.theta),
-            way.fields(device),
+            setting.fields(device),
             keep=lambda image: image.numpy()[0],
         )
 

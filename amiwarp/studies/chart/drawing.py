@@ -197,7 +197,7 @@ class ChartPanel:
         from matplotlib.text import Text
         from matplotlib.transforms import Bbox
 
-        here = self.at(row)
+        place = self.at(row)
         label = self.ax.annotate(
             text,
             (_across(row), row.error_px),
@@ -231,22 +231,22 @@ class ChartPanel:
             return outside, letters, drawn
 
         def crosses(spot: Any) -> bool:
-            way = here + np.linspace(0.05, 0.95, 19)[:, None] * (spot - here)
-            other_points = [point for point in self.points if not point.contains(*here)]
+            way = place + np.linspace(0.05, 0.95, 19)[:, None] * (spot - place)
+            other_points = [point for point in self.points if not point.contains(*place)]
             return any(one.count_contains(way) for one in [*self.letters, *other_points])
 
         # Of the spots that cover least, the nearest to which the label's line crosses nothing
         spots = []
         for distance in DISTANCES:
             for direction in DIRECTIONS:
-                spots.append(here + np.array(direction) * (near + distance * self.unit))
+                spots.append(place + np.array(direction) * (near + distance * self.unit))
         costs = [covered(spot) for spot in spots]
         least = min(costs)
         best = [spot for spot, cost in zip(spots, costs, strict=True) if cost == least]
         spot = next((each for each in best if not crosses(each)), best[0])
-        label.xyann = (spot - here) / self.unit
+        label.xyann = (spot - place) / self.unit
         self.letters.append(box(spot))
-        self.lines.append(Bbox([np.minimum(here, spot), np.maximum(here, spot)]))
+        self.lines.append(Bbox([np.minimum(place, spot), np.maximum(place, spot)]))
 
 
 def _across(row: Row) -> float:

@@ -1,5 +1,6 @@
 """Evaluation of apex and speed: blur of edges for several bandwidths, timing errors and models, and event rate."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -46,6 +47,7 @@ from amiwarp.studies.evaluate.results import (
     finite,
     grouped,
     rows_of,
+    where,
 )
 from amiwarp.studies.evaluate.streams import Stream, Streams
 
@@ -109,6 +111,8 @@ QUICK_ERRORS_US = (1000.0,)
 """Sizes of the timing errors: their rms [us]."""
 USUAL_US = 1000.0
 """Size of the timing error in the verdicts [us]."""
+TIMING_ERRORS = f"timing errors of {USUAL_US * 1e-3:g} ms"
+"""The timing error of the verdicts in words."""
 WANDER_US = 20_000.0
 """Time between the knots of a slow wander [us]."""
 EXACT = "exact model"
@@ -122,6 +126,16 @@ USUAL_RPM = 720.0
 """Speed above which the paper reports a surge [turns/min]."""
 SURGE = 0.1
 """Least amount by which the relative growth of an error above :data:`USUAL_RPM`, per doubling, exceeds that below."""
+ERROR_VALUES = ("displacement", "blur", "edge_blur")
+ERROR_COLUMNS = (
+    "displacement [px]",
+    "std of displacement",
+    "blur [px]",
+    "std",
+    "edge blur [px]",
+    "std of edge blur",
+)
+"""Values of a row of errors, and the columns of their mean and standard deviation in tables."""
 FIELDS = {
     "90° across the width": 90.0,
     "90° across the diagonal": float(np.degrees(2.0 * np.arctan(WHOLE[0] / np.hypot(*WHOLE)))),
@@ -200,13 +214,13 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     The blur is also given for the edges of bright and of dark discs alone, with the delay of both and with their own;
     and, for the usual sensor, under timing errors and with the paper's circle.
     """
-    seen = _Seen(streams)
-    blur = {delay: seen.blur(delay) for delay in DELAYS_US[::COARSE].tolist()}
+    turn = _TurnEvents(streams)
+    blur = {delay: turn.blur(delay) for delay in DELAYS_US[::COARSE].tolist()}
     for name in ("all", "bright", "dark"):
         rough = min(blur, key=lambda d: blur[d][name])
         for delay in DELAYS_US[np.abs(DELAYS_US - rough) < 100 * COARSE].tolist():
             if delay not in blur:
-                blur[delay] = seen.blur(delay)
+                blur[delay] = turn.blur(delay)
     best = {name: min(blur, key=lambda d: blur[d][name]) for name in ("all", "bright", "dark")}
     delay = best["all"]
 
@@ -216,7 +230,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     row = {
         "blur": finite(blur[delay]["all"]),
         "delay": delay,
-        "edge_blur": seen.edge_blur(delay),
+        "edge_blur": turn.edge_blur(delay),
         "mev_per_s": count / streams.end_us,
     }
     light = []
@@ -234,11 +248,11 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     is_usual = condition.only is None and condition.cutoff_hz == USUAL_HZ
     if is_usual:
         sizes_us = QUICK_ERRORS_US if settings.quick else ERRORS_US
-        errors = seen.errors(delay, sizes_us)
+        errors = turn.errors(delay, sizes_us)
     return {"rows": [known | row], "light": light, "errors": [known | error for error in errors]}
 
 
-class _Seen:
+class _TurnEvents:
     """Events of a turn of a prism of constant speed before the discs, and what a compensation makes of them."""
 
     def __init__(self, streams: Streams) -> None:
@@ -319,13 +333,14 @@ class _Seen:
     def _timing(self, kind: str, us: float) -> NDArray[np.float64]:
         """Return the timing error of each event [us], shape (n,): those drawn at random have the rms ``us``."""
         t = (self._events.t - self._events.t[0]).astype(np.float64)
-        if kind not in (SAMPLES, WANDER):
-            # By the calibrated phase
-            absorbed = USUAL_RPM / self._streams.condition.rpm if kind == OFFSET else 0.0
+        if kind == OFFSET:
+            # The calibrated phase has absorbed the angle that the prism turns by at the usual speed.
+            absorbed = USUAL_RPM / self._streams.condition.rpm
             return np.full(len(t), us * (1.0 - absorbed))
-        knots = np.arange(
-            0.0, t[-1] + 2.0 * WANDER_US, self._interval_us if kind == SAMPLES else WANDER_US
-        )
+        if kind not in (SAMPLES, WANDER):
+            return np.full(len(t), us)
+        interval_us = self._interval_us if kind == SAMPLES else WANDER_US
+        knots = np.arange(0.0, t[-1] + 2.0 * WANDER_US, interval_us)
         drawn = np.random.default_rng([self._streams.condition.seed, 2]).normal(size=len(knots))
         error = np.interp(t, knots, drawn)
         return np.asarray(us * error / np.sqrt(np.mean(error**2)))
@@ -346,8 +361,8 @@ def best_circle(true: Model) -> CircleModel:
 
     bounds = (0.8 * middle, 1.3 * middle)
     tolerance = 1e-4 * middle
-    found = minimize_scalar(error, bounds=bounds, method="bounded", options={"xatol": tolerance})
-    return circle(found.x)
+    optimum = minimize_scalar(error, bounds=bounds, method="bounded", options={"xatol": tolerance})
+    return circle(optimum.x)
 
 
 @cache
@@ -361,185 +376,41 @@ def circle_error(degrees: float, fov_deg: float) -> ModelError:
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return blur, edge blur, delay and event rate over speed, apex and bandwidth; and the blur of single limits."""
     rows = _rows(results, "rows", cropped=True)
-    whole = [r for r in rows if r["only"] is None]
-    columns = ("apex", "bandwidth", "speed [rpm]")
-
-    def over_speed(name: str, title: str, value: str, label: str, caption: str) -> Table:
-        chart = Chart("speed [rpm]", label, "bandwidth", "std", panels=("apex",), log_x=True)
-        return Table(
-            name,
-            title,
-            (*columns, "seeds", label, "std"),
-            grouped(whole, ("apex_name", "bandwidth", "rpm"), [value]),
-            caption,
-            chart,
-        )
-
-    errors = [r | {"size": f"{r['error_us'] * 1e-3:g} ms"} for r in _rows(results, "errors")]
-    crop = [r for r in errors if _cropped(r) and r["model"] == EXACT]
-    timings = [r for r in crop if r["error_us"] in (0.0, USUAL_US)]
-    sizes = [r for r in crop if r["timing"] in (NONE, WANDER)]
-    models = [
-        r | {"timing": f"{r['timing']} of {r['size']}" if r["error_us"] else "no timing error"}
-        for r in _whole_sensor(errors)
-    ]
-    measures = (
-        "displacement [px]",
-        "std of displacement",
-        "blur [px]",
-        "std",
-        "edge blur [px]",
-        "std of edge blur",
-    )
+    all_limits = where(rows, only=None)
+    light = where(_rows(results, "light", cropped=True), only=None, degrees=USUAL_DEG)
+    errors = _rows(results, "errors")
     return [
-        over_speed(
+        _speed_table(
+            all_limits,
             "apex_speed_blur",
             "Blur of edges over speed",
             "blur",
             "blur [px]",
             "Distance of events from the true edges, compensated by the true model with the best delay.",
         ),
-        over_speed(
+        _speed_table(
+            all_limits,
             "apex_speed_edge_blur",
             "The paper's measure of blur over speed",
             "edge_blur",
             "edge blur [px]",
             "Edges are found in the events themselves, and events more than 3 px away do not count.",
         ),
-        Table(
-            "apex_speed_limits",
-            "Blur of a sensor with one limit only (apex 0.5°)",
-            ("limit", "speed [rpm]", "seeds", "blur [px]", "std"),
-            _limits(rows),
-            f"An ideal sensor (limit: {IDEAL}) with one limit of the DVXplorer's model, or with a lower "
-            "bandwidth; and the model with all limits.",
-            Chart("speed [rpm]", "blur [px]", "limit", "std", log_x=True),
-        ),
-        Table(
-            "apex_speed_light",
-            "Blur and delay of bright and dark edges (apex 0.5°)",
-            (
-                "bandwidth",
-                "edges of discs",
-                "speed [rpm]",
-                "seeds",
-                "blur [px]",
-                "std",
-                "own delay [us]",
-                "std of delay",
-                "blur with own delay [px]",
-                "std of blur",
-            ),
-            grouped(
-                [
-                    r
-                    for r in _rows(results, "light", cropped=True)
-                    if r["only"] is None and r["degrees"] == USUAL_DEG
-                ],
-                ("bandwidth", "light", "rpm"),
-                ["blur", "own_delay", "own_blur"],
-            ),
-            "One phase for all pixels removes the mean delay, not its difference between bright and dark pixels.",
-            Chart(
-                "speed [rpm]",
-                "blur [px]",
-                "edges of discs",
-                "std",
-                panels=("bandwidth",),
-                log_x=True,
-            ),
-        ),
-        Table(
-            "apex_speed_timing",
-            "Error over speed with timing errors of 1 ms",
-            ("apex", "timing error", "speed [rpm]", "seeds", *measures),
-            grouped(timings, ("apex_name", "timing", "rpm"), ["displacement", "blur", "edge_blur"]),
-            f"True model, {USUAL_HZ:g} Hz. Displacement: rms distance from the places without the timing error.",
-            Chart("speed [rpm]", "blur [px]", "timing error", "std", panels=("apex",), log_x=True),
-        ),
-        Table(
-            "apex_speed_timing_size",
-            "Error over speed with a slow wander of the encoder's clock",
-            ("apex", "rms timing error", "speed [rpm]", "seeds", *measures),
-            grouped(sizes, ("apex_name", "size", "rpm"), ["displacement", "blur", "edge_blur"]),
-            f"True model, {USUAL_HZ:g} Hz.",
-            Chart(
-                "speed [rpm]", "blur [px]", "rms timing error", "std", panels=("apex",), log_x=True
-            ),
-        ),
-        Table(
-            "apex_speed_surge",
-            "Surge of the error above 720 rpm over the timing error (slow wander)",
-            (
-                "measure",
-                "apex",
-                "rms timing error [ms]",
-                "seeds",
-                "growth 360 to 720 rpm",
-                "std of growth below",
-                "growth 720 to 1440 rpm",
-                "std of growth above",
-                "surge",
-                "std",
-            ),
-            grouped(
-                [
-                    r | {"measure": measure.replace("_", " "), "ms": r["error_us"] * 1e-3}
-                    for measure in ("edge_blur", "blur")
-                    for r in surge_of(sizes, measure)
-                ],
-                ("measure", "apex_name", "ms"),
-                ["below", "above", "surge"],
-            ),
-            f"The error surges if the second growth is larger by more than {SURGE:g}.",
-            Chart(
-                "rms timing error [ms]",
-                "surge",
-                "apex",
-                "std",
-                panels=("measure",),
-                marks={"surge": SURGE},
-            ),
-        ),
-        Table(
-            "apex_speed_models",
-            "Error of the circle and of the exact model over the whole sensor",
-            ("apex", "timing error", "model", "seeds", *measures),
-            grouped(
-                models, ("apex_name", "timing", "model"), ["displacement", "blur", "edge_blur"]
-            ),
-            "640x480 px, 720 rpm. Displacement: rms distance of the events from their places by the true model.",
-            Chart(
-                "apex",
-                "displacement [px]",
-                "model",
-                "std of displacement",
-                panels=("timing error",),
-                kind=ChartKind.BARS,
-                marks={"the paper's system": PRACTICAL_PX},
-            ),
-        ),
-        Table(
-            "apex_speed_circle",
-            "Distance of the best circle from exact refraction, computed",
-            ("apex", "field of view", "rms [px]", "largest [px]"),
-            [
-                (f"apex {degrees:g}°", f"{fov:.3g}°", error.rms, error.worst)
-                for degrees in (APEX_DEG if models else ())
-                for fov in (60.0, FIELDS["90° across the diagonal"], 90.0)
-                for error in (circle_error(degrees, fov),)
-            ],
-            "Over 640x480 px and a turn. The field of view is that across the width; 77.3° are 90° across the "
-            "diagonal. The paper states 2 px in 90°, without apex angle and focal length.",
-        ),
-        over_speed(
+        _limits_table(rows),
+        _light_table(light),
+        *_timing_tables(errors),
+        _models_table(errors),
+        _circle_table(has_models=bool(_whole_sensor(errors))),
+        _speed_table(
+            all_limits,
             "apex_speed_delay",
             "Delay of the sensor over speed",
             "delay",
             "delay [us]",
             "Delay at which the blur is smallest.",
         ),
-        over_speed(
+        _speed_table(
+            all_limits,
             "apex_speed_rate",
             "Event rate over speed",
             "mev_per_s",
@@ -549,8 +420,22 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     ]
 
 
-def _limits(rows: Sequence[dict[str, Any]]) -> list[tuple[Value, ...]]:
-    """Return the blur over limit and speed; all limits together last."""
+def _speed_table(
+    rows: Sequence[dict[str, Any]], name: str, title: str, value: str, label: str, caption: str
+) -> Table:
+    """Return a table of a value, whose column is called ``label``, over apex, bandwidth and speed."""
+    return Table(
+        name,
+        title,
+        ("apex", "bandwidth", "speed [rpm]", "seeds", label, "std"),
+        grouped(rows, ("apex_name", "bandwidth", "rpm"), [value]),
+        caption,
+        Chart("speed [rpm]", label, "bandwidth", "std", panels=("apex",), log_x=True),
+    )
+
+
+def _limits_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Return the table of the blur over limit and speed; all limits together last."""
     single = []
     together = []
     for row in rows:
@@ -562,10 +447,145 @@ def _limits(rows: Sequence[dict[str, Any]]) -> list[tuple[Value, ...]]:
         if limit == BANDWIDTH:
             limit = f"bandwidth {row['cutoff_hz'] or USUAL_HZ:g} Hz"
         single.append(row | {"limit": limit})
-    return grouped([*single, *together], ("limit", "rpm"), ["blur"])
+    return Table(
+        "apex_speed_limits",
+        "Blur of a sensor with one limit only (apex 0.5°)",
+        ("limit", "speed [rpm]", "seeds", "blur [px]", "std"),
+        grouped([*single, *together], ("limit", "rpm"), ["blur"]),
+        f"An ideal sensor (limit: {IDEAL}) with one limit of the DVXplorer's model, or with a lower "
+        "bandwidth; and the model with all limits.",
+        Chart("speed [rpm]", "blur [px]", "limit", "std", log_x=True),
+    )
 
 
-def _cropped(row: dict[str, Any]) -> bool:
+def _light_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Return the table of blur and delay of bright and of dark edges over bandwidth and speed."""
+    columns = (
+        "bandwidth",
+        "edges of discs",
+        "speed [rpm]",
+        "seeds",
+        "blur [px]",
+        "std",
+        "own delay [us]",
+        "std of delay",
+        "blur with own delay [px]",
+        "std of blur",
+    )
+    return Table(
+        "apex_speed_light",
+        "Blur and delay of bright and dark edges (apex 0.5°)",
+        columns,
+        grouped(rows, ("bandwidth", "light", "rpm"), ["blur", "own_delay", "own_blur"]),
+        "One phase for all pixels removes the mean delay, not its difference between bright and dark pixels.",
+        Chart(
+            "speed [rpm]", "blur [px]", "edges of discs", "std", panels=("bandwidth",), log_x=True
+        ),
+    )
+
+
+def _timing_tables(errors: Sequence[dict[str, Any]]) -> list[Table]:
+    """Return the tables of the true model with timing errors: over their kind and size, and how the error surges."""
+    true_model = [r for r in _with_sizes(errors) if _is_cropped(r) and r["model"] == EXACT]
+    usual_size = [r for r in true_model if r["error_us"] in (0.0, USUAL_US)]
+    wander = [r for r in true_model if r["timing"] in (NONE, WANDER)]
+    surges = [
+        surge | {"measure": _in_words(measure), "ms": surge["error_us"] * 1e-3}
+        for measure in ("edge_blur", "blur")
+        for surge in surge_of(wander, measure)
+    ]
+    surge_columns = (
+        "measure",
+        "apex",
+        "rms timing error [ms]",
+        "seeds",
+        "growth 360 to 720 rpm",
+        "std of growth below",
+        "growth 720 to 1440 rpm",
+        "std of growth above",
+        "surge",
+        "std",
+    )
+    return [
+        Table(
+            "apex_speed_timing",
+            "Error over speed with timing errors of 1 ms",
+            ("apex", "timing error", "speed [rpm]", "seeds", *ERROR_COLUMNS),
+            grouped(usual_size, ("apex_name", "timing", "rpm"), ERROR_VALUES),
+            f"True model, {USUAL_HZ:g} Hz. Displacement: rms distance from the places without the timing error.",
+            Chart("speed [rpm]", "blur [px]", "timing error", "std", panels=("apex",), log_x=True),
+        ),
+        Table(
+            "apex_speed_timing_size",
+            "Error over speed with a slow wander of the encoder's clock",
+            ("apex", "rms timing error", "speed [rpm]", "seeds", *ERROR_COLUMNS),
+            grouped(wander, ("apex_name", "size", "rpm"), ERROR_VALUES),
+            f"True model, {USUAL_HZ:g} Hz.",
+            Chart(
+                "speed [rpm]", "blur [px]", "rms timing error", "std", panels=("apex",), log_x=True
+            ),
+        ),
+        Table(
+            "apex_speed_surge",
+            "Surge of the error above 720 rpm over the timing error (slow wander)",
+            surge_columns,
+            grouped(surges, ("measure", "apex_name", "ms"), ["below", "above", "surge"]),
+            f"The error surges if the second growth is larger by more than {SURGE:g}.",
+            Chart(
+                "rms timing error [ms]",
+                "surge",
+                "apex",
+                "std",
+                panels=("measure",),
+                marks={"surge": SURGE},
+            ),
+        ),
+    ]
+
+
+def _models_table(errors: Sequence[dict[str, Any]]) -> Table:
+    """Return the table of both models over the whole sensor, with and without timing errors."""
+    rows = []
+    for row in _whole_sensor(_with_sizes(errors)):
+        timing = f"{row['timing']} of {row['size']}" if row["error_us"] else "no timing error"
+        rows.append(row | {"timing": timing})
+    return Table(
+        "apex_speed_models",
+        "Error of the circle and of the exact model over the whole sensor",
+        ("apex", "timing error", "model", "seeds", *ERROR_COLUMNS),
+        grouped(rows, ("apex_name", "timing", "model"), ERROR_VALUES),
+        "640x480 px, 720 rpm. Displacement: rms distance of the events from their places by the true model.",
+        Chart(
+            "apex",
+            "displacement [px]",
+            "model",
+            "std of displacement",
+            panels=("timing error",),
+            kind=ChartKind.BARS,
+            marks={"the paper's system": PRACTICAL_PX},
+        ),
+    )
+
+
+def _circle_table(*, has_models: bool) -> Table:
+    """Return the table of the best circle's distance from exact refraction; empty unless models were compared."""
+    rows: list[tuple[Value, ...]] = []
+    if has_models:
+        for degrees in APEX_DEG:
+            for fov_deg in (60.0, FIELDS["90° across the diagonal"], 90.0):
+                error = circle_error(degrees, fov_deg)
+                rows.append((f"apex {degrees:g}°", f"{fov_deg:.3g}°", error.rms, error.worst))
+    return Table(
+        "apex_speed_circle",
+        "Distance of the best circle from exact refraction, computed",
+        ("apex", "field of view", "rms [px]", "largest [px]"),
+        rows,
+        "Over 640x480 px and a turn. The field of view is that across the width; 77.3° are 90° across the "
+        "diagonal. The paper states 2 px in 90°, without apex angle and focal length.",
+    )
+
+
+def _is_cropped(row: dict[str, Any]) -> bool:
     """Return whether a row belongs to the middle of the sensor."""
     return (row["width"], row["height"]) != WHOLE
 
@@ -579,266 +599,285 @@ def _rows(
     """
     named = []
     for row in rows_of(results, name):
-        if row["blur"] is None or (cropped and not _cropped(row)):
+        if row["blur"] is None or (cropped and not _is_cropped(row)):
             continue
-        names = {"bandwidth": _name(row["cutoff_hz"]), "apex_name": f"apex {row['degrees']:g}°"}
+        names = {
+            "bandwidth": _bandwidth_name(row["cutoff_hz"]),
+            "apex_name": f"apex {row['degrees']:g}°",
+        }
         named.append({**row, **names})
     return named
 
 
-def _name(cutoff_hz: float | None) -> str:
+def _bandwidth_name(cutoff_hz: float | None) -> str:
     return f"{cutoff_hz:g} Hz" if cutoff_hz else "unlimited"
+
+
+def _with_sizes(errors: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of errors with the size of the timing error in words."""
+    return [row | {"size": f"{row['error_us'] * 1e-3:g} ms"} for row in errors]
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the surge above 720 rpm and its cause, on 2 deg, and on apex and speed in general."""
-    rows = [r for r in _rows(results, "rows", cropped=True) if r["only"] is None]
-    bandwidths = sorted(
-        {r["cutoff_hz"] for r in rows if r["cutoff_hz"] != USUAL_HZ}, key=lambda hz: hz or np.inf
-    )
-    usual = [r for r in rows if (r["rpm"], r["cutoff_hz"]) == (USUAL_RPM, USUAL_HZ)]
+    rows = where(_rows(results, "rows", cropped=True), only=None)
     errors = _rows(results, "errors")
-    crop = [r for r in errors if _cropped(r) and r["model"] == EXACT]
-    timed = [r for r in crop if (r["timing"], r["error_us"]) == (WANDER, USUAL_US)]
-    none = [r for r in crop if (r["timing"], r["error_us"]) == (NONE, 0.0)]
-    apex = [r for r in rows if (r["degrees"], r["cutoff_hz"]) == (USUAL_DEG, USUAL_HZ)]
-    fast = {"rpm": 2 * USUAL_RPM}
-    slow = {"rpm": USUAL_RPM}
-    growth = []
-    by_degrees = differences(timed, "edge_blur", fast, slow, by=("degrees",))
-    for degrees, of_seeds in by_degrees.items():
-        for seed, value in of_seeds.items():
-            growth.append({"degrees": float(degrees), "seed": seed, "growth": value})
-    large = f"timing errors of {USUAL_US * 1e-3:g} ms"
-
-    def surges(
-        text: str, rows: Sequence[dict[str, Any]], degrees: float, measure: str, *, no: bool = False
-    ) -> Claim:
-        surge = surge_of([r for r in rows if r["degrees"] == degrees], measure)
-        limit: Any = {"below" if no else "above": SURGE}
-        return judge(
-            None,
-            text,
-            differences(surge, "surge", {}, by=("apex_name",)),
-            f"the {_growth(measure)}",
-            **limit,
-        )
-
-    def caused(degrees: float, measure: str) -> Claim:
-        both = []
-        for kind, rows in (("timed", timed), ("none", none)):
-            of_apex = [r for r in rows if r["degrees"] == degrees]
-            both += [surge | {"kind": kind} for surge in surge_of(of_apex, measure)]
-        found = differences(both, "surge", {"kind": "timed"}, {"kind": "none"}, by=("apex_name",))
-        growths = f"growth of the {_named(measure)} above 720 rpm relative to that below"
-        text = f"{large.capitalize()} rms enlarge the {growths} (apex {degrees:g}°)."
-        return judge(
-            None,
-            text,
-            found,
-            f"the {_growth(measure)}, with timing errors less without,",
-            above=0.0,
-        )
-
-    def of(degrees: float, model: str) -> dict[str, Any]:
-        return {"degrees": degrees, "model": model}
-
     return [
+        *_surge_claims(rows, errors),
+        *_accuracy_claims(errors),
+        *_circle_claims(has_errors=bool(errors)),
+        *_large_apex_claims(errors),
+        *_rate_claims(rows),
+    ]
+
+
+def _surge_claims(rows: Sequence[dict[str, Any]], errors: Sequence[dict[str, Any]]) -> list[Claim]:
+    """Judge whether errors surge above 720 rpm: with timing errors, without, and by a sensor's bandwidth alone."""
+    true_model = [r for r in errors if _is_cropped(r) and r["model"] == EXACT]
+    with_errors = where(true_model, timing=WANDER, error_us=USUAL_US)
+    without = where(true_model, timing=NONE, error_us=0.0)
+    cases = [(measure, degrees) for measure in ("edge_blur", "blur") for degrees in (0.5, 1.0)]
+    verdicts = [
         untestable(
             13,
             "The error surges dramatically above 720 rpm, because of synchronisation errors, and more with "
             "a larger apex.",
             "the paper states neither how large the synchronisation errors are nor from which "
-            f"growth on an error surges dramatically; see the checks for {large}, our choice",
-        ),
-        *(caused(degrees, measure) for measure in ("edge_blur", "blur") for degrees in (0.5, 1.0)),
-        *(
-            surges(
-                f"With {large} rms, the {_named(measure)} surges by more than {SURGE:.0%} (apex {degrees:g}°).",
-                timed,
-                degrees,
-                measure,
-            )
-            for measure in ("edge_blur", "blur")
-            for degrees in (0.5, 1.0)
-        ),
-        *(
-            surges(
-                f"Without timing errors, the {_named(measure)} does not surge by more than {SURGE:.0%} (apex "
-                f"{degrees:g}°).",
-                none,
-                degrees,
-                measure,
-                no=True,
-            )
-            for measure in ("edge_blur", "blur")
-            for degrees in (0.5, 1.0)
-        ),
-        judge(
-            None,
-            f"With {large} rms, the edge blur grows more at 1° than at 0.5° (720 to 1440 rpm).",
-            differences(growth, "growth", {"degrees": 1.0}, {"degrees": 0.5}, by=()),
-            "the growth of the edge blur at 1° less that at 0.5°",
-            above=0.0,
-            unit="px",
-        ),
-        *(
-            surges(
-                f"The blur surges above 720 rpm without timing errors (apex 0.5°, bandwidth {_name(hz)}).",
-                [r for r in rows if r["cutoff_hz"] == hz],
-                0.5,
-                "blur",
-            )
-            for hz in bandwidths
-        ),
+            f"growth on an error surges dramatically; see the checks for {TIMING_ERRORS}, our choice",
+        )
+    ]
+    for measure, degrees in cases:
+        verdicts.append(_cause_of_surge(with_errors, without, degrees, measure))
+    for measure, degrees in cases:
+        text = (
+            f"With {TIMING_ERRORS} rms, the {_in_words(measure)} surges by more than {SURGE:.0%} "
+            f"(apex {degrees:g}°)."
+        )
+        verdicts.append(_surges(text, where(with_errors, degrees=degrees), measure, above=SURGE))
+    for measure, degrees in cases:
+        text = (
+            f"Without timing errors, the {_in_words(measure)} does not surge by more than {SURGE:.0%} "
+            f"(apex {degrees:g}°)."
+        )
+        verdicts.append(_surges(text, where(without, degrees=degrees), measure, below=SURGE))
+    verdicts.append(_growth_with_apex(with_errors))
+
+    bandwidths = {row["cutoff_hz"] for row in rows} - {USUAL_HZ}
+    for hz in sorted(bandwidths, key=lambda hz: hz or np.inf):
+        text = f"The blur surges above 720 rpm without timing errors (apex 0.5°, bandwidth {_bandwidth_name(hz)})."
+        of_sensor = where(rows, cutoff_hz=hz, degrees=0.5)
+        verdicts.append(_surges(text, of_sensor, "blur", above=SURGE))
+    return verdicts
+
+
+def _surges(
+    text: str,
+    rows: Sequence[dict[str, Any]],
+    measure: str,
+    *,
+    above: float = -math.inf,
+    below: float = math.inf,
+) -> Claim:
+    """Judge the surge of a measure of one apex against a limit."""
+    surges = differences(surge_of(rows, measure), "surge", {}, by=("apex_name",))
+    rule = f"the {_growth_in_words(measure)}"
+    return judge(None, text, surges, rule, above=above, below=below)
+
+
+def _cause_of_surge(
+    with_errors: Sequence[dict[str, Any]],
+    without: Sequence[dict[str, Any]],
+    degrees: float,
+    measure: str,
+) -> Claim:
+    """Judge whether timing errors enlarge the surge of a measure, at an apex [deg]."""
+    surges = [
+        surge | {"kind": kind}
+        for kind, rows in (("with", with_errors), ("without", without))
+        for surge in surge_of(where(rows, degrees=degrees), measure)
+    ]
+    growths = f"growth of the {_in_words(measure)} above 720 rpm relative to that below"
+    return judge(
+        None,
+        f"{TIMING_ERRORS.capitalize()} rms enlarge the {growths} (apex {degrees:g}°).",
+        differences(surges, "surge", {"kind": "with"}, {"kind": "without"}, by=("apex_name",)),
+        f"the {_growth_in_words(measure)}, with timing errors less without,",
+        above=0.0,
+    )
+
+
+def _growth_with_apex(with_errors: Sequence[dict[str, Any]]) -> Claim:
+    """Judge whether the edge blur grows more above 720 rpm at 1 deg than at 0.5 deg."""
+    fast = {"rpm": 2 * USUAL_RPM}
+    slow = {"rpm": USUAL_RPM}
+    growths = []
+    by_degrees = differences(with_errors, "edge_blur", fast, slow, by=("degrees",))
+    for degrees, of_seeds in by_degrees.items():
+        for seed, growth in of_seeds.items():
+            growths.append({"degrees": float(degrees), "seed": seed, "growth": growth})
+    return judge(
+        None,
+        f"With {TIMING_ERRORS} rms, the edge blur grows more at 1° than at 0.5° (720 to 1440 rpm).",
+        differences(growths, "growth", {"degrees": 1.0}, {"degrees": 0.5}, by=()),
+        "the growth of the edge blur at 1° less that at 0.5°",
+        above=0.0,
+        unit="px",
+    )
+
+
+def _accuracy_claims(errors: Sequence[dict[str, Any]]) -> list[Claim]:
+    """Judge the error of a system as the paper's; its speed on an onboard computer cannot be judged."""
+    with_errors = _whole_sensor(errors, USUAL_US)
+    verdicts = [
         untestable(
             11,
             "Events are compensated with an error of about 1.5 to 2.0 px.",
             "this is the error of the paper's rig, whose timing errors are not stated; see the checks for 1 ms",
-        ),
-        *(
-            judge(
-                None,
-                f"The error of a system as the paper's, with the circle and {large}, is at most {PRACTICAL_PX:g} "
-                f"px (rms, apex {degrees:g}°, 720 rpm, whole sensor).",
-                differences(
-                    _whole_sensor(errors, USUAL_US), "displacement", of(degrees, CIRCLE), by=()
-                ),
-                "the rms displacement error",
-                below=PRACTICAL_PX,
-                unit="px",
-            )
-            for degrees in (0.5, 1.0, 2.0)
-        ),
-        untestable(
-            11,
-            "Compensation runs in real time on an onboard computer.",
-            "no onboard computer was at hand: the documentation states the rate on two cores of a server",
-        ),
-        *untestable_as_stated(
-            12,
-            f"The circle's error is within {CIRCLE_PX:g} px in a field of view of 90°.",
-            "the apex angle, along which axis the 90° are, and whether the error is the rms or the "
-            "largest one",
-            [
-                judge_number(
+        )
+    ]
+    for degrees in APEX_DEG:
+        circle = {"degrees": degrees, "model": CIRCLE}
+        claim = judge(
+            None,
+            f"The error of a system as the paper's, with the circle and {TIMING_ERRORS}, is at most "
+            f"{PRACTICAL_PX:g} px (rms, apex {degrees:g}°, 720 rpm, whole sensor).",
+            differences(with_errors, "displacement", circle, by=()),
+            "the rms displacement error",
+            below=PRACTICAL_PX,
+            unit="px",
+        )
+        verdicts.append(claim)
+    on_board = untestable(
+        11,
+        "Compensation runs in real time on an onboard computer.",
+        "no onboard computer was at hand: the documentation states the rate on two cores of a server",
+    )
+    return [*verdicts, on_board]
+
+
+def _circle_claims(*, has_errors: bool) -> list[Claim]:
+    """Judge the circle's error in 90 deg by all readings of what the paper states; by none without results."""
+    readings = []
+    for degrees in (USUAL_DEG, 1.0) if has_errors else ():
+        for field, fov_deg in FIELDS.items():
+            error = circle_error(degrees, fov_deg)
+            for extent, value, measure in (
+                ("in the rms", error.rms, "rms error"),
+                ("everywhere in the image", error.worst, "largest error"),
+            ):
+                reading = judge_number(
                     None,
-                    f"The circle's error is within {CIRCLE_PX:g} px {where} (apex {degrees:g}°, {fov}).",
-                    getattr(circle_error(degrees, FIELDS[fov]), name),
-                    f"the {what} over 640x480 px and a turn",
+                    f"The circle's error is within {CIRCLE_PX:g} px {extent} (apex {degrees:g}°, {field}).",
+                    value,
+                    f"the {measure} over 640x480 px and a turn",
                     below=CIRCLE_PX,
                     unit="px",
                 )
-                for degrees in ((USUAL_DEG, 1.0) if errors else ())
-                for fov in FIELDS
-                for where, name, what in (
-                    ("in the rms", "rms", "rms error"),
-                    ("everywhere in the image", "worst", "largest error"),
-                )
-            ],
-        ),
+                readings.append(reading)
+    return untestable_as_stated(
+        12,
+        f"The circle's error is within {CIRCLE_PX:g} px in a field of view of 90°.",
+        "the apex angle, along which axis the 90° are, and whether the error is the rms or the "
+        "largest one",
+        readings,
+    )
+
+
+def _large_apex_claims(errors: Sequence[dict[str, Any]]) -> list[Claim]:
+    """Judge the error of 2 deg, with both models, against the error of 1 deg with the circle."""
+    verdicts = [
         untestable(
             14,
             "The compensation error of 2° is too high to be practical.",
             "the paper states no error at which a prism is not practical; see the checks",
-        ),
-        *(
-            judge(
+        )
+    ]
+    timings = (("without timing errors", 0.0), ("with timing errors of 1 ms", USUAL_US))
+    for number, model, name, relation, low, high in (
+        (15, CIRCLE, "the circle", "larger", 0.0, np.inf),
+        (None, EXACT, "exact refraction", "smaller", -np.inf, 0.0),
+    ):
+        for timing, error_us in timings:
+            two_degrees = {"degrees": 2.0, "model": model}
+            one_degree = {"degrees": 1.0, "model": CIRCLE}
+            rows = _whole_sensor(errors, error_us)
+            claim = judge(
                 number,
-                f"With {word}, {timing}, the error of 2° is {more} than the error of 1° with the circle (720 rpm, "
-                "whole sensor).",
-                differences(
-                    _whole_sensor(errors, us),
-                    "displacement",
-                    of(2.0, model),
-                    of(1.0, CIRCLE),
-                    by=(),
-                ),
+                f"With {name}, {timing}, the error of 2° is {relation} than the error of 1° with the circle "
+                "(720 rpm, whole sensor).",
+                differences(rows, "displacement", two_degrees, one_degree, by=()),
                 "the difference of the rms displacement errors",
                 above=low,
                 below=high,
                 unit="px",
             )
-            for number, model, word, more, low, high in (
-                (15, CIRCLE, "the circle", "larger", 0.0, np.inf),
-                (None, EXACT, "exact refraction", "smaller", -np.inf, 0.0),
-            )
-            for timing, us in (
-                ("without timing errors", 0.0),
-                ("with timing errors of 1 ms", USUAL_US),
-            )
-        ),
-        *(
-            judge(
-                14,
-                f"A prism of 2° gives more events than one of {other:g}° (720 rpm).",
-                differences(usual, "mev_per_s", {"degrees": 2.0}, {"degrees": other}, by=("rpm",)),
-                f"the event rate at 2° less that at {other:g}°",
-                above=0.0,
-                unit="Mev/s",
-            )
-            for other in (1.0, 0.5)
-        ),
-        *(
-            judge(
-                15,
-                f"{word} gives more {what}.",
-                differences(chosen, value, first, second, by=("only",)),
-                f"the {name} {sides}",
-                above=0.0,
-                unit=unit,
-            )
-            for value, what, name, unit in (
-                ("mev_per_s", "events", "event rate", "Mev/s"),
-                ("edge_blur", "error", "edge blur", "px"),
-            )
-            for word, chosen, first, second, sides in (
-                (
-                    "A larger apex (720 rpm)",
-                    usual,
-                    {"degrees": 1.0},
-                    {"degrees": 0.5},
-                    "at 1° less that at 0.5°",
-                ),
-                (
-                    "A higher speed (apex 0.5°)",
-                    apex,
-                    fast,
-                    slow,
-                    "at 1440 rpm less that at 720 rpm",
-                ),
-            )
-        ),
-    ]
+            verdicts.append(claim)
+    return verdicts
 
 
-def _named(measure: str) -> str:
+def _rate_claims(rows: Sequence[dict[str, Any]]) -> list[Claim]:
+    """Judge whether a larger apex and a higher speed give more events and more error."""
+    usual_speed = where(rows, rpm=USUAL_RPM, cutoff_hz=USUAL_HZ)
+    usual_apex = where(rows, degrees=USUAL_DEG, cutoff_hz=USUAL_HZ)
+    verdicts = []
+    for degrees in (1.0, 0.5):
+        claim = judge(
+            14,
+            f"A prism of 2° gives more events than one of {degrees:g}° (720 rpm).",
+            differences(
+                usual_speed, "mev_per_s", {"degrees": 2.0}, {"degrees": degrees}, by=("rpm",)
+            ),
+            f"the event rate at 2° less that at {degrees:g}°",
+            above=0.0,
+            unit="Mev/s",
+        )
+        verdicts.append(claim)
+    for value, amount, name, unit in (
+        ("mev_per_s", "events", "event rate", "Mev/s"),
+        ("edge_blur", "error", "edge blur", "px"),
+    ):
+        by_apex = differences(usual_speed, value, {"degrees": 1.0}, {"degrees": 0.5}, by=("only",))
+        by_speed = differences(
+            usual_apex, value, {"rpm": 2 * USUAL_RPM}, {"rpm": USUAL_RPM}, by=("only",)
+        )
+        for change, growth, sides in (
+            ("A larger apex (720 rpm)", by_apex, "at 1° less that at 0.5°"),
+            ("A higher speed (apex 0.5°)", by_speed, "at 1440 rpm less that at 720 rpm"),
+        ):
+            text = f"{change} gives more {amount}."
+            rule = f"the {name} {sides}"
+            verdicts.append(judge(15, text, growth, rule, above=0.0, unit=unit))
+    return verdicts
+
+
+def _in_words(measure: str) -> str:
     """Return a measure in words."""
     return measure.replace("_", " ")
 
 
-def _growth(measure: str) -> str:
+def _growth_in_words(measure: str) -> str:
     """Return in words what a surge of a measure is."""
-    return f"relative growth of the {_named(measure)} from 720 to 1440 rpm less that from 360 to 720 rpm"
+    return f"relative growth of the {_in_words(measure)} from 720 to 1440 rpm less that from 360 to 720 rpm"
 
 
 def surge_of(rows: Sequence[dict[str, Any]], measure: str) -> list[dict[str, Any]]:
     """Return the surge of a measure above 720 rpm for each apex, timing error and seed: see :data:`SURGE`."""
-    found: dict[tuple[Any, ...], dict[float, dict[str, Any]]] = {}
+    rows_by_speed: dict[tuple[Any, ...], dict[float, dict[str, Any]]] = {}
     for row in rows:
-        key = (row["apex_name"], row.get("timing"), row.get("error_us"), row["seed"])
+        case = (row["apex_name"], row.get("timing"), row.get("error_us"), row["seed"])
         if row[measure] is not None:
-            found.setdefault(key, {})[row["rpm"]] = row
-    out = []
-    for speeds in found.values():
+            rows_by_speed.setdefault(case, {})[row["rpm"]] = row
+    surges = []
+    for speeds in rows_by_speed.values():
         if {USUAL_RPM / 2.0, USUAL_RPM, 2.0 * USUAL_RPM} <= set(speeds):
             low = speeds[USUAL_RPM / 2.0][measure]
             usual = speeds[USUAL_RPM][measure]
             high = speeds[2.0 * USUAL_RPM][measure]
             below = usual / low - 1.0
             above = high / usual - 1.0
-            out.append(speeds[USUAL_RPM] | {"below": below, "above": above, "surge": above - below})
-    return out
+            growths = {"below": below, "above": above, "surge": above - below}
+            surges.append(speeds[USUAL_RPM] | growths)
+    return surges
 
 
 def _whole_sensor(rows: Sequence[dict[str, Any]], *sizes_us: float) -> list[dict[str, Any]]:
@@ -847,4 +886,4 @@ def _whole_sensor(rows: Sequence[dict[str, Any]], *sizes_us: float) -> list[dict
     ``sizes_us``: sizes of the timing errors, by default both.
     """
     kinds = [(NONE if us == 0.0 else WANDER, us) for us in sizes_us or (0.0, USUAL_US)]
-    return [r for r in rows if not _cropped(r) and (r["timing"], r["error_us"]) in kinds]
+    return [r for r in rows if not _is_cropped(r) and (r["timing"], r["error_us"]) in kinds]

@@ -61,13 +61,13 @@ def estimate_rotation(events: Events, camera: Camera) -> CameraRotation:
         return CameraRotation()
     few = dithered(thinned(events, MOST_EVENTS))
     search = _RotationSearch(few, camera)
-    found = []
+    optima = []
     for coarsest in range(len(SMOOTHING_PX)):
         rate = np.zeros(3)
         for sigma in SMOOTHING_PX[coarsest:]:
             rate, cost = search.refine(rate, sigma)
-        found.append((cost, rate))
-    _, best = min(found, key=lambda pair: pair[0])
+        optima.append((cost, rate))
+    _, best = min(optima, key=lambda pair: pair[0])
     return search.rotation(best)
 
 
@@ -117,8 +117,8 @@ class _RotationSearch:
             "fatol": np.inf,
             "maxiter": 60,
         }
-        found = minimize(cost, rate, method="Nelder-Mead", options=options)
-        return np.asarray(found.x), float(found.fun)
+        optimum = minimize(cost, rate, method="Nelder-Mead", options=options)
+        return np.asarray(optimum.x), float(optimum.fun)
 
     def _log_variance(self, events: Events, sigma: float) -> NDArray[np.float32]:
         """Return the logarithm of the image's variance in each tile that has events."""

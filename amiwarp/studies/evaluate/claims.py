@@ -124,29 +124,27 @@ class Interval:
     @classmethod
     def of(cls, values: Sequence[float]) -> Interval:
         """Return the interval of the mean of independent values, one for each seed."""
-        n = len(values)
+        seeds = len(values)
         mean = float(np.mean(values))
-        if n < 2:
-            return cls(mean, -math.inf, math.inf, n)
-        half = float(
-            special.stdtrit(n - 1, 0.5 + LEVEL / 2.0) * np.std(values, ddof=1) / math.sqrt(n)
-        )
-        return cls(mean, mean - half, mean + half, n)
+        if seeds < 2:
+            return cls(mean, -math.inf, math.inf, seeds)
+        quantile = special.stdtrit(seeds - 1, 0.5 + LEVEL / 2.0)
+        half = float(quantile * np.std(values, ddof=1) / math.sqrt(seeds))
+        return cls(mean, mean - half, mean + half, seeds)
 
     def verdict(self, above: float, below: float) -> Verdict:
         """Return the verdict on the claim that the mean is larger than ``above`` and smaller than ``below``."""
         if self.low > above and self.high < below:
             return Verdict.REPRODUCED
-        return (
-            Verdict.NOT_REPRODUCED if self.high < above or self.low > below else Verdict.UNDECIDED
-        )
+        if self.high < above or self.low > below:
+            return Verdict.NOT_REPRODUCED
+        return Verdict.UNDECIDED
 
     def text(self, unit: str = "") -> str:
         """Return the mean, the interval and the number of seeds in words."""
         ends = f" [{self.low:.3g}, {self.high:.3g}]" if self.seeds > 1 else ""
-        return (
-            f"{self.mean:.3g}{ends}{unit and ' '}{unit}, {self.seeds} seed{'s'[: self.seeds != 1]}"
-        )
+        seeds = "1 seed" if self.seeds == 1 else f"{self.seeds} seeds"
+        return f"{self.mean:.3g}{ends}{unit and ' '}{unit}, {seeds}"
 
 
 @dataclass(frozen=True)
@@ -175,8 +173,8 @@ class Claim:
 def judge(
     number: int | None,
     text: str,
-    found: Differences,
-    what: str,
+    values: Differences,
+    quantity: str,
     *,
     above: float = -math.inf,
     below: float = math.inf,
@@ -186,45 +184,47 @@ def judge(
 
     A seed's value is the mean over its cases, so that seeds are independent. Every seed runs all cases; one that lacks
     the value of a case, as of a refused calibration, is counted in the text. "No worse by more than m" is
-    ``above=-m`` where larger is better. ``what``: the value in words.
+    ``above=-m`` where larger is better. ``quantity``: the value in words.
     """
     limits = [
-        f"{word} {value:g}"
-        for word, value in (("above", above), ("below", below))
-        if math.isfinite(value)
+        f"{relation} {limit:g}"
+        for relation, limit in (("above", above), ("below", below))
+        if math.isfinite(limit)
     ]
-    rule = f"the 95 % interval over the seeds of {what} lies {' and '.join(limits)}{unit and ' '}{unit}"
+    rule = f"the 95 % interval over the seeds of {quantity} lies {' and '.join(limits)}{unit and ' '}{unit}"
     by_seed: dict[int, list[float]] = {}
-    for values in found.values():
-        for seed, value in values.items():
+    for of_case in values.values():
+        for seed, value in of_case.items():
             by_seed.setdefault(seed, []).append(value)
     if not by_seed:
         return Claim(number, text, NO_RESULT, Verdict.NOT_TESTABLE, rule)
-    interval = Interval.of([float(np.mean(values)) for values in by_seed.values()])
-    inside = {case: Interval.of(list(values.values())) for case, values in found.items() if values}
-    fewer = sum(len(values) < len(inside) for values in by_seed.values())
+    interval = Interval.of([float(np.mean(of_seed)) for of_seed in by_seed.values()])
     verdict = interval.verdict(above, below)
     ours = interval.text(unit)
+
+    # Cases in which the verdict alone would be another one
+    intervals = {
+        case: Interval.of(list(of_case.values())) for case, of_case in values.items() if of_case
+    }
     for other in (Verdict.REPRODUCED, Verdict.NOT_REPRODUCED):
-        among = [
-            case
-            for case, one in inside.items()
-            if one.verdict(above, below) is other is not verdict
-        ]
-        ours += f"; {other} in {' and '.join(among)}" if among else ""
-    ours += f"; seeds that lack a case: {fewer}" if fewer else ""
-    cases = {case: one.text(unit) for case, one in inside.items()} if len(inside) > 1 else {}
-    return Claim(number, text, ours, verdict, rule, cases)
+        cases = [case for case, own in intervals.items() if own.verdict(above, below) is other]
+        if cases and verdict is not other:
+            ours += f"; {other} in {' and '.join(cases)}"
+
+    incomplete = sum(len(of_seed) < len(intervals) for of_seed in by_seed.values())
+    if incomplete:
+        ours += f"; seeds that lack a case: {incomplete}"
+    texts = {case: own.text(unit) for case, own in intervals.items()}
+    return Claim(number, text, ours, verdict, rule, texts if len(texts) > 1 else {})
 
 
 def judge_number(
-    number: int | None, text: str, value: float, what: str, *, below: float, unit: str
+    number: int | None, text: str, value: float, quantity: str, *, below: float, unit: str
 ) -> Claim:
     """Return the claim that a number lies below a limit, which is computed without recordings and has no spread."""
     verdict = Verdict.REPRODUCED if value < below else Verdict.NOT_REPRODUCED
-    return Claim(
-        number, text, f"{value:.3g} {unit}, computed", verdict, f"{what} is below {below:g} {unit}"
-    )
+    rule = f"{quantity} is below {below:g} {unit}"
+    return Claim(number, text, f"{value:.3g} {unit}, computed", verdict, rule)
 
 
 def untestable(number: int, text: str, reason: str) -> Claim:
@@ -263,30 +263,29 @@ def differences(
     are left out, as are values that are None or not finite.
     """
     means = [_means(rows, value, kind, by) for kind in (first, second) if kind is not None]
-    out: dict[str, dict[int, float]] = {}
+    by_case: dict[str, dict[int, float]] = {}
     for (case, seed), ours in means[0].items():
         theirs = 0.0 if second is None else means[-1].get((case, seed))
-        if theirs is not None and not (relative and theirs == 0.0):
-            out.setdefault(case, {})[seed] = (ours - theirs) / theirs if relative else ours - theirs
-    return out
+        if theirs is None or (relative and theirs == 0.0):
+            continue
+        difference = ours - theirs
+        by_case.setdefault(case, {})[seed] = difference / theirs if relative else difference
+    return by_case
 
 
 def _means(
     rows: Sequence[Mapping[str, Any]], value: str, kind: Mapping[str, Any], by: Sequence[str]
 ) -> dict[tuple[str, int], float]:
     """Return the mean of a column over the rows of a kind, by case and seed."""
-    found: dict[tuple[str, int], list[float]] = {}
+    groups: dict[tuple[str, int], list[float]] = {}
     for row in rows:
-        given = row.get(value)
-        if (
-            given is not None
-            and math.isfinite(given)
-            and all(row[name] == v for name, v in kind.items())
-        ):
-            found.setdefault((", ".join(str(row[name]) for name in by), row["seed"]), []).append(
-                float(given)
-            )
-    return {key: float(np.mean(values)) for key, values in found.items()}
+        measured = row.get(value)
+        if measured is None or not math.isfinite(measured):
+            continue
+        if all(row[name] == wanted for name, wanted in kind.items()):
+            case = ", ".join(str(row[name]) for name in by)
+            groups.setdefault((case, row["seed"]), []).append(float(measured))
+    return {key: float(np.mean(values)) for key, values in groups.items()}
 
 
 def ranges(
@@ -296,15 +295,15 @@ def ranges(
 
     Those with fewer than two values are left out.
     """
-    found: dict[tuple[Any, ...], dict[Any, list[float]]] = {}
+    groups: dict[tuple[Any, ...], dict[Any, list[float]]] = {}
     for row in rows:
         if row.get(value) is None:
             continue
-        of_case = found.setdefault((row["scene"], row["seed"], row["stream"]), {})
+        of_case = groups.setdefault((row["scene"], row["seed"], row["stream"]), {})
         of_case.setdefault(row[over], []).append(float(row[value]))
 
     ranges_of_cases = []
-    for (scene, seed, stream), values in found.items():
+    for (scene, seed, stream), values in groups.items():
         if len(values) > 1:
             means = [np.mean(several) for several in values.values()]
             case = {"scene": scene, "seed": seed, "stream": stream}

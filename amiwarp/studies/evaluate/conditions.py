@@ -94,10 +94,10 @@ class Condition:
         """Description in words: world, motion, prism and seed, and what else differs from the defaults."""
         prism = f"apex {math.degrees(self.apex):.4g}°, {self.rpm:g} rpm"
         parts = [f"{self.world} {self.trajectory}", prism, f"seed {self.seed}"]
-        said = {"world", "trajectory", "apex", "rpm", "seed"}
+        stated = {"world", "trajectory", "apex", "rpm", "seed"}
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name not in said and value != field.default:
+            if field.name not in stated and value != field.default:
                 parts.append(f"{field.name} {value}")
         return ", ".join(parts)
 

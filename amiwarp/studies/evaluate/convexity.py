@@ -19,7 +19,7 @@ from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.optics.prism import Prism
-from amiwarp.studies.evaluate.claims import Claim, differences, judge, untestable
+from amiwarp.studies.evaluate.claims import Claim, Differences, differences, judge, untestable
 from amiwarp.studies.evaluate.conditions import DISCS, IDEAL, INDEX, Condition, Settings
 from amiwarp.studies.evaluate.cost_shape import shape_of
 from amiwarp.studies.evaluate.results import (
@@ -147,8 +147,8 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     for seconds in lengths:
         for name, cost, events in _costs(streams, round(seconds * 1e6), step):
             shape = shape_of(cost)
-            i, j = shape.lowest
-            error = radius * abs(SIZES[i] * np.exp(1j * PHASES[j]) - 1.0)
+            size, phase = shape.lowest
+            error = radius * abs(SIZES[size] * np.exp(1j * PHASES[phase]) - 1.0)
             rows.append(
                 {
                     "cost": name,
@@ -183,8 +183,8 @@ def _costs(
     events = recording.events.between(0, length_us)[::step]
     part = replace(recording, events=MemoryEvents(events, *streams.size))
     phase = recording.truth.parameters["phase"]
-    found = surfaces_of(part, _deflection(streams), phase, device=streams.device)
-    return [(name, cost, len(events)) for name, cost in found.items()]
+    costs = surfaces_of(part, _deflection(streams), phase, device=streams.device)
+    return [(name, cost, len(events)) for name, cost in costs.items()]
 
 
 def surfaces_of(
@@ -196,25 +196,26 @@ def surfaces_of(
         settings = CalibrationSettings(
             model="circle", sharpness=kind, events=len(recording.events), stages=STAGES[:1]
         )
-        return prepare(recording, settings, device=device)[0]
+        search, *_ = prepare(recording, settings, device=device)
+        return search
 
     def over_grid(search: Search, cost: Callable[[dict[str, float]], Any]) -> NDArray[np.float64]:
-        start = search.space.start
-        grid = [
-            [{**start, "deflection": s * deflection, "phase": phase + p} for p in PHASES]
-            for s in SIZES
-        ]
-        return np.array([[cost(point) for point in line] for line in grid])
+        rows = []
+        for size in SIZES:
+            of_size = {**search.space.start, "deflection": size * deflection}
+            rows.append([cost({**of_size, "phase": phase + shift}) for shift in PHASES])
+        return np.array(rows)
 
     by_paper = search_by(Sharpness.PAPER_J)
 
-    def both(point: dict[str, float]) -> tuple[float, float]:
+    def costs_of_paper(point: dict[str, float]) -> tuple[float, float]:
+        """Return J with η = 1, and J with a large η, which counts the pixels with events."""
         cost = -by_paper.fine.values(point)
         return cost, 0.5 * np.count_nonzero(by_paper.fine.image(point).numpy() > 0.0)
 
-    paper, pixels = np.moveaxis(over_grid(by_paper, both), -1, 0)
+    paper, pixels = np.moveaxis(over_grid(by_paper, costs_of_paper), -1, 0)
     ours = search_by(Sharpness.VARIANCE)
-    found = {
+    costs = {
         PAPER: paper,
         PIXELS: pixels,
         OURS: over_grid(ours, lambda point: -ours.fine.values(point)),
@@ -222,8 +223,8 @@ def surfaces_of(
     tiles = tiles_of(ours.calibration_events, ours.space)
     for name, finest in ((LONG_WAVES, BANDS[0]), (ALL_WAVES, FINEST)):
         in_phase = PhaseObjective(ours.space, tiles, finest)
-        found[name] = -over_grid(ours, in_phase.measure)[..., 0]
-    return found
+        costs[name] = -over_grid(ours, in_phase.measure)[..., 0]
+    return costs
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
@@ -286,7 +287,7 @@ def _scene(world: str, only: str | None) -> str:
 
 def pictures(results: Sequence[CellResult]) -> list[Picture]:
     """Return the surfaces of the first seed as contours, with the convex domain."""
-    found = []
+    drawn = []
     for result in results:
         condition = result.condition
         if isinstance(condition, Condition) and result.values.get("surfaces"):
@@ -295,11 +296,10 @@ def pictures(results: Sequence[CellResult]) -> list[Picture]:
                 f"Costs over deflection and phase, {scene}, 2 s, first seed. White: boundary of the "
                 "convex domain. Cross: true values. Circle: lowest cell."
             )
+            name = scene.replace(", ", "_").replace(" ", "_")
             frame = contours(result.values["surfaces"])
-            found.append(
-                Picture(f"convexity_{scene.replace(', ', '_').replace(' ', '_')}", caption, [frame])
-            )
-    return found
+            drawn.append(Picture(f"convexity_{name}", caption, [frame]))
+    return drawn
 
 
 def contours(surfaces: Sequence[dict[str, Any]]) -> NDArray[np.uint8]:
@@ -315,12 +315,10 @@ def contours(surfaces: Sequence[dict[str, Any]]) -> NDArray[np.uint8]:
         degrees = np.degrees(PHASES)
         shape = shape_of(cost)
         ax.contourf(degrees, SIZES, cost, levels=20, cmap="viridis")
-        ax.contour(
-            degrees, SIZES, shape.convex.astype(float), levels=[0.5], colors="white", linewidths=1.2
-        )
-        ax.plot(
-            degrees[shape.lowest[1]], SIZES[shape.lowest[0]], "o", mfc="none", mec="white", ms=7
-        )
+        convex = shape.convex.astype(float)
+        ax.contour(degrees, SIZES, convex, levels=[0.5], colors="white", linewidths=1.2)
+        size, phase = shape.lowest
+        ax.plot(degrees[phase], SIZES[size], "o", mfc="none", mec="white", ms=7)
         ax.plot(0.0, 1.0, "x", color="red", ms=6)
         ax.set_title(surface["cost"], fontsize=9)
         ax.set_xlabel("phase error [°]", fontsize=8)
@@ -333,12 +331,12 @@ def contours(surfaces: Sequence[dict[str, Any]]) -> NDArray[np.uint8]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the calibration from 2 s: its optimum, and the convexity of the cost around it."""
-    every = _rows(results)
-    all_ideal = [row for row in every if row["only"] is not None]
-    all_noisy = [row for row in every if row["only"] is None]
+    rows = _rows(results)
+    all_ideal = [row for row in rows if row["only"] is not None]
+    all_noisy = [row for row in rows if row["only"] is None]
     ideal = _of_usual_length(all_ideal)
     noisy = _of_usual_length(all_noisy)
-    found = [
+    return [
         untestable(
             16,
             "Recordings shorter than 2 s sometimes do not converge.",
@@ -346,40 +344,48 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
         ),
         *_lengths(16, PIXELS, all_ideal),
         *_lengths(None, OURS, all_noisy),
+        # The paper states no η: its claim is about the one for which it can hold, and the others are checks.
+        *_shape_claims(16, PIXELS, ideal, "ideal sensor"),
+        *_shape_claims(None, PIXELS, noisy, "DVXplorer"),
+        *_shape_claims(None, PAPER, ideal, "ideal sensor"),
+        *_shape_claims(None, PAPER, noisy, "DVXplorer"),
+        *_shape_claims(None, OURS, noisy, "DVXplorer"),
     ]
-    # the paper states no η: its claim is about the one for which it can hold, and the others are checks
-    for number, cost, chosen, sensor in (
-        (16, PIXELS, ideal, "ideal sensor"),
-        (None, PIXELS, noisy, "DVXplorer"),
-        (None, PAPER, ideal, "ideal sensor"),
-        (None, PAPER, noisy, "DVXplorer"),
-        (None, OURS, noisy, "DVXplorer"),
-    ):
-        for text, value, what, limits in (
-            (
-                "the optimum is the true one",
-                "error",
-                "the error of the optimum",
-                {"below": FOUND_PX, "unit": "px"},
-            ),
-            (
-                "the optimum is unique",
-                "unique",
-                "the share of recordings with one minimum on the grid",
-                {"above": 1.0 - SOMETIMES},
-            ),
-            (
-                "the cost is convex around the true values",
-                "convex_deg",
-                "half the range of convex phases",
-                {"above": LEAST_PHASE_DEG, "unit": "°"},
-            ),
-        ):
-            values = differences(chosen, value, {"cost": cost}, by=("scene",))
-            found.append(
-                judge(number, f"With '{cost}' and 2 s, {text} ({sensor}).", values, what, **limits)
-            )
-    return found
+
+
+def _shape_claims(
+    number: int | None, cost: str, rows: Sequence[dict[str, Any]], sensor: str
+) -> list[Claim]:
+    """Judge the optimum of a cost from 2 s: whether it is the true one, unique, and within a convex domain."""
+
+    def values(column: str) -> Differences:
+        return differences(rows, column, {"cost": cost}, by=("scene",))
+
+    return [
+        judge(
+            number,
+            f"With '{cost}' and 2 s, the optimum is the true one ({sensor}).",
+            values("error"),
+            "the error of the optimum",
+            below=FOUND_PX,
+            unit="px",
+        ),
+        judge(
+            number,
+            f"With '{cost}' and 2 s, the optimum is unique ({sensor}).",
+            values("unique"),
+            "the share of recordings with one minimum on the grid",
+            above=1.0 - SOMETIMES,
+        ),
+        judge(
+            number,
+            f"With '{cost}' and 2 s, the cost is convex around the true values ({sensor}).",
+            values("convex_deg"),
+            "half the range of convex phases",
+            above=LEAST_PHASE_DEG,
+            unit="°",
+        ),
+    ]
 
 
 def _of_usual_length(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

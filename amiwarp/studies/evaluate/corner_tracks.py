@@ -134,9 +134,9 @@ def track_frames(grey: Sequence[NDArray[np.uint8]], t_us: Sequence[int]) -> Trac
     total = 0
     for k, frame in enumerate(grey):
         if k and len(xy):
-            there, kept = _tracked(grey[k - 1], frame, xy)
-            number = number[kept]
-            xy = there[kept]
+            moved, is_tracked = _tracked(grey[k - 1], frame, xy)
+            number = number[is_tracked]
+            xy = moved[is_tracked]
         new = _new_corners(frame, xy)
         number = np.concatenate([number, total + np.arange(len(new))])
         xy = np.concatenate([xy, new])
@@ -154,11 +154,11 @@ def _tracked(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return where corners of the frame before are [px], and whether tracking back leads to where they were."""
     cv2 = library("cv2")
-    there, found_there, _ = cv2.calcOpticalFlowPyrLK(before, frame, xy, None)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(frame, before, there, None)
+    moved, was_found, _ = cv2.calcOpticalFlowPyrLK(before, frame, xy, None)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(frame, before, moved, None)
     away = back - xy
     returns = np.hypot(away[:, 0], away[:, 1]) < BACK_PX
-    return there, (found_there.ravel() == 1) & (found_back.ravel() == 1) & returns
+    return moved, (was_found.ravel() == 1) & (found_back.ravel() == 1) & returns
 
 
 def _new_corners(frame: NDArray[np.uint8], xy: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -232,10 +232,10 @@ def true_paths(
     instants = np.array([frame.t_us for frame in frames])
     nearest = np.abs(tracks.t[:, None] - instants).argmin(axis=1)
     for k, frame in enumerate(frames):
-        here = np.flatnonzero((nearest == k) & np.isfinite(truth).all(axis=1))
-        at, _ = project(camera, trajectory, points[here], np.full(len(here), frame.t_us))
-        hidden = _farthest(frame.depth, at) < OCCLUDED * depth[here]
-        truth[here[hidden]] = np.nan
+        rows = np.flatnonzero((nearest == k) & np.isfinite(truth).all(axis=1))
+        at, _ = project(camera, trajectory, points[rows], np.full(len(rows), frame.t_us))
+        hidden = _farthest(frame.depth, at) < OCCLUDED * depth[rows]
+        truth[rows[hidden]] = np.nan
     return truth
 
 

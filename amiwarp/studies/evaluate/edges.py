@@ -1,6 +1,7 @@
 """Evaluation of edges: event images against the Canny edges of the grey picture and the edges of the geometry."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypedDict
 
@@ -30,8 +31,10 @@ from amiwarp.studies.evaluate.results import (
     Count,
     Share,
     Table,
+    Value,
     grouped,
     rows_of,
+    where,
 )
 from amiwarp.studies.evaluate.stored_pictures import (
     Picture,
@@ -92,6 +95,22 @@ VALUES_IN_WORDS = {
 """What the values are called in the claims."""
 SET = ("scene", "camera", "stream", "truth", "tolerance")
 """Columns whose values make a set of images with one best threshold."""
+COLUMNS = {
+    "scene": "scene",
+    "camera": "camera",
+    "true edges": "truth",
+    "tolerance [px]": "tolerance",
+    "stream": "stream",
+    "ODS-F": "f",
+    "std": "std",
+    "chance": "chance",
+    "margin over chance": "margin",
+    "precision": "precision",
+    "recall": "recall",
+    "entropy [bit/px]": "entropy",
+    "seeds": "seeds",
+}
+"""Columns of the tables of scores, with the names of their values in a row of :func:`scores`."""
 SECTORS = 6
 """Number of classes of the angle between image motion and the normal of an edge."""
 KEPT = 0.1
@@ -170,18 +189,17 @@ class _Image:
 
     def masks(self) -> list[Masks]:
         """Return the pixels above each threshold, and the same thinned; equal masks are the same arrays."""
-        known: dict[int, Masks] = {}
-        out = []
+        skeletonize = library("skimage.morphology").skeletonize
+        # Masks of the same number of pixels are equal, because each lies within the mask of a lower threshold.
+        masks_by_count: dict[int, Masks] = {}
+        masks = []
         for threshold in THRESHOLDS:
             above = np.asarray(self.image >= threshold, np.bool_)
             count = int(above.sum())
-            if count not in known:
-                known[count] = (
-                    above,
-                    np.asarray(library("skimage.morphology").skeletonize(above), np.bool_),
-                )
-            out.append(known[count])
-        return out
+            if count not in masks_by_count:
+                masks_by_count[count] = above, np.asarray(skeletonize(above), np.bool_)
+            masks.append(masks_by_count[count])
+        return masks
 
 
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
@@ -191,40 +209,45 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     sectors = []
     pictures = {}
     middle_us = streams.end_us // 2
-    names: list[str] = [s.value for s in streams.names if _enough(streams, s)]
+    names: list[str] = [s.value for s in streams.names if _has_enough_events(streams, s)]
     names += [camera.value for camera in Frames]
+    tolerances = QUICK_TOLERANCES if settings.quick else TOLERANCES
     for name in names:
         window = _image(streams, name, middle_us)
         masks = window.masks()
-        images.append(_summary(name, masks))
-        counted = _count(name, window, masks, QUICK_TOLERANCES if settings.quick else TOLERANCES)
-        rows += counted
-        strict = next(r for r in counted if (r["truth"], r["tolerance"]) == (CANNY, STRICT))
-        best = best_f(_counts(strict, images[-1]))[0]
-        sectors += _sectors(name, window, masks[best][1])
+        summary = _summary(name, masks)
+        images.append(summary)
+        counts = _count(name, window, masks, tolerances)
+        rows += counts
+        (strict,) = where(counts, truth=CANNY, tolerance=STRICT)
+        best, _ = best_f(_counts(strict, summary))
+        _, thinned = masks[best]
+        sectors += _sectors(name, window, thinned)
         pictures[name] = _shown(window.image)
     frame = streams.frame(middle_us)
     pictures["grey picture"] = _shown(grey_picture(frame.intensity))
-    true = _true(frame)
+    true = _true_edges(frame)
     pictures |= {name: _shown(true[name]) for name in (CANNY, GEOMETRY)}
-    first = streams.condition.seed == settings.first_seed
+    is_first = streams.condition.seed == settings.first_seed
     return {
         "images": images,
         "rows": rows,
         "sectors": sectors,
-        "pictures": pictures if first else {},
+        "pictures": pictures if is_first else {},
     }
 
 
-def _enough(streams: Streams, stream: Stream) -> bool:
+def _has_enough_events(streams: Streams, stream: Stream) -> bool:
     """Return whether the stream with the same count has as many events, which it never has at rest."""
     if stream is not Stream.SAME_COUNT:
         return True
-    span = streams.end_us // 2 - WINDOW_US // 2, streams.end_us // 2 + WINDOW_US // 2
+    middle_us = streams.end_us // 2
+    span = middle_us - WINDOW_US // 2, middle_us + WINDOW_US // 2
     return len(streams.window(stream, *span)) >= ENOUGH * streams.count(Stream.RAW, *span)
 
 
-def _true(frame: FrameTruth) -> dict[str, NDArray[np.bool_]]:
+def _true_edges(frame: FrameTruth) -> dict[str, NDArray[np.bool_]]:
+    """Return the true edges of an instant by their kind."""
     canny = {name: canny_edges(frame.intensity, sigma) for sigma, name in SIGMAS.items()}
     return {**canny, GEOMETRY: geometric_edges(frame)}
 
@@ -236,18 +259,19 @@ def _image(streams: Streams, name: str, middle_us: int) -> _Image:
     if name in set(Frames):
         exposed = streams.last_exposure(Frames(name), span[1])
         assert exposed is not None
-        return _Image(normalised(edge_strength(streams.grey_frame(exposed))), _true(frame), frame)
+        return _Image(
+            normalised(edge_strength(streams.grey_frame(exposed))), _true_edges(frame), frame
+        )
     events = streams.window(Stream(name), *span)
-    return _Image(
-        normalised(iwe(events, *streams.size, device=streams.device)), _true(frame), frame
-    )
+    image = iwe(events, *streams.size, device=streams.device)
+    return _Image(normalised(image), _true_edges(frame), frame)
 
 
 def _summary(name: str, masks: Sequence[Masks]) -> dict[str, Any]:
     """Return the number of thinned pixels and the entropy of a stream's image over the thresholds."""
     entropy = np.array([binary_entropy(above) for above, _ in masks])
-    found = [int(np.count_nonzero(thin)) for _, thin in masks]
-    return {"stream": name, "found": found, "entropy": entropy.round(4).tolist()}
+    counts = [int(np.count_nonzero(thin)) for _, thin in masks]
+    return {"stream": name, "found": counts, "entropy": entropy.round(4).tolist()}
 
 
 def _count(
@@ -263,13 +287,13 @@ def _count(
         turned = edges[::-1, ::-1]
         matched = np.transpose(_matched(masks, edges, tolerances)).tolist()
         chance = np.transpose(_matched(masks, turned, tolerances)).tolist()
-        for k, tolerance in enumerate(tolerances):
+        for index, tolerance in enumerate(tolerances):
             row = {
                 "stream": name,
                 "truth": truth,
                 "tolerance": tolerance,
-                "matched": matched[k],
-                "chance": chance[k],
+                "matched": matched[index],
+                "chance": chance[index],
                 "true": int(edges.sum()),
             }
             rows.append(row)
@@ -281,13 +305,15 @@ def _matched(
 ) -> list[list[int]]:
     """Return the number of matches for each threshold and tolerance."""
     counts: list[list[int]] = []
-    for k, (_, thin) in enumerate(masks):
-        same_as_before = k > 0 and thin is masks[k - 1][1]
-        if same_as_before:
+    previous = None
+    for _, thin in masks:
+        # Equal masks are the same arrays.
+        if thin is previous:
             counts.append(counts[-1])
             continue
         matches = match(thin, true, tolerances)
         counts.append([int(np.count_nonzero(matched)) for matched in matches])
+        previous = thin
     return counts
 
 
@@ -298,19 +324,24 @@ def _counts(row: dict[str, Any], images: dict[str, Any], which: str = "matched")
     return Counts(matched, found, np.full(len(found), row["true"]))
 
 
-def _sectors(name: str, image: _Image, found: NDArray[np.bool_]) -> list[dict[str, Any]]:
-    """Return the recall of Canny edges by the angle between the image motion and the normal of the edge."""
-    edges = np.linspace(0.0, 90.0, SECTORS + 1)
-    at = np.nonzero(image.true[CANNY])
-    seen = match(found, image.true[CANNY], [STRICT])[0][at]
-    angle = _angle(image.frame)[at]
-    sector = np.clip(np.digitize(angle, edges) - 1, 0, SECTORS - 1)
+def _sectors(name: str, image: _Image, thinned: NDArray[np.bool_]) -> list[dict[str, Any]]:
+    """Return the recall of Canny edges by the angle between the image motion and the normal of the edge.
+
+    ``thinned``: pixels of the image's edges.
+    """
+    limits_deg = np.linspace(0.0, 90.0, SECTORS + 1)
+    true = image.true[CANNY]
+    (matched,) = match(thinned, true, [STRICT])
+    is_found = matched[true]
+    angle_deg = _angle(image.frame)[true]
+    sector = np.clip(np.digitize(angle_deg, limits_deg) - 1, 0, SECTORS - 1)
     rows = []
-    for k in range(SECTORS):
-        chosen = np.isfinite(angle) & (sector == k)
+    for index in range(SECTORS):
+        chosen = np.isfinite(angle_deg) & (sector == index)
         if chosen.any():
-            middle = float(edges[k : k + 2].mean())
-            rows.append({"stream": name, "angle": middle, "recall": float(seen[chosen].mean())})
+            middle = float(limits_deg[index : index + 2].mean())
+            recall = float(is_found[chosen].mean())
+            rows.append({"stream": name, "angle": middle, "recall": recall})
     return rows
 
 
@@ -346,52 +377,53 @@ class _Member:
 
 def _sets(results: Sequence[CellResult]) -> dict[tuple[Any, ...], list[_Member]]:
     """Return the recordings of each scene, motion, stream, kind of truth and tolerance."""
-    images = {(_recording(r), r["stream"]): r for r in rows_of(results, "images")}
+    images = {(_recording(row), row["stream"]): row for row in rows_of(results, "images")}
     sets: dict[tuple[Any, ...], list[_Member]] = {}
     for row in rows_of(results, "rows"):
-        seen = images[_recording(row), row["stream"]]
+        summary = images[_recording(row), row["stream"]]
         member = _Member(
-            row["seed"], _counts(row, seen), _counts(row, seen, "chance"), seen["entropy"]
+            row["seed"], _counts(row, summary), _counts(row, summary, "chance"), summary["entropy"]
         )
-        sets.setdefault(tuple(row[c] for c in SET), []).append(member)
+        sets.setdefault(tuple(row[column] for column in SET), []).append(member)
     return sets
 
 
 def _best(members: Sequence[Counts]) -> tuple[Counts, int]:
     """Return the counts of a set, and the index of its best threshold."""
-    total = Counts(
-        *(np.sum([getattr(c, n) for c in members], axis=0) for n in ("matched", "found", "true"))
-    )
-    return total, best_f(total)[0]
+    matched = np.sum([member.matched for member in members], axis=0)
+    found = np.sum([member.found for member in members], axis=0)
+    true = np.sum([member.true for member in members], axis=0)
+    total = Counts(matched, found, true)
+    best, _ = best_f(total)
+    return total, best
 
 
 def scores(results: Sequence[CellResult]) -> list[dict[str, Any]]:
     """Return the ODS-F of each world, motion, stream, kind of truth and tolerance, with its precision and recall."""
-    out = []
+    rows = []
     for key, members in _sets(results).items():
-        total, best = _best([m.counts for m in members])
-        chance, worst = _best([m.chance for m in members])
-        f = float(total.f_score[best])
-        level = float(chance.f_score[worst])
-        out.append(
-            {
-                **dict(zip(SET, key, strict=True)),
-                "f": f,
-                "chance": level,
-                "margin": f - level,
-                "std": float(np.std([m.counts.f_score[best] for m in members])),
-                "precision": float(total.precision[best]),
-                "seeds": len(members),
-                "recall": float(total.recall[best]),
-                "entropy": float(np.mean([m.entropy[best] for m in members])),
-            }
-        )
-    return out
+        total, best = _best([member.counts for member in members])
+        chance, best_of_chance = _best([member.chance for member in members])
+        score = float(total.f_score[best])
+        score_of_chance = float(chance.f_score[best_of_chance])
+        row = {
+            **dict(zip(SET, key, strict=True)),
+            "f": score,
+            "chance": score_of_chance,
+            "margin": score - score_of_chance,
+            "std": float(np.std([member.counts.f_score[best] for member in members])),
+            "precision": float(total.precision[best]),
+            "seeds": len(members),
+            "recall": float(total.recall[best]),
+            "entropy": float(np.mean([member.entropy[best] for member in members])),
+        }
+        rows.append(row)
+    return rows
 
 
 def _by_seed(results: Sequence[CellResult]) -> list[dict[str, Any]]:
     """Return score, margin over chance and entropy of each recording, at the best thresholds of its set."""
-    out = []
+    rows = []
     for key, members in _sets(results).items():
         _, best = _best([member.counts for member in members])
         _, best_of_chance = _best([member.chance for member in members])
@@ -406,8 +438,8 @@ def _by_seed(results: Sequence[CellResult]) -> list[dict[str, Any]]:
                 "margin": float(score - by_chance),
                 "entropy": member.entropy[best],
             }
-            out.append(row)
-    return out
+            rows.append(row)
+    return rows
 
 
 def _recording(row: dict[str, Any]) -> tuple[Any, ...]:
@@ -416,153 +448,108 @@ def _recording(row: dict[str, Any]) -> tuple[Any, ...]:
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return scores at two tolerances, the curve over the tolerance, and the recall by direction."""
-    found = scores(results)
-    names = (
-        "scene",
-        "camera",
-        "true edges",
-        "tolerance [px]",
-        "stream",
-        "ODS-F",
-        "std",
-        "chance",
-        "margin over chance",
-        "precision",
-        "recall",
-        "entropy [bit/px]",
-        "seeds",
-    )
-    keys = (
-        "scene",
-        "camera",
-        "truth",
-        "tolerance",
-        "stream",
-        "f",
-        "std",
-        "chance",
-        "margin",
-        "precision",
-        "recall",
-        "entropy",
-        "seeds",
-    )
-    usual = [r for r in found if r["truth"] in (CANNY, GEOMETRY)]
-    widths = {name: sigma for sigma, name in SIGMAS.items()}
-    smoothed = [
-        r | {"sigma": widths[r["truth"]]}
-        for r in found
-        if r["truth"] in widths and r["tolerance"] == STRICT
-    ]
-    sectors = grouped(
-        rows_of(results, "sectors"), ("scene", "camera", "angle", "stream"), ["recall"]
-    )
+    all_scores = scores(results)
+    usual = [row for row in all_scores if row["truth"] in (CANNY, GEOMETRY)]
+    at_two = [row for row in usual if row["tolerance"] in (USUAL, STRICT)]
+    panels = ("scene", "camera", "true edges")
     return [
         Table(
             "edges",
             "F-score, entropy, precision and recall at two tolerances",
-            names,
-            [tuple(r[k] for k in keys) for r in usual if r["tolerance"] in (USUAL, STRICT)],
+            tuple(COLUMNS),
+            _in_columns(at_two, COLUMNS),
             "Scores belong to the best threshold of each row. The spread is over the seeds at this threshold.",
         ),
         Table(
             "edges_tolerance",
             "F-score over the tolerance",
-            names,
-            [tuple(r[k] for k in keys) for r in usual],
+            tuple(COLUMNS),
+            _in_columns(usual, COLUMNS),
             "A wide tolerance hides blur and errors of the compensation, and rewards chance.",
-            Chart(
-                "tolerance [px]", "ODS-F", "stream", "std", panels=("scene", "camera", "true edges")
-            ),
+            Chart("tolerance [px]", "ODS-F", "stream", "std", panels=panels),
         ),
         Table(
             "edges_margin",
             "Margin of the F-score over chance, over the tolerance",
-            names,
-            [tuple(r[k] for k in keys) for r in usual],
+            tuple(COLUMNS),
+            _in_columns(usual, COLUMNS),
             "What a stream's score has above its own chance.",
-            Chart(
-                "tolerance [px]",
-                "margin over chance",
-                "stream",
-                panels=("scene", "camera", "true edges"),
-            ),
+            Chart("tolerance [px]", "margin over chance", "stream", panels=panels),
         ),
-        Table(
-            "edges_canny",
-            "Margin over chance over the smoothing of the true edges (Canny, 1.5 px)",
-            ("scene", "camera", "σ [px]", "stream", "margin over chance", "std", "ODS-F", "chance"),
-            [
-                tuple(
-                    r[k]
-                    for k in ("scene", "camera", "sigma", "stream", "margin", "std", "f", "chance")
-                )
-                for r in smoothed
-            ],
-            "With little smoothing the true edges include the fine texture of walls, which chance finds too.",
-            Chart("σ [px]", "margin over chance", "stream", "std", panels=("scene", "camera")),
-        ),
-        Table(
-            "edges_direction",
-            "Recall by the direction of edges (Canny, 1.5 px)",
-            (
-                "scene",
-                "camera",
-                "angle between motion and edge normal [deg]",
-                "stream",
-                "windows",
-                "recall",
-                "std",
-            ),
-            sectors,
-            "At 90° an edge lies along the motion, and a plain event camera loses it. The threshold is the "
-            "best of the recording. A still camera has no motion.",
-            Chart(
-                "angle between motion and edge normal [deg]",
-                "recall",
-                "stream",
-                "std",
-                panels=("scene", "camera"),
-                kind=ChartKind.LINES,
-            ),
-        ),
+        _smoothing_table(where(all_scores, tolerance=STRICT)),
+        _direction_table(rows_of(results, "sectors")),
     ]
+
+
+def _in_columns(
+    rows: Sequence[dict[str, Any]], columns: Mapping[str, str]
+) -> list[tuple[Value, ...]]:
+    """Return the values of rows, in the order of the columns."""
+    return [tuple(row[name] for name in columns.values()) for row in rows]
+
+
+def _smoothing_table(scores: Sequence[dict[str, Any]]) -> Table:
+    """Return the table of the scores at the strict tolerance over the smoothing of Canny's edges."""
+    sigma_of = {name: sigma for sigma, name in SIGMAS.items()}
+    rows = [row | {"sigma": sigma_of[row["truth"]]} for row in scores if row["truth"] in sigma_of]
+    columns = {
+        "scene": "scene",
+        "camera": "camera",
+        "σ [px]": "sigma",
+        "stream": "stream",
+        "margin over chance": "margin",
+        "std": "std",
+        "ODS-F": "f",
+        "chance": "chance",
+    }
+    return Table(
+        "edges_canny",
+        "Margin over chance over the smoothing of the true edges (Canny, 1.5 px)",
+        tuple(columns),
+        _in_columns(rows, columns),
+        "With little smoothing the true edges include the fine texture of walls, which chance finds too.",
+        Chart("σ [px]", "margin over chance", "stream", "std", panels=("scene", "camera")),
+    )
+
+
+def _direction_table(sectors: Sequence[dict[str, Any]]) -> Table:
+    """Return the table of the recall over the angle between the image motion and the normal of an edge."""
+    angle = "angle between motion and edge normal [deg]"
+    return Table(
+        "edges_direction",
+        "Recall by the direction of edges (Canny, 1.5 px)",
+        ("scene", "camera", angle, "stream", "windows", "recall", "std"),
+        grouped(sectors, ("scene", "camera", "angle", "stream"), ["recall"]),
+        "At 90° an edge lies along the motion, and a plain event camera loses it. The threshold is the "
+        "best of the recording. A still camera has no motion.",
+        Chart(angle, "recall", "stream", "std", panels=("scene", "camera"), kind=ChartKind.LINES),
+    )
 
 
 def pictures(results: Sequence[CellResult]) -> list[Picture]:
     """Return the first event images of each motion, side by side."""
-    out = []
-    for camera in dict.fromkeys(
-        r.condition.trajectory for r in results if isinstance(r.condition, Condition)
-    ):
-        cells = [
-            r
-            for r in results
-            if isinstance(r.condition, Condition) and r.condition.trajectory == camera
-        ]
-        given = next((r.values["pictures"] for r in cells if r.values.get("pictures")), None)
-        if given is not None:
-            names = [
-                n
-                for n in (
-                    "grey picture",
-                    CANNY,
-                    GEOMETRY,
-                    Stream.PLAIN,
-                    Stream.CALIBRATED,
-                    Frames.FAST,
-                )
-                if n in given
-            ]
-            caption = f"Camera {camera}. From left to right: {', '.join(names)}."
-            out.append(
-                Picture(
-                    f"edges_{camera}",
-                    caption,
-                    [_mosaic([decode_picture(given[n]) for n in names])],
-                )
-            )
-    return out
+    pictures_of: dict[str, dict[str, str]] = {}
+    for result in results:
+        if isinstance(result.condition, Condition) and result.values.get("pictures"):
+            pictures_of.setdefault(result.condition.trajectory, result.values["pictures"])
+
+    shown = ("grey picture", CANNY, GEOMETRY, Stream.PLAIN, Stream.CALIBRATED, Frames.FAST)
+    mosaics = []
+    for camera in _motions(results):
+        stored = pictures_of.get(camera)
+        if stored is None:
+            continue
+        names = [name for name in shown if name in stored]
+        caption = f"Camera {camera}. From left to right: {', '.join(names)}."
+        mosaic = _mosaic([decode_picture(stored[name]) for name in names])
+        mosaics.append(Picture(f"edges_{camera}", caption, [mosaic]))
+    return mosaics
+
+
+def _motions(results: Sequence[CellResult]) -> list[str]:
+    """Return the motions of the camera in the order in which they appear."""
+    motions = [r.condition.trajectory for r in results if isinstance(r.condition, Condition)]
+    return list(dict.fromkeys(motions))
 
 
 def _mosaic(images: Sequence[NDArray[np.uint8]], columns: int = 3) -> NDArray[np.uint8]:
@@ -570,136 +557,151 @@ def _mosaic(images: Sequence[NDArray[np.uint8]], columns: int = 3) -> NDArray[np
     height, width = images[0].shape
     gap = 6
     rows = -(-len(images) // columns)
-    out = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap), 255, np.uint8)
-    for k, image in enumerate(images):
-        top = (k // columns) * (height + gap)
-        left = (k % columns) * (width + gap)
-        out[top : top + height, left : left + width] = image
-    return out
+    mosaic = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap), 255, np.uint8)
+    for index, image in enumerate(images):
+        row, column = divmod(index, columns)
+        top = row * (height + gap)
+        left = column * (width + gap)
+        mosaic[top : top + height, left : left + width] = image
+    return mosaic
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the F-score, its steadiness, the entropy and the recall by direction; and robustness."""
-    rows = _by_seed(results)
-
-    def more(
-        number: int | None,
-        text: str,
-        value: str,
-        *,
-        other: Stream = Stream.PLAIN,
-        moving: bool = True,
-        tolerance: float = USUAL,
-        truth: str = CANNY,
-    ) -> Claim:
-        chosen = [
-            r
-            for r in rows
-            if r["tolerance"] == tolerance
-            and r["truth"] == truth
-            and (r["camera"] != "still") == moving
-        ]
-        found = differences(chosen, value, {"stream": Stream.CALIBRATED}, {"stream": other})
-        return judge(
-            number,
-            text,
-            found,
-            f"{VALUES_IN_WORDS[value]} of '{Stream.CALIBRATED}' less the same of '{other}'",
-            above=0.0,
-        )
-
-    def steadier(number: int | None, text: str, value: str, tolerance: float) -> Claim:
-        moving = [
-            r
-            for r in rows
-            if r["camera"] != "still" and r["tolerance"] == tolerance and r["truth"] == CANNY
-        ]
-        found = differences(
-            ranges(moving, value),
-            value,
-            {"stream": Stream.CALIBRATED},
-            {"stream": Stream.PLAIN},
-            by=("scene",),
-        )
-        return judge(
-            number,
-            text,
-            found,
-            f"the range of {VALUES_IN_WORDS[value]} over the motions of "
-            f"'{Stream.CALIBRATED}' less the same of '{Stream.PLAIN}'",
-            below=0.0,
-        )
-
+    rows = where(_by_seed(results), truth=CANNY)
+    moving = [row for row in rows if row["camera"] != "still"]
+    at_rest = where(rows, camera="still")
+    usual = where(moving, tolerance=USUAL)
+    strict = where(moving, tolerance=STRICT)
+    geometry = [
+        row
+        for row in where(_by_seed(results), truth=GEOMETRY, tolerance=STRICT)
+        if row["camera"] != "still"
+    ]
     return [
-        more(
+        _is_higher(
             2,
             "Event images of the moving AMI-EV fit the picture's edges better (Canny, 6 px).",
+            usual,
             "f",
         ),
-        steadier(2, "They do so more steadily over the camera's motions.", "f", USUAL),
-        more(2, "Their entropy is higher (moving camera).", "entropy"),
+        _is_steadier(2, "They do so more steadily over the camera's motions.", usual, "f"),
+        _is_higher(2, "Their entropy is higher (moving camera).", usual, "entropy"),
         *_fading(rows_of(results, "sectors")),
-        more(
+        _is_higher(
             None,
             "They are better than chance by a larger margin at 6 px, where chance scores high.",
+            usual,
             "margin",
         ),
-        more(None, "So they are at rest, where the S-EV sees nothing.", "margin", moving=False),
-        more(
+        _is_higher(
             None,
-            "The margin over chance is larger at a tolerance of 1.5 px.",
+            "So they are at rest, where the S-EV sees nothing.",
+            where(at_rest, tolerance=USUAL),
             "margin",
-            tolerance=STRICT,
         ),
-        steadier(None, "That margin is steadier over the camera's motions.", "margin", STRICT),
-        more(
-            None,
-            "It is larger for geometric edges, at 1.5 px.",
-            "margin",
-            tolerance=STRICT,
-            truth=GEOMETRY,
+        _is_higher(
+            None, "The margin over chance is larger at a tolerance of 1.5 px.", strict, "margin"
         ),
-        more(
+        _is_steadier(None, "That margin is steadier over the camera's motions.", strict, "margin"),
+        _is_higher(None, "It is larger for geometric edges, at 1.5 px.", geometry, "margin"),
+        _is_higher(
             None,
             "It is larger at 1.5 px than with an S-EV with as many events.",
+            strict,
             "margin",
-            tolerance=STRICT,
-            other=Stream.SAME_COUNT,
+            than=Stream.SAME_COUNT,
         ),
-        more(
+        _is_higher(
             None,
             "The entropy is higher than with an S-EV with as many events.",
+            usual,
             "entropy",
-            other=Stream.SAME_COUNT,
+            than=Stream.SAME_COUNT,
         ),
     ]
+
+
+def _is_higher(
+    number: int | None,
+    text: str,
+    rows: Sequence[dict[str, Any]],
+    value: str,
+    *,
+    than: Stream = Stream.PLAIN,
+) -> Claim:
+    """Judge whether a value of the AMI-EV's images is higher than the value of another stream's."""
+    return judge(
+        number,
+        text,
+        differences(rows, value, {"stream": Stream.CALIBRATED}, {"stream": than}),
+        f"{VALUES_IN_WORDS[value]} of '{Stream.CALIBRATED}' less the same of '{than}'",
+        above=0.0,
+    )
+
+
+def _is_steadier(
+    number: int | None, text: str, moving: Sequence[dict[str, Any]], value: str
+) -> Claim:
+    """Judge whether a value varies less over the camera's motions for the AMI-EV than for the S-EV."""
+    of_scenes = differences(
+        ranges(moving, value),
+        value,
+        {"stream": Stream.CALIBRATED},
+        {"stream": Stream.PLAIN},
+        by=("scene",),
+    )
+    return judge(
+        number,
+        text,
+        of_scenes,
+        f"the range of {VALUES_IN_WORDS[value]} over the motions of "
+        f"'{Stream.CALIBRATED}' less the same of '{Stream.PLAIN}'",
+        below=0.0,
+    )
 
 
 def _fading(rows: Sequence[dict[str, Any]]) -> list[Claim]:
     """Judge whether edges along the motion fade from the S-EV, and whether they do not from the AMI-EV."""
-    sides = [
-        r | {"along": r["angle"] > 60.0} for r in rows if r["angle"] > 60.0 or r["angle"] < 30.0
-    ]
-
-    def judged(text: str, stream: Stream, **limit: Any) -> Claim:
-        across = {"stream": stream, "along": False}
-        found = differences(sides, "recall", across | {"along": True}, across, relative=True)
-        return judge(
-            3,
-            text,
-            found,
-            f"the recall by '{stream}' of edges whose normal is over 60° from the motion, "
-            "less the same of edges below 30°, relative to the latter,",
-            **limit,
-        )
-
+    sides = []
+    for row in rows:
+        if row["angle"] > 60.0:
+            sides.append(row | {"along": True})
+        elif row["angle"] < 30.0:
+            sides.append(row | {"along": False})
     return [
-        judged(
+        _recall_along(
             "The S-EV finds fewer of the edges along the motion than of those across it.",
+            sides,
             Stream.PLAIN,
             below=0.0,
         ),
-        judged(
-            f"The AMI-EV finds no fewer of them, within {KEPT:.0%}.", Stream.CALIBRATED, above=-KEPT
+        _recall_along(
+            f"The AMI-EV finds no fewer of them, within {KEPT:.0%}.",
+            sides,
+            Stream.CALIBRATED,
+            above=-KEPT,
         ),
     ]
+
+
+def _recall_along(
+    text: str,
+    sides: Sequence[dict[str, Any]],
+    stream: Stream,
+    *,
+    above: float = -math.inf,
+    below: float = math.inf,
+) -> Claim:
+    """Judge a stream's recall of edges along the motion, relative to edges across it."""
+    along = {"stream": stream, "along": True}
+    across = {"stream": stream, "along": False}
+    return judge(
+        3,
+        text,
+        differences(sides, "recall", along, across, relative=True),
+        f"the recall by '{stream}' of edges whose normal is over 60° from the motion, "
+        "less the same of edges below 30°, relative to the latter,",
+        above=above,
+        below=below,
+    )

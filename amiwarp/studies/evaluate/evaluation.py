@@ -149,8 +149,10 @@ def evaluate(
         if scheduler is None:
             jobs = [replace(job, threads=max(1, cpu_threads() // count)) for job in jobs]
         store = Store(folder / "cells")
-        with start_workers("amiwarp evaluate", "evaluate", scheduler, count, device) as there:
-            results, new, processor_s = _run(jobs, store, there, progress or silent)
+        with start_workers(
+            "amiwarp evaluate", "evaluate", scheduler, count, device
+        ) as started_workers:
+            results, new, processor_s = _run(jobs, store, started_workers, progress or silent)
 
         sections = []
         for name in EVALUATIONS:
@@ -182,8 +184,8 @@ def evaluate(
 def _count_verdicts(sections: Sequence[Section]) -> dict[str, int]:
     """Return how many tested parts of the paper's claims have each verdict, in order of appearance."""
     counts: dict[str, int] = {}
-    for one in sections:
-        for claim in one.claims:
+    for evaluated in sections:
+        for claim in evaluated.claims:
             # Claims without a number are our checks, not the paper's.
             if claim.number is not None:
                 counts[claim.verdict.value] = counts.get(claim.verdict.value, 0) + 1

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.prism import Prism
-from amiwarp.studies.evaluate.claims import Claim, differences, judge, untestable
+from amiwarp.studies.evaluate.claims import Claim, Differences, differences, judge, untestable
 from amiwarp.studies.evaluate.conditions import INDEX, Condition, Settings
 from amiwarp.studies.evaluate.results import (
     Amount,
@@ -21,6 +21,7 @@ from amiwarp.studies.evaluate.results import (
     Table,
     grouped,
     rows_of,
+    where,
 )
 from amiwarp.studies.evaluate.stored_pictures import (
     Picture,
@@ -53,14 +54,15 @@ TILE = 30
 """Size of a tile [px]."""
 EDGES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0)
 """Limits of the classes of the relative speed."""
-LEAST_RATE = 20.0
+LEAST_EVENTS = 20.0
 """Smallest mean number of events of a tile in a part of a turn. Tiles with less texture say nothing."""
 DIP = (0.0, 0.5)
 USUAL = (0.75, 1.25)
 """Classes of the relative speed that are compared: cancelling motion, and the prism alone."""
 FADED = 0.25
+"""Loss of the event rate of a tile at which its texture fades, relative to its mean."""
 SMALL = 0.25
-"""Loss of the event rate of a tile at which its texture fades, and of the whole image up to which it is small."""
+"""Loss of the event rate of the whole image up to which it is small, relative to its mean."""
 RARE = 0.1
 """Share of tiles and moments up to which cancelling motion counts as rare."""
 TILE_COLUMNS = (
@@ -143,40 +145,43 @@ def orbit_speed(condition: Condition) -> float:
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     """Return the relative event rate by class of relative speed, the lowest one of the whole image, tiles and film."""
     condition = streams.condition
-    length = round(60e6 / condition.rpm / PARTS)
-    starts = range(0, min(streams.end_us - length + 1, MOST_TURNS * PARTS * length), length)
+    part_us = round(60e6 / condition.rpm / PARTS)
+    end_us = min(streams.end_us - part_us + 1, MOST_TURNS * PARTS * part_us)
     orbit = orbit_speed(condition)
-    numbers = []
-    counts = []
-    speeds = []
-    cameras = []
-    frames = []
     is_first = condition.seed == settings.first_seed
-    film = is_first and condition.trajectory == "fast" and condition.rpm == 720.0
-    for start in starts:
-        events = streams.window(Stream.RAW, start, start + length)
-        numbers.append(len(events))
-        counts.append(_tiles(events.x, events.y, np.ones(len(events)), streams.size))
-        frame = streams.frame(start + length // 2)
+    has_film = is_first and condition.trajectory == "fast" and condition.rpm == 720.0
+
+    # For each part of a turn: events of the image and of each tile, and speeds of each tile relative to the prism's
+    image_counts = []
+    tile_counts = []
+    speeds = []
+    camera_speeds = []
+    film = []
+    for start in range(0, end_us, part_us):
+        events = streams.window(Stream.RAW, start, start + part_us)
+        image_counts.append(len(events))
+        tile_counts.append(_tile_sums(events.x, events.y, np.ones(len(events)), streams.size))
+        frame = streams.frame(start + part_us // 2)
         speeds.append(_mean_speed(frame.flow_with_prism, streams.size) / orbit)
-        cameras.append(_mean_speed(frame.flow, streams.size) / orbit)
-        if film:
-            frames.append(_frame(events.x, events.y, streams.size, _marked(cameras[-1])))
-    rows = _classes(np.array(counts), np.array(speeds))
+        camera_speed = _mean_speed(frame.flow, streams.size) / orbit
+        camera_speeds.append(camera_speed)
+        if has_film:
+            film.append(_frame(events.x, events.y, streams.size, _marked(camera_speed)))
+
     width, _ = streams.size
-    rates = 1e3 * np.array(counts) / length
+    rates = 1e3 * np.array(tile_counts) / part_us
     tiles = {
-        "part_ms": length * 1e-3,
+        "part_ms": part_us * 1e-3,
         "columns": width // TILE,
         "rate": np.round(rates, 3).tolist(),
         "speed": np.round(speeds, 3).tolist(),
-        "camera_speed": np.round(cameras, 3).tolist(),
+        "camera_speed": np.round(camera_speeds, 3).tolist(),
     }
-    lowest = min(numbers) / max(float(np.mean(numbers)), 1.0)
+    lowest = min(image_counts) / max(float(np.mean(image_counts)), 1.0)
     return {
-        "rows": rows,
+        "rows": _classes(np.array(tile_counts), np.array(speeds)),
         "whole": [{"lowest": lowest}],
-        "film": frames,
+        "film": film,
         "tiles": tiles if is_first else None,
     }
 
@@ -185,20 +190,21 @@ def _mean_speed(flow: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np
     """Return the mean speed of the image in each tile [px/s], shape (tiles,); 0 where the flow is unknown."""
     y, x = np.mgrid[: flow.shape[0], : flow.shape[1]]
     speed = np.nan_to_num(np.hypot(flow[..., 0], flow[..., 1]))
-    return _tiles(x.ravel(), y.ravel(), speed.ravel(), size) / TILE**2
+    return _tile_sums(x.ravel(), y.ravel(), speed.ravel(), size) / TILE**2
 
 
-def _marked(camera: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the tiles that the camera alone moves about as fast as the prism does, by their relative speed."""
-    return np.asarray((camera >= USUAL[0]) & (camera < USUAL[1]))
+def _marked(camera_speed: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which tiles the camera alone moves about as fast as the prism does, by their relative speed."""
+    slowest, fastest = USUAL
+    return np.asarray((camera_speed >= slowest) & (camera_speed < fastest))
 
 
 def _tile_rows(tiles: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row for each part of a turn and tile, of the tiles that :func:`measure` returns."""
     rate = np.array(tiles["rate"])
     speed = np.array(tiles["speed"])
-    camera = np.array(tiles["camera_speed"])
-    marked = _marked(camera)
+    camera_speed = np.array(tiles["camera_speed"])
+    marked = _marked(camera_speed)
     rows = []
     for part, tile in np.ndindex(rate.shape):
         row, column = divmod(tile, tiles["columns"])
@@ -208,33 +214,33 @@ def _tile_rows(tiles: dict[str, Any]) -> list[dict[str, Any]]:
             "row": row,
             "rate": float(rate[part, tile]),
             "speed": float(speed[part, tile]),
-            "camera_speed": float(camera[part, tile]),
+            "camera_speed": float(camera_speed[part, tile]),
             "marked": bool(marked[part, tile]),
         }
         rows.append(values)
     return rows
 
 
-def _tiles(
+def _tile_sums(
     x: NDArray[Any], y: NDArray[Any], weight: NDArray[Any], size: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Return the sums of the weights in each whole tile."""
+    """Return the sums of the weights of places [px] in each tile that lies whole in the image, shape (tiles,)."""
     width, height = size
     columns = width // TILE
     rows = height // TILE
     column = x.astype(np.int64) // TILE
     row = y.astype(np.int64) // TILE
-    whole = (column < columns) & (row < rows)
-    tile = (row * columns + column)[whole]
-    return np.asarray(np.bincount(tile, weight[whole], rows * columns), np.float64)
+    in_tile = (column < columns) & (row < rows)
+    tile = (row * columns + column)[in_tile]
+    return np.asarray(np.bincount(tile, weight[in_tile], rows * columns), np.float64)
 
 
 def _classes(counts: NDArray[np.float64], speeds: NDArray[np.float64]) -> list[dict[str, Any]]:
     """Return the mean relative event rate of each class of relative speed. Arrays of shape (parts, tiles)."""
     mean = counts.mean(axis=0)
-    good = mean >= LEAST_RATE
-    relative = counts[:, good] / mean[good]
-    speed = speeds[:, good]
+    textured = mean >= LEAST_EVENTS
+    relative = counts[:, textured] / mean[textured]
+    speed = speeds[:, textured]
     rows = []
     for low, high in itertools.pairwise(EDGES):
         chosen = (speed >= low) & (speed < high)
@@ -252,44 +258,38 @@ def _frame(
     The borders of marked tiles are red.
     """
     width, height = size
-    counts = np.bincount(y.astype(np.int64) * width + x, minlength=width * height).reshape(
-        height, width
-    )
-    picture = np.repeat((255 - np.minimum(255, 85 * counts)).astype(np.uint8)[..., None], 3, axis=2)
-    for tile in np.flatnonzero(marked).tolist():
-        row, column = divmod(tile, width // TILE)
-        part = picture[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
-        part[[0, -1]] = RED
-        part[:, [0, -1]] = RED
+    pixel = y.astype(np.int64) * width + x
+    counts = np.bincount(pixel, minlength=width * height).reshape(height, width)
+    grey = (255 - np.minimum(255, 85 * counts)).astype(np.uint8)
+    picture = np.repeat(grey[..., None], 3, axis=2)
+    for index in np.flatnonzero(marked).tolist():
+        row, column = divmod(index, width // TILE)
+        tile = picture[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
+        tile[[0, -1]] = RED
+        tile[:, [0, -1]] = RED
     return encode_picture(picture)
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the relative event rate over the relative speed, and the rate of every tile over time."""
-    rows = [{**row, "prism": f"{row['rpm']:g} rpm"} for row in rows_of(results, "rows")]
-    whole = [{**row, "prism": f"{row['rpm']:g} rpm"} for row in rows_of(results, "whole")]
-    tiles = []
-    for result in results:
-        condition = result.condition
-        if isinstance(condition, Condition) and result.values.get("tiles"):
-            known = {"camera": condition.trajectory, "rpm": condition.rpm}
-            tiles += [{**known, **row} for row in _tile_rows(result.values["tiles"])]
-    x = "speed through the prism / δ·2πf"
+    classes = _with_speed_of_prism(rows_of(results, "rows"))
+    images = _with_speed_of_prism(rows_of(results, "whole"))
+    speed = "speed through the prism / δ·2πf"
     return [
         Table(
             "fading",
             "Event rate where camera and prism cancel",
-            ("camera", "prism", x, "seeds", "relative rate", "std"),
-            grouped(rows, ("camera", "prism", "speed"), ["rate"]),
+            ("camera", "prism", speed, "seeds", "relative rate", "std"),
+            grouped(classes, ("camera", "prism", "speed"), ["rate"]),
             "Rate of a tile relative to its mean over the recording. Near 0 the motions cancel; 1 is the prism's own "
             "speed.",
-            Chart(x, "relative rate", "camera", "std", panels=("prism",)),
+            Chart(speed, "relative rate", "camera", "std", panels=("prism",)),
         ),
         Table(
             "fading_whole",
             "Lowest event rate of the whole image",
             ("camera", "prism", "seeds", "relative rate", "std"),
-            grouped(whole, ("camera", "prism"), ["lowest"]),
+            grouped(images, ("camera", "prism"), ["lowest"]),
             "Rate in the worst twelfth of a turn relative to the mean over up to two turns.",
         ),
         Table(
@@ -302,15 +302,31 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
                 "tile column",
                 "tile row",
                 "rate [kev/s]",
-                x,
+                speed,
                 "camera's speed / δ·2πf",
                 "camera as fast as the prism",
             ),
-            [tuple(r[k] for k in TILE_COLUMNS) for r in tiles],
+            [tuple(row[name] for name in TILE_COLUMNS) for row in _rows_of_tiles(results)],
             f"Tiles of {TILE} px, raw events, first seed.",
             long=True,
         ),
     ]
+
+
+def _with_speed_of_prism(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows with the speed of the prism in words."""
+    return [{**row, "prism": f"{row['rpm']:g} rpm"} for row in rows]
+
+
+def _rows_of_tiles(results: Sequence[CellResult]) -> list[dict[str, Any]]:
+    """Return a row for each part of a turn and tile of all results that have tiles."""
+    rows = []
+    for result in results:
+        condition = result.condition
+        if isinstance(condition, Condition) and result.values.get("tiles"):
+            known = {"camera": condition.trajectory, "rpm": condition.rpm}
+            rows += [{**known, **row} for row in _tile_rows(result.values["tiles"])]
+    return rows
 
 
 def pictures(results: Sequence[CellResult]) -> list[Picture]:
@@ -329,30 +345,18 @@ def pictures(results: Sequence[CellResult]) -> list[Picture]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the dip of the event rate, on its size, and on how rare it is."""
-    rows = [r for r in rows_of(results, "rows") if r["camera"] == "fast"]
-    classes = {"dip": DIP, "usual": USUAL}
-    two = []
-    for row in rows:
-        for name, (low, high) in classes.items():
-            if low <= row["speed"] <= high:
-                two.append(row | {"class": name})
-    found = differences(
-        two, "rate", {"class": "dip"}, {"class": "usual"}, by=("scene", "rpm"), relative=True
+    rows = where(rows_of(results, "rows"), camera="fast")
+    images = where(rows_of(results, "whole"), camera="fast")
+    loss = _loss_in_dip(rows)
+    relative_rate = (
+        "the event rate below half of the speed δ·2πf relative to that at 0.75 to 1.25 of it"
     )
-    what = "the event rate below half of the speed δ·2πf relative to that at 0.75 to 1.25 of it"
-    shares: dict[str, dict[int, float]] = {}
-    for seed in dict.fromkeys(
-        r["seed"] for r in rows if r["rpm"] == Condition.rpm
-    ):  # the paper's speed
-        own = [r for r in rows if (r["rpm"], r["seed"]) == (Condition.rpm, seed)]
-        dip = sum(r["tiles"] for r in own if r["speed"] < DIP[1])
-        shares.setdefault("room", {})[seed] = dip / sum(r["tiles"] for r in own)
     return [
         judge(
             5,
             "Texture fades where the camera's motion cancels the prism's.",
-            found,
-            what,
+            loss,
+            relative_rate,
             below=-FADED,
         ),
         untestable(
@@ -363,27 +367,47 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
         judge(
             5,
             "These moments are rare (720 rpm).",
-            shares,
+            # The speed is the paper's.
+            {"room": _shares_of_dip(where(rows, rpm=Condition.rpm))},
             "the share of tiles and moments below half of the speed δ·2πf",
             below=RARE,
         ),
         judge(
             None,
             f"The event rate of the whole image falls by less than {SMALL:.0%}.",
-            differences(
-                [r for r in rows_of(results, "whole") if r["camera"] == "fast"],
-                "lowest",
-                {},
-                by=("scene", "rpm"),
-            ),
+            differences(images, "lowest", {}, by=("scene", "rpm")),
             "the event rate in the worst twelfth of a turn relative to its mean",
             above=1.0 - SMALL,
         ),
         judge(
             None,
             "The event rate of the tiles concerned falls by less than half.",
-            found,
-            what,
+            loss,
+            relative_rate,
             above=-0.5,
         ),
     ]
+
+
+def _loss_in_dip(rows: Sequence[dict[str, Any]]) -> Differences:
+    """Return the change of the event rate where the motions cancel, relative to where only the prism moves."""
+    of_class = []
+    for row in rows:
+        for name, (low, high) in (("dip", DIP), ("usual", USUAL)):
+            if low <= row["speed"] <= high:
+                of_class.append(row | {"class": name})
+    return differences(
+        of_class, "rate", {"class": "dip"}, {"class": "usual"}, by=("scene", "rpm"), relative=True
+    )
+
+
+def _shares_of_dip(rows: Sequence[dict[str, Any]]) -> dict[int, float]:
+    """Return the share of tiles and moments in which the motions cancel, by seed."""
+    tiles: dict[int, int] = {}
+    tiles_in_dip: dict[int, int] = {}
+    for row in rows:
+        seed = row["seed"]
+        tiles[seed] = tiles.get(seed, 0) + row["tiles"]
+        if row["speed"] < DIP[1]:
+            tiles_in_dip[seed] = tiles_in_dip.get(seed, 0) + row["tiles"]
+    return {seed: tiles_in_dip.get(seed, 0) / count for seed, count in tiles.items()}

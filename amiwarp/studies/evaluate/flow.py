@@ -112,9 +112,9 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
                 found_flows = _camera_estimate(streams, stream, middle)
             else:
                 found_flows = _estimates(streams, stream, middle, window)
-            for method, flow, seen in found_flows:
+            for method, flow, has_events in found_flows:
                 known = {"stream": stream.value, "method": method, "turns": turns}
-                at_events = _error(flow, truth.flow, seen & still, window)
+                at_events = _error(flow, truth.flow, has_events & still, window)
                 at_edges = _error(flow, truth.flow, edges, window)
                 rows.append(known | {"pixels": "events"} | at_events)
                 rows.append(known | {"pixels": "edges"} | at_edges)
@@ -129,10 +129,10 @@ def _error(
     flow: NDArray[Any], truth: NDArray[Any], where: NDArray[np.bool_], window_us: int
 ) -> dict[str, Any]:
     """Return the errors of a flow [px/s] in a window, as values of a row."""
-    found = flow_error(flow * window_us * 1e-6, truth * window_us * 1e-6, where)
+    error = flow_error(flow * window_us * 1e-6, truth * window_us * 1e-6, where)
     return {
-        "epe": finite(found.epe),
-        "outliers": finite(found.outliers),
+        "epe": finite(error.epe),
+        "outliers": finite(error.outliers),
         "share": float(where.mean()),
     }
 
@@ -157,10 +157,10 @@ def _camera_estimate(
     streams: Streams, camera: Frames, middle: int
 ) -> list[tuple[str, NDArray[np.float32], NDArray[np.bool_]]]:
     """Return the flow between the two frames of a camera whose middle is nearest to a time; for all pixels."""
-    found = camera_flow(streams, camera, middle)
-    if found is None:
+    flow_and_time = camera_flow(streams, camera, middle)
+    if flow_and_time is None:
         return []
-    flow, _ = found
+    flow, _ = flow_and_time
     return [(METHODS[0], flow, np.ones(flow.shape[:2], np.bool_))]
 
 
@@ -258,14 +258,14 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
 
     dis, contrast = METHODS
     grows = f"The endpoint error grows by no more than {PAPER_PX} px ({dis}, handheld camera)."
-    made = [
+    verdicts = [
         claim(10, grows, dis),
         claim(None, f"The same for {contrast}; the paper names no method.", contrast),
     ]
     for method in METHODS:
         text = f"The same with a fast camera, whose image moves further in a window ({method})."
-        made.append(claim(None, text, method, fast=True))
+        verdicts.append(claim(None, text, method, fast=True))
     for method in METHODS:
         text = f"The error is smaller than by predicting nothing ({method}, handheld camera)."
-        made.append(claim(None, text, method, ZERO, 0.0))
-    return made
+        verdicts.append(claim(None, text, method, ZERO, 0.0))
+    return verdicts

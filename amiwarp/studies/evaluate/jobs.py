@@ -99,9 +99,9 @@ def run_setup(job: Job) -> tuple[Setup, float]:
     began = time.process_time()
     assert job.setup_condition is not None
     with limited_cpu_threads(job.threads):
-        found = known_setup(job.setup_condition, job.settings.device)
+        setup = known_setup(job.setup_condition, job.settings.device)
     release_memory()
-    return found, time.process_time() - began
+    return setup, time.process_time() - began
 
 
 def compile_kernels(names: Sequence[str], device: str) -> float:
@@ -201,4 +201,7 @@ def plan(
         if not evaluation.NEEDS_TRUTH:
             for path in recordings:
                 names_of.setdefault(RecordedCondition(path), []).append(name)
-    return [Job(condition, tuple(found), settings) for condition, found in names_of.items()]
+    return [
+        Job(condition, tuple(names_of_condition), settings)
+        for condition, names_of_condition in names_of.items()
+    ]

@@ -65,10 +65,10 @@ def moving_events(
     back = rotated_back(dithered(events), camera, estimate_rotation(events, camera))
     gain = agreement_gain(back, size, settings[0], scale)
     bodies = []
-    for each in settings:
-        blurred = gain > each.gain
+    for chosen in settings:
+        blurred = gain > chosen.gain
         body = np.zeros(len(events), np.intp)
-        body[blurred] = large_clusters(back[blurred], size, each, scale)
+        body[blurred] = large_clusters(back[blurred], size, chosen, scale)
         bodies.append(body)
     return bodies
 

@@ -92,7 +92,7 @@ def measure(
 
     ``detectors``: detectors by name, which are judged next to our check of the plumbing.
     """
-    found: dict[str, Detector] = {"blob": blob_keypoints, **(detectors or {})}
+    all_detectors: dict[str, Detector] = {"blob": blob_keypoints, **(detectors or {})}
     rows: list[dict[str, Any]] = []
     makers = {stream: PictureMaker(streams, stream) for stream in reconstructed_streams(streams)}
     for rate in RATES_HZ:
@@ -102,7 +102,7 @@ def measure(
             rows += _rows(streams, window, rate, image_joints(streams, window.middle_us), known)
         for stream, maker in makers.items():
             for window, picture in zip(chosen, maker.pictures(chosen), strict=True):
-                for name, detect in found.items():
+                for name, detect in all_detectors.items():
                     known = {"stream": stream.value, "detector": name}
                     rows += _rows(streams, window, rate, detect(displayed(picture)), known)
     return {"rows": rows}

@@ -139,13 +139,13 @@ def _about(sections: Sequence[Section], settings: Settings, processor_s: float) 
     }
 
 
-def _json(one: Section) -> dict[str, Any]:
+def _json(section_of_page: Section) -> dict[str, Any]:
     """Return a section as JSON data, without its pictures."""
-    data = dict(vars(one))
+    data = dict(vars(section_of_page))
     for name in ("pictures", "claims", "tables"):
         del data[name]
-    data["claims"] = [asdict(claim) | {"paper": claim.paper} for claim in one.claims]
-    data["tables"] = [asdict(table) for table in one.tables if not table.long]
+    data["claims"] = [asdict(claim) | {"paper": claim.paper} for claim in section_of_page.claims]
+    data["tables"] = [asdict(table) for table in section_of_page.tables if not table.long]
     return data
 
 

@@ -109,6 +109,11 @@ def rows_of(results: Sequence[CellResult], name: str) -> list[dict[str, Any]]:
     return rows
 
 
+def where(rows: Sequence[dict[str, Any]], **values: Any) -> list[dict[str, Any]]:
+    """Return the rows that have the given value in each named column."""
+    return [row for row in rows if all(row[name] == value for name, value in values.items())]
+
+
 def grouped(
     rows: Sequence[dict[str, Any]], by: Sequence[str], values: Sequence[str]
 ) -> list[tuple[Value, ...]]:

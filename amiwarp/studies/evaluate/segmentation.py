@@ -123,62 +123,81 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
 
     A quick run has the standard choice, and only the streams that the verdicts need.
     """
-    varied = {} if settings.quick else VARIED
-    choices = [
-        STANDARD,
-        *(replace(STANDARD, **{n: v}) for n, values in varied.items() for v in values),
-    ]
+    choices = [STANDARD]
+    if not settings.quick:
+        for name, values in VARIED.items():
+            choices += [replace(STANDARD, **{name: value}) for value in values]
     length = round(WINDOW_TURNS * 60e6 / streams.condition.rpm)
     count = QUICK_WINDOWS if settings.quick else FULL_WINDOWS
-    starts = np.linspace(streams.start_us, streams.end_us - length, count + 2).astype(np.int64)[
-        1:-1
+    starts = np.linspace(streams.start_us, streams.end_us - length, count + 2).astype(np.int64)
+    names = [
+        name
+        for name in streams.names_with_own(settings)
+        if name in QUICK_STREAMS or not settings.quick
     ]
     rows = []
-    for start in starts.tolist():
+    # Windows do not begin at the ends of the recording.
+    for start in starts[1:-1].tolist():
         end = start + length
-        frames = [streams.frame(t).instance for t in (start, (start + end) // 2, end)]
-        masks = [
-            np.logical_or.reduce([frame == k for frame in frames])
-            for k in moving_instances(streams)
-        ]
-        bodies = [mask for mask in masks if np.count_nonzero(mask) >= LEAST_PIXELS]
-        names = [
-            s for s in streams.names_with_own(settings) if s in QUICK_STREAMS or not settings.quick
-        ]
-        windows = {stream: streams.window(stream, start, end) for stream in names}
-        fewest = min(map(len, windows.values()))
-        for stream, events in windows.items():
-            instance = streams.event_truth(stream, start, end).instance
-            assert instance is not None
-            truth = np.isin(instance, moving_instances(streams))
-            own = _scores(events, truth, bodies, streams.camera, choices)
-            rows += [row | {"stream": stream.value, "budget": OWN} for row in own]
-            if stream is not Stream.SAME_COUNT:
-                equal = own[:1]
-                if len(events) > fewest:
-                    some = np.arange(fewest) * len(events) // max(fewest, 1)
-                    equal = _scores(events[some], truth[some], bodies, streams.camera, [STANDARD])
-                rows += [row | {"stream": stream.value, "budget": EQUAL} for row in equal]
+        rows += _event_scores(streams, names, start, end, choices)
         for kind in Frames:
             rows += _frame_scores(streams, kind, (start + end) // 2, length * 1e-6)
     return {"rows": rows}
+
+
+def _event_scores(
+    streams: Streams,
+    names: Sequence[Stream],
+    start_us: int,
+    end_us: int,
+    choices: Sequence[SegmentationSettings],
+) -> list[dict[str, Any]]:
+    """Return the scores of a window of each stream: with all of its events, and with the events that all have."""
+    bodies = _bodies(streams, start_us, end_us)
+    windows = {stream: streams.window(stream, start_us, end_us) for stream in names}
+    fewest = min(map(len, windows.values()))
+    rows = []
+    for stream, events in windows.items():
+        instance = streams.event_truth(stream, start_us, end_us).instance
+        assert instance is not None
+        truth = np.isin(instance, moving_instances(streams))
+        own = _scores(events, truth, bodies, streams.camera, choices)
+        rows += [row | {"stream": stream.value, "budget": OWN} for row in own]
+        if stream is Stream.SAME_COUNT:
+            continue
+        equal = own[:1]
+        if len(events) > fewest:
+            thinned = np.arange(fewest) * len(events) // max(fewest, 1)
+            equal = _scores(events[thinned], truth[thinned], bodies, streams.camera, [STANDARD])
+        rows += [row | {"stream": stream.value, "budget": EQUAL} for row in equal]
+    return rows
+
+
+def _bodies(streams: Streams, start_us: int, end_us: int) -> list[NDArray[np.bool_]]:
+    """Return the pixels that each moving body covers at the start, in the middle or at the end of a window."""
+    instants = (start_us, (start_us + end_us) // 2, end_us)
+    frames = [streams.frame(t).instance for t in instants]
+    masks = [
+        np.logical_or.reduce([frame == number for frame in frames])
+        for number in moving_instances(streams)
+    ]
+    return [mask for mask in masks if np.count_nonzero(mask) >= LEAST_PIXELS]
 
 
 def _frame_scores(
     streams: Streams, kind: Frames, middle_us: int, seconds: float
 ) -> list[dict[str, Any]]:
     """Return the score per object of the frames of a standard camera that are nearest to the middle of a window."""
-    found = camera_flow(streams, kind, middle_us)
-    if found is None:
+    flow_and_time = camera_flow(streams, kind, middle_us)
+    if flow_and_time is None:
         return []
-    flow, flow_us = found
-    number = moving_pixels(flow, streams.camera, seconds)
-    instance = streams.frame(flow_us).instance
-    masks = [instance == k for k in moving_instances(streams)]
-    bodies = [mask for mask in masks if np.count_nonzero(mask) >= LEAST_PIXELS]
+    flow, flow_us = flow_and_time
+    bodies = _bodies(streams, flow_us, flow_us)
     if not bodies:
         return []
-    objects = best_ious([number == k for k in range(1, int(number.max()) + 1)], bodies)
+    object_of_pixel = moving_pixels(flow, streams.camera, seconds)
+    objects = range(1, int(object_of_pixel.max()) + 1)
+    ious = best_ious([object_of_pixel == number for number in objects], bodies)
     unknown = dict.fromkeys(("share", "iou", "precision", "recall"))
     return [
         {
@@ -187,7 +206,7 @@ def _frame_scores(
             "events": 0,
             **_values(STANDARD),
             **unknown,
-            "object_iou": float(np.mean(objects)),
+            "object_iou": float(np.mean(ious)),
         }
     ]
 
@@ -201,15 +220,17 @@ def _scores(
 ) -> list[dict[str, Any]]:
     """Return the scores of a window for each choice of settings; ``truth``: which events see a moving body."""
     rows = []
-    for chosen, number in zip(choices, moving_events(events, camera, choices), strict=True):
-        scores = {name: finite(value) for name, value in asdict(overlap(number > 0, truth)).items()}
-        objects = object_ious(events, number, bodies) if bodies else []
+    objects = moving_events(events, camera, choices)
+    for settings, object_of_event in zip(choices, objects, strict=True):
+        per_event = asdict(overlap(object_of_event > 0, truth))
+        scores = {name: finite(value) for name, value in per_event.items()}
+        ious = object_ious(events, object_of_event, bodies) if bodies else []
         rows.append(
             {
                 "events": len(events),
-                **_values(chosen),
+                **_values(settings),
                 **scores,
-                "object_iou": float(np.mean(objects)) if objects else None,
+                "object_iou": float(np.mean(ious)) if ious else None,
                 "share": float(truth.mean()) if len(truth) else None,
             }
         )

@@ -36,15 +36,15 @@ def similarity(picture: NDArray[Any], truth: NDArray[Any]) -> Similarity:
         )
     metrics = library("skimage.metrics")
     expected = truth.astype(np.float64)
-    found = picture.astype(np.float64)
+    values = picture.astype(np.float64)
 
     # scikit-image would divide by the mean square error, which is 0 for equal pictures.
     psnr = float("inf")
-    if not np.array_equal(expected, found):
-        psnr = float(metrics.peak_signal_noise_ratio(expected, found, data_range=1.0))
+    if not np.array_equal(expected, values):
+        psnr = float(metrics.peak_signal_noise_ratio(expected, values, data_range=1.0))
     ssim = metrics.structural_similarity(
         expected,
-        found,
+        values,
         data_range=1.0,
         gaussian_weights=True,
         sigma=1.5,

@@ -58,11 +58,11 @@ def decode_picture(text: str, what: str = "the picture") -> NDArray[np.uint8]:
 
 def check_pictures(texts: Sequence[str], axes: int, what: str) -> None:
     """Check that texts are pictures of 8-bit values, all of one shape of ``axes`` axes."""
-    found = set()
+    shapes = set()
     for text in texts:
         picture = decode_picture(text, what)
-        found.add((picture.shape, picture.dtype.str))
-    if len(found) > 1 or any(len(shape) != axes or kind != "|u1" for shape, kind in found):
+        shapes.add((picture.shape, picture.dtype.str))
+    if len(shapes) > 1 or any(len(shape) != axes or kind != "|u1" for shape, kind in shapes):
         raise AmiwarpError(
-            f"{what} has pictures of shapes and types {found}; expected one shape of {axes} axes, 8 bit"
+            f"{what} has pictures of shapes and types {shapes}; expected one shape of {axes} axes, 8 bit"
         )

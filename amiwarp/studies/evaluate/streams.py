@@ -184,13 +184,13 @@ class RecordedStreams:
             return None, None
         return self._calibrated(self.own_calibration)
 
-    def _calibrated(self, found: Calibration | None) -> tuple[Model | None, Any]:
+    def _calibrated(self, calibration: Calibration | None) -> tuple[Model | None, Any]:
         """Return the model and the encoder of a calibration."""
-        if found is None:
+        if calibration is None:
             return None, None
         events = self.recording.events
-        encoder = found.encoder_for(self.recording.encoder, events.t_first, events.t_last)
-        return found.model, encoder
+        encoder = calibration.encoder_for(self.recording.encoder, events.t_first, events.t_last)
+        return calibration.model, encoder
 
 
 @dataclass(frozen=True)
@@ -233,10 +233,10 @@ def sensor_delay(streams: Streams) -> float:
         moved = Events(xy[kept, 0], xy[kept, 1], events.t[kept], events.p[kept])
         return -float(smooth_image(moved, votes, DENSITY_PX).var())
 
-    found = minimize_scalar(
+    optimum = minimize_scalar(
         blur, bounds=(0.0, LONGEST_DELAY_US), method="bounded", options={"xatol": 10.0}
     )
-    return float(found.x)
+    return float(optimum.x)
 
 
 class Streams(RecordedStreams):

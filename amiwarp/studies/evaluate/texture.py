@@ -17,6 +17,7 @@ from amiwarp.studies.evaluate.results import (
     Table,
     grouped,
     rows_of,
+    where,
 )
 from amiwarp.studies.evaluate.streams import ENOUGH, RecordedStreams, Stream
 
@@ -79,11 +80,13 @@ def measure(streams: RecordedStreams, settings: Settings) -> dict[str, Any]:
     for stream in streams.names_with_own(settings):
         for window_ms in WINDOWS:
             counts = [
-                event_counts(e.x, e.y, streams.size) for e in _windows(streams, stream, window_ms)
+                event_counts(events.x, events.y, streams.size)
+                for events in _windows(streams, stream, window_ms)
             ]
             for h_px in WIDTHS if window_ms == WINDOW_MS else (H_PX,):
-                seen = [v for v in (density_variance(c, h_px) for c in counts) if np.isfinite(v)]
-                variance = float(np.mean(seen)) if seen else None
+                of_windows = [density_variance(of_window, h_px) for of_window in counts]
+                finite = [variance for variance in of_windows if np.isfinite(variance)]
+                variance = float(np.mean(finite)) if finite else None
                 rows.append(
                     {"stream": stream.value, "h": h_px, "window": window_ms, "variance": variance}
                 )
@@ -98,20 +101,26 @@ def _windows(streams: RecordedStreams, stream: Stream, window_ms: float) -> list
 
     Windows of the stream with the same count are left out if the plain event camera recorded too few events.
     """
-    length = min(round(window_ms * 1e3), streams.end_us - streams.start_us)
-    number = min(REPEATS, (streams.end_us - streams.start_us) // length)
-    starts = np.linspace(streams.start_us, streams.end_us - length, number).astype(np.int64)
-    found = [(int(t), streams.window(stream, int(t), int(t) + length)) for t in starts]
-    if stream is not Stream.SAME_COUNT:
-        return [events for _, events in found]
-    return [e for t, e in found if len(e) >= ENOUGH * streams.count(Stream.RAW, t, t + length)]
+    duration_us = streams.end_us - streams.start_us
+    length_us = min(round(window_ms * 1e3), duration_us)
+    number = min(REPEATS, duration_us // length_us)
+    starts = np.linspace(streams.start_us, streams.end_us - length_us, number).astype(np.int64)
+    windows = []
+    for start in starts.tolist():
+        end = start + length_us
+        events = streams.window(stream, start, end)
+        if stream is Stream.SAME_COUNT:
+            wanted = streams.count(Stream.RAW, start, end)
+            if len(events) < ENOUGH * wanted:
+                continue
+        windows.append(events)
+    return windows
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the variances of the paper's protocol, both sensitivity curves, and the event rates."""
     rows = rows_of(results, "rows")
     rates = rows_of(results, "rates")
-    by = ("scene", "camera", "stream")
     names = ("scene", "camera", "stream")
     variance = ("seeds", "variance of ρ / mean ρ", "std")
 
@@ -120,16 +129,15 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
             x, variance[1], "stream", "std", panels=("scene", "camera"), marks=PAPER, **extra
         )
 
-    standard = [r for r in rows if (r["h"], r["window"]) == (H_PX, WINDOW_MS)]
-    kernel, window = (
-        [r for r in rows if r[o] == v] for o, v in (("window", WINDOW_MS), ("h", H_PX))
-    )
+    standard = where(rows, h=H_PX, window=WINDOW_MS)
+    over_width = where(rows, window=WINDOW_MS)
+    over_window = where(rows, h=H_PX)
     return [
         Table(
             "texture",
             "Variance of the event density, h = 3 px, 33 ms",
             (*names, *variance),
-            grouped(standard, by, ["variance"]),
+            grouped(standard, names, ["variance"]),
             "Lower is more even. At rest the S-EV records noise only, "
             "which is even, and never as many events as the AMI-EV. Raw and compensated events of the AMI-EV differ "
             "little: the measure does not show the compensation. A self-calibrated stream has fewer seeds where the "
@@ -148,7 +156,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
             "texture_kernel",
             "Variance over the kernel's width, windows of 33 ms",
             (*names, "h [px]", *variance),
-            grouped(kernel, (*by, "h"), ["variance"]),
+            grouped(over_width, (*names, "h"), ["variance"]),
             "A wide kernel hides blur; a narrow one counts noise.",
             chart("h [px]"),
         ),
@@ -156,7 +164,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
             "texture_window",
             "Variance over the length of the window, h = 3 px",
             (*names, "window [ms]", *variance),
-            grouped(window, (*by, "window"), ["variance"]),
+            grouped(over_window, (*names, "window"), ["variance"]),
             "A quarter turn at 720 rpm takes 21 ms.",
             chart("window [ms]", log_x=True),
         ),
@@ -164,7 +172,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
             "event_rate",
             "Event rate",
             (*names, "seeds", "rate [Mev/s]", "std"),
-            grouped(rates, by, ["rate"]),
+            grouped(rates, names, ["rate"]),
             "Events of the whole recording over its duration.",
         ),
     ]
@@ -172,58 +180,55 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the evenness, on its dependence on the camera's motion, and on their robustness."""
-    rows = [r for r in rows_of(results, "rows") if r["camera"] != "recording"]
-    standard = [r for r in rows if (r["h"], r["window"]) == (H_PX, WINDOW_MS)]
-    moving = [r for r in standard if r["camera"] != "still"]
-    ami = {"stream": Stream.CALIBRATED}
-    what = f"the variance of '{Stream.CALIBRATED}' less the variance of "
-
-    def less(number: int | None, text: str, rows: list[dict[str, Any]], other: Stream) -> Claim:
-        return judge(
-            number,
-            text,
-            differences(rows, "variance", ami, {"stream": other}),
-            f"{what}'{other}'",
-            below=0.0,
-        )
-
-    # at rest the S-EV records noise alone, which is even
-    spread = differences(
-        ranges(moving, "variance"), "variance", ami, {"stream": Stream.PLAIN}, by=("scene",)
-    )
-    return [
-        less(
+    moving = [
+        row for row in rows_of(results, "rows") if row["camera"] not in ("recording", "still")
+    ]
+    standard = where(moving, h=H_PX, window=WINDOW_MS)
+    verdicts = [
+        _is_more_even(
             1,
             "The density of events is more even than the S-EV's (moving camera; at rest an S-EV records noise "
             "alone: see the table).",
-            moving,
+            standard,
             Stream.PLAIN,
         ),
         judge(
             1,
             "It depends less on the camera's motion.",
-            spread,
+            differences(
+                ranges(standard, "variance"),
+                "variance",
+                {"stream": Stream.CALIBRATED},
+                {"stream": Stream.PLAIN},
+                by=("scene",),
+            ),
             "the range of the variance over the camera's "
             f"motions of '{Stream.CALIBRATED}' less the same of '{Stream.PLAIN}'",
             below=0.0,
         ),
-        *(
-            less(
-                None,
-                f"More even with h = {h:g} px and windows of {window:g} ms.",
-                [
-                    r
-                    for r in rows
-                    if (r["h"], r["window"]) == (h, window) and r["camera"] != "still"
-                ],
-                Stream.PLAIN,
-            )
-            for h, window in (
-                (WIDTHS[0], WINDOW_MS),
-                (WIDTHS[-1], WINDOW_MS),
-                (H_PX, WINDOWS[0]),
-                (H_PX, WINDOWS[-1]),
-            )
-        ),
-        less(None, "More even than an S-EV with as many events.", moving, Stream.SAME_COUNT),
     ]
+    for h_px, window_ms in (
+        (WIDTHS[0], WINDOW_MS),
+        (WIDTHS[-1], WINDOW_MS),
+        (H_PX, WINDOWS[0]),
+        (H_PX, WINDOWS[-1]),
+    ):
+        text = f"More even with h = {h_px:g} px and windows of {window_ms:g} ms."
+        rows = where(moving, h=h_px, window=window_ms)
+        verdicts.append(_is_more_even(None, text, rows, Stream.PLAIN))
+    same_count = "More even than an S-EV with as many events."
+    verdicts.append(_is_more_even(None, same_count, standard, Stream.SAME_COUNT))
+    return verdicts
+
+
+def _is_more_even(
+    number: int | None, text: str, rows: Sequence[dict[str, Any]], than: Stream
+) -> Claim:
+    """Judge whether the density of the AMI-EV's events varies less than the density of another stream's."""
+    return judge(
+        number,
+        text,
+        differences(rows, "variance", {"stream": Stream.CALIBRATED}, {"stream": than}),
+        f"the variance of '{Stream.CALIBRATED}' less the variance of '{than}'",
+        below=0.0,
+    )

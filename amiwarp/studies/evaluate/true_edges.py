@@ -57,7 +57,7 @@ def _differ(frame: FrameTruth, here: Any, there: Any) -> NDArray[np.bool_]:
         is_step = np.abs(near - far) > DEPTH_STEP * np.minimum(near, far)
     cos_of_normals = np.sum(frame.normal[here] * frame.normal[there], axis=-1)
     is_crease = cos_of_normals < CREASE_COS
-    one = frame.instance[here]
-    other = frame.instance[there]
-    both_sky = (one == 0) & (other == 0)
-    return np.asarray((one != other) | ((is_step | is_crease) & ~both_sky))
+    instance = frame.instance[here]
+    next_instance = frame.instance[there]
+    both_sky = (instance == 0) & (next_instance == 0)
+    return np.asarray((instance != next_instance) | ((is_step | is_crease) & ~both_sky))

@@ -124,8 +124,8 @@ class Atlas:
 
     def failing(self, outcome: Outcome) -> list[AxisPoint]:
         """Return the points at which the default method has this outcome, the highest rate first."""
-        found = [s for s in self.spots if s.method == DEFAULT and s.rate(outcome).count]
-        return sorted(found, key=lambda s: -s.rate(outcome).share)
+        spots = [s for s in self.spots if s.method == DEFAULT and s.rate(outcome).count]
+        return sorted(spots, key=lambda s: -s.rate(outcome).share)
 
 
 def aggregate(

@@ -93,8 +93,8 @@ class Store(CellStore):
 
     def load_all(self) -> list[Stored]:
         """Return all cells of the folder; damaged cells and cells of other versions are left out."""
-        found = (self._load(path.name) for path in sorted(self.folder.glob("*.json")))
-        return [known for known in found if known is not None]
+        cells = (self._load(path.name) for path in sorted(self.folder.glob("*.json")))
+        return [known for known in cells if known is not None]
 
     def _load(self, name: str) -> Stored | None:
         """Return the cell of a file; None if it is missing, damaged, of another version or renamed."""

@@ -330,23 +330,23 @@ OPTIC_ALWAYS: dict[str, tuple[float, float]] = {
 """Ranges of the condition fields that every random combination with an optic draws."""
 
 
-def sensible(c: Condition, events: int) -> bool:
+def sensible(condition: Condition, events: int) -> bool:
     """Return whether a calibration is expected to work under a condition (the sensible region).
 
     That is a working rig, and a scene that the aims cover.
     """
     if events < FEWEST_EVENTS:
         return False
-    if c.scene not in (SceneKind.TEXTURE, SceneKind.EDGES, SceneKind.PRINT):
+    if condition.scene not in (SceneKind.TEXTURE, SceneKind.EDGES, SceneKind.PRINT):
         return False
     for name, most in LARGEST_VALUES.items():
-        if not getattr(c, name) <= most:
+        if not getattr(condition, name) <= most:
             return False
     for name, least in SMALLEST_VALUES.items():
-        if not getattr(c, name) >= least:
+        if not getattr(condition, name) >= least:
             return False
     for name, least in SMALLEST_OR_NONE.items():
-        value = getattr(c, name)
+        value = getattr(condition, name)
         if value and not value >= least:
             return False
     return True

@@ -211,7 +211,7 @@ def judge(cell: Cell, method: Method, sample: SimulatedSample | OpticSample, dev
         limit = max(LIMIT_PX, BEST_FIT * best_fit(cell.condition, method.model))
     began = time.perf_counter()
     try:
-        found = method.run(sample, cell.condition, cell.seed, device)
+        calibration = method.run(sample, cell.condition, cell.seed, device)
     except AmiwarpError as error:
         seconds = time.perf_counter() - began
         return Result(Outcome.REFUSAL, None, limit, seconds, str(error))
@@ -223,25 +223,25 @@ def judge(cell: Cell, method: Method, sample: SimulatedSample | OpticSample, dev
     seconds = time.perf_counter() - began
 
     if isinstance(sample, OpticSample):
-        return judge_optic(cell.condition, sample, found, seconds)
-    error_px = compare(found, sample).rms
+        return judge_optic(cell.condition, sample, calibration, seconds)
+    error_px = compare(calibration, sample).rms
     outcome = Outcome.SUCCESS if error_px <= limit else Outcome.SILENT
     away = {}
     if method.model == "exact":
-        away = deviations(found, cell.condition, sample)
-    message = "; ".join(found.warnings)
+        away = deviations(calibration, cell.condition, sample)
+    message = "; ".join(calibration.warnings)
     stored_px = min(error_px, LARGEST_PX)
     return Result(outcome, stored_px, limit, seconds, message, deviations=away)
 
 
 def judge_optic(
-    condition: Condition, sample: OpticSample, found: Calibration, seconds: float
+    condition: Condition, sample: OpticSample, calibration: Calibration, seconds: float
 ) -> Result:
     """Compare a calibration of any optic with the truth."""
-    stage = found.photometric
+    stage = calibration.photometric
     if stage is not None and not stage.accepted:
         return Result(Outcome.REFUSAL, None, OPTIC_LIMIT_PX, seconds, stage.verdict)
-    error_px = placing_error.error_px(sample.rig, sample.recording, found)
+    error_px = placing_error.error_px(sample.rig, sample.recording, calibration)
     error_px = min(error_px, LARGEST_PX)
 
     # Causes that may hide an error as large as this one
@@ -255,24 +255,24 @@ def judge_optic(
             stated_px = min(stage.deviation_px, LARGEST_PX)
 
     outcome = Outcome.SILENT
-    said = [*found.warnings, *could_hide]
+    messages = [*calibration.warnings, *could_hide]
     if error_px <= OPTIC_LIMIT_PX:
         outcome = Outcome.SUCCESS
-        said = [*found.warnings]
-    elif names_cause(said, troubles_of(condition)):
+        messages = [*calibration.warnings]
+    elif names_cause(messages, troubles_of(condition)):
         outcome = Outcome.NAMED
-    message = "; ".join(said)
+    message = "; ".join(messages)
     return Result(outcome, error_px, OPTIC_LIMIT_PX, seconds, message, stated_px=stated_px)
 
 
 def deviations(
-    found: Calibration, condition: Condition, sample: SimulatedSample
+    calibration: Calibration, condition: Condition, sample: SimulatedSample
 ) -> dict[str, float]:
     """Return the distance of each parameter of :data:`STATED` from the truth [stated standard deviations].
 
     Quantities without a stated standard deviation are left out; so is the phase if the sensor's timing is part of it.
     """
-    exact = found.exact
+    exact = calibration.exact
     difference = compare(exact, sample)
     apex = exact.parameters["apex"]
     away = {
@@ -305,15 +305,15 @@ class Difference:
     """Relative error of the size of the displacements."""
 
 
-def compare(found: Calibration, sample: SimulatedSample) -> Difference:
+def compare(calibration: Calibration, sample: SimulatedSample) -> Difference:
     """Compare a calibration, the path that it gives the prism included, with the truth."""
     events = sample.recording.events
-    xy, t = _places(found, sample)
+    xy, t = _places(calibration, sample)
     target = sample.truth.compensate_points(xy, sample.motion.angle(t))
-    encoder = found.encoder_for(sample.plain, events.t_first, events.t_last)
+    encoder = calibration.encoder_for(sample.plain, events.t_first, events.t_last)
     encoder = encoder.with_clock_offset(0.0)
     theta = encoder.angle_at(np.clip(t, *encoder.coverage))
-    model = found.model
+    model = calibration.model
 
     def away(lag: float) -> NDArray[np.float64]:
         return model.compensate_points(xy, theta + lag) - target
@@ -341,7 +341,7 @@ def compare(found: Calibration, sample: SimulatedSample) -> Difference:
 
 
 def _places(
-    found: Calibration, sample: SimulatedSample
+    calibration: Calibration, sample: SimulatedSample
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return pixels [px] and times [us] at which a calibration is compared: over the image, and over a turn.
 
@@ -349,7 +349,7 @@ def _places(
     cover the whole recording.
     """
     events = sample.recording.events
-    if found.ladder is not None and found.model_name != "exact":
+    if calibration.ladder is not None and calibration.model_name != "exact":
         step = max(1, len(events) // JUDGED)
         some = events.slice(0, len(events))[::step]
         return np.stack([some.x, some.y], axis=1).astype(np.float64), some.t

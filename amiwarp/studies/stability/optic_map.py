@@ -274,23 +274,25 @@ class RigOnMap:
         }
 
 
-def rows_for(found: OpticMap, optic: str, given: Mapping[str, float]) -> list[tuple[str, str, str]]:
+def rows_for(
+    optic_map: OpticMap, optic: str, given: Mapping[str, float]
+) -> list[tuple[str, str, str]]:
     """Return rows of text: trouble, value that is given or measured, and what was measured there.
 
     For a trouble that is given, these are the measured values about it. For others, it is how far from harmless all
     recordings were answered.
     """
     rows = []
-    for axis in found.of(optic):
+    for axis in optic_map.of(optic):
         if axis.field not in given:
             rows.append((axis_text(axis), "not given", _answered_up_to(axis)))
             continue
         value = given[axis.field]
         near = [f"{label_of(axis, point.value)}: {point}" for point in axis.about(value)]
-        said = "; ".join(near)
+        text = "; ".join(near)
         if not axis.measured_at(value):
-            said = f"not measured there; nearest: {said}"
-        rows.append((axis_text(axis), f"{value:g}", said))
+            text = f"not measured there; nearest: {text}"
+        rows.append((axis_text(axis), f"{value:g}", text))
     return rows
 
 
@@ -304,10 +306,10 @@ def _answered_up_to(axis: MapAxis) -> str:
             good.append(label)
         if point.silent:
             bad.append(label)
-    said = f"all answered at {', '.join(good)}" if good else "nowhere all answered"
+    text = f"all answered at {', '.join(good)}" if good else "nowhere all answered"
     if bad:
-        said += f"; silent failures at {', '.join(bad)}"
-    return said
+        text += f"; silent failures at {', '.join(bad)}"
+    return text
 
 
 def label_of(axis: MapAxis, value: Any) -> str:
@@ -326,11 +328,11 @@ FONT = 9.5
 """Font size of the figure [point]."""
 
 
-def chart(found: OpticMap, optic: str, given: Mapping[str, float]) -> Any:
+def chart(optic_map: OpticMap, optic: str, given: Mapping[str, float]) -> Any:
     """Draw the outcomes along each axis of an optic as a Matplotlib figure; given values are marked."""
     from matplotlib.patches import Patch
 
-    axes = found.of(optic)
+    axes = optic_map.of(optic)
     height = TOP + len(axes) * (ROW + GAP) + BOTTOM
     figure = blank((WIDTH, height), dpi=130)
     # Places in the figure are shares of its width and height.
@@ -340,7 +342,7 @@ def chart(found: OpticMap, optic: str, given: Mapping[str, float]) -> Any:
         bottom = height - TOP - (k + 1) * (ROW + GAP) + GAP
         ax = figure.add_axes((left, bottom / height, width, ROW / height))
         _strip(ax, axis, given.get(axis.field))
-    title = f"Where a {optic} can be calibrated: answers within {found.limit_px:g} px"
+    title = f"Where a {optic} can be calibrated: answers within {optic_map.limit_px:g} px"
     top = 1.0 - 0.3 / height
     figure.text(0.3 / WIDTH, top, title, fontsize=12.0, fontweight="bold", va="center")
     handles = [Patch(color=colour, label=name) for name, colour in COLOURS.items()]

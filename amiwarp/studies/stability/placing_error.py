@@ -22,7 +22,7 @@ LAGS_S = np.linspace(-2e-3, 2e-3, 41)
 """Lags of all events that are tried [s]."""
 
 
-def error_px(rig: Rig, recording: Recording, found: Calibration) -> float:
+def error_px(rig: Rig, recording: Recording, calibration: Calibration) -> float:
     """Return the error of a calibration [px rms] over the image and the recording; infinite if it is nowhere valid.
 
     One lag of all events and one shift of the picture are removed: neither can be seen. For a plate it is the error at
@@ -38,15 +38,15 @@ def error_px(rig: Rig, recording: Recording, found: Calibration) -> float:
     t_us = np.repeat(times, len(pixels))
 
     events = recording.events
-    encoder = found.encoder_for(recording.encoder, events.t_first, events.t_last)
+    encoder = calibration.encoder_for(recording.encoder, events.t_first, events.t_last)
     angles = encoder.angles_at(times.astype(np.int64))
     theta = np.repeat(angles, len(pixels), axis=0)
     if rig.inverse_depth is None:
-        places = found.model.compensate_points(xy, theta)
+        places = calibration.model.compensate_points(xy, theta)
     else:
-        assert isinstance(found.model, PlateModel)
+        assert isinstance(calibration.model, PlateModel)
         inverse_depth = rig.inverse_depth(rig.places(xy, t_us))
-        places = found.model.compensate_at(xy, theta, inverse_depth)
+        places = calibration.model.compensate_at(xy, theta, inverse_depth)
 
     def rms(lag_s: float) -> float:
         apart = places - rig.places(xy, t_us - 1e6 * lag_s)

@@ -63,8 +63,8 @@ def _wilson(count: int, total: int) -> tuple[float, float]:
     """Return Wilson's 95 % confidence interval of ``count / total``."""
     if not total:
         return 0.0, 1.0
-    found = binomtest(count, total).proportion_ci(confidence_level=0.95, method="wilson")
-    return float(found.low), float(found.high)
+    interval = binomtest(count, total).proportion_ci(confidence_level=0.95, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 @dataclass(frozen=True)

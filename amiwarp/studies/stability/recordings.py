@@ -17,10 +17,11 @@ from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.stability import optics
+from amiwarp.studies.stability.changing_scenes import Lamp, PassingObject
 from amiwarp.studies.stability.condition import HARDWARE_APEX, HARDWARE_DEG, TEXELS, Condition
 from amiwarp.studies.stability.encoders import index_pulses
 from amiwarp.studies.stability.rigs import Rig, rig_of
-from amiwarp.studies.stability.scenes import Lamp, PassingObject, SceneKind, draw
+from amiwarp.studies.stability.scenes import SceneKind, draw
 
 
 @dataclass(frozen=True)
@@ -253,12 +254,9 @@ def _noisy(condition: Condition, simulation: Simulation, clean: int) -> SensorMo
 
     ``clean`` is the number of events without noise.
     """
-    hz = (
-        clean
-        * condition.noise
-        / (1.0 - condition.noise)
-        / (condition.width * condition.height * simulation.duration_s)
-    )
+    pixel_seconds = condition.width * condition.height * simulation.duration_s
+    noise_events = clean * condition.noise / (1.0 - condition.noise)
+    hz = noise_events / pixel_seconds
     return replace(simulation.sensor, shot_noise_hz=hz)
 
 
@@ -285,15 +283,13 @@ def scanned(events: Events, interval_us: float) -> Events:
 
 def distorted_encoder(encoder: Encoder, condition: Condition, rng: np.random.Generator) -> Encoder:
     """Return the encoder with the errors that the condition demands."""
-    angle = encoder.angle + math.radians(condition.jitter_deg) * rng.standard_normal(
-        len(encoder.angle)
-    )
+    jitter = math.radians(condition.jitter_deg) * rng.standard_normal(len(encoder.angle))
+    angle = encoder.angle + jitter
     if condition.slip_deg:
         half_turns = np.floor(angle / math.pi)
-        angle = (
-            angle
-            - math.radians(condition.slip_deg) * (half_turns - half_turns[0]) * 30.0 / condition.rpm
-        )
+        # Half a turn takes 30 s / rpm.
+        lost = math.radians(condition.slip_deg) * (half_turns - half_turns[0]) * 30.0
+        angle = angle - lost / condition.rpm
     angle = angle * (1.0 + condition.encoder_scale)
     if condition.backwards:
         angle = -angle

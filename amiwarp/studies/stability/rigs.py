@@ -48,10 +48,12 @@ class Rig:
         plate = self.simulation.plate
         if plate is not None:
             assert self.inverse_depth is not None
-            seen = xy
+            places_of_pixels = xy
             for _ in range(6):  # the depth belongs to the place, which depends on the depth
-                seen = plate.compensate_at(xy, theta, self.inverse_depth(seen))
-            return seen
+                places_of_pixels = plate.compensate_at(
+                    xy, theta, self.inverse_depth(places_of_pixels)
+                )
+            return places_of_pixels
         places = self.simulation.moving_model.compensate_points(xy, theta)
         if self.swing is None:
             return places

@@ -93,12 +93,12 @@ def named_world(
     one_of(trajectory, TRAJECTORIES, "trajectory")
     seed = whole(seed, "seed", 0, 2**63 - 1)
     duration_s = real(duration_s, "duration_s", 1e-3, LONGEST_S, " s")
-    made = NAMED[name]
+    entry = NAMED[name]
     # The camera has a generator of its own, so that the world is the same with every trajectory. Worlds that are added
     # come last, and change no other one.
     place = WORLDS.index(name)
     of_world = np.random.default_rng([seed, place + (place >= CAMERA_NUMBER)])
     of_camera = np.random.default_rng([seed, CAMERA_NUMBER])
-    world = made.build(of_world, duration_s)
-    camera = camera_trajectory(made.view, trajectory, duration_s, of_camera)
+    world = entry.build(of_world, duration_s)
+    camera = camera_trajectory(entry.view, trajectory, duration_s, of_camera)
     return world, camera
