@@ -1,8 +1,7 @@
 """Options with a fixed set of values that several rooms, or commands and settings, use.
 
 In this order: optical models, images of warped events, costs of a search, corners, films, reconstructed pictures, event
-clouds. An option
-of one room is in the room, such as `amiwarp/simulation/choices.py`.
+clouds. An option of one room is in the room, such as `amiwarp/simulation/choices.py`.
 """
 
 from amiwarp.errors import Option
@@ -202,6 +201,10 @@ class View(Option):
     """Direction from which the event clouds are viewed."""
 
     FREE = "free"
+    """From a corner: all three axes are seen."""
     XY = "x-y"
-    X_AXIS = "x-θ"
-    Y_AXIS = "y-θ"
+    """Along the third axis: the image."""
+    X_THIRD = "x-θ"
+    """Along y: x and the third axis, which may also be the time."""
+    Y_THIRD = "y-θ"
+    """Along x: y and the third axis."""

@@ -20,6 +20,7 @@ Result = TypeVar("Result")
 _limit: int | None = None
 """Largest number of threads while :func:`limited_cpu_threads` is active."""
 _of_thread = threading.local()
+"""What each thread knows of itself: ``one_core``, whether it works on one core."""
 
 
 def cpu_threads() -> int:
@@ -34,9 +35,9 @@ def works_on_one_core() -> bool:
 
 def cores() -> int:
     """Return the number of CPU cores that this process may use."""
-    available = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    )
+    available = os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        available = len(os.sched_getaffinity(0))
     return available if _limit is None else min(available, _limit)
 
 
@@ -57,8 +58,7 @@ MAX_THREADS = 12
 lock."""
 
 EXTRA_JOBS = 2
-"""Number of jobs in flight in addition to one per thread. Their results wait in memory for their
-turn."""
+"""Number of jobs in flight in addition to one per thread. Their results wait in memory for their turn."""
 
 
 def in_order(
@@ -153,7 +153,8 @@ def interrupts_later() -> Iterator[list[int]]:
     before = {}
     if threading.current_thread() is threading.main_thread():
         for number in numbers:
-            if callable(handler := signal.getsignal(number)):
+            handler = signal.getsignal(number)
+            if callable(handler):
                 before[number] = handler
                 signal.signal(number, lambda number, _frame: arrived.append(number))
     try:
@@ -186,15 +187,18 @@ class BackgroundLoop:
         """End the loop and wait for it. Raises the error that ended it, once."""
         self._ended.set()
         self._thread.join()
-        failure, self._failure = self._failure, None
+        failure = self._failure
+        self._failure = None
         if failure is not None:
             raise failure
 
     def _guarded_run(self) -> None:
+        """Run the loop, and keep the error that ends it for :meth:`close`."""
         try:
             self._run()
         except Exception as error:
             self._failure = error
 
     def _run(self) -> None:
+        """Run until :attr:`_ended` is set: what a derived class does."""
         raise NotImplementedError

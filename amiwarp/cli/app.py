@@ -17,7 +17,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.workarounds import load_extensions_whole
 
 BAD_INPUT = 1
+"""Exit code for input that cannot be used."""
 USAGE = 2
+"""Exit code for a command line that is wrong."""
 
 _UsageError: Any = typer.BadParameter.__base__
 """Class ``UsageError`` of click, taken from Typer, because newer versions of Typer contain their own copy of click."""
@@ -212,9 +214,9 @@ def _loaded(name: str) -> Any:
     """Load the module of a command and return the command."""
     from amiwarp.cli.common import command  # NumPy is loaded with it
 
-    one = typer.Typer(rich_markup_mode="rich", add_completion=False)
-    command(one, function_of(name), name=name, example=COMMANDS[name].example)
-    return typer.main.get_command(one)
+    alone = typer.Typer(rich_markup_mode="rich", add_completion=False)
+    command(alone, function_of(name), name=name, example=COMMANDS[name].example)
+    return typer.main.get_command(alone)
 
 
 class _Group(TyperGroup):
@@ -230,7 +232,7 @@ class _Group(TyperGroup):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help with the summaries, without loading the commands."""
         self.commands = {
-            name: TyperCommand(name, help=one.summary) for name, one in COMMANDS.items()
+            name: TyperCommand(name, help=command.summary) for name, command in COMMANDS.items()
         }
         try:
             super().format_help(ctx, formatter)

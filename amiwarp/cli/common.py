@@ -119,8 +119,8 @@ class FileOptions(LayoutOptions):
 
     def given(self) -> dict[str, Any]:
         """Return the arguments of :func:`amiwarp.open_recording` that the options give."""
-        found = super().given()
-        return found if self.size is None else {**found, "size": parse_size(self.size)}
+        values = super().given()
+        return values if self.size is None else {**values, "size": parse_size(self.size)}
 
 
 @dataclass(frozen=True)
@@ -191,16 +191,15 @@ class NominalPrismOptions:
 
         The apex stays unknown if neither ``known`` nor the options hold one.
         """
-        if (
-            isinstance(known, Plate)
-            or self.thickness_mm is not None
-            or self.plate_tilt_deg is not None
-        ):
-            return self._plate(known if isinstance(known, Plate) else None)
-        given = {"index": self.index, "flat_side": self.flat_side}
-        changes: dict[str, Any] = {
-            name: value for name, value in given.items() if value is not None
-        }
+        if isinstance(known, Plate):
+            return self._plate(known)
+        if self.thickness_mm is not None or self.plate_tilt_deg is not None:
+            return self._plate(None)
+        changes: dict[str, Any] = {}
+        if self.index is not None:
+            changes["index"] = self.index
+        if self.flat_side is not None:
+            changes["flat_side"] = self.flat_side
         prism = replace(known or UnsizedPrism(), **changes)
         if self.nominal_apex_deg is not None:
             apex = apex_from(self.nominal_apex_deg, "--nominal-apex-deg")
@@ -213,9 +212,8 @@ class NominalPrismOptions:
                     "--second-apex-deg needs the apex of the first prism; give --nominal-apex-deg",
                     ErrorCode.OPTIONS,
                 )
-            second = Prism(
-                apex_from(self.second_apex_deg, "--second-apex-deg"), prism.index, prism.flat_side
-            )
+            second_apex = apex_from(self.second_apex_deg, "--second-apex-deg")
+            second = Prism(second_apex, prism.index, prism.flat_side)
             return replace(prism, second=second)
         return prism if changes else known
 
@@ -316,12 +314,8 @@ class EncoderOptions:
             )
         if self.second_ratio is not None:
             return first.with_second(self.second_ratio)
-        return first.with_second(
-            cast(
-                "Encoder",
-                replace(self, encoder=self.second_encoder, encoder_from=None)._first(source, topic),
-            )
-        )
+        of_second = replace(self, encoder=self.second_encoder, encoder_from=None)
+        return first.with_second(cast("Encoder", of_second._first(source, topic)))
 
     def _first(self, source: Path, topic: str | None) -> Encoder | None:
         if self.encoder_from is not None:
@@ -448,7 +442,11 @@ def interval(text: str, unit: str, name: str) -> tuple[float, float]:
 
 
 def _suffix(text: str, unit: str) -> str:
-    return next((k for k in FORMS[unit][0] if text.strip().endswith(k)), "")
+    """Return the suffix of a value in ``unit``; empty if it has none."""
+    for suffix in FORMS[unit][0]:
+        if text.strip().endswith(suffix):
+            return suffix
+    return ""
 
 
 def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
@@ -585,15 +583,17 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[type, list[str]]] = {}
     for parameter in inspect.signature(function).parameters.values():
-        kind = hints[parameter.name]
-        if is_dataclass(kind) and isinstance(kind, type):
-            parameters += _option_parameters(kind)
-            groups[parameter.name] = (kind, [f.name for f in fields(kind)])
+        hint = hints[parameter.name]
+        if is_dataclass(hint) and isinstance(hint, type):
+            parameters += _option_parameters(hint)
+            groups[parameter.name] = (hint, [field.name for field in fields(hint)])
         else:
             parameters.append(
-                parameter.replace(annotation=kind, kind=inspect.Parameter.KEYWORD_ONLY)
+                parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY)
             )
-    marks = {p.name: getattr(p.annotation, "__metadata__", ()) for p in parameters}
+    marks = {}
+    for parameter in parameters:
+        marks[parameter.name] = getattr(parameter.annotation, "__metadata__", ())
     writes = any(OUTPUT in mark or OUTPUT_FOLDER in mark for mark in marks.values())
     if writes:
         parameters.append(
@@ -612,42 +612,40 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
             path for name, path in paths if not {OUTPUT, OUTPUT_FOLDER, NO_FILE} & set(marks[name])
         ]
         for path in inputs:
-            if (
-                path.exists() and not path.is_dir()
-            ):  # the command itself reports missing files and folders
+            # The command itself reports missing files and folders.
+            if path.exists() and not path.is_dir():
                 check_regular(path)
         outputs = [path for name, path in paths if OUTPUT in marks[name]]
-        for key, (kind, names) in groups.items():
-            values[key] = kind(**{n: values.pop(n) for n in names})
+        for group_name, (group, names) in groups.items():
+            values[group_name] = group(**{name: values.pop(name) for name in names})
         with protecting_files(inputs, outputs, overwrite=force):
             function(**values)
 
     del run.__wrapped__  # otherwise Typer would read the signature of ``function``
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     app.command(name, epilog=f"[bold]Example:[/bold] {example}", help=inspect.getdoc(function))(run)
 
 
 def _paths(values: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
     """Yield every path among the values of the options, with the option's name."""
     for name, value in values.items():
-        for one in value if isinstance(value, list | tuple) else [value]:
-            if isinstance(one, Path):
-                yield name, one
+        entries = value if isinstance(value, list | tuple) else [value]
+        for entry in entries:
+            if isinstance(entry, Path):
+                yield name, entry
 
 
 def _option_parameters(group: type) -> list[inspect.Parameter]:
+    """Return a keyword parameter for each field of a group of options."""
     hints = get_type_hints(group, include_extras=True)
     keyword = inspect.Parameter.KEYWORD_ONLY
-    return [
-        inspect.Parameter(
-            f.name,
-            keyword,
-            default=inspect.Parameter.empty if f.default is MISSING else f.default,
-            annotation=hints[f.name],
-        )
-        for f in fields(group)
-    ]
+    parameters = []
+    for field in fields(group):
+        default = inspect.Parameter.empty if field.default is MISSING else field.default
+        hint = hints[field.name]
+        parameters.append(inspect.Parameter(field.name, keyword, default=default, annotation=hint))
+    return parameters
 
 
 # What commands do alike: choice of the device, progress bar, printed result.
@@ -736,10 +734,12 @@ def table(rows: Iterable[tuple[str, ...]], *headings: str) -> Table:
 
     grid = Table(box=None, show_header=bool(headings), pad_edge=False, header_style="bold")
     cells = [[Text(printable(cell)) for cell in row] for row in rows]
-    for k in range(max((len(row) for row in cells), default=len(headings))):
-        grid.add_column(
-            headings[k] if headings else "", style="dim" if k == 0 and not headings else None
-        )
+    columns = max((len(row) for row in cells), default=len(headings))
+    for column in range(columns):
+        if headings:
+            grid.add_column(headings[column])
+        else:
+            grid.add_column("", style="dim" if column == 0 else None)
     for row in cells:
         grid.add_row(*row)
     return grid
@@ -750,25 +750,25 @@ def assumption_lines(texts: Iterable[str]) -> list[str]:
     return [f"note: assumed {text}" for text in texts]
 
 
-def format_notes(d: dict[str, Any]) -> list[str]:
+def format_notes(result: dict[str, Any]) -> list[str]:
     """Return what the format of the output has changed and left out."""
     lines = []
-    if d["rounding"] is not None:
+    if result["rounding"] is not None:
         lines.append(
-            f"note: rounded to whole pixels ({d['rounding']}); {d['dropped']:,} events outside are dropped"
+            f"note: rounded to whole pixels ({result['rounding']}); {result['dropped']:,} events outside are dropped"
         )
-    if d["left_out"]:
-        native = d["format"] is OutputFormat.NATIVE
-        who = "the new file" if native else f"{LIMITS[d['format']].label} does not hold, and"
-        lines.append(f"note: {who} leaves out: {', '.join(d['left_out'])}")
-    return [*lines, *time_notes(d)]
+    if result["left_out"]:
+        native = result["format"] is OutputFormat.NATIVE
+        who = "the new file" if native else f"{LIMITS[result['format']].label} does not hold, and"
+        lines.append(f"note: {who} leaves out: {', '.join(result['left_out'])}")
+    return [*lines, *time_notes(result)]
 
 
-def time_notes(d: dict[str, Any]) -> list[str]:
+def time_notes(result: dict[str, Any]) -> list[str]:
     """Return what the format of the output has changed in the times."""
-    if not d["subtracted_us"]:
+    if not result["subtracted_us"]:
         return []
     return [
-        f"note: the times begin at 0: {d['subtracted_us']:,} us are subtracted, because packets in a ROS 2 bag hold "
-        "up to 28 h; only the stamps of its messages hold them"
+        f"note: the times begin at 0: {result['subtracted_us']:,} us are subtracted, because packets in a ROS 2 bag "
+        "hold up to 28 h; only the stamps of its messages hold them"
     ]

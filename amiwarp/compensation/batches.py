@@ -174,14 +174,14 @@ class BatchPipeline:
             for name, values in larger.items():
                 setattr(params, prefix + name, values)
         first = np.array([0, count - 1], np.int32)
-        given = {"first": first, "start": start, "angle": angle, "slope": slope}
-        for name, values in given.items():
-            to = getattr(params, prefix + name)
+        columns = {"first": first, "start": start, "angle": angle, "slope": slope}
+        for name, values in columns.items():
+            target = getattr(params, prefix + name)
             if self._device.is_cpu:
-                to.numpy()[: len(values)] = values
+                target.numpy()[: len(values)] = values
             else:
-                on_host = wp.array(values, dtype=to.dtype, device="cpu", copy=False)
-                wp.copy(to, on_host, count=len(values))
+                on_host = wp.array(values, dtype=target.dtype, device="cpu", copy=False)
+                wp.copy(target, on_host, count=len(values))
 
     def _padded(self, n: int) -> int:
         """Return the length of the range of the buffers that ``n`` events take."""
@@ -190,7 +190,6 @@ class BatchPipeline:
     def stage(self, parts: list[Events], arrived_us: int) -> StagedBatch:
         """Start to copy packets into the buffers; long packets are copied by several threads."""
         n = sum(part.t.size for part in parts)
-        several = len(parts) > 1
         at, end = self._reserve(n)
         direct = self._device.is_cuda and n > LEAST_DIRECT
         if direct:
@@ -198,20 +197,20 @@ class BatchPipeline:
         else:
             locked_t = None
             t = self._host["t"][at:end]
-        to = [self._host["x"][at:end], self._host["y"][at:end], t]
-        if not several:
+        targets = [self._host["x"][at:end], self._host["y"][at:end], t]
+        if len(parts) == 1:
             p = parts[0].p
         else:
             if direct:
                 _, p = self._pool.result(self._batch, n, wp.uint8)
             else:
                 p = np.empty(n, np.uint8)
-            to.append(p)
+            targets.append(p)
         if n > PIECE:
             self._copiers.reverse()
-            wait = self._copiers[0](parts, to)
+            wait = self._copiers[0](parts, targets)
         else:
-            wait = partial(ColumnCheck, *join_packets(parts, to))
+            wait = partial(ColumnCheck, *join_packets(parts, targets))
         return StagedBatch(
             parts=parts,
             at=at,
@@ -317,10 +316,10 @@ class BatchPipeline:
         _, _, max_x, max_y, _, _ = limits(events)
         if unknown < count:
             columns = self._plan.device_columns(events)
-            found = self._plan.run(columns, self._encoder, max_x, max_y)
-            x = found.out_x[:count]
-            y = found.out_y[:count]
-            inside = found.inside[:count]
+            results = self._plan.run(columns, self._encoder, max_x, max_y)
+            x = results.out_x[:count]
+            y = results.out_y[:count]
+            inside = results.inside[:count]
         else:
             x = wp.empty(count, dtype=float, device=device)
             y = wp.empty(count, dtype=float, device=device)
@@ -348,13 +347,15 @@ class BatchPipeline:
             views.append(view)
         return views
 
-    def _copy(self, to: Any, source: Any, names: Iterable[str], at: int, end: int) -> None:
+    def _copy(self, target: Any, source: Any, names: Iterable[str], at: int, end: int) -> None:
+        """Copy the events ``at`` to ``end`` of columns between the device and the host."""
         for name in names:
-            to_column = getattr(to, name)
+            target_column = getattr(target, name)
             source_column = getattr(source, name)
-            wp.copy(to_column, source_column, dest_offset=at, src_offset=at, count=end - at)
+            wp.copy(target_column, source_column, dest_offset=at, src_offset=at, count=end - at)
 
     def _launch(self, first: int, blocks: int, outside: bool) -> None:
+        """Launch the compensation of ``blocks`` blocks. ``outside``: whether events may lie outside the sensor."""
         kernel = self._plan.kernel
         inputs = self._plan.inputs(self._encoder, self._columns, outside=outside)
         device = self._device

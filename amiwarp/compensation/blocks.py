@@ -70,8 +70,8 @@ class BlockCompensator:
         one_thread = self._pieces.one_thread if self._pieces else contextlib.nullcontext()
         with one_thread:
             columns = self._plan.device_columns(events)
-            found = self._plan.run(columns, self._encoder, max_x, max_y)
-        return found.out_x[: len(events)], found.out_y[: len(events)]
+            results = self._plan.run(columns, self._encoder, max_x, max_y)
+        return results.out_x[: len(events)], results.out_y[: len(events)]
 
     def _compensate(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
         """Return compensated x and y [px] and 1 for each event inside the image, on a CPU."""
@@ -84,10 +84,10 @@ class BlockCompensator:
         ]
         max_x = events.x.max()
         max_y = events.y.max()
-        found = self._plan.run(columns, self._encoder, max_x, max_y, all_cores=all_cores)
-        x = found.out_x.numpy()
-        y = found.out_y.numpy()
-        inside = found.inside.numpy()
+        results = self._plan.run(columns, self._encoder, max_x, max_y, all_cores=all_cores)
+        x = results.out_x.numpy()
+        y = results.out_y.numpy()
+        inside = results.inside.numpy()
         return [x[:count], y[:count], inside[:count]]
 
 

@@ -118,9 +118,10 @@ def run_compensate(
     from amiwarp.results.depth_map import DepthMap
 
     device = cli.choose_device(common.device)
-    found = Calibration.load(calibration)
+    calibrated = Calibration.load(calibration)
     if preset is not None:
-        found = simplified(found, Preset.load(preset, "compensation").settings["model"])
+        model_name = Preset.load(preset, "compensation").settings["model"]
+        calibrated = simplified(calibrated, model_name)
     log = encoder.build(recording, topic)
     opened = open_recording(recording, topic=topic, **layout.given())
     if log is not None:
@@ -130,7 +131,7 @@ def run_compensate(
     with cli.progress("compensating") as advance, files or contextlib.nullcontext():
         done = compensate(
             opened,
-            found,
+            calibrated,
             out,
             depth=depths,
             device=device,
@@ -143,7 +144,7 @@ def run_compensate(
         )
     data: dict[str, Any] = {
         "file": str(out),
-        "model": found.model_name,
+        "model": calibrated.model_name,
         "events": done.events,
         "outside": done.outside,
         "format": done.format,
@@ -160,10 +161,11 @@ def run_compensate(
 
 
 def _compensated_lines(data: dict[str, Any]) -> list[str]:
+    """Return the result of the command as lines of text."""
     events = f"{data['events']:,} events ({data['outside']:,} outside the image)"
     speed = f"{data['seconds']:.2f} s, {data['mev_per_s']:.3g} Mev/s"
-    by = f"by the {data['model']} model on {data['device']}"
+    means = f"by the {data['model']} model on {data['device']}"
     images = data["iwe"]
     if len(images) > 3:
         images = [f"{images[0]} .. {images[-1]} ({len(images)} files)"]
-    return [f"{data['file']}: {events}, {speed} {by}", *cli.format_notes(data), *images]
+    return [f"{data['file']}: {events}, {speed} {means}", *cli.format_notes(data), *images]

@@ -15,10 +15,10 @@ from amiwarp.kernels.compensation import Columns, LaunchPlan
 from amiwarp.kernels.launch import RecordedLaunch
 from amiwarp.kernels.page_locked_memory import page_locked
 
-GIVEN = {"x": wp.uint16, "y": wp.uint16, "t": wp.int64}
+INPUTS = {"x": wp.uint16, "y": wp.uint16, "t": wp.int64}
 """Types of the columns that the kernel reads."""
-FOUND = {"out_x": wp.float32, "out_y": wp.float32, "inside": wp.uint8}
-"""Types of the columns that it writes."""
+RESULTS = {"out_x": wp.float32, "out_y": wp.float32, "inside": wp.uint8}
+"""Types of the columns that the kernel writes."""
 BUFFERS = 3
 """Number of pieces that threads process on the GPU at a time. Page-locking the memory of a piece takes 5 ms."""
 PIECE = 4 * CHUNK
@@ -39,11 +39,10 @@ class PieceBuffers:
         self._columns = Columns()
         self._locked = {}
         self._host = {}
-        for name, dtype in (GIVEN | FOUND).items():
+        for name, dtype in (INPUTS | RESULTS).items():
             on_device = wp.empty(room, dtype=dtype, device=device)
             setattr(self._columns, name, on_device)
-            given = name in GIVEN
-            locked = page_locked(self, (room,), dtype, device, written_by_host=given)
+            locked = page_locked(self, (room,), dtype, device, written_by_host=name in INPUTS)
             self._locked[name] = locked
             self._host[name] = locked.numpy()
         self._launches: dict[bool, RecordedLaunch] = {}
@@ -51,12 +50,12 @@ class PieceBuffers:
     def put(self, events: Events) -> None:
         """Copy events to the page-locked memory."""
         count = len(events)
-        for name in GIVEN:
+        for name in INPUTS:
             self._host[name][:count] = getattr(events, name)
 
     def start(self, n: int, outside: bool) -> None:
         """Start the compensation of ``n`` events. ``outside``: whether events may lie outside the sensor."""
-        for name in GIVEN:
+        for name in INPUTS:
             wp.copy(getattr(self._columns, name), self._locked[name], count=n)
         compensate = self._launches.get(outside)
         if compensate is None:
@@ -64,14 +63,14 @@ class PieceBuffers:
             compensate = RecordedLaunch(self._plan.kernel, [*inputs, 0], [], device=self._device)
             self._launches[outside] = compensate
         compensate(0, n)
-        for name in FOUND:
+        for name in RESULTS:
             wp.copy(self._locked[name], getattr(self._columns, name), count=n)
         self._device.stream.record_event(self._done)
 
-    def take(self, found: list[NDArray[Any]]) -> None:
+    def take(self, results: list[NDArray[Any]]) -> None:
         """Wait for the GPU, and store x and y [px] and 1 for each event inside the image in arrays."""
         wp.synchronize_event(self._done)
-        for name, values in zip(FOUND, found, strict=True):
+        for name, values in zip(RESULTS, results, strict=True):
             values[:] = self._host[name][: len(values)]
 
 
@@ -93,21 +92,22 @@ class GpuPieces:
         largest_x = int(events.x.max())
         largest_y = int(events.y.max())
         outside = self._plan.any_outside(largest_x, largest_y)
-        found = []
-        for dtype in FOUND.values():
-            found.append(np.empty(count, wp.dtype_to_numpy(dtype)))
+        results = []
+        for dtype in RESULTS.values():
+            results.append(np.empty(count, wp.dtype_to_numpy(dtype)))
         for first in range(0, count, PIECE):
             piece = slice(first, first + PIECE)
-            self._run(events[piece], outside, [column[piece] for column in found])
-        return found
+            self._run(events[piece], outside, [column[piece] for column in results])
+        return results
 
-    def _run(self, events: Events, outside: bool, found: list[NDArray[Any]]) -> None:
+    def _run(self, events: Events, outside: bool, results: list[NDArray[Any]]) -> None:
+        """Compensate one piece, and store its columns in ``results``."""
         with self._free:
             buffers = self._buffers(len(events))
             buffers.put(events)
             with self.one_thread:
                 buffers.start(len(events), outside)
-            buffers.take(found)
+            buffers.take(results)
             self._idle.append(buffers)
 
     def _buffers(self, n: int) -> PieceBuffers:

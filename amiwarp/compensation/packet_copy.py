@@ -45,14 +45,14 @@ class ColumnCheck(NamedTuple):
     """Largest y of all events [px]."""
 
 
-def join_packets(parts: list[Events], to: list[NDArray[Any]]) -> ColumnCheck:
+def join_packets(parts: list[Events], targets: list[NDArray[Any]]) -> ColumnCheck:
     """Copy packets into the columns x, y, t and, if it is given, p. Times must not decrease between packets."""
-    for name, column in zip(COLUMNS, to, strict=False):
+    for name, column in zip(COLUMNS, targets, strict=False):
         if len(parts) == 1:  # faster by 1 us for each column
             column[:] = getattr(parts[0], name)
         else:
             np.concatenate([getattr(part, name) for part in parts], out=column)
-    x, y, t, *_ = to
+    x, y, t, *_ = targets
     falls = t[1:] < t[:-1]
     return ColumnCheck(
         unsorted=bool(falls.any()),
@@ -68,6 +68,7 @@ class PacketCopier:
     """
 
     def __init__(self) -> None:
+        """Allocate a table for batches of up to 64 packets, which grows with longer ones."""
         self._allocate(64)
 
     def _allocate(self, rows: int) -> None:
@@ -82,12 +83,14 @@ class PacketCopier:
             command = RecordedLaunch(gather_parts, [table, found, 0], [], device="cpu")
             self._commands.append(command)
 
-    def __call__(self, parts: list[Events], to: list[NDArray[Any]]) -> Callable[[], ColumnCheck]:
+    def __call__(
+        self, parts: list[Events], targets: list[NDArray[Any]]
+    ) -> Callable[[], ColumnCheck]:
         """Start to copy packets; return a function that waits. Call it before the next copy."""
         rows = len(parts)
         if rows > len(self._table):
             self._allocate(2 * rows)
-        kept = self._fill_table(parts, to)
+        kept_alive = self._fill_table(parts, targets)
 
         # The first rows are the caller's, the others are divided among the threads.
         caller, *others = self._commands
@@ -98,9 +101,9 @@ class PacketCopier:
         for command, (start, stop) in zip(others, pairwise(edges), strict=True):
             jobs.append(pool().submit(command, start, stop - start))
         caller(0, ours)
-        return partial(self._wait, jobs, rows, kept)
+        return partial(self._wait, jobs, rows, kept_alive)
 
-    def _fill_table(self, parts: list[Events], to: list[NDArray[Any]]) -> list[Any]:
+    def _fill_table(self, parts: list[Events], targets: list[NDArray[Any]]) -> list[Any]:
         """Fill a row for each packet: where its columns are, where they go to, and how many events it has.
 
         Return what must be kept alive until the packets are copied.
@@ -109,15 +112,15 @@ class PacketCopier:
         offsets = np.concatenate([[0], np.cumsum(counts)[:-1]])
         table = self._table[: len(parts)]
         table[:] = 0
-        kept = []
-        for k, column in enumerate(to):
+        kept_alive = []
+        for k, column in enumerate(targets):
             columns = [getattr(part, COLUMNS[k]) for part in parts]
             places, alive = pointer_places(columns)
             table[:, k] = places
             table[:, 4 + k] = address(column) + WIDTHS[k] * offsets
-            kept.append(alive)
+            kept_alive.append(alive)
         table[:, 8] = counts
-        return kept
+        return kept_alive
 
     def _wait(self, jobs: list[Future[None]], rows: int, _kept: object) -> ColumnCheck:
         """Wait for the copy of ``rows`` packets.

@@ -158,9 +158,9 @@ def compensate(
     began = time.perf_counter()
     out_path = Path(out_path)
     check_output(out_path, overwrite=overwrite)
-    chosen = output_format(out_path, format)
-    codec = check_codec(out_path, codec, chosen)
-    rounding = check_rounding(out_path, rounding, chosen)
+    output = output_format(out_path, format)
+    codec = check_codec(out_path, codec, output)
+    rounding = check_rounding(out_path, rounding, output)
     events = recording.events
     check_size(calibration, events.size, recording.name)
     model = calibration.model if depth is None else at_depths(calibration.model, depth)
@@ -176,54 +176,74 @@ def compensate(
             compensator = BlockCompensator(model, encoder, events.t_first, events.t_last, device)
 
     tally = _Tally(len(events), progress, on_block)
-    if chosen is not OutputFormat.NATIVE:
-        with contextlib.closing(_counted(events, compensator, tally)) as blocks:
-            dropped = export(
-                events,
-                out_path,
-                chosen,
-                events.size,
-                codec=codec,
-                progress=None,
-                overwrite=overwrite,
-                blocks=blocks,
-                rounding=rounding,
-                seed=seed,
-                bag=bag_of(recording, chosen),
-            )
-        missing = left_out(recording, chosen)
-        seconds = time.perf_counter() - began
-        moved = subtracted_us(events, chosen)
-        return CompensationSummary(
-            tally.done, tally.outside, seconds, chosen, rounding, dropped, missing, moved
+    if output is OutputFormat.NATIVE:
+        truth = recording.truth
+        width, height = events.size
+        writer = RecordingWriter(
+            out_path,
+            width=width,
+            height=height,
+            camera=model.camera,
+            prism=recording.prism,
+            encoder=encoder,
+            truth_parameters=None if truth is None else truth.parameters,
+            truth_labels=None if truth is None else truth.labels,
+            metadata={**recording.metadata, "compensated_with": calibration.model_name},
+            overwrite=overwrite,
+            codec=codec,
         )
+        _write_native(writer, recording, compensator, tally)
+        missing = _left_out_of_native(recording)
+        seconds = time.perf_counter() - began
+        return CompensationSummary(tally.done, tally.outside, seconds, left_out=missing)
 
-    truth = recording.truth
-    width, height = events.size
-    with RecordingWriter(
-        out_path,
-        width=width,
-        height=height,
-        camera=model.camera,
-        prism=recording.prism,
-        encoder=encoder,
-        truth_parameters=None if truth is None else truth.parameters,
-        truth_labels=None if truth is None else truth.labels,
-        metadata={**recording.metadata, "compensated_with": calibration.model_name},
-        overwrite=overwrite,
-        codec=codec,
-    ) as writer:
+    with contextlib.closing(_counted(events, compensator, tally)) as blocks:
+        dropped = export(
+            events,
+            out_path,
+            output,
+            events.size,
+            codec=codec,
+            progress=None,
+            overwrite=overwrite,
+            blocks=blocks,
+            rounding=rounding,
+            seed=seed,
+            bag=bag_of(recording, output),
+        )
+    missing = left_out(recording, output)
+    seconds = time.perf_counter() - began
+    return CompensationSummary(
+        tally.done,
+        tally.outside,
+        seconds,
+        output,
+        rounding,
+        dropped,
+        missing,
+        subtracted_us(events, output),
+    )
+
+
+def _write_native(
+    writer: RecordingWriter,
+    recording: Recording,
+    compensator: BlockCompensator | None,
+    tally: _Tally,
+) -> None:
+    """Write the compensated events of a recording, and what else it holds, to a native file.
+
+    ``compensator``: None for a recording without events.
+    """
+    with writer:
         if compensator is not None:
             compile_checksums()
-            pieces = compensated_pieces(events, compensator)
-            written = writer.fill(pieces, count=PIECE, t_first=events.t_first)
+            pieces = compensated_pieces(recording.events, compensator)
+            written = writer.fill(pieces, count=PIECE, t_first=recording.events.t_first)
             with contextlib.closing(written):
                 for compensated, inside, _ in written:
                     tally.count(compensated, inside)
         copy_records(recording, writer)
-    missing = _left_out_of_native(recording)
-    seconds = time.perf_counter() - began
-    return CompensationSummary(tally.done, tally.outside, seconds, left_out=missing)
 
 
 class _Tally:
@@ -313,12 +333,14 @@ def compensated_pieces(
 def _compensate_stored(
     source: NativeEvents, start: int, compensator: BlockCompensator
 ) -> FlaggedEvents:
+    """Return a compensated piece of a native file, with its times and polarities as they are encoded there."""
     stop = start + PIECE
     events, inside = compensator(source.slice(start, stop))
     return events, inside, source.encoded_times_and_polarities(start, stop)
 
 
 def _compensate_piece(events: Events, compensator: BlockCompensator) -> FlaggedEvents:
+    """Return a compensated piece of events, whose times and polarities the writer encodes."""
     compensated, inside = compensator(events)
     return compensated, inside, {}
 

@@ -23,9 +23,8 @@ from amiwarp.kernels.plain_models import even, is_even
 from amiwarp.kernels.prism_angle import (
     THETA_U32_RAD,
     EncoderParams,
-    of_second,
+    both_angles,
     piece_at,
-    radians,
     theta_u32_at,
     theta_u32_on,
 )
@@ -100,8 +99,8 @@ def state_at_time(
     model: PairParams, encoder: EncoderParams, azimuths: wp.array(dtype=float), t: wp.int64
 ):
     """Return the state of both prisms at event time ``t`` [us]."""
-    second = radians(theta_u32_at(of_second(encoder), t))
-    w0, w1 = state_of(model, radians(theta_u32_at(encoder, t)), second)
+    first, second = both_angles(encoder, t)
+    w0, w1 = state_of(model, first, second)
     return w0, w1
 
 

@@ -34,6 +34,29 @@ class ExactParams:
 
 
 @wp.func
+def shift_at_faces(sine: float, cosine: float, bent: float, along: float, z: float, entering: int):
+    """Return the shift Gamma sin(alpha) of a direction by both faces, and q, by Snell's law.
+
+    ``along`` and ``z`` are the components of the direction along w and the axis, ``sine`` and ``cosine`` belong to
+    alpha. ``bent`` is n^2 - 1, times the squared length of the direction. ``entering`` is 1 if the light enters at the
+    tilted face, where q is its cosine. It is 0 if the light leaves there: q is then the cosine behind the flat face,
+    and n^2 - 1 changes its sign. There are no branches, so that LLVM computes several shifts at once.
+    """
+    q = sine * along + cosine * wp.where(entering == 1, z, wp.sqrt(z * z + bent))
+    return (wp.sqrt(q * q + wp.where(entering == 1, bent, -bent)) - q) * sine, q
+
+
+@wp.func
+def shifted(x: float, y: float, z: float, w0: float, w1: float, along: float, shift: float):
+    """Return a direction shifted along w at equal length; NaN if no such direction exists.
+
+    z^2 is computed from its change, because computing it from x^2 + y^2 would cancel in float32 far from the axis.
+    ``along``: component of the direction along w.
+    """
+    return x + shift * w0, y + shift * w1, wp.sqrt(z * z - shift * (2.0 * along + shift))
+
+
+@wp.func
 def refract_in_prism_frame(
     sine: float,
     cosine: float,
@@ -45,36 +68,30 @@ def refract_in_prism_frame(
     w1: float,
     entering: int,
 ):
-    """Refract a direction at both faces, in the prism's frame; NaN if no light passes.
+    """Refract a direction of any length at both faces, in the prism's frame; NaN if no light passes.
 
-    The faces shift it by Gamma sin(alpha) along w. ``entering`` is 1 if the light enters at the tilted face, where q is
-    its cosine. It is 0 if the light leaves there: q is then the cosine behind the flat face, and n^2 - 1 changes its
-    sign. z^2 is computed from its change, because computing it from x^2 + y^2 would cancel in float32 far from the
-    axis. ``sine`` and ``cosine`` belong to alpha.
+    ``sine`` and ``cosine`` belong to the apex angle alpha; ``entering``: as for :func:`shift_at_faces`.
     """
-    length2 = x * x + y * y + z * z
-    bent = (index2 - 1.0) * length2
-    d = w0 * x + w1 * y
-    q = sine * d + cosine * wp.where(entering == 1, z, wp.sqrt(z * z + bent))
-    shift = (wp.sqrt(q * q + wp.where(entering == 1, bent, -bent)) - q) * sine
-    z2 = z * z - shift * (2.0 * d + shift)
-    passes = wp.min(wp.min(z, q), z2) > 0.0  # z2 may be NaN and comes last: min(a, NaN) is NaN here
-    return x + shift * w0, y + shift * w1, wp.where(passes, wp.sqrt(z2), NAN)
+    bent = (index2 - 1.0) * (x * x + y * y + z * z)
+    along = w0 * x + w1 * y
+    shift, q = shift_at_faces(sine, cosine, bent, along, z, entering)
+    a, b, c = shifted(x, y, z, w0, w1, along, shift)
+    passes = wp.min(wp.min(z, q), c) > 0.0  # c may be NaN and comes last: min(a, NaN) is NaN here
+    return a, b, wp.where(passes, c, NAN)
 
 
 @wp.func
 def prism_shift(m: ExactParams, along: float, z: float) -> float:
-    """Return the shift of :func:`refract_in_prism_frame` for a unit direction, as the simulator computes it.
+    """Return the shift of :func:`shift_at_faces` for a unit direction; NaN if no light passes.
 
-    ``along`` and ``z`` are the components of the direction along w and the axis. There are no branches, so that LLVM
-    computes several shifts at once: if no light passes, the square root of a negative number gives NaN.
+    It is the same side of the branch for all directions. So each side has a constant ``entering``, and computes no
+    square root in vain.
     """
-    inside = m.index2 - 1.0
     if m.flat_to_scene == 1:
-        q = m.sin_apex * along + m.cos_apex * z
-        return m.sin_apex * (wp.sqrt(inside + q * q) - wp.where(q > 0.0, q, NAN))
-    q = m.sin_apex * along + m.cos_apex * wp.sqrt(inside + z * z)
-    return m.sin_apex * (wp.sqrt(q * q - inside) - q)
+        shift, q = shift_at_faces(m.sin_apex, m.cos_apex, m.index2 - 1.0, along, z, 1)
+        return wp.where(q > 0.0, shift, NAN)
+    shift, q = shift_at_faces(m.sin_apex, m.cos_apex, m.index2 - 1.0, along, z, 0)
+    return shift
 
 
 @wp.func

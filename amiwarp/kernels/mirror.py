@@ -7,14 +7,7 @@ import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.compensation import state_at_time
-from amiwarp.kernels.native_code import load_uint16, store_float
-from amiwarp.kernels.prism_angle import (
-    THETA_U16_RAD,
-    EncoderParams,
-    of_second,
-    radians,
-    theta_u32_at,
-)
+from amiwarp.kernels.prism_angle import EncoderParams, both_angles
 from amiwarp.kernels.refraction import (
     advanced,
     compensate_direction,
@@ -24,7 +17,13 @@ from amiwarp.kernels.refraction import (
     state_of_angles,
 )
 from amiwarp.kernels.vibration import rotate_by_vector
-from amiwarp.kernels.votes import EventArrays, load_states, stored_state
+from amiwarp.kernels.votes import (
+    EventArrays,
+    load_angles,
+    load_states,
+    stored_angles,
+    stored_state,
+)
 
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -70,16 +69,16 @@ def state_at_time(
     model: MirrorParams, encoder: EncoderParams, azimuths: wp.array(dtype=float), t: wp.int64
 ):
     """Return the state at event time ``t`` [us]."""
-    second = radians(theta_u32_at(of_second(encoder), t))
-    w0, w1 = state_of(model, radians(theta_u32_at(encoder, t)), second)
+    first, second = both_angles(encoder, t)
+    w0, w1 = state_of(model, first, second)
     return w0, w1
 
 
 @wp.func
 def stored_state(model: MirrorParams, events: EventArrays, i: int):
     """Return the angles of both commands at event ``i`` [rad]."""
-    first = float(int(load_uint16(events.turn, i)))
-    return first * THETA_U16_RAD, float(int(load_uint16(events.second, i))) * THETA_U16_RAD
+    first, second = stored_angles(events, i)
+    return first, second
 
 
 @wp.func
@@ -87,10 +86,7 @@ def load_states(
     model: MirrorParams, events: EventArrays, first: int, states: wp.array(dtype=float)
 ):
     """Load what :func:`stored_state` returns for a block of 64 events."""
-    for k in range(64):
-        a, b = stored_state(model, events, first + k)
-        store_float(states, 2 * k, a)
-        store_float(states, 2 * k + 1, b)
+    load_angles(events, first, states)
 
 
 @wp.func

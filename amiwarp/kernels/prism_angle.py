@@ -83,3 +83,10 @@ def of_second(encoder: EncoderParams) -> EncoderParams:
 def radians(theta: wp.uint32) -> float:
     """Return theta_u32 as an angle from -pi to pi [rad]."""
     return float(wp.float64(wp.int32(theta)) * wp.float64(THETA_U32_RAD))
+
+
+@wp.func
+def both_angles(encoder: EncoderParams, t: wp.int64):
+    """Return the angles of both encoders, or of both commands, at event time ``t`` [us], from -pi to pi [rad]."""
+    first = radians(theta_u32_at(encoder, t))
+    return first, radians(theta_u32_at(of_second(encoder), t))

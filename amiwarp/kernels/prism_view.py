@@ -10,6 +10,7 @@ from amiwarp.kernels.exact import (
     prism_shift,
     ray_without_prism,
     refract_in_prism_frame,
+    shifted,
 )
 from amiwarp.kernels.steerer import with_transverse
 
@@ -167,8 +168,7 @@ def see_level(view: View, step: Step, ray: wp.vec3) -> float:
     else:
         along = w[0] * ray[0] + w[1] * ray[1]
         shift = prism_shift(view.prism, along, ray[2])
-        x, y = ray[0] + shift * w[0], ray[1] + shift * w[1]
-        z = wp.sqrt(ray[2] * ray[2] - shift * (2.0 * along + shift))
+        x, y, z = shifted(ray[0], ray[1], ray[2], w[0], w[1], along, shift)
     x, y, z = behind_second(view.second, view.steered, x, y, z, step.second[0], step.second[1])
     h = step.to_texel * wp.vec3(x, y, z)
     depth = depth_or_nan(h[2])
@@ -196,9 +196,7 @@ def texels_ahead(
     while j < AHEAD:
         along = m[0, j] * ray[0] + m[1, j] * ray[1]
         shift = prism_shift(prism, along, ray[2])
-        x = ray[0] + shift * m[0, j]
-        y = ray[1] + shift * m[1, j]
-        z = wp.sqrt(ray[2] * ray[2] - shift * (2.0 * along + shift))
+        x, y, z = shifted(ray[0], ray[1], ray[2], m[0, j], m[1, j], along, shift)
         depth = depth_or_nan(m[8, j] * x + m[9, j] * y + m[10, j] * z)
         met[0, j] = (m[2, j] * x + m[3, j] * y + m[4, j] * z) / depth
         met[1, j] = (m[5, j] * x + m[6, j] * y + m[7, j] * z) / depth

@@ -104,10 +104,17 @@ def stored_state(model: Any, events: EventArrays, i: int):
 
 
 @wp.func
-def stored_state(model: PairParams, events: EventArrays, i: int):
-    """Return the angles of both encoders at event ``i`` [rad]."""
+def stored_angles(events: EventArrays, i: int):
+    """Return the angles of both encoders, or of both commands, at event ``i`` [rad]."""
     first = float(int(load_uint16(events.turn, i)))
     return first * THETA_U16_RAD, float(int(load_uint16(events.second, i))) * THETA_U16_RAD
+
+
+@wp.func
+def stored_state(model: PairParams, events: EventArrays, i: int):
+    """Return the angles of both encoders at event ``i`` [rad]."""
+    first, second = stored_angles(events, i)
+    return first, second
 
 
 @wp.func
@@ -117,12 +124,18 @@ def load_states(model: Any, events: EventArrays, first: int, states: wp.array(dt
 
 
 @wp.func
-def load_states(model: PairParams, events: EventArrays, first: int, states: wp.array(dtype=float)):
-    """Load what :func:`stored_state` returns for a block of 64 events."""
+def load_angles(events: EventArrays, first: int, states: wp.array(dtype=float)):
+    """Load what :func:`stored_angles` returns for a block of 64 events."""
     for k in range(64):
-        a, b = stored_state(model, events, first + k)
+        a, b = stored_angles(events, first + k)
         store_float(states, 2 * k, a)
         store_float(states, 2 * k + 1, b)
+
+
+@wp.func
+def load_states(model: PairParams, events: EventArrays, first: int, states: wp.array(dtype=float)):
+    """Load what :func:`stored_state` returns for a block of 64 events."""
+    load_angles(events, first, states)
 
 
 @wp.func

@@ -324,7 +324,7 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
     out = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
     lens = camera.distortion
     if lens is not None:
-        [kind] = [name for name, of_kind in DISTORTIONS.items() if isinstance(lens, of_kind)]
+        [kind] = [name for name, lens_class in DISTORTIONS.items() if isinstance(lens, lens_class)]
         out["distortion"] = {"kind": kind, **coefficients(lens)}
     return out
 
@@ -378,10 +378,14 @@ def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=lens)
 
 
+BORDER_POINTS = 9
+"""Number of points on each side of the image's border, corners included."""
+
+
 def border(camera: Camera) -> NDArray[np.float64]:
-    """Return pixels along the image's border [px], shape (n, 2)."""
-    x = np.linspace(0, camera.width - 1, 9)
-    y = np.linspace(0, camera.height - 1, 9)
+    """Return pixels along the image's border, evenly on each side [px], shape (32, 2)."""
+    x = np.linspace(0, camera.width - 1, BORDER_POINTS)
+    y = np.linspace(0, camera.height - 1, BORDER_POINTS)
     columns, rows = np.meshgrid(x, y)
     grid = np.stack([columns.ravel(), rows.ravel()], axis=1)
     left_or_right = np.isin(grid[:, 0], x[[0, -1]])

@@ -15,6 +15,9 @@ from amiwarp.schema.calls import guarded
 from amiwarp.validation import real, shown
 
 Vector = tuple[float, float, float]
+"""Three numbers about the camera's x, y and z axes."""
+PATH_TIMES = 33
+"""Number of times in a window at which the displacement by a known path is computed."""
 
 
 @guarded
@@ -68,19 +71,23 @@ class CameraRotation:
         AmiwarpError
             If a forward motion has reached the scene before the new reference time.
         """
-        later = (middle_us - self.middle_us) * 1e-6
+        later_s = (middle_us - self.middle_us) * 1e-6
         x, y, z = (
-            r + c * later
-            for r, c in zip(self.angular_velocity, self.angular_acceleration, strict=True)
+            velocity + acceleration * later_s
+            for velocity, acceleration in zip(
+                self.angular_velocity, self.angular_acceleration, strict=True
+            )
         )
-        left = 1.0 - self.growth * later
-        if left <= 0.0:
+        depth_left = (
+            1.0 - self.growth * later_s
+        )  # as a share of the depth at the present reference time
+        if depth_left <= 0.0:
             raise AmiwarpError(
                 f"middle_us is {middle_us}; with growth {self.growth:g} 1/s the camera reaches the scene "
                 f"{1.0 / self.growth:g} s after {self.middle_us} us; give a time before that, or no growth"
             )
         return CameraRotation(
-            (x, y, z), self.angular_acceleration, middle_us, self.growth / left, self.path
+            (x, y, z), self.angular_acceleration, middle_us, self.growth / depth_left, self.path
         )
 
     @property
@@ -107,10 +114,12 @@ class CameraRotation:
             raise AmiwarpError(
                 f"tau = {shown(tau)} is not within 1e9 s of the reference time; give seconds"
             )
-        turned = np.outer(tau, self.angular_velocity) + np.outer(
-            0.5 * tau**2, self.angular_acceleration
-        )
-        return turned if self.path is None else turned + self.path.at(tau, self.middle_us)
+        by_velocity = np.outer(tau, self.angular_velocity)
+        by_acceleration = np.outer(0.5 * tau**2, self.angular_acceleration)
+        turned = by_velocity + by_acceleration
+        if self.path is not None:
+            turned = turned + self.path.at(tau, self.middle_us)
+        return turned
 
     def params(self, device: Any) -> Any:
         """Return the parameters for kernels.
@@ -129,15 +138,15 @@ class CameraRotation:
 
         from amiwarp.kernels.camera_rotation import CameraRotationParams
 
-        p = CameraRotationParams()
-        p.velocity = wp.vec3(*self.angular_velocity)
-        p.acceleration = wp.vec3(*self.angular_acceleration)
-        p.growth = self.growth
+        params = CameraRotationParams()
+        params.velocity = wp.vec3(*self.angular_velocity)
+        params.acceleration = wp.vec3(*self.angular_acceleration)
+        params.growth = self.growth
         if self.path is not None:
-            p.path = rotation_table(self.path, self.middle_us, str(wp.get_device(device)))
-            p.path_start = (self.path.start_us - self.middle_us) * 1e-6
-            p.path_rate = 1e6 / STEP_US
-        return p
+            params.path = rotation_table(self.path, self.middle_us, str(wp.get_device(device)))
+            params.path_start = (self.path.start_us - self.middle_us) * 1e-6
+            params.path_rate = 1e6 / STEP_US
+        return params
 
     def reach(self, camera: Camera, half_s: float) -> NDArray[np.float64]:
         """Return the largest displacement of border pixels within ``half_s`` of the reference time.
@@ -156,30 +165,27 @@ class CameraRotation:
             view.
         """
         half_s = real(half_s, "half_s", 0.0, 1e9, " s")
-        ends = (
-            np.array([-half_s, half_s]) if self.path is None else np.linspace(-half_s, half_s, 33)
-        )
-        rotations = self.rotation(ends)
-        sizes = 1.0 - self.growth * ends
+        # Without a path, the rotation is largest at one of the window's ends.
+        times_s = np.array([-half_s, half_s])
+        if self.path is not None:
+            times_s = np.linspace(-half_s, half_s, PATH_TIMES)
+        rotations = self.rotation(times_s)
         if not (rotations.any() or self.growth):
             return np.zeros(2)
         # Here, because a still camera does not need this slow import
-        from scipy.spatial.transform import (
-            Rotation,
-        )
+        from scipy.spatial.transform import Rotation
 
         xy = border(camera)
         rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float32)), np.float64)
-        sizes = np.where(sizes > 0.0, sizes, np.nan)  # beyond the scene
-        turned = (
-            Rotation.from_rotvec(r).apply(rays) * (s, s, 1.0)
-            for r, s in zip(rotations, sizes, strict=True)
-        )
-        moved = [camera.rays_to_pixels(each.astype(np.float32)) for each in turned]
-        displacement = np.abs(np.concatenate([np.asarray(m) - xy for m in moved]))
+        sizes = 1.0 - self.growth * times_s
+        sizes = np.where(sizes > 0.0, sizes, np.nan)  # else the camera is beyond the scene
+        displacements = []
+        for rotation, size in zip(rotations, sizes, strict=True):
+            turned = Rotation.from_rotvec(rotation).apply(rays) * (size, size, 1.0)
+            moved = camera.rays_to_pixels(turned.astype(np.float32))
+            displacements.append(np.abs(np.asarray(moved) - xy))
+        displacement = np.concatenate(displacements)
         visible = displacement[np.isfinite(displacement).all(axis=1)]
-        return (
-            visible.max(axis=0)
-            if len(visible)
-            else np.array([camera.width, camera.height], np.float64)
-        )
+        if not len(visible):
+            return np.array([camera.width, camera.height], np.float64)
+        return visible.max(axis=0)

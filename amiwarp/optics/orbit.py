@@ -42,7 +42,8 @@ def image_grid(camera: Camera, columns: int, rows: int) -> NDArray[np.float64]:
     """Return points evenly over an image, row by row, shape (rows * columns, 2) [px]."""
     x = np.linspace(0.0, camera.width - 1.0, columns)
     y = np.linspace(0.0, camera.height - 1.0, rows)
-    return np.stack([m.ravel() for m in np.meshgrid(x, y)], axis=1)
+    columns_of_points, rows_of_points = np.meshgrid(x, y)
+    return np.stack([columns_of_points.ravel(), rows_of_points.ravel()], axis=1)
 
 
 def orbits_of(model: Model, points: NDArray[np.float64]) -> Orbits:
@@ -55,8 +56,8 @@ def orbits_of(model: Model, points: NDArray[np.float64]) -> Orbits:
             f"the {model.NAME} model has {model.ANGLES} angles; sums in phase need an optic with one angle"
         )
     angles = np.arange(ANGLES) * (math.tau / ANGLES)
-    everywhere = np.repeat(points, ANGLES, axis=0)
-    moved = model.compensate_points(everywhere, np.tile(angles, len(points))) - everywhere
+    repeated = np.repeat(points, ANGLES, axis=0)
+    moved = model.compensate_points(repeated, np.tile(angles, len(points))) - repeated
     if not np.isfinite(moved).all():
         raise AmiwarpError(
             "the model moves a pixel to no finite place; give the calibration of this recording"

@@ -67,11 +67,12 @@ class Prism:
     """Second prism of a pair (Risley pair), behind this one as seen from the camera; None for one prism."""
 
     def __post_init__(self) -> None:
-        if (
-            self.second is not None
-            and instance(self.second, Prism, "prism second").second is not None
-        ):
-            raise AmiwarpError("the second prism has a second one itself; a pair has two prisms")
+        if self.second is not None:
+            second = instance(self.second, Prism, "prism second")
+            if second.second is not None:
+                raise AmiwarpError(
+                    "prism second: it has a second prism itself; a pair has two prisms"
+                )
         hint = " rad, 0 .. 30 deg; is it given in degrees?"
         object.__setattr__(
             self, "apex", real(self.apex, "prism apex", 0.0, _BELOW_LARGEST_APEX, hint)
@@ -171,20 +172,20 @@ NominalPrism: TypeAlias = Prism | UnsizedPrism | Plate
 
 
 @overload
-def as_wedge(glass: Prism | Plate) -> Prism: ...
+def as_wedge(prism: Prism | Plate) -> Prism: ...
 
 
 @overload
-def as_wedge(glass: NominalPrism) -> Prism | UnsizedPrism: ...
+def as_wedge(prism: NominalPrism) -> Prism | UnsizedPrism: ...
 
 
-def as_wedge(glass: NominalPrism) -> Prism | UnsizedPrism:
-    """Return the glass if it is a wedge prism; raise :class:`AmiwarpError` for a plate."""
-    if isinstance(glass, Plate):
+def as_wedge(prism: NominalPrism) -> Prism | UnsizedPrism:
+    """Return the prism if it is a wedge; raise :class:`AmiwarpError` for a plate."""
+    if isinstance(prism, Plate):
         raise AmiwarpError(
             "the glass is a plane-parallel plate, but this works with a wedge prism; give a prism"
         )
-    return glass
+    return prism
 
 
 @guarded
@@ -219,18 +220,21 @@ def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSi
     >>> round(amiwarp.deflection_from_apex(0.02, 1.5168), 6)
     0.010337
     """
-    scene = choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE
+    flat_to_scene = choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE
     index = check_index(index, "index")
-    # The ray starts at the camera. With the flat face to the scene it enters the tilted face and leaves the flat one.
-    incidence = apex - math.asin(math.sin(apex) / index) if scene else apex
+    # The ray starts at the camera. With the flat face to the scene it enters the tilted face and leaves the flat one;
+    # else it enters the flat face straight. ``incidence`` is its angle inside, to the normal of the face it leaves.
+    incidence = apex
+    if flat_to_scene:
+        incidence = apex - math.asin(math.sin(apex) / index)
     sine = index * math.sin(incidence)
     if not abs(sine) <= 1.0:
         raise AmiwarpError(
             f"an apex of {math.degrees(apex):.4g} deg with index {index:.4g} totally reflects the camera's axial ray; "
             "give a smaller apex or index"
         )
-    direction = math.asin(sine)
-    return direction if scene else direction - apex
+    direction = math.asin(sine)  # to the normal of the face that the ray leaves
+    return direction if flat_to_scene else direction - apex
 
 
 @guarded

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
@@ -106,23 +107,25 @@ class RotationPath:
             )
         first, last = vector(span, 2, "span", partial(whole, low=-TIME_LIMIT, high=TIME_LIMIT))
         if not len(t) or t[0] > first or t[-1] < last:
-            raise AmiwarpError(f"the gyroscope does not cover the time from {first} to {last} us")
+            raise AmiwarpError(
+                f"the gyroscope does not cover the time from {first} to {last} us; give a span within its times"
+            )
         if not 0 < last - first <= LONGEST_US:
             raise AmiwarpError(
-                f"the path of a camera lasts {(last - first) * 1e-6:g} s; expected up to 10 s"
+                f"the path of a camera lasts {(last - first) * 1e-6:g} s; expected above 0 and up to 10 s"
             )
-        steps = -(-(last - first) // STEP_US)
-        middles = STEP_US * (np.arange(steps) + 0.5)
-        since = (t - first).astype(np.float64)
-        turned = np.stack([np.interp(middles, since, axis) for axis in rates.T], axis=1) * (
-            STEP_US * 1e-6
-        )
+        steps = math.ceil((last - first) / STEP_US)
+        middles_us = STEP_US * (np.arange(steps) + 0.5)
+        times_us = (t - first).astype(np.float64)
+        rates_in_middles = [np.interp(middles_us, times_us, rate) for rate in rates.T]
+        turned = np.stack(rates_in_middles, axis=1) * (STEP_US * 1e-6)
+
         orientation = Rotation.identity()
-        found = [orientation]
+        orientations = [orientation]
         for step in Rotation.from_rotvec(turned):
             orientation = orientation * step
-            found.append(orientation)
-        return cls(first, np.stack([each.as_quat() for each in found]))
+            orientations.append(orientation)
+        return cls(first, np.stack([each.as_quat() for each in orientations]))
 
     @property
     def stop_us(self) -> int:
@@ -144,15 +147,17 @@ class RotationPath:
         """
         from scipy.spatial.transform import Rotation
 
+        times = np.atleast_1d(as_times(t, "t"))
+        if times.ndim != 1:
+            raise AmiwarpError(f"t has shape {times.shape}; give times of shape (k,)")
         known = Rotation.from_quat(self.quaternions)
         last = len(self.quaternions) - 1
-        given = np.atleast_1d(as_times(t, "t"))
-        if given.ndim != 1:
-            raise AmiwarpError(f"t has shape {given.shape}; give times of shape (k,)")
-        at = np.clip((given - self.start_us).astype(np.float64) / STEP_US, 0.0, last)
-        before = np.minimum(at.astype(np.int64), last - 1)
+
+        # Each time lies in a step, and turns by its share of the step's rotation.
+        position = np.clip((times - self.start_us).astype(np.float64) / STEP_US, 0.0, last)
+        before = np.minimum(position.astype(np.int64), last - 1)
         step = (known[before].inv() * known[before + 1]).as_rotvec()
-        return known[before] * Rotation.from_rotvec((at - before)[:, None] * step)
+        return known[before] * Rotation.from_rotvec((position - before)[:, None] * step)
 
     def vectors(self, middle_us: int) -> NDArray[np.float64]:
         """Return the rotation at each time of the path since a reference time.
@@ -193,10 +198,10 @@ class RotationPath:
             )
         finite(tau, "times tau")
         middle_us = whole(middle_us, "middle_us", -TIME_LIMIT, TIME_LIMIT)
-        known = (
-            float(self.start_us - middle_us) + STEP_US * np.arange(len(self.quaternions))
-        ) * 1e-6
-        return np.stack([np.interp(tau, known, axis) for axis in self.vectors(middle_us).T], axis=1)
+        start_us = float(self.start_us - middle_us)
+        known_s = (start_us + STEP_US * np.arange(len(self.quaternions))) * 1e-6
+        components = self.vectors(middle_us).T
+        return np.stack([np.interp(tau, known_s, values) for values in components], axis=1)
 
 
 @lru_cache(maxsize=32)

@@ -82,17 +82,16 @@ class StageSummary:
             The summary.
         """
         scores = stage.scores.tolist()
-        found = list(values)
-        if len(found) != len(scores) or not all(
-            isinstance(at, Mapping) and at.keys() >= {*names} for at in found
-        ):
+        values = list(values)
+        complete = all(isinstance(each, Mapping) and each.keys() >= {*names} for each in values)
+        if len(values) != len(scores) or not complete:
             raise AmiwarpError(
-                f"values are {shown(found)}; give {', '.join(names)} at each of {len(scores)} points"
+                f"values are {shown(values)}; give {', '.join(names)} at each of {len(scores)} points"
             )
-        points = [
-            {**{n: at[n] for n in names}, "score": score}
-            for at, score in zip(found, scores, strict=True)
-        ]
+        points = []
+        for at_point, score in zip(values, scores, strict=True):
+            point = {name: at_point[name] for name in names}
+            points.append({**point, "score": score})
         return cls(
             name=name,
             algorithm=stage.algorithm,
@@ -241,7 +240,9 @@ class ModelChoice:
 
 
 FORMAT = "amiwarp-calibration"
+"""Value of the calibration file's field ``format``."""
 VERSION = 1
+"""Version of the calibration file's layout."""
 NEEDED = (
     "format",
     "version",
@@ -257,9 +258,11 @@ NEEDED = (
     "warnings",
     "stages",
 )
+"""Fields that every calibration file has."""
 OPTIONAL = ("middle_us", "ladder", "harmonics", "path")
 """Fields of the calibration file that files of earlier versions lack."""
 SHARPNESS = [kind.value for kind in Sharpness]
+"""Names of the sharpness measures."""
 
 
 @guarded
@@ -335,18 +338,20 @@ class Calibration:
     def __repr__(self) -> str:
         values = ", ".join(map(self._in_words, self.parameters))
         gain = f"{self.sharpness_name} {self.sharpness_before:.3g} -> {self.sharpness_after:.3g}"
-        warned = (
-            f", {len(self.warnings)} warning{'s'[: len(self.warnings) > 1]}"
-            if self.warnings
-            else ""
-        )
+        warned = ""
+        if len(self.warnings) == 1:
+            warned = ", 1 warning"
+        elif self.warnings:
+            warned = f", {len(self.warnings)} warnings"
         return f"Calibration({self.model_name}: {values};\n            {gain}, {self.events:,} events{warned})"
 
     def _in_words(self, name: str) -> str:
         """Return a parameter with its standard deviation and unit, angles in degrees."""
         unit = units().get(name, "")
-        turned = unit.startswith("rad")
-        scale, unit = (math.degrees(1.0), unit.replace("rad", "deg", 1)) if turned else (1.0, unit)
+        scale = 1.0
+        if unit.startswith("rad"):
+            scale = math.degrees(1.0)
+            unit = unit.replace("rad", "deg", 1)
         std = f" ± {self.uncertainty[name] * scale:.2g}" if name in self.uncertainty else ""
         return f"{name} {self.parameters[name] * scale:.5g}{std} {unit}".rstrip()
 
@@ -362,17 +367,20 @@ class Calibration:
             return self
         size = MODELS[self.model_name].SIZE
         exact = ExactModel
-        free = tuple(exact.SIZE if n == size else n for n in self.free)
-        found = self.ladder.exact
-        std = self.ladder.exact_uncertainty
+        free = tuple(exact.SIZE if name == size else name for name in self.free)
         return replace(
-            self, model_name=exact.NAME, parameters=found, uncertainty=std, free=free, ladder=None
+            self,
+            model_name=exact.NAME,
+            parameters=self.ladder.exact,
+            uncertainty=self.ladder.exact_uncertainty,
+            free=free,
+            ladder=None,
         )
 
     @property
     def camera_rotation(self) -> CameraRotation | None:
         """Rotation of the camera about the time ``middle_us``; None if it was neither free nor given."""
-        if not any(n in self.parameters for n in MOTION):
+        if not any(name in self.parameters for name in MOTION):
             return None
         return rotation_from_values(self.parameters, self.middle_us or 0)
 
@@ -401,18 +409,24 @@ class Calibration:
             If the recording has no encoder and the calibration no rpm, or a path that does not cover the events; or if
             it has one and the calibration was made without.
         """
-        kind = MODELS[self.model_name]
-        if all(self.parameters.get(size) == 0.0 for size, _ in kind.ORBITS):
+        model = MODELS[self.model_name]
+        if all(self.parameters.get(size) == 0.0 for size, _ in model.ORBITS):
             rest = constant_speed(0.0, t_first, t_last, t_first)
-            return rest if kind.ANGLES == 1 else rest.with_second(1.0)
-        if encoder is not None:
-            check_made_with_encoder(self)
-            if self.path is not None and replaces(self.path, encoder):
-                encoder = replace(self.path, clock_offset_us=encoder.clock_offset_us)
-            encoder = encoder.with_clock_offset(
-                self.parameters.get("clock_offset", encoder.clock_offset_us)
-            )
-            return encoder if self.harmonics is None else encoder.with_harmonics(self.harmonics)
+            return rest if model.ANGLES == 1 else rest.with_second(1.0)
+        if encoder is None:
+            return self._path_found(t_first, t_last)
+        check_made_with_encoder(self)
+        if self.path is not None and replaces(self.path, encoder):
+            encoder = replace(self.path, clock_offset_us=encoder.clock_offset_us)
+        offset_us = self.parameters.get("clock_offset", encoder.clock_offset_us)
+        encoder = encoder.with_clock_offset(offset_us)
+        return encoder if self.harmonics is None else encoder.with_harmonics(self.harmonics)
+
+    def _path_found(self, t_first: int, t_last: int) -> Encoder:
+        """Return the path or the constant speed that a calibration without an encoder found, for a span of times [us].
+
+        Raises :class:`AmiwarpError` if there is neither, or the path does not cover the span.
+        """
         if self.path is not None:
             if not self.path.covers(t_first, t_last):
                 first, last = self.path.coverage
@@ -462,16 +476,17 @@ class Calibration:
         }
 
     def _parameter(self, name: str) -> dict[str, Any]:
+        """Return the content of the file about one parameter."""
         value = self.parameters[name]
         unit = units()[name]
-        out: dict[str, Any] = {"value": value, "unit": unit, "free": name in self.free}
+        entry: dict[str, Any] = {"value": value, "unit": unit, "free": name in self.free}
         if name in self.uncertainty:
-            out["std"] = self.uncertainty[name]
+            entry["std"] = self.uncertainty[name]
         if unit == "rad":
-            out["degrees"] = math.degrees(value)
+            entry["degrees"] = math.degrees(value)
         if name == "rpm" and not MODELS[self.model_name].PRISM:
-            out["hz"] = value / 60.0
-        return out
+            entry["hz"] = value / 60.0
+        return entry
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write the calibration to a JSON file.
@@ -550,6 +565,7 @@ class Calibration:
             path=None if path is None else path.encoder(),
             **{name: getattr(rest, name) for name in names},
         )
+        # Values that no model can have are a damaged file; the closed form checks them quickly.
         _ = replace(result, model_name=MODELS[model].closed_form().NAME).model
         return result
 
@@ -590,8 +606,14 @@ def prism_to_json(prism: Prism | Plate) -> dict[str, Any]:
     """Return a prism, with the second one of a pair, or a plate, in types that JSON knows."""
     if isinstance(prism, Plate):
         return {"thickness_m": prism.thickness, "tilt_rad": prism.tilt, "index": prism.index}
-    found = {"apex_rad": prism.apex, "index": prism.index, "flat_side": prism.flat_side.value}
-    return found if prism.second is None else {**found, "second": prism_to_json(prism.second)}
+    fields_of_prism: dict[str, Any] = {
+        "apex_rad": prism.apex,
+        "index": prism.index,
+        "flat_side": prism.flat_side.value,
+    }
+    if prism.second is not None:
+        fields_of_prism["second"] = prism_to_json(prism.second)
+    return fields_of_prism
 
 
 def prism_from_json(data: Any, name: str) -> Prism | Plate:

@@ -32,32 +32,18 @@ from amiwarp.validation import finite, instance, one_of, real, shown, vector
 
 NOMINAL_APEX = math.radians(2.0)
 """Apex angle assumed if a recording does not give it [rad]. The search goes up to twice this value."""
-
-
 DRIFTS = ("clock_offset", "rpm")
 """Parameters that shift the prism angle of each event by an amount that depends on the event's time."""
-
-
 RATES = ("rate_x", "rate_y", "rate_z")
 """Angular velocity of the camera about its x, y and z axes: names of the parameters."""
-
-
 CHANGES = ("change_x", "change_y", "change_z")
 """Angular acceleration of the camera about its x, y and z axes: names of the parameters."""
-
-
 GROWTH = "growth"
 """Growth of the image of a camera that moves forward: name of the parameter."""
-
-
 MOTION = (*RATES, *CHANGES, GROWTH)
 """Names of all parameters of the camera's motion."""
-
-
 LINEAR_UNKNOWNS = ("off_ratio", "leak")
 """Free parameters that only the photometric stage has: unknowns of its linear equations."""
-
-
 _UNITS = {
     "clock_offset": "us",
     "rpm": "1/min",
@@ -92,9 +78,9 @@ def of_orbit(space: ParameterSpace, k: int, at: Mapping[str, float]) -> Paramete
 
     Prisms before it have the values ``at``, later ones the size 0 if theirs is free.
     """
-    kind = MODELS[space.model]
-    later = {size: 0.0 for size, _ in kind.ORBITS[k + 1 :] if size in space.names}
-    others = {*space.names} - {*kind.TOGETHER[k]}
+    model = MODELS[space.model]
+    later = {size: 0.0 for size, _ in model.ORBITS[k + 1 :] if size in space.names}
+    others = {*space.names} - {*model.TOGETHER[k]}
     return space.holding({**at, **later}).without(tuple(others))
 
 
@@ -103,9 +89,9 @@ def phase_names() -> set[str]:
     return {phase for model in MODELS.values() for _, phase in model.ORBITS}
 
 
-def orbit_names(kind: type[Model]) -> tuple[str, ...]:
+def orbit_names(model: type[Model]) -> tuple[str, ...]:
     """Return the names of size and phase of each prism."""
-    return tuple(name for orbit in kind.ORBITS for name in orbit)
+    return tuple(name for orbit in model.ORBITS for name in orbit)
 
 
 def like_size(names: Iterable[str]) -> tuple[str, ...]:
@@ -199,7 +185,7 @@ class ParameterSpace:
         ParameterSpace
             The space without these free parameters.
         """
-        return replace(self, names=tuple(n for n in self.names if n not in names))
+        return replace(self, names=tuple(name for name in self.names if name not in names))
 
     def holding(self, values: Mapping[str, float]) -> ParameterSpace:
         """Return the parameter space with other start values.
@@ -396,12 +382,12 @@ def check_names(
         vector(pair, 2, f"bounds of {name}", real)
 
 
-def nominal(prism: NominalPrism | None, kind: type[Model] | None = None) -> Prism | Plate:
+def nominal(prism: NominalPrism | None, model: type[Model] | None = None) -> Prism | Plate:
     """Return a recording's nominal glass, with the apex :data:`NOMINAL_APEX` if the apex of its prism is unknown.
 
-    For a ``kind`` of model without a prism, its apex is 0.
+    For a ``model`` without a prism, its apex is 0.
     """
-    if kind is not None and not kind.PRISM:
+    if model is not None and not model.PRISM:
         return Prism(0.0)
     if isinstance(prism, Prism | Plate):
         return prism

@@ -36,14 +36,14 @@ from amiwarp.results.parameters import (
 MOST_TURNS_OFF = 0.25
 """Largest error of the number of turns in a recording that the frequency of a vibrating camera may start with."""
 _RELATIVE_RANGE = {"rpm": 0.02, "focal_length": 0.2}
-"""The same for these parameters, as a share of the start value."""
+"""Half width of the default bounds of these parameters about their start value, as a share of it."""
 _HALF_RANGE = {
     "clock_offset": 5000.0,
     **dict.fromkeys(RATES, 5.0),
     **dict.fromkeys(CHANGES, 50.0),
     GROWTH: 5.0,
 }
-"""Half width of the default bounds of each parameter about its start value, in the parameter's unit."""
+"""Half width of the default bounds of the other parameters about their start value, in the parameter's unit."""
 
 
 def make_space(
@@ -98,20 +98,20 @@ def make_space(
         If a name is unknown, not part of the model or in conflict with another one, if the bounds are in the wrong
         order, or if a free parameter moves no event.
     """
-    kind = MODELS[model]
-    names = _ordered_names(kind, kind.FREED if free is None else free)
-    _check_given(kind, names, start, bounds)
-    nominal = {**kind.start_values(prism), "focal_length": camera.fx}
+    model_class = MODELS[model]
+    names = _ordered_names(model_class, model_class.FREED if free is None else free)
+    _check_given(model_class, names, start, bounds)
+    nominal = {**model_class.start_values(prism), "focal_length": camera.fx}
     values = {
         name: start.get(name, nominal.get(name, 0.0))
-        for name in (*orbit_names(kind), *names, *start)
+        for name in (*orbit_names(model_class), *names, *start)
     }
 
     # The bounds, and the start within them.
     low: dict[str, float] = {}
     high: dict[str, float] = {}
     for name in names:
-        default = _default_bounds(kind, name, values[name], camera, prism, duration_us)
+        default = _default_bounds(model_class, name, values[name], camera, prism, duration_us)
         low[name], high[name] = bounds.get(name) or default
         if not low[name] < high[name]:
             raise AmiwarpError(
@@ -190,10 +190,12 @@ def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
     )
 
 
-def _ordered_names(kind: type[Model], free: tuple[str, ...]) -> tuple[str, ...]:
+def _ordered_names(model_class: type[Model], free: tuple[str, ...]) -> tuple[str, ...]:
     """Return the free parameters' names in the search vector's order; raise for unknown or conflicting names."""
     # Any model's name of the size stands for this model's.
-    wanted = {kind.SIZE if name in size_names() else name for name in free if name != "motion"}
+    wanted = {
+        model_class.SIZE if name in size_names() else name for name in free if name != "motion"
+    }
     if "motion" in free:
         wanted |= set(RATES)
     unknown = wanted - set(units())
@@ -204,36 +206,37 @@ def _ordered_names(kind: type[Model], free: tuple[str, ...]) -> tuple[str, ...]:
         )
     if not wanted:
         raise AmiwarpError("no parameter is free; name at least one free parameter")
-    foreign = sorted(wanted - set(_names_of(kind)))
+    foreign = sorted(wanted - set(_names_of(model_class)))
     if foreign:
         other = next(each.NAME for each in MODELS.values() if foreign[0] in each.FREE)
-        raise AmiwarpError(f"the {kind.NAME} model has no {foreign[0]}; use model {other!r}")
+        raise AmiwarpError(f"the {model_class.NAME} model has no {foreign[0]}; use model {other!r}")
     if set(DRIFTS) <= wanted:
         raise AmiwarpError(
             "clock_offset and rpm cannot both be free; free rpm only for recordings without an encoder, else free "
             "clock_offset",
             ErrorCode.OPTIONS,
         )
-    return tuple(name for name in _names_of(kind) if name in wanted)
+    return tuple(name for name in _names_of(model_class) if name in wanted)
 
 
-def _names_of(kind: type[Model]) -> tuple[str, ...]:
+def _names_of(model_class: type[Model]) -> tuple[str, ...]:
     """Return the names of all parameters that can be free for a model, in the search vector's order."""
-    return (*kind.FREE[:2], *DRIFTS, *kind.FREE[2:], "focal_length", *MOTION)
+    return (*model_class.FREE[:2], *DRIFTS, *model_class.FREE[2:], "focal_length", *MOTION)
 
 
 def _check_given(
-    kind: type[Model],
+    model_class: type[Model],
     names: tuple[str, ...],
     start: Mapping[str, float],
     bounds: Mapping[str, tuple[float, float]],
 ) -> None:
     """Raise :class:`AmiwarpError` for start values that the model lacks and bounds of parameters that are not free."""
-    known = _names_of(kind)
+    known = _names_of(model_class)
     for name in start:
         if name not in known:
             raise AmiwarpError(
-                f"start names {name}, which is no parameter of the {kind.NAME} model; choose among {', '.join(known)}"
+                f"start names {name}, which is no parameter of the {model_class.NAME} model; choose among "
+                f"{', '.join(known)}"
             )
     for name in bounds:
         if name not in names:
@@ -243,7 +246,7 @@ def _check_given(
 
 
 def _default_bounds(
-    kind: type[Model],
+    model_class: type[Model],
     name: str,
     value: float,
     camera: Camera,
@@ -251,9 +254,9 @@ def _default_bounds(
     duration_us: float,
 ) -> tuple[float, float]:
     """Return the bounds of a parameter that has none given, about its start value."""
-    if name in kind.FREE:
-        return kind.default_bounds(name, value, camera, prism)
-    if name == "rpm" and not kind.PRISM:
+    if name in model_class.FREE:
+        return model_class.default_bounds(name, value, camera, prism)
+    if name == "rpm" and not model_class.PRISM:
         half = MOST_TURNS_OFF * 60e6 / max(duration_us, 1.0)
     elif name in _RELATIVE_RANGE:
         half = _RELATIVE_RANGE[name] * abs(value)
@@ -277,15 +280,15 @@ def _pixels_per_unit(
     The displacement is differentiated by finite differences over a grid of pixels and prism angles, at the nominal
     size.
     """
-    kind = MODELS[model].closed_form()
-    typical = {size: kind.start_values(prism)[size] for size, _ in kind.ORBITS}
-    nominal = {**values, **typical, kind.SIZE: kind.typical_size(camera, prism)}
+    model_class = MODELS[model].closed_form()
+    typical = {size: model_class.start_values(prism)[size] for size, _ in model_class.ORBITS}
+    nominal = {**values, **typical, model_class.SIZE: model_class.typical_size(camera, prism)}
     drifts = bool(set(DRIFTS) & set(names))
 
-    # The steps of the differences. What a drift does follows from the phase.
-    steps = dict.fromkeys((kind.SIZE, *optical_parameters()), 0.02)
+    # The steps of the differences. The effect of a drift follows from the effect of the phase.
+    steps = dict.fromkeys((model_class.SIZE, *optical_parameters()), 0.02)
     steps |= {"center_x": 1.0, "center_y": 1.0, "k1": 0.01, "fy_over_fx": 0.01}
-    for size, phase in kind.ORBITS:
+    for size, phase in model_class.ORBITS:
         steps |= {size: 0.25 * nominal[size], phase: 0.05}
     needed = {*names, "phase"} if drifts else {*names}
     steps = {name: step for name, step in steps.items() if name in needed}
@@ -296,7 +299,7 @@ def _pixels_per_unit(
     built = []
     for name, step in steps.items():
         for value in (nominal[name] + step, nominal[name] - step):
-            built.append(build_model(kind.NAME, camera, prism, {**nominal, name: value}))
+            built.append(build_model(model_class.NAME, camera, prism, {**nominal, name: value}))
     moved = compensate_by_each(built, *_grid_points(camera.width, camera.height))
     moved = (moved[0::2] - moved[1::2]) / (2.0 * np.array([*steps.values()])[:, None, None])
     shifts = dict(zip(steps, map(rms, moved), strict=True))
@@ -306,7 +309,7 @@ def _pixels_per_unit(
         shifts["rpm"] = shifts["phase"] * 2.0 * math.pi / 60e6 * duration_us / math.sqrt(12.0)
     seconds = duration_us * 1e-6
     shifts |= _pixels_of_motion(camera, seconds)
-    # at least the effect that a camera rotation of 0.5 rad/s would make visible
+    # At least the effect that a camera rotation of 0.5 rad/s would make visible.
     if "focal_length" in names:
         shifts["focal_length"] = max(shifts["focal_length"], 0.5 * seconds / math.sqrt(12.0))
     return {name: shifts[name] for name in names}

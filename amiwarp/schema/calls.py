@@ -87,7 +87,10 @@ def guarded(target: Target) -> Target:
     bases = [
         base for base in reversed(target.__mro__[:-1]) if not getattr(base, "_is_protocol", False)
     ]
-    for name, member in {name: one for base in bases for name, one in vars(base).items()}.items():
+    members: dict[str, Any] = {}
+    for base in bases:
+        members |= vars(base)
+    for name, member in members.items():
         if name.startswith("_") and name != "__init__":
             continue
         label = target.__name__ if name == "__init__" else f"{target.__name__}.{name}"
@@ -215,11 +218,11 @@ class _Parameter:
             return value  # a shortcut
         what = f"{self._label}: {self._name}"
         if float in parts_of(kind):
-            found: float = real(value, what)
+            plain: float = real(value, what)
         else:
             is_time = self._name == "t" or self._name.startswith("t_")
-            found = whole(value, what, *INT64, TIME_HINT if is_time else "")
-        return found if isinstance(value, np.generic | np.ndarray) else value
+            plain = whole(value, what, *INT64, TIME_HINT if is_time else "")
+        return plain if isinstance(value, np.generic | np.ndarray) else value
 
 
 def _remedies(value: Any, expected: str) -> str:
@@ -230,7 +233,8 @@ def _remedies(value: Any, expected: str) -> str:
     elif isinstance(value, np.ndarray) and value.dtype.names is not None:
         given = {"structured array"}
     words = expected.replace(",", " ").split()
-    found = [
-        text for (kind, wanted), text in _REMEDIES.items() if kind in given and wanted in words
-    ]
-    return "".join(f"; {text}" for text in sorted(found))
+    remedies = []
+    for (kind, wanted), text in _REMEDIES.items():
+        if kind in given and wanted in words:
+            remedies.append(f"; {text}")
+    return "".join(sorted(remedies))

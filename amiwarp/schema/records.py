@@ -32,8 +32,9 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 Made = TypeVar("Made")
+"""Any type."""
 Record = TypeVar("Record", bound="DataclassInstance")
-"""Any type, and any dataclass."""
+"""Any dataclass."""
 
 LARGEST_INTEGER = 2**62
 """Largest accepted magnitude of a whole number, equal to :data:`amiwarp.validation.TIME_LIMIT`."""
@@ -245,14 +246,18 @@ def _fields_reader(
 
 
 def _checking_reader(read: Reader, check: Callable[[Any, str], Any]) -> Reader:
+    """Return the reader of a type with a check that each value then passes."""
     return lambda value, place: check(read(value, place), f"field {name_of(place)}")
 
 
 def _optional_reader(read: Reader) -> Reader:
+    """Return the reader of a type that may also be None."""
     return lambda value, place: None if value is None else read(value, place)
 
 
 def _mapping_reader(read: Reader) -> Reader:
+    """Return the reader of an object whose fields have any name, and one type."""
+
     def read_mapping(value: Any, place: Place) -> dict[str, Any]:
         given = value if isinstance(value, dict) else fields_of(value, name_of(place))
         return {name: read(entry, (place, name)) for name, entry in given.items()}
@@ -261,6 +266,7 @@ def _mapping_reader(read: Reader) -> Reader:
 
 
 def _entries(value: Any, place: Place) -> list[Any]:
+    """Return the entries of a list. Raises :class:`AmiwarpError` for another value."""
     if not isinstance(value, list):
         raise AmiwarpError(
             f"field {name_of(place)} is {shown(value)}; expected a list", ErrorCode.FIELD

@@ -17,17 +17,17 @@ def not_called(instead: str) -> Callable[[Target], Target]:
     """Decorate a protocol or base class, so that a call of it says what to do ``instead``. Derived classes are free."""
 
     def decorate(target: Target) -> Target:
-        kind: Any = target
+        base: Any = target
 
         def init(self: Any, *args: Any, **options: Any) -> None:
-            if type(self) is kind:
+            if type(self) is base:
                 raise AmiwarpError(
-                    f"{kind.__name__} is a type for annotations and for own classes; {instead}"
+                    f"{base.__name__} is a type for annotations and for own classes; {instead}"
                 )
-            super(kind, self).__init__(*args, **options)
+            super(base, self).__init__(*args, **options)
 
         init.__signature__ = inspect.signature(lambda self: None)  # type: ignore[attr-defined]  # as it was
-        type.__setattr__(kind, "__init__", init)
+        type.__setattr__(base, "__init__", init)
         return target
 
     return decorate

@@ -32,15 +32,16 @@ class Actions:
     time_window: tuple[int, int]
     """Start and length of the wanted time window on the events' clock [us]."""
     b: Knobs | None = None
-    """Parameters that were kept as B."""
-    found: Calibration | None = None
+    """Parameters that were kept as B, to compare with; None if none were kept."""
+    calibration_result: Calibration | None = None
     """Result of a calibration that is not accepted yet."""
     history: History | None = None
+    """States that can be undone and redone; None before anything is shown."""
     request: Callable[..., None]
     """Request updates, by their names. Successive ones with an equal ``change`` are undone in one step."""
     say: Callable[..., None]
     """Show a text as a message."""
-    steps: tuple[Callable[[History], ViewState], ...] = ()
+    history_steps: tuple[Callable[[History], ViewState], ...] = ()
     """Steps through the history that are to be made after the changes which were requested before them."""
     bookmarks: Bookmarks | None = None
     """Named views of the recording; None if it is no file."""
@@ -134,20 +135,20 @@ class Actions:
 
     def accept(self) -> None:
         """Set the parameters to the result of the calibration."""
-        if self.found is not None:
+        if self.calibration_result is not None:
             with self.errors_shown("knobs"):
-                self.inspector.accept(self.found)
+                self.inspector.accept(self.calibration_result)
             self.discard()
             self.knobs_taken()
 
     def discard(self) -> None:
         """Forget the result of the calibration."""
-        self.found = None
+        self.calibration_result = None
 
     # Time
 
     def step(self, count: int) -> None:
-        """Move the time window by turns; without a prism, by its length; set by number, by as many events."""
+        """Move the time window ``count`` times by a turn, without a prism by its length, or by its number of events."""
         start_us, length_us = self.time_window
         if self.inspector.fixed_count is not None:
             self.move(self.inspector.start_after(count))
@@ -158,7 +159,10 @@ class Actions:
         self.released()
 
     def move(self, start_us: int, change: str = "") -> bool:
-        """Move the time window to a start, within the recording. Return whether it is at the end."""
+        """Move the time window to a start within the recording. Return whether it is at the end.
+
+        ``start_us``: start on the events' clock [us]. ``change``: name of a change that lasts, see :attr:`request`.
+        """
         first = self.inspector.recording.events.t_first
         _, length_us = self.time_window
         last = first + max(0, self.whole_us - length_us)
@@ -177,18 +181,21 @@ class Actions:
     def can_play(self) -> bool:
         """Go back to the start from the end. Return whether there is something to play, or a live stream to follow."""
         start_us, length_us = self.time_window
-        if self.inspector.latest is None:
-            if length_us >= self.whole_us:
-                self.say("the window holds the whole recording; make it shorter to play")
-                return False
-            if self.move(start_us):
-                self.move(self.inspector.recording.events.t_first)
+        if self.inspector.latest is not None:
+            return True
+        if length_us >= self.whole_us:
+            self.say("the window holds the whole recording; make it shorter to play")
+            return False
+        is_at_end = self.move(start_us)
+        if is_at_end:
+            self.move(self.inspector.recording.events.t_first)
         return True
 
     def advance(self, shown_us: float, *, loop: bool) -> bool:
-        """Move the time window on while the recording is played, once or in a loop. Return whether it goes on."""
+        """Move the time window on by ``shown_us`` [us], once or in a loop. Return whether playing goes on."""
         start_us = self.time_window[0] + round(shown_us)
-        if not self.move(start_us):
+        is_at_end = self.move(start_us)
+        if not is_at_end:
             return True
         self.move(self.inspector.recording.events.t_first if loop else start_us)
         return loop
@@ -216,7 +223,7 @@ class Actions:
 
     def travel(self, step: Callable[[History], ViewState]) -> None:
         """Request the state that a step through the history gives."""
-        self.steps = (*self.steps, step)
+        self.history_steps = (*self.history_steps, step)
         self.request("state")
         self.released()
 
@@ -226,8 +233,8 @@ class Actions:
 
     def travelled(self) -> ViewState | None:
         """Make the requested steps, and return the state to show; None to stay."""
-        steps = self.steps
-        self.steps = ()
+        steps = self.history_steps
+        self.history_steps = ()
         state = None
         if self.history is not None:
             for step in steps:
@@ -252,7 +259,7 @@ class Actions:
 
     def announce(self) -> None:
         """Tell the listener what is shown now, unless steps through the history will change it at once."""
-        if self.listener is not None and not self.steps:
+        if self.listener is not None and not self.history_steps:
             self.listener(self.state_now())
 
     def remember(self, change: str) -> History:

@@ -20,8 +20,8 @@ from amiwarp.viewer.view_state import ViewState
 
 LONGEST_QUERY = 2000
 """Largest length of a state as text [characters]."""
-LONGEST_NOISE_US = 10_000_000
-"""Largest time of a filter or a decay in an address [us]."""
+LONGEST_TIME_US = 10_000_000
+"""Largest time of a filter, and largest decay time, in an address [us]."""
 RATE_LIMITS = (0.0, 1e12)
 """Smallest and largest rate to which events are limited [events/s]; 0 for no limit."""
 MOST_EVERY = 1_000_000
@@ -132,12 +132,12 @@ def _fields(size: tuple[int, int], duration_us: int) -> dict[str, _Field]:
         "noise_us": (
             "selection.noise_us",
             lambda us: str(us or 0),
-            lambda us: _whole(us, 0, LONGEST_NOISE_US) or None,
+            lambda us: _whole(us, 0, LONGEST_TIME_US) or None,
         ),
         "refractory_us": (
             "selection.refractory_us",
             str,
-            lambda us: _whole(us, 0, LONGEST_NOISE_US),
+            lambda us: _whole(us, 0, LONGEST_TIME_US),
         ),
         "most_per_s": (
             "selection.most_per_s",
@@ -150,7 +150,7 @@ def _fields(size: tuple[int, int], duration_us: int) -> dict[str, _Field]:
             lambda n: str(n or 0),
             lambda n: _whole(n, 0, MOST_COUNT) or None,
         ),
-        "decay_us": ("decay_us", str, lambda us: _whole(us, 1, LONGEST_NOISE_US)),
+        "decay_us": ("decay_us", str, lambda us: _whole(us, 1, LONGEST_TIME_US)),
         "same_scale": one_of("same_scale", flags),
         "difference": one_of("difference", flags),
         "overlaid": one_of("overlaid", flags),

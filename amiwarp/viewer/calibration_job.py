@@ -12,7 +12,7 @@ from amiwarp.results.calibration import Calibration
 from amiwarp.tasks import Progress
 from amiwarp.viewer.filters import rate_text
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.log_intensity import select_part
+from amiwarp.viewer.selected_part import select_part
 from amiwarp.viewer.sliders import orbit_text
 
 SHARPNESS_ONLY = ("sharpness",)

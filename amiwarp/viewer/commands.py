@@ -21,12 +21,14 @@ from amiwarp.io import open_recording
 from amiwarp.io.output_formats import check_ending
 from amiwarp.live.commands.session import SourceOptions, check_angles
 from amiwarp.viewer.host_names import is_local
+from amiwarp.viewer.look import PICTURE_PX
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector
     from amiwarp.viewer.library import Library
     from amiwarp.viewer.look import Look
     from amiwarp.viewer.publish import Page
+    from amiwarp.viewer.view_state import ViewState
 
 _LOOK = "Window and picture"
 _SERVER = "Server"
@@ -40,8 +42,6 @@ MOST_DPI = 1200
 """Smallest and largest width or height of a figure [mm], and smallest and largest resolution [1/inch]."""
 LARGEST_OFFSET_S = 1e6
 """Largest distance in time between two recordings on one axis [s]."""
-PICTURE_PX = 1400, 620
-"""Width and height of a screenshot [px]."""
 LEAST_MOTION = 0.05
 """Diameter of the orbit of a scene point, as a share of the image's width, from which a screenshot shows the whole
 image. The clouds of a smaller one look alike before and after compensation."""
@@ -118,7 +118,10 @@ class LookOptions:
         return Look(self.colour, third, dark=self.dark, overlaid=self.overlaid)
 
     def pixels(self, usual: tuple[int, int]) -> tuple[int, int]:
-        """Return width and height [px], by default the ``usual`` ones. Raises :class:`AmiwarpError` for a bad size."""
+        """Return width and height [px], by default the ``usual`` ones.
+
+        Raises :class:`AmiwarpError` for a size out of range.
+        """
         width, height = usual if self.size is None else cli.parse_size(self.size)
         if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
             raise AmiwarpError(
@@ -154,44 +157,30 @@ class LookOptions:
 
         Raises :class:`AmiwarpError` for an unknown format, or a size out of range.
         """
-        from amiwarp.viewer.address import load_bookmark
-        from amiwarp.viewer.bookmarks import Bookmarks
         from amiwarp.viewer.first_phase import estimate_phase
-        from amiwarp.viewer.layout import notes
+        from amiwarp.viewer.layout import what_is_missing
         from amiwarp.viewer.publish import FIGURE_ENDINGS, save_clouds, save_figure
         from amiwarp.viewer.screenshot import save_screenshot
-        from amiwarp.viewer.view_state import apply_state, current_state
 
         ending = check_ending(path, "pictures are written", [*FIGURE_ENDINGS, ".vtp"])
-        if ending == ".vtp" and (self.size, self.dpi) != (None, None):
-            raise AmiwarpError(
-                f"{path}: a .vtp holds points, which have no size; leave --size and --dpi out",
-                ErrorCode.OPTIONS,
-            )
-        figure = self.is_figure(path)
-        if figure and self.dark:
-            raise AmiwarpError(
-                f"{path}: a figure for print has a light background; leave --dark out",
-                ErrorCode.OPTIONS,
-            )
-        page = self.page() if figure else None
-        size = PICTURE_PX if figure else self.pixels(PICTURE_PX)
+        self._check_style(path)
+        page = self.page() if self.is_figure(path) else None
+        size = PICTURE_PX if page is not None else self.pixels(PICTURE_PX)
         estimate_phase(inspector)
         look = self.look(inspector)
         view = self.view
         against = None
-        chosen: list[str] = []
-        if inspector.path is not None and inspector.bookmark:
-            bookmarks = Bookmarks(inspector.path)
-            first = current_state(inspector)
-            state, wrong = load_bookmark(bookmarks, inspector.bookmark, inspector, first)
-            apply_state(inspector, state)
+        notes: list[str] = []
+        bookmark = self._apply_bookmark(inspector)
+        if bookmark is not None:
+            state, wrong = bookmark
             look = replace(look, colour=state.colour, axis=state.axis, overlaid=state.overlaid)
             view = state.view
             against = state.against
-            chosen += wrong
+            notes += wrong
         if self.region is not None or not inspector.bookmark:
-            chosen += self._choose_region(inspector)
+            notes += self._choose_region(inspector)
+
         shown = inspector.show(against=against)
         drawn = len(shown.events)
         if ending == ".vtp":
@@ -200,6 +189,7 @@ class LookOptions:
             drawn = save_figure(inspector, path, page, view=view, look=look, against=against)
         else:
             save_screenshot(inspector, path, view=view, look=look, size=size, against=against)
+        missing = what_is_missing(inspector) if inspector.has_optic else []
         return {
             "file": str(path),
             "events": shown.span.count,
@@ -207,8 +197,35 @@ class LookOptions:
             "sharpness_before": shown.sharpness_before,
             "sharpness_after": shown.sharpness_after if math.isfinite(inspector.turn_us) else None,
             "region": list(shown.region),
-            "notes": [*(notes(inspector) if inspector.has_optic else []), *chosen],
+            "notes": [*missing, *notes],
         }
+
+    def _check_style(self, path: Path) -> None:
+        """Raise :class:`AmiwarpError` for options that do not apply to the kind of file."""
+        if path.suffix.lower() == ".vtp" and (self.size, self.dpi) != (None, None):
+            raise AmiwarpError(
+                f"{path}: a .vtp holds points, which have no size; leave --size and --dpi out",
+                ErrorCode.OPTIONS,
+            )
+        if self.is_figure(path) and self.dark:
+            raise AmiwarpError(
+                f"{path}: a figure for print has a light background; leave --dark out",
+                ErrorCode.OPTIONS,
+            )
+
+    def _apply_bookmark(self, inspector: Inspector) -> tuple[ViewState, tuple[str, ...]] | None:
+        """Show the bookmark that the inspector names; return its state and what is wrong with it, or None."""
+        from amiwarp.viewer.address import load_bookmark
+        from amiwarp.viewer.bookmarks import Bookmarks
+        from amiwarp.viewer.view_state import apply_state, current_state
+
+        if inspector.path is None or not inspector.bookmark:
+            return None
+        bookmarks = Bookmarks(inspector.path)
+        first = current_state(inspector)
+        state, wrong = load_bookmark(bookmarks, inspector.bookmark, inspector, first)
+        apply_state(inspector, state)
+        return state, wrong
 
     def _choose_region(self, inspector: Inspector) -> list[str]:
         """Show the wanted region; return a note if it was chosen because the motion is small.
@@ -277,15 +294,16 @@ class StreamOptions:
 
         messages: list[str] = []
 
-        def tell(text: str) -> None:
+        def show_message(text: str) -> None:
+            # The page shows only the latest message, the terminal all of them.
             messages[:] = [text]
             say(text)
 
         with SourceOptions(port=self.controller).link() as link:
-            stream = open_source(source, say=tell)
+            stream = open_source(source, say=show_message)
             check_angles(stream, link)
             recent = RecentEvents(stream)
-            with followed(stream, link, recent, tell, partial(reopen_source, source)):
+            with followed(stream, link, recent, show_message, partial(reopen_source, source)):
                 yield LiveSource(recent, messages)
 
 
@@ -330,8 +348,9 @@ class PageOptions:
         from amiwarp.viewer.serve_panel import serve_panel
 
         def ready(url: str) -> None:
-            if (text := warning(self.host)) is not None:
-                say(text)
+            warning = exposure_warning(self.host)
+            if warning is not None:
+                say(warning)
             cli.report(common, {"url": url}, [f"{name}: {url}", "stop with Ctrl-C"])
 
         serve_panel(new_inspector, library, host=self.host, port=self.port, ready=ready)
@@ -405,9 +424,9 @@ class StartOptions:
         from amiwarp.results.depth_map import DepthMap
         from amiwarp.viewer.inspector import Inspector
 
-        found = None if self.calibration is None else Calibration.load(self.calibration)
+        calibration = None if self.calibration is None else Calibration.load(self.calibration)
         inspector = Inspector(
-            recording, found, device=device, latest=latest, most_points=most_points
+            recording, calibration, device=device, latest=latest, most_points=most_points
         )
         if self.model is not None:
             if self.model not in MODELS:
@@ -417,8 +436,8 @@ class StartOptions:
             inspector.use_model(self.model)
         if self.window is not None:
             events = inspector.recording.events
-            low, high = cli.span(self.window, events.t_first, events.t_last)
-            inspector.window = low, high - low
+            start_us, stop_us = cli.span(self.window, events.t_first, events.t_last)
+            inspector.window = start_us, stop_us - start_us
         for path, offset_s in zip(self.beside or (), self._offsets(), strict=True):
             inspector.put_beside(open_recording(path), round(offset_s * 1e6))
         if self.depth is not None:
@@ -453,13 +472,11 @@ class StartOptions:
             say(f"{error}; the recording is shown without bookmarks")
             return ""
         if self.bookmark is not None and self.bookmark not in names:
-            known = (
-                f"choose among {', '.join(names)}"
-                if names
-                else "save a view in the inspector first"
-            )
+            remedy = "save a view in the inspector first"
+            if names:
+                remedy = f"choose among {', '.join(names)}"
             raise AmiwarpError(
-                f"--bookmark {self.bookmark!r}: {Bookmarks(recording).path} does not hold it; {known}"
+                f"--bookmark {self.bookmark!r}: {Bookmarks(recording).path} does not hold it; {remedy}"
             )
         return self.bookmark or ""
 
@@ -486,6 +503,56 @@ def run_view(
     from amiwarp.viewer.library import Library
     from amiwarp.viewer.serve import check_libraries
 
+    _check_together(stream, start, page, look, layout)
+    if page.web:
+        check_libraries()
+    bookmark = "" if stream.live else start.chosen_bookmark(recording)
+    device = cli.choose_device(common.device)
+    with stream.follow(str(recording)) as latest:
+
+        def new_inspector() -> Inspector:
+            opened = open_recording(recording, **layout.given()) if latest is None else latest()
+            inspector = start.build(
+                cli.complete(opened, camera, prism),
+                device,
+                latest,
+                None if page.web else WINDOW_POINTS,
+            )
+            inspector.path = None if stream.live else recording
+            inspector.bookmark = bookmark
+            return inspector
+
+        # Created before the page opens, so that bad input is reported at once.
+        first = new_inspector()
+        if look.screenshot is not None:
+            data = {**look.write(first, look.screenshot), "device": device}
+            cli.report(common, data, _lines(data))
+            return
+        if not page.web:
+            _open_window(first, look)
+            return
+
+        def open_other(path: Path) -> Inspector:
+            opened = open_recording(path, **(layout.given() if path == recording else {}))
+            return Inspector(cli.complete(opened, camera, prism), device=device)
+
+        library = None if stream.live else Library(recording.parent, open_other)
+        unused = [first]
+
+        def inspector_of_tab() -> Inspector:
+            return unused.pop() if unused else new_inspector()
+
+        page.serve(inspector_of_tab, library, name=recording.name, common=common)
+
+
+def _check_together(
+    stream: StreamOptions,
+    start: StartOptions,
+    page: PageOptions,
+    look: LookOptions,
+    layout: cli.LayoutOptions,
+) -> None:
+    """Raise :class:`AmiwarpError` for options that do not go together, before anything is opened."""
     if look.screenshot is not None and page.web:
         raise AmiwarpError(
             "--screenshot and --web are both given; give one of them", ErrorCode.OPTIONS
@@ -503,60 +570,27 @@ def run_view(
         raise AmiwarpError("--host and --port apply to the page; give --web too", ErrorCode.OPTIONS)
     if stream.live and layout.given():
         raise AmiwarpError(
-            "--live shows a stream, to which the options for the layout of a file do not apply"
+            "--live shows a stream, to which the options for the layout of a file do not apply; leave them out"
         )
     if stream.live and start.bookmark is not None:
         raise AmiwarpError(
             "--bookmark is kept beside a file; leave it out with --live", ErrorCode.OPTIONS
         )
-    if page.web:
-        check_libraries()
-    bookmark = "" if stream.live else start.chosen_bookmark(recording)
-    device = cli.choose_device(common.device)
-    with stream.follow(str(recording)) as latest:
-
-        def new_inspector() -> Inspector:
-            opened = open_recording(recording, **layout.given()) if latest is None else latest()
-            made = start.build(
-                cli.complete(opened, camera, prism),
-                device,
-                latest,
-                None if page.web else WINDOW_POINTS,
-            )
-            made.path = None if stream.live else recording
-            made.bookmark = bookmark
-            return made
-
-        # Created before the page opens, so that bad input is reported at once
-        waiting = [new_inspector()]
-        if look.screenshot is not None:
-            data = {**look.write(waiting[0], look.screenshot), "device": device}
-            cli.report(common, data, _lines(data))
-            return
-        if not page.web:
-            from amiwarp.viewer import window
-            from amiwarp.viewer.display import check_display
-
-            check_display(
-                "run with --web to serve the page for a browser, or with --screenshot to write a picture"
-            )
-            size = None if look.size is None else look.pixels(PICTURE_PX)
-            window.Window(waiting[0], look=look.look(waiting[0]), view=look.view, size=size).run()
-            return
-
-        def open_other(path: Path) -> Inspector:
-            opened = open_recording(path, **(layout.given() if path == recording else {}))
-            return Inspector(cli.complete(opened, camera, prism), device=device)
-
-        library = None if stream.live else Library(recording.parent, open_other)
-
-        def inspector_of_tab() -> Inspector:
-            return waiting.pop() if waiting else new_inspector()
-
-        page.serve(inspector_of_tab, library, name=recording.name, common=common)
 
 
-def warning(host: str) -> str | None:
+def _open_window(inspector: Inspector, look: LookOptions) -> None:
+    """Show an inspector in a window until it is closed. Raises :class:`AmiwarpError` without a display."""
+    from amiwarp.viewer import window
+    from amiwarp.viewer.display import check_display
+
+    check_display(
+        "run with --web to serve the page for a browser, or with --screenshot to write a picture"
+    )
+    size = None if look.size is None else look.pixels(PICTURE_PX)
+    window.Window(inspector, look=look.look(inspector), view=look.view, size=size).run()
+
+
+def exposure_warning(host: str) -> str | None:
     """Return a warning for the user if other machines can connect to ``host``, else None."""
     if is_local(host):
         return None
@@ -567,8 +601,10 @@ def warning(host: str) -> str | None:
     )
 
 
-def _lines(d: dict[str, Any]) -> list[str]:
+def _lines(picture: dict[str, Any]) -> list[str]:
     """Return the lines that are printed about a written picture."""
-    after = "" if d["sharpness_after"] is None else f", {d['sharpness_after']:.3f} compensated"
-    gain = f"sharpness {d['sharpness_before']:.3f} as recorded{after}"
-    return [*d["notes"], f"{d['file']}: {d['events']:,} events, {d['drawn']:,} drawn; {gain}"]
+    sharpness = f"sharpness {picture['sharpness_before']:.3f} as recorded"
+    if picture["sharpness_after"] is not None:
+        sharpness += f", {picture['sharpness_after']:.3f} compensated"
+    numbers = f"{picture['events']:,} events, {picture['drawn']:,} drawn"
+    return [*picture["notes"], f"{picture['file']}: {numbers}; {sharpness}"]

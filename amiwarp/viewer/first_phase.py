@@ -9,7 +9,7 @@ import numpy as np
 from amiwarp.imaging.regions import MOST_SEARCHED, busiest
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.knobs import Source
-from amiwarp.viewer.log_intensity import select_part
+from amiwarp.viewer.selected_part import select_part
 
 COARSE = 24
 """Number of phases of the first search, over one turn."""

@@ -23,13 +23,13 @@ from amiwarp.schema.calls import guarded
 from amiwarp.validation import choice, instance, one_of, real, vector, whole
 from amiwarp.viewer import first_phase, view_state
 from amiwarp.viewer.actions import Actions
-from amiwarp.viewer.address import LONGEST_NOISE_US, MOST_EVERY, RATE_LIMITS
+from amiwarp.viewer.address import LONGEST_TIME_US, MOST_EVERY, RATE_LIMITS
 from amiwarp.viewer.display import check_display
 from amiwarp.viewer.drawn_truth import colours_on_offer
 from amiwarp.viewer.images import ImageKind
 from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector
 from amiwarp.viewer.knobs import Source, foreign_names
-from amiwarp.viewer.look import Look
+from amiwarp.viewer.look import PICTURE_PX, Look
 from amiwarp.viewer.screenshot import draw_picture
 from amiwarp.viewer.sliders import LIMITS, UNITS
 from amiwarp.viewer.view_state import ViewState
@@ -46,8 +46,6 @@ SELECTION = ("region", "polarity", "hide_hot", "noise_us", "refractory_us", "mos
 """Names of the values that select events."""
 STYLE = ("image", "decay_us", "difference", "same_scale", "colour", "axis", "view", "overlaid")
 """Names of the values of how the events are shown."""
-PICTURE_PX = (1400, 620)
-"""Default width and height of a picture [px]."""
 
 
 def parameter_names(inspector: Inspector, model: str) -> list[str]:
@@ -111,18 +109,18 @@ def with_values(inspector: Inspector, state: ViewState, values: dict[str, Any]) 
     if "noise_us" in values:
         given = values["noise_us"]
         selection["noise_us"] = (
-            None if given is None else whole(given, "noise_us", 1, LONGEST_NOISE_US)
+            None if given is None else whole(given, "noise_us", 1, LONGEST_TIME_US)
         )
     if "refractory_us" in values:
         selection["refractory_us"] = whole(
-            values["refractory_us"], "refractory_us", 0, LONGEST_NOISE_US
+            values["refractory_us"], "refractory_us", 0, LONGEST_TIME_US
         )
     if "most_per_s" in values:
         selection["most_per_s"] = real(values["most_per_s"], "most_per_s", *RATE_LIMITS)
     if "every" in values:
         selection["every"] = whole(values["every"], "every", 1, MOST_EVERY)
     if "decay_us" in values:
-        other["decay_us"] = whole(values["decay_us"], "decay_us", 1, LONGEST_NOISE_US)
+        other["decay_us"] = whole(values["decay_us"], "decay_us", 1, LONGEST_TIME_US)
     for name, kind in (("image", ImageKind), ("axis", Axis), ("view", View)):
         if name in values:
             other[name] = choice(kind, values[name], name)

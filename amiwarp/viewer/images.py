@@ -6,6 +6,7 @@ import enum
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from types import EllipsisType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +29,13 @@ _prepared: set[str] = set()
 
 
 def prepare(inspector: Inspector) -> None:
-    """Compile and load what time surface and log intensity need, once per device, so that the first take no longer."""
+    """Compile and load the kernels of time surface and log intensity, once per device, before a user asks for one."""
     if str(inspector.device) in _prepared:
         return
     with suppress(AmiwarpError):
-        window = replace(inspector.loaded, chosen=[])
-        _time_surface(inspector, window, inspector.knobs)
+        # The small picture must not choose the smoothness of the pictures that follow.
+        window = replace(inspector.loaded, last_picture=[])
+        _time_surface(_ImageSource(inspector, window, inspector.knobs))
         log_intensity(inspector, window, inspector.knobs, share=PREPARING_SHARE)
         _prepared.add(str(inspector.device))
 
@@ -61,10 +63,10 @@ class ImageKind(enum.StrEnum):
     """Depth of what each pixel sees, of a depth map."""
 
 
-OF_PHASE = (ImageKind.EDGES, ImageKind.MISFIT)
+PHASE_KINDS = (ImageKind.EDGES, ImageKind.MISFIT)
 """Kinds that are made from sums in phase, of an optic that rotates."""
-SLOW_KINDS = (ImageKind.LOG_INTENSITY, *OF_PHASE)
-"""Kinds that are made when nothing moves."""
+SLOW_KINDS = (ImageKind.LOG_INTENSITY, *PHASE_KINDS)
+"""Kinds that take so long that they are made only when nothing moves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +94,16 @@ MOST_FREQUENCIES = 3
 """Largest number of frequencies that are named below an image of frequencies."""
 
 
+@dataclass(frozen=True, eq=False)
+class _ImageSource:
+    """What one of the two images is made of: the events of an inspector's window, and parameters that move them."""
+
+    inspector: Inspector
+    window: LoadedWindow
+    knobs: Knobs | None
+    """Parameters that compensate the events; None for the events as recorded."""
+
+
 def make_images(
     inspector: Inspector,
     kind: ImageKind,
@@ -112,42 +124,34 @@ def make_images(
     counts that do not follow the values, while a slider moves. Raises :class:`AmiwarpError` if a log intensity,
     edges or misfit cannot be made, or there is no depth map.
     """
-    window = inspector.loaded
-    knobs = inspector.knobs
-    left, top, right, bottom = window.region
-    part = np.s_[..., top:bottom, left:right]
     if kind is ImageKind.LOG_INTENSITY:
-        return _log_intensities(inspector, window, against)
-    if kind in OF_PHASE:
-        return _phase_maps(inspector, window, against, kind)
+        return _log_intensities(inspector, against)
+    if kind in PHASE_KINDS:
+        return _phase_maps(inspector, against, kind)
     if kind is ImageKind.DEPTH:
-        if inspector.depth is None:
-            raise AmiwarpError("there is no depth map; start 'amiwarp view' with --depth")
-        counts = make_images(inspector, ImageKind.COUNT, against=against, shown=shown)
-        metres, scale = depth_image(inspector.depth)
-        return replace(counts, after=metres[part], after_scale=scale)
+        return _count_and_depth(inspector, against, shown)
 
-    # What both images show: an inspector, its window and parameters.
-    first = inspector
+    left_inspector = inspector
     if against is None and inspector.beside is not None:
-        first = inspector.beside
-    left_one = (first, first.loaded, against)
-    right_one = (inspector, window, knobs)
+        left_inspector = inspector.beside
+    left = _ImageSource(left_inspector, left_inspector.loaded, against)
+    right = _ImageSource(inspector, inspector.loaded, inspector.knobs)
+    part = _shown_part(inspector)
 
     if kind is ImageKind.TIME_SURFACE:
-        before = _time_surface(*left_one)[part]
-        after = _time_surface(*right_one)[part]
-        length_ms = window.span.length_us * 1e-3
+        before = _time_surface(left)[part]
+        after = _time_surface(right)[part]
+        length_ms = right.window.span.length_us * 1e-3
         scale = Scale("time after the window's start", "ms", 0.0, length_ms, ON_BLACK)
         return ShownImages(before, after, scale)
     if kind is ImageKind.DECAY:
-        before = _decayed(*left_one, decay_us)[part]
-        after = _decayed(*right_one, decay_us)[part]
+        before = _decayed(left, decay_us)[part]
+        after = _decayed(right, decay_us)[part]
         scale = Scale(f"exp(-age / {decay_us * 1e-3:g} ms)", "1", 0.0, 1.0, "inferno")
         return ShownImages(before, after, scale)
     if kind is ImageKind.FREQUENCY:
-        before = _frequencies(*left_one)[part]
-        after = _frequencies(*right_one)[part]
+        before = _frequencies(left)[part]
+        after = _frequencies(right)[part]
         return ShownImages(before, after, _frequency_scale(before, after), frequency_text(after))
 
     if kind is ImageKind.COUNT and shown is not None:
@@ -155,28 +159,53 @@ def make_images(
         after = shown.image_after[part]
     else:
         per_polarity = kind is ImageKind.POLARITY
-        before = first.counts(first.loaded, against, per_polarity=per_polarity)[part]
-        after = inspector.counts(window, knobs, per_polarity=per_polarity)[part]
-    colours = "polarity" if kind is ImageKind.POLARITY else "gray"
+        before = _counts(left, per_polarity=per_polarity)[part]
+        after = _counts(right, per_polarity=per_polarity)[part]
     if kept is not None and not difference:
         scale, after_scale = kept
         return ShownImages(before, after, scale, after_scale=after_scale)
-    if first is not inspector and not same_scale:
+    colours = "polarity" if kind is ImageKind.POLARITY else "gray"
+    if left_inspector is not inspector and not same_scale:
         scale = count_scale((before,), colours)
-        after_scale = count_scale((after,), colours)
-        return ShownImages(before, after, scale, after_scale=after_scale)
+        return ShownImages(before, after, scale, after_scale=count_scale((after,), colours))
     scale = count_scale((before, after), colours)
-    if not (difference and kind is ImageKind.COUNT):
-        return ShownImages(before, after, scale)
-    most = max(float(np.abs(after - before).max()), 1.0)
-    own = Scale("difference of events", "per pixel", -most, most, "difference")
-    return ShownImages(before, after - before, scale, after_scale=own)
+    if difference and kind is ImageKind.COUNT:
+        change = after - before
+        return ShownImages(before, change, scale, after_scale=_difference_scale(change))
+    return ShownImages(before, after, scale)
 
 
-def _log_intensities(
-    inspector: Inspector, window: LoadedWindow, against: Knobs | None
+def _shown_part(inspector: Inspector) -> tuple[EllipsisType, slice, slice]:
+    """Return the index of the shown region in an image of the whole sensor, of one or of two polarities."""
+    left, top, right, bottom = inspector.loaded.region
+    return ..., slice(top, bottom), slice(left, right)
+
+
+def _count_and_depth(
+    inspector: Inspector, against: Knobs | None, shown: DisplayedWindow | None
 ) -> ShownImages:
+    """Return the counts of the first image, and the depth map as the second one."""
+    if inspector.depth is None:
+        raise AmiwarpError("there is no depth map; start 'amiwarp view' with --depth")
+    counts = make_images(inspector, ImageKind.COUNT, against=against, shown=shown)
+    metres, scale = depth_image(inspector.depth)
+    return replace(counts, after=metres[_shown_part(inspector)], after_scale=scale)
+
+
+def _counts(source: _ImageSource, *, per_polarity: bool) -> NDArray[np.float32]:
+    """Return the number of events per pixel, shape ``(height, width)``, or ``(2, height, width)`` per polarity."""
+    return source.inspector.counts(source.window, source.knobs, per_polarity=per_polarity)
+
+
+def _difference_scale(change: NDArray[np.float32]) -> Scale:
+    """Return the scale of a difference of counts, with 0 in its middle."""
+    most = max(float(np.abs(change).max()), 1.0)
+    return Scale("difference of events", "per pixel", -most, most, "difference")
+
+
+def _log_intensities(inspector: Inspector, against: Knobs | None) -> ShownImages:
     """Return the log intensity with the current parameters, and before it the one with those compared with."""
+    window = inspector.loaded
     before = None
     known_before: tuple[NDArray[np.float32], ...] = ()
     if against is not None:
@@ -194,17 +223,16 @@ def _log_intensities(
     return ShownImages(before, after, scale, note)
 
 
-def _phase_maps(
-    inspector: Inspector, window: LoadedWindow, against: Knobs | None, kind: ImageKind
-) -> ShownImages:
+def _phase_maps(inspector: Inspector, against: Knobs | None, kind: ImageKind) -> ShownImages:
     """Return edges or misfit with the current parameters, and before it those with the parameters compared with."""
-    left, top, right, bottom = window.region
+    window = inspector.loaded
+    part = _shown_part(inspector)
     before = None
     if against is not None:
         compared, _ = phase_of_window(inspector, window, against)
-        before = _phase_map(compared, kind)[top:bottom, left:right]
-    found, note = phase_of_window(inspector, window, inspector.knobs)
-    after = _phase_map(found, kind)[top:bottom, left:right]
+        before = _phase_map(compared, kind)[part]
+    current, note = phase_of_window(inspector, window, inspector.knobs)
+    after = _phase_map(current, kind)[part]
     if kind is ImageKind.MISFIT:
         scale = Scale(
             "misfit", "1", 0.0, 1.0, "inferno", missing=SKY, missing_text="hardly any events"
@@ -220,45 +248,47 @@ def _phase_map(image: PhaseImage, kind: ImageKind) -> NDArray[np.float32]:
     return image.misfit if kind is ImageKind.MISFIT else edge_strength(image)
 
 
-def _time_surface(
-    inspector: Inspector, window: LoadedWindow, knobs: Knobs | None
-) -> NDArray[np.float32]:
+def _time_surface(source: _ImageSource) -> NDArray[np.float32]:
     """Return the time of the latest event of each pixel from the start of the window on [ms]; NaN without events."""
-    encoder = None if knobs is None else inspector.encoder_of(knobs)
-    model = None if knobs is None else inspector.model_of(knobs)
-    latest = latest_times(
-        window.counted,
+    inspector = source.inspector
+    encoder = None
+    model = None
+    if source.knobs is not None:
+        encoder = inspector.encoder_of(source.knobs)
+        model = inspector.model_of(source.knobs)
+    latest_us = latest_times(
+        source.window.counted,
         *inspector.recording.events.size,
         per_polarity=False,
         model=model,
         encoder=encoder,
         device=inspector.device,
     )
-    start_us = window.span.start_us
-    times_ms = np.where(latest < start_us, np.nan, (latest - start_us) * 1e-3)
+    start_us = source.window.span.start_us
+    # A pixel without events has a time before all events.
+    times_ms = np.where(latest_us < start_us, np.nan, (latest_us - start_us) * 1e-3)
     return times_ms.astype(np.float32)
 
 
-def _decayed(
-    inspector: Inspector, window: LoadedWindow, knobs: Knobs | None, decay_us: int
-) -> NDArray[np.float32]:
+def _decayed(source: _ImageSource, decay_us: int) -> NDArray[np.float32]:
     """Return exp(-age / decay time) of the latest event of each pixel; NaN without events.
 
     The age is taken at the end of the window, or at the last event of a recording that ends before.
     """
-    span = window.span
-    last_us = inspector.recording.events.t_last
+    span = source.window.span
+    last_us = source.inspector.recording.events.t_last
     end_ms = min(span.length_us, last_us - span.start_us) * 1e-3
-    age_ms = end_ms - _time_surface(inspector, window, knobs)
+    age_ms = end_ms - _time_surface(source)
     return np.exp(-age_ms / (decay_us * 1e-3)).astype(np.float32)
 
 
-def _frequencies(
-    inspector: Inspector, window: LoadedWindow, knobs: Knobs | None
-) -> NDArray[np.float32]:
+def _frequencies(source: _ImageSource) -> NDArray[np.float32]:
     """Return the frequency of each pixel [Hz], shape ``(height, width)``; NaN without one."""
-    events = inspector.at_pixels(window, knobs if math.isfinite(inspector.turn_us) else None)
-    starts = window.span.run_starts if len(window.span.runs) > 1 else None
+    inspector = source.inspector
+    turns = math.isfinite(inspector.turn_us)
+    events = inspector.at_pixels(source.window, source.knobs if turns else None)
+    span = source.window.span
+    starts = span.run_starts if len(span.runs) > 1 else None
     return pixel_frequencies(events, inspector.recording.events.size, starts=starts)
 
 
@@ -269,7 +299,7 @@ def _frequency_scale(*images: NDArray[np.float32]) -> Scale:
     high = 1.0
     if len(known):
         low, high = np.percentile(known, (2.0, 98.0)).tolist()
-    # Wider, so that one frequency alone has a colour of the middle.
+    # Wider than the values, so that a single frequency gets the colour in the middle.
     low *= 0.9
     high *= 1.1
     return Scale("frequency", "Hz", low, high, ON_BLACK, missing_text="no frequency")
@@ -277,7 +307,7 @@ def _frequency_scale(*images: NDArray[np.float32]) -> Scale:
 
 def frequency_text(image: NDArray[np.float32]) -> str:
     """Return which frequencies most pixels of an image have."""
-    found = strongest(image, MOST_FREQUENCIES)
-    if not found:
+    frequencies = strongest(image, MOST_FREQUENCIES)
+    if not frequencies:
         return "no pixel has a frequency: it takes 4 equal periods in the window"
-    return "; ".join(f"{hz:.4g} Hz: {count:,} px" for hz, count in found)
+    return "; ".join(f"{hz:.4g} Hz: {count:,} px" for hz, count in frequencies)

@@ -54,27 +54,13 @@ from amiwarp.viewer.knobs import (
     size_name,
 )
 from amiwarp.viewer.shown_window import DisplayedWindow, LoadedWindow
-
-
-def _in_pixels(span: Span, size: tuple[int, int]) -> Span:
-    """Return the span with the pixels of its events, also if these were compensated and lie anywhere."""
-    events = span.events
-    if not np.issubdtype(events.x.dtype, np.floating):
-        return span
-    width, height = size
-    x = np.clip(np.rint(events.x), 0, width - 1).astype(np.uint16)
-    y = np.clip(np.rint(events.y), 0, height - 1).astype(np.uint16)
-    places = np.stack([events.x, events.y], axis=1).astype(np.float32)
-    return replace(span, events=Events(x, y, events.t, events.p), places=places)
-
+from amiwarp.viewer.window_statistics import window_statistics
 
 MOST_POINTS = 100_000
 WINDOW_POINTS = 1_000_000
 """Largest number of points in each event cloud: of the page, and of the window or a browser with a graphics card."""
 CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
-INTERVALS_US = np.logspace(0, 6, 49)
-"""Edges of the bins of the histogram of intervals [us]: eight bins per decade, from 1 us to 1 s."""
 MOST_EVENTS = 2_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
 FOV_DEG = 60.0
@@ -88,6 +74,18 @@ LARGEST_APEX = math.radians(3.0)
 """Apex angle up to which events that move into the region are in its images, if the nominal apex is smaller [rad]."""
 WINDOW_US = 100_000
 """Length of the first time window if the prism does not rotate [us]."""
+
+
+def _at_whole_pixels(span: Span, size: tuple[int, int]) -> Span:
+    """Return the span with its events at whole pixels; places between pixels, of compensated events, are kept apart."""
+    events = span.events
+    if not np.issubdtype(events.x.dtype, np.floating):
+        return span
+    width, height = size
+    x = np.clip(np.rint(events.x), 0, width - 1).astype(np.uint16)
+    y = np.clip(np.rint(events.y), 0, height - 1).astype(np.uint16)
+    places = np.stack([events.x, events.y], axis=1).astype(np.float32)
+    return replace(span, events=Events(x, y, events.t, events.p), places=places)
 
 
 def _first_sources(recording: Recording) -> dict[str, Source]:
@@ -155,18 +153,7 @@ class Inspector:
         """Nominal glass of the recording; a prism with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
         """Time at which the prism angle is 0 if there is no encoder [us]."""
-        best = self._best_model
-        ratio = None if recording.encoder is None else recording.encoder.ratio
-        second = {}
-        if ratio is not None:  # of a pair of prisms
-            wedge = as_wedge(self.prism)
-            second = {"second_apex": (wedge.second or wedge).apex, "ratio": ratio}
-        self.knobs = Knobs.given(
-            second | self._typical_size(best),
-            model=best,
-            apex=self.nominal_apex,
-            clock_offset=self._recorded_offset_us,
-        )
+        self.knobs = self._first_knobs()
         self.window: tuple[int, int] | None = None
         """Start and length of the time window [us]; None: the window of :meth:`first_window`."""
         self.fixed_count: int | None = None
@@ -181,17 +168,20 @@ class Inspector:
         self.besides: tuple[Inspector, ...] = ()
         """Other recordings on the time axis of this one, see :meth:`put_beside`."""
         self.beside: Inspector | None = None
-        """The one of them that is shown beside this one."""
+        """The recording of :attr:`besides` that is shown beside this one."""
         self.offset_us = 0
-        """Of a recording beside another one: time of its first event after that one's first event [us]."""
-        self._angles_are_lent = False  # of a recording beside another one, whose encoder it uses
+        """If this recording is beside another one: its first event's time after the other one's first event [us]."""
+        self._angles_are_lent = False
+        """Whether this recording is beside another one and uses the encoder of the other one."""
         self.depth: DepthMap | None = None
         """Depths of what the pixels see through a plate, see :meth:`use_depths`."""
-        self._is_beside = False
-        self._found: tuple[Knobs, Calibration] | None = None
+        self._shown_beside = False
+        """Whether this recording is beside another one."""
+        self._accepted: tuple[Knobs, Calibration] | None = None
+        """The calibration that was accepted last, with its parameters: they are equal while no slider has moved."""
         self._harmonics: tuple[float, ...] | None = None
-        # Angles that a calibration found instead of the encoder's.
-        self._mended: Encoder | None = None
+        self._calibrated_encoder: Encoder | None = None
+        """Angles that a calibration found, which replace the encoder's."""
         self._window: LoadedWindow | None = None
         self._span: Span | None = None
         self._closing = Event()
@@ -202,21 +192,37 @@ class Inspector:
         if calibration is not None:
             self.accept(calibration)
 
+    def _first_knobs(self) -> Knobs:
+        """Return the nominal parameters of the recording's optic, with which the inspector starts."""
+        model = self._best_model
+        encoder = self.recording.encoder
+        values = self._typical_size(model)
+        if encoder is not None and encoder.ratio is not None:  # a pair of prisms
+            wedge = as_wedge(self.prism)
+            second = wedge.second or wedge
+            values |= {"second_apex": second.apex, "ratio": encoder.ratio}
+        return Knobs.given(
+            values,
+            model=model,
+            apex=self.nominal_apex,
+            clock_offset=self._recorded_offset_us,
+        )
+
     def copy(self) -> Inspector:
         """Return an inspector that shows the same, with buffers of its own, for another thread."""
-        made = copy(self)
+        copied = copy(self)
         size = self.recording.events.size
-        made.lock = Lock()
-        made._votes = {}
-        made.sources = dict(self.sources)
-        made._imager = RegionSharpness(size, self.device)
-        made._window = None
-        made._span = None
-        made.besides = tuple(each.copy() for each in self.besides)
-        made.beside = None
+        copied.lock = Lock()
+        copied._votes = {}
+        copied.sources = dict(self.sources)
+        copied._imager = RegionSharpness(size, self.device)
+        copied._window = None
+        copied._span = None
+        copied.besides = tuple(each.copy() for each in self.besides)
+        copied.beside = None
         if self.beside is not None:
-            made.beside = made.besides[self.besides.index(self.beside)]
-        return made
+            copied.beside = copied.besides[self.besides.index(self.beside)]
+        return copied
 
     def snapshot(self) -> Inspector:
         """Return an inspector of what is shown now, for work in another thread that takes long.
@@ -224,9 +230,9 @@ class Inspector:
         It shares window and buffers, but what is set or renewed in this inspector meanwhile does not change it: a live
         stream goes on to events and angles that do not belong together with the window.
         """
-        made = copy(self)
-        made.sources = dict(self.sources)
-        return made
+        snapshot = copy(self)
+        snapshot.sources = dict(self.sources)
+        return snapshot
 
     @property
     def closed(self) -> bool:
@@ -317,16 +323,18 @@ class Inspector:
 
     def _encoder(self, rpm: float) -> Encoder:
         source = self.recording.events
-        return self._corrected or constant_speed(rpm, source.t_first, source.t_last, self.zero_us)
+        return self._corrected_encoder or constant_speed(
+            rpm, source.t_first, source.t_last, self.zero_us
+        )
 
     @cached_property
-    def _corrected(self) -> Encoder | None:
+    def _corrected_encoder(self) -> Encoder | None:
         """The recording's encoder without the errors that a calibration found in it; None if there is no encoder."""
         encoder = self.recording.encoder
         if encoder is None:
             return None
-        if self._mended is not None:
-            encoder = replace(self._mended, clock_offset_us=encoder.clock_offset_us)
+        if self._calibrated_encoder is not None:
+            encoder = replace(self._calibrated_encoder, clock_offset_us=encoder.clock_offset_us)
         if self._harmonics is not None:
             encoder = encoder.with_harmonics(self._harmonics)
         return encoder
@@ -387,15 +395,15 @@ class Inspector:
     @property
     def hot(self) -> NDArray[np.bool_]:
         """Hot pixels of the recording, and behind a prism that rotates the flickering ones; shape (height, width)."""
-        return self._searched[0]
+        return self._hot_pixels[0]
 
     @property
     def hot_pixels(self) -> tuple[HotPixel, ...]:
         """The pixels of :attr:`hot`, the busiest first. Rates and shares are of the part that was searched for them."""
-        return self._searched[1]
+        return self._hot_pixels[1]
 
     @cached_property
-    def _searched(self) -> tuple[NDArray[np.bool_], tuple[HotPixel, ...]]:
+    def _hot_pixels(self) -> tuple[NDArray[np.bool_], tuple[HotPixel, ...]]:
         """Hot pixels as a mask and as a list, found in the middle of the recording."""
         source = self.recording.events
         encoder = self.encoder
@@ -460,7 +468,7 @@ class Inspector:
 
     def _forget_angles(self) -> None:
         """Forget what depends on the encoder's angles."""
-        for name in ("_searched", "_corrected"):
+        for name in ("_hot_pixels", "_corrected_encoder"):
             self.__dict__.pop(name, None)
         if self._window is not None:
             self._window.angles.clear()
@@ -480,16 +488,16 @@ class Inspector:
         self._harmonics = calibration.harmonics
         own = self.recording.encoder
         path = calibration.path
-        self._mended = None
+        self._calibrated_encoder = None
         if own is not None and path is not None and replaces(path, own):
-            self._mended = path
+            self._calibrated_encoder = path
         self._forget_angles()
         self.set(self.knobs_of(calibration))
 
         self.sources |= dict.fromkeys(self._shown_names(calibration.parameters), Source.FILE)
         free = self._shown_names(calibration.free)
         self.sources |= dict.fromkeys(("model", *free), Source.CALIBRATED)
-        self._found = self.knobs, calibration
+        self._accepted = self.knobs, calibration
 
     def _shown_names(self, names: Iterable[str]) -> set[str]:
         """Return which of a model's parameters the page shows, by its names: any size of a wedge is the apex."""
@@ -498,17 +506,17 @@ class Inspector:
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
         values = calibration.parameters
-        kind = MODELS[calibration.model_name]
+        model = MODELS[calibration.model_name]
         rpm = values.get("rpm", 0.0)
         if calibration.zero_us is not None:
             turned = rpm * math.tau / 60e6 * (self.zero_us - calibration.zero_us)
-            values = kind.turned_values(values, turned)
+            values = model.turned_values(values, turned)
         apex = self.knobs.apex
-        if kind.SIZE in WEDGE_SIZES:
-            apex = kind.apex_from_size(values[kind.SIZE], as_wedge(calibration.prism))
+        if model.SIZE in WEDGE_SIZES:
+            apex = model.apex_from_size(values[model.SIZE], as_wedge(calibration.prism))
         return Knobs.given(
             values,
-            model=kind.NAME,
+            model=model.NAME,
             apex=apex,
             phase=values["phase"],
             clock_offset=values.get("clock_offset", self._recorded_offset_us),
@@ -518,9 +526,9 @@ class Inspector:
 
     @property
     def truth(self) -> Knobs | None:
-        """Known parameters of a simulated recording, at the current speed, which ground truth does not hold.
+        """Known parameters of a simulated recording; None if the recording has no ground truth of its prism.
 
-        None if the recording has no ground truth of its prism.
+        Ground truth holds no speed, because the encoder measures it: the current one stands in for it.
         """
         values = {} if self.recording.truth is None else self.recording.truth.parameters
         if "apex" not in values or "phase" not in values:
@@ -546,15 +554,15 @@ class Inspector:
 
     def as_calibration(self) -> Calibration:
         """Return the accepted calibration if no parameter was changed since, else one of the current parameters."""
-        if self._found is not None and self._found[0] == self.knobs:
-            return self._found[1]
+        if self._accepted is not None and self._accepted[0] == self.knobs:
+            return self._accepted[1]
         knobs = self.knobs
         window = self.loaded
-        kind = MODELS[knobs.model]
+        model = MODELS[knobs.model]
 
         values = self._values(knobs)
-        others = [name for name in kind.FREE if name in SLIDING]
-        names = (kind.SIZE, *others, "phase", *knobs.calibrated_only)
+        sliding = [name for name in model.FREE if name in SLIDING]
+        names = (model.SIZE, *sliding, "phase", *knobs.calibrated_only)
         parameters = {name: values[name] for name in names}
         if self.has_encoder:
             parameters["clock_offset"] = knobs.clock_offset
@@ -567,7 +575,7 @@ class Inspector:
         return Calibration(
             model_name=knobs.model,
             camera=self.camera,
-            prism=nominal(self.prism, kind),
+            prism=nominal(self.prism, model),
             parameters=parameters,
             uncertainty={},
             free=(),
@@ -580,7 +588,7 @@ class Inspector:
             warnings=("set by hand in the inspector",),
             zero_us=None if self.has_encoder else self.zero_us,
             harmonics=self._harmonics,
-            path=self._mended,
+            path=self._calibrated_encoder,
         )
 
     def set(self, knobs: Knobs) -> None:
@@ -602,16 +610,16 @@ class Inspector:
 
         Raises :class:`AmiwarpError` if it has no events that meet the ``selection``.
         """
-        chosen = selection or self.selection
+        selection = selection or self.selection
         if self.fixed_count is not None:
             start_us, length_us = self.window_of(start_us, self.fixed_count)
-        self._window = self._load(start_us, max(1, length_us), chosen)
-        self.selection = chosen
+        self._window = self._load(start_us, max(1, length_us), selection)
+        self.selection = selection
         self.window = (start_us, length_us)
 
     @property
-    def chosen(self) -> tuple[tuple[int, int] | None, Selection]:
-        """Time window and selection, by which is known whether something was computed for other ones."""
+    def window_and_selection(self) -> tuple[tuple[int, int] | None, Selection]:
+        """Time window and selection. A result that was computed for another pair is out of date."""
         return self.window, self.selection
 
     def suggest_region(self) -> Region:
@@ -651,25 +659,25 @@ class Inspector:
             recording = replace(
                 recording, encoder=Encoder(own.t + shift, own.angle, own.clock_offset_us)
             )
-        made = Inspector(recording, device=self.device, most_points=self.most_points)
-        made._is_beside = True
-        made.offset_us = offset_us
-        made._angles_are_lent = lent
-        made.zero_us = source.t_first + self.zero_us - self.recording.events.t_first - offset_us
-        self.besides = (*self.besides, made)
-        self.beside = self.beside or made
+        other = Inspector(recording, device=self.device, most_points=self.most_points)
+        other._shown_beside = True
+        other.offset_us = offset_us
+        other._angles_are_lent = lent
+        other.zero_us = source.t_first + self.zero_us - self.recording.events.t_first - offset_us
+        self.besides = (*self.besides, other)
+        self.beside = self.beside or other
 
     @property
     def angles_lent(self) -> bool:
         """Whether the recording beside has no encoder of its own, and is shown at this recording's prism angles."""
         return self.beside is not None and self.beside._angles_are_lent
 
-    def time_of(self, t_us: int) -> int:
-        """Return the time on the clock of this recording beside another one, by the time after that one's first event.
+    def time_of(self, shared_us: int) -> int:
+        """Return a time on this recording's clock [us].
 
-        Both are in us.
+        ``shared_us``: the time on the shared axis, after the first event of the other recording [us].
         """
-        return self.recording.events.t_first + t_us - self.offset_us
+        return self.recording.events.t_first + shared_us - self.offset_us
 
     def counts_beside(self, span: Span) -> list[int]:
         """Return how many events each recording on this time axis has in the time of a span, whatever is selected."""
@@ -683,13 +691,14 @@ class Inspector:
             counts.append(stop - first)
         return counts
 
-    def _beside(
+    def _shown_as_recorded(
         self, span: Span, selection: Selection, image_after: NDArray[np.float32], lent: Knobs | None
     ) -> DisplayedWindow:
-        """Return what this recording, as recorded, shows beside another one in the time of that one's ``span``.
+        """Return what this recording, as recorded, shows beside another one.
 
-        ``image_after``: compensated image of the other recording, which sets the scale of colours. ``lent``: parameters
-        of the other one whose speed and clock offset this one gets; None for its own.
+        ``span``: time that the other one shows. ``image_after``: compensated image of the other one, which sets the
+        scale of colours. ``lent``: parameters of the other one whose speed and clock offset this one takes over; None
+        to keep its own.
         """
         if lent is not None:
             self.knobs = replace(self.knobs, rpm=lent.rpm, clock_offset=lent.clock_offset)
@@ -727,12 +736,14 @@ class Inspector:
         knobs = knobs or self.knobs
         before = window.before if against is None else self._moved(window, against)
         image_after, sharpness_after = self._measured(window, knobs)
-        other = None
+        shown_beside = None
         if self.beside is not None and against is None:
             lent = knobs if self.angles_lent else None
-            other = self.beside._beside(window.span, self.selection, image_after, lent)
-            image_before = other.image_before
-            sharpness_before = other.sharpness_before
+            shown_beside = self.beside._shown_as_recorded(
+                window.span, self.selection, image_after, lent
+            )
+            image_before = shown_beside.image_before
+            sharpness_before = shown_beside.sharpness_before
         else:
             image_before, sharpness_before = self._measured(window, against)
         return DisplayedWindow(
@@ -749,7 +760,7 @@ class Inspector:
             image_after=image_after,
             sharpness_before=sharpness_before,
             sharpness_after=sharpness_after,
-            beside=other,
+            beside=shown_beside,
         )
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -789,45 +800,8 @@ class Inspector:
         return sharpness
 
     def statistics(self) -> dict[str, Any]:
-        """Return the statistics of the selected events of the time window for page and window.
-
-        They are rows of name and value, and the shares [%] and the median of the intervals between successive events of
-        a pixel, over the logarithm of the interval [us]. Intervals between runs are not counted. Those under 1 us are
-        in the first bin, those over 1 s in the last one.
-        """
-        window = self.loaded
-        left, top, right, bottom = window.region
-        width = right - left
-        height = bottom - top
-        area = width * height
-        events = window.counted[inside(window.counted, window.region)]
-
-        # Events of one pixel and one run of events come together, in the order of their times.
-        run = np.searchsorted(window.span.run_starts, events.t, side="right")
-        row = events.y.astype(np.int64) - top
-        pixel = (run * height + row) * width + events.x - left
-        order = np.argsort(pixel, kind="stable")
-        same_pixel = np.diff(pixel[order]) == 0
-        intervals_us = np.diff(events.t[order])[same_pixel]
-
-        known = bool(len(intervals_us))
-        counts, _ = np.histogram(np.clip(intervals_us, 1, 999_999), INTERVALS_US)
-        decades = np.log10(INTERVALS_US)
-        median_us = float(np.median(intervals_us)) if known else math.nan
-        pixels = len(np.unique(pixel % area))
-        rows = [
-            ("rate", f"{len(events) / window.read_us * 1e6:,.0f} events/s"),
-            ("events per pixel", f"{len(events) / area:.3g}"),
-            ("ON", f"{100.0 * events.p.mean():.1f} %"),
-            ("pixels with events", f"{100.0 * pixels / area:.1f} %"),
-            ("median interval of a pixel", f"{median_us:,.0f} µs" if known else "–"),
-        ]
-        return {
-            "rows": [list(row) for row in rows],
-            "x": (0.5 * (decades[1:] + decades[:-1])).tolist() if known else [],
-            "y": (100.0 * counts / max(1, counts.sum())).tolist(),
-            "median": math.log10(max(median_us, 1.0)) if known else None,
-        }
+        """Return the statistics of the selected events of the time window, see :func:`window_statistics`."""
+        return window_statistics(self.loaded)
 
     def orbit(self, x: float, y: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Return the orbit of the scene point that would appear at (x, y) [px] without the prism.
@@ -868,10 +842,10 @@ class Inspector:
             sliding = {name: knobs.value(name) or 0.0 for name in SLIDING}
         values = {**calibrated, **sliding, "phase": knobs.phase}
 
-        kind = MODELS[knobs.model]
-        if kind.SIZE in WEDGE_SIZES:
+        model = MODELS[knobs.model]
+        if model.SIZE in WEDGE_SIZES:
             wedge = replace(as_wedge(self.prism), index=calibrated.get("index", self.prism.index))
-            values[kind.SIZE] = kind.size_from_apex(knobs.apex if turns else 0.0, wedge)
+            values[model.SIZE] = model.size_from_apex(knobs.apex if turns else 0.0, wedge)
         return values
 
     def model_of(
@@ -913,8 +887,8 @@ class Inspector:
         span = self._span
         if span is None or (span.start_us, span.length_us) != (start_us, length_us):
             span = read_span(self.recording.events, start_us, length_us, most_events=MOST_EVENTS)
-            if self._is_beside:
-                span = _in_pixels(span, self.recording.events.size)
+            if self._shown_beside:
+                span = _at_whole_pixels(span, self.recording.events.size)
             self._span = span
         return self.select(span, selection)
 
@@ -927,7 +901,7 @@ class Inspector:
         running = self.selected_events(selection)
         keep = running.keep(span.events)
         if span.places is not None:  # compensated events outside of the image have no pixel
-            half = np.array(recording.events.size) / 2.0
+            half = np.array(recording.events.size) / 2.0  # from the image's middle to its sides
             keep &= (np.abs(span.places + 0.5 - half) <= half).all(axis=1)
         near = None if keep.all() else np.flatnonzero(keep)  # None stands for all
         counted = span.events if near is None else span.events[near]
@@ -939,17 +913,17 @@ class Inspector:
             if len(span.events):
                 what = f"{span.count:,} events, none of them selected,"
             raise AmiwarpError(
-                f"{what} from {span.start_ms:.3f} ms on for {span.length_us * 1e-3:.3f} ms; "
-                "take another window"
+                f"{recording.name}: {what} from {span.start_ms:.3f} ms on for {span.length_us * 1e-3:.3f} ms; "
+                "take another window, or a wider selection"
             )
 
-        # The drawn ones are evenly spaced among the selected ones.
+        # The drawn events are evenly spaced among the selected ones.
         points = min(selected, self.most_points)
-        thin = np.arange(points) * selected // points
+        drawn_at = np.arange(points) * selected // points
         if within is not None:
-            thin = within[thin]
-        drawn = counted[thin]
-        truth = DrawnTruth(recording.truth, span, thin if near is None else near[thin])
+            drawn_at = within[drawn_at]
+        drawn = counted[drawn_at]
+        truth = DrawnTruth(recording.truth, span, drawn_at if near is None else near[drawn_at])
         if span.places is None:
             before = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
         else:
@@ -979,14 +953,17 @@ class Inspector:
     def _angles(
         self, window: LoadedWindow, knobs: Knobs
     ) -> tuple[UploadedEvents, NDArray[np.float64], NDArray[np.float64]]:
-        """Return the prism angles of a window; the angles of the two last speeds are kept."""
+        """Return a window's events on the device, and the drawn events' prism angles [rad] and speeds [rad/us].
+
+        These are without the drift of the clock offset. The angles of the two last speeds are kept.
+        """
         rpm = 0.0 if self.has_encoder else knobs.rpm
         if rpm not in window.angles:
             encoder = self._encoder(rpm)
             t = window.events.t
             for old in list(window.angles)[:-1]:
                 del window.angles[old]
-            # with the slope, the clock offset of the encoder can be changed afterwards
+            # With the slope of the angle, the kernels can move the clock offset without a new upload.
             slope = encoder.speed_at(window.counted.t) * 1e-6 if self.has_encoder else None
             uploaded = upload_events(window.counted, encoder, self.device, slope=slope)
             window.angles[rpm] = uploaded, encoder.angle_at(t), encoder.speed_at(t) * 1e-6
@@ -1013,7 +990,7 @@ class Inspector:
         encoder = self.encoder_of(knobs)
         first_us, last_us = events.t[[0, -1]].tolist()
         if encoder.covers(first_us, last_us) and events.x.dtype == np.uint16:
-            # several times as fast
+            # This way is several times as fast, but takes only whole pixels and known angles.
             return np.asarray(compensate_events(events, model, encoder, device=self.device))
         theta = self._theta(window, knobs).astype(np.float32)
         return np.asarray(model.compensate_points(window.before, theta), np.float32)
@@ -1025,7 +1002,7 @@ class Inspector:
             return events
         recorded = np.stack([events.x, events.y], axis=1).astype(np.float32)
         moved = self._moved(replace(window, events=events, before=recorded, angles={}), knobs)
-        half = np.array(self.recording.events.size) / 2.0
+        half = np.array(self.recording.events.size) / 2.0  # from the image's middle to its sides
         seen = (np.abs(moved + 0.5 - half) < half).all(axis=1)  # False for NaN
         x, y = np.rint(moved[seen]).astype(np.uint16).T
         return Events(x, y, events.t[seen], events.p[seen])
@@ -1057,11 +1034,11 @@ class Inspector:
 
         If ``knobs`` is None, it shows the events as recorded, and is measured only once.
         """
-        if knobs is None and window.unmoved:
-            return window.unmoved[0]
+        if knobs is None and window.as_recorded:
+            return window.as_recorded[0]
         with self.lock:
             _, sharpness = self._imager.measure(*self.warped(window, knobs), window.region)
-        found = self.counts(window, knobs), sharpness
+        measured = self.counts(window, knobs), sharpness
         if knobs is None:
-            window.unmoved.append(found)
-        return found
+            window.as_recorded.append(measured)
+        return measured

@@ -33,8 +33,8 @@ KEYS = (
     (" ", ("play",), "play (or follow a live stream), or stop"),
     ("1", ("look_from", View.FREE.value), "view from the corner"),
     ("2", ("look_from", View.XY.value), "view along the third axis: x-y, the image"),
-    ("3", ("look_from", View.X_AXIS.value), "view along y: x-θ"),
-    ("4", ("look_from", View.Y_AXIS.value), "view along x: y-θ"),
+    ("3", ("look_from", View.X_THIRD.value), "view along y: x-θ"),
+    ("4", ("look_from", View.Y_THIRD.value), "view along x: y-θ"),
     ("e", ("suggest",), "show the suggested region"),
     ("w", ("whole",), "show the whole image"),
     ("t", ("toggle_axis",), "third axis: prism angle or time"),
@@ -52,8 +52,8 @@ KEYS = (
     ("?", ("toggle", "help_shown"), "show or hide this help"),
 )
 """Keys of the page: name of the key, method of the panel with its arguments, and help text."""
-BINS = 400
-"""Number of points of the drawn event rates."""
+RATE_BINS = 400
+"""Number of bins of the drawn event rates."""
 EXPORTS = {
     "picture": ("picture", ".png"),
     "image": ("images", ".png"),
@@ -72,7 +72,7 @@ EXPORTS = {
 }
 """Downloads by name: text of the button, and suffix."""
 FILMS = ("turntable", "film")
-"""Downloads that take long."""
+"""Downloads that are films: they take long, and the page shows their progress."""
 OF_OPTICS = ("compensated", "vtp_after", "calibration")
 """Downloads that only a recording with an optic has."""
 CALLS = (
@@ -158,30 +158,93 @@ CLIENT_ONLY = (
     "view_name",
 )
 """State variables that the browser keeps to itself."""
-EMPTY: tuple[tuple[Any, str], ...] = (
-    (
-        "",
-        "trame_error_report_msg stream_note hover measured address events drawn sharpness message rate_note "
-        "picked_text image_note against_title after_title b_text busy found view_name views_file",
-    ),
-    (
-        b"",
-        "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off orbit "
-        "column",
-    ),
-    (
-        False,
-        "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
-        "difference has_b calibrating same_scale recording",
-    ),
-    (None, "overview before after surface image_scale after_scale marked hot_rows"),
-    (
-        (),
-        "live_rows updating titles against_choices old steps beside_rows views rate_rows beside_counts",
-    ),
-    (0, "fixed_count"),
+TEXTS = (
+    "trame_error_report_msg",
+    "stream_note",
+    "hover",
+    "measured",
+    "address",
+    "events",
+    "drawn",
+    "sharpness",
+    "message",
+    "rate_note",
+    "picked_text",
+    "image_note",
+    "against_title",
+    "after_title",
+    "b_text",
+    "busy",
+    "found",
+    "view_name",
+    "views_file",
 )
-"""Values of state variables before the first update, and their names."""
+"""State variables that are texts."""
+ARRAYS = (
+    "cloud_before",
+    "cloud_after",
+    "cloud_third",
+    "third_before",
+    "colours_before",
+    "colours_after",
+    "rate_on",
+    "rate_off",
+    "orbit",
+    "column",
+)
+"""State variables that are arrays as bytes: points, colours, rates and lines."""
+FLAGS = (
+    "help_shown",
+    "open_shown",
+    "playing",
+    "loop",
+    "hide_hot",
+    "noise_filter",
+    "dark",
+    "overlaid",
+    "can_undo",
+    "can_redo",
+    "image_slow",
+    "difference",
+    "has_b",
+    "calibrating",
+    "same_scale",
+    "recording",
+)
+"""State variables that are true or false."""
+OPTIONAL = (
+    "overview",
+    "before",
+    "after",
+    "surface",
+    "image_scale",
+    "after_scale",
+    "marked",
+    "hot_rows",
+)
+"""State variables that are None while there is nothing to show: images, maps and lists."""
+ROWS = (
+    "live_rows",
+    "updating",
+    "titles",
+    "against_choices",
+    "old",
+    "steps",
+    "beside_rows",
+    "views",
+    "rate_rows",
+    "beside_counts",
+)
+"""State variables that are rows of texts, names or numbers."""
+EMPTY: dict[str, Any] = {
+    **dict.fromkeys(TEXTS, ""),
+    **dict.fromkeys(ARRAYS, b""),
+    **dict.fromkeys(FLAGS, False),
+    **dict.fromkeys(OPTIONAL, None),
+    **dict.fromkeys(ROWS, ()),
+    "fixed_count": 0,
+}
+"""Values of state variables before the first update, by name."""
 
 
 def initial_state(inspector: Inspector) -> dict[str, Any]:
@@ -196,7 +259,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         kinds.remove(ImageKind.DEPTH)
     axis = Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME
     return {
-        **{name: value for value, names in EMPTY for name in names.split()},
+        **EMPTY,
         **source_state(inspector),
         **knob_state(inspector),
         "turn_ms": turn_ms(inspector),
@@ -283,7 +346,7 @@ def knob_state(inspector: Inspector) -> dict[str, Any]:
         "knobs": sliders(inspector),
         "given": given_fields(inspector),
         "model": inspector.knobs.model,
-        "notes": notes(inspector),
+        "notes": what_is_missing(inspector),
     }
 
 
@@ -292,14 +355,14 @@ def turn_ms(inspector: Inspector) -> float:
     return inspector.turn_us * 1e-3 if math.isfinite(inspector.turn_us) else 0.0
 
 
-def notes(inspector: Inspector) -> list[str]:
+def what_is_missing(inspector: Inspector) -> list[str]:
     """Return what the recording lacks or what is only assumed, for the place where it matters."""
     texts = {
         Source.ASSUMED: "phase assumed, not known: calibrate, or set it",
         Source.ESTIMATED: "phase estimated from the events: calibrate for an accurate one",
     }
-    found = list(inspector.notes)
+    notes = list(inspector.notes)
     source = inspector.sources["phase"]
     if source in texts and math.isfinite(inspector.turn_us):
-        found.append(texts[source])
-    return found
+        notes.append(texts[source])
+    return notes

@@ -13,10 +13,12 @@ BACKGROUND_AND_INK = {False: ("white", "#333333"), True: ("#15181c", "#d8d8d8")}
 CAMERA_DIRECTIONS = {
     View.FREE: ((1.0, -1.35, 0.75), (0.0, 0.0, 1.0)),
     View.XY: ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
-    View.X_AXIS: ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
-    View.Y_AXIS: ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    View.X_THIRD: ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+    View.Y_THIRD: ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
 }
 """Direction from the clouds to the camera, and the upward direction, for each view."""
+PICTURE_PX = (1400, 620)
+"""Default width and height of a picture of the clouds [px]."""
 ORBIT_COLOUR = "#009e73"
 """Colour of the model's orbit, as on the page."""
 

@@ -68,13 +68,15 @@ QUICK = {
     **dict.fromkeys(("newest", "window", "suggestion", "state", "knobs"), ("clouds", "images")),
     "look": ("clouds",),
 }
+"""Updates that are made at once, with the parts of the page that wait for them."""
 SLOW = ("curve", "picture", "statistics")
-"""Updates that are made at once, with the parts of the page that wait for them, and updates that take longer."""
+"""Updates that take longer; each is named as the part of the page that waits for it."""
 PLAY_S = 0.05
+"""Shortest interval between two pictures while a recording is played [s]."""
 FOLLOW_S = 0.1
+"""Shortest interval between two pictures while a live stream is followed [s]."""
 RATES_S = 1.0
-"""Shortest interval between two pictures while a recording is played, and while a live stream is followed, and between
-two counts of a live stream's events for the timeline [s]."""
+"""Shortest interval between two counts of a live stream's events for the timeline [s]."""
 
 
 class Panel(Actions):
@@ -99,35 +101,44 @@ class Panel(Actions):
             self.device_lock = _CUDA_LOCK
         self._quick_requests: set[str] = set()
         self._slow_requests: set[str] = set()
-        self._doing: set[str] = set()
-        self._quick: asyncio.Task[None] | None = None
-        self._slow: asyncio.Task[None] | None = None
+        self._being_made: set[str] = set()
+        self._quick_task: asyncio.Task[None] | None = None
+        self._slow_task: asyncio.Task[None] | None = None
         self._jobs: set[asyncio.Task[None]] = set()
         self._error_source = ""
-        # A tab's own pool, which ends with the tab: calibration or film; curve or picture; quick updates.
+        # The tab's own pool, which ends with it. One thread each for: calibration or film, slow updates, quick updates.
         self._threads = ThreadPoolExecutor(3, "amiwarp-tab")
         self.shown: DisplayedWindow | None = None
         """Window as the page shows it; None before the first update."""
         self.plays = False
         """Whether the playback runs; after a stop it runs until it notices the stop."""
         self._picked = -1
-        self._card = False
-        self._held = False
+        """Index of the drawn event that is described; -1 for none."""
+        self._has_card = False
+        """Whether the browser draws with a graphics card."""
+        self._lasting = False
         """Whether a change lasts, such as a drag: meanwhile the brightness of images does not follow it."""
         self._scales: tuple[Scale, Scale] | None = None
+        """Scales of the two images that are shown."""
         self._scales_of: ImageKind | None = None
-        self._surface_about: Knobs | None = None  # parameters in the middle of the map of sharpness
-        # Window and selection of which the slow parts of the page are, by name.
+        """Kind of the images that have these scales."""
+        self._surface_middle: Knobs | None = None
+        """Parameters in the middle of the map of sharpness."""
         self._made_for: dict[str, Any] = {}
+        """Window and selection for which each slow part of the page was made, by its name."""
         # Successive changes of one name are undone together, until a release.
         self._change = ""
         self._drags = 0
-        self._rates: list[EventRates] = []  # of the recording, and of those on its time axis
+        self._rates: list[EventRates] = []
+        """Counted events of the recording, and of the recordings on its time axis."""
         self._rates_first_us = 0
+        """First event of the recording when its events were counted [us]."""
         self._progress = JobProgress(self._show_progress)  # of the latest calibration or film
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
         use_page(server, self._folder.name)
         self.state.client_only(*layout.CLIENT_ONLY)
+        self._wanted: dict[str, Any] = {}
+        """Values that were set on the page, and that the inspector has not taken yet, in the page's units."""
         self._listen()
         self.start(inspector)
 
@@ -136,12 +147,12 @@ class Panel(Actions):
         self.inspector = inspector
         self.shown = None
         self.b = None
-        self.found = None
+        self.calibration_result = None
         self._picked = -1
         self.history = None
-        self.steps = ()
+        self.history_steps = ()
         self._made_for.clear()
-        self.use_card(self._card)
+        self.use_card(self._has_card)
         inspector.renew()  # a live stream may have gone on since the inspector was made
         files: list[list[str]] = []
         folder = ""
@@ -149,8 +160,7 @@ class Panel(Actions):
             files = self._library.files()
             folder = str(self._library.folder)
         self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder})
-        # Values that were set on the page, and that the inspector has not taken yet.
-        self._wanted: dict[str, Any] = {}
+        self._wanted = {}
         self.time_window = inspector.window or inspector.first_window()
         self.start_job(self._count_events())
         self.request("window")
@@ -161,7 +171,7 @@ class Panel(Actions):
         if inspector.latest is not None:
             self.play()
         if isinstance(inspector.latest, WatchedStream):
-            self.start_job(self._watch(inspector.latest))
+            self.start_job(self._show_stream_figures(inspector.latest))
         self.bookmarks = None if inspector.path is None else Bookmarks(inspector.path)
         self._list_views()
         if inspector.bookmark:
@@ -187,8 +197,15 @@ class Panel(Actions):
     @property
     def look(self) -> Look:
         """Style of the clouds."""
-        s = self.state
-        return Look(Colour(s.colour), Axis(s.axis), s.point_size, s.opacity, s.dark, s.overlaid)
+        state = self.state
+        return Look(
+            Colour(state.colour),
+            Axis(state.axis),
+            state.point_size,
+            state.opacity,
+            state.dark,
+            state.overlaid,
+        )
 
     @look.setter
     def look(self, look: Look) -> None:
@@ -246,29 +263,29 @@ class Panel(Actions):
         ``change``: name of a change that lasts, such as a drag; it is undone in one step.
         """
         self._change = f"{change} {self._drags}" if change else ""
-        self._held = bool(change)
+        self._lasting = bool(change)
         self._quick_requests.update(what)
         self._show_pending()
-        if self._quick is None or self._quick.done():
-            self._quick = self.start_job(self._update())
+        if self._quick_task is None or self._quick_task.done():
+            self._quick_task = self.start_job(self._run_quick_updates())
 
     def request_slow(self, *what: str) -> None:
         """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
         self._slow_requests.update(what)
         self._show_pending()
-        if self._slow is None or self._slow.done():
-            self._slow = self.start_job(self._update_slowly())
+        if self._slow_task is None or self._slow_task.done():
+            self._slow_task = self.start_job(self._run_slow_updates())
 
     async def until_drawn(self) -> None:
         """Wait until no quick update is pending."""
-        while self._quick is not None and not self._quick.done():
-            await asyncio.wait([self._quick])
+        while self._quick_task is not None and not self._quick_task.done():
+            await asyncio.wait([self._quick_task])
 
     def start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run a job until it ends or the browser tab is closed."""
         task = asyncio.get_running_loop().create_task(work)
         self._jobs.add(task)
-        task.add_done_callback(self._ended)
+        task.add_done_callback(self._job_ended)
         return task
 
     async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
@@ -295,12 +312,13 @@ class Panel(Actions):
 
     def _show_pending(self) -> None:
         """Show which parts of the page wait for an update."""
-        parts = (self._slow_requests | self._doing) & {*SLOW}
-        for what in self._quick_requests | self._doing:
+        parts = (self._slow_requests | self._being_made) & {*SLOW}
+        for what in self._quick_requests | self._being_made:
             parts.update(QUICK.get(what, ()))
         self.state.updating = sorted(parts)
 
-    def _ended(self, task: asyncio.Task[None]) -> None:
+    def _job_ended(self, task: asyncio.Task[None]) -> None:
+        """Forget a job, and show the error that ended it."""
         self._jobs.discard(task)
         error = None if task.cancelled() else task.exception()
         if error is not None:
@@ -308,14 +326,15 @@ class Panel(Actions):
             text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
             self.say(text, "error")
 
-    async def _update(self) -> None:
+    async def _run_quick_updates(self) -> None:
+        """Make the requested quick updates until none is left; requests that arrive meanwhile are made together."""
         while self._quick_requests:
             while self._page_lags():
                 await asyncio.sleep(WAIT_S)
             todo = self._quick_requests
             self._quick_requests = set()
-            async with self._done(todo), self.device_lock, self.buffers_lock:
-                await self.make(todo)
+            async with self._marked_on_page(todo), self.device_lock, self.buffers_lock:
+                await self.update_quickly(todo)
             await asyncio.sleep(0)
 
     def _page_lags(self) -> bool:
@@ -323,24 +342,25 @@ class Panel(Actions):
         page = self.server.protocol
         return page is not None and page.network_monitor.pending > MOST_IN_FLIGHT
 
-    async def _update_slowly(self) -> None:
+    async def _run_slow_updates(self) -> None:
+        """Make the requested slow updates one after the other, each when no quick update is pending."""
         while self._slow_requests:
             await self.until_drawn()
             # In alphabetical order: the curve first, the preparation last
             name = min(self._slow_requests)
             self._slow_requests.discard(name)
-            async with self._done({name}), self.device_lock:
+            async with self._marked_on_page({name}), self.device_lock:
                 with self.errors_shown(name):
-                    await self.make_slow(name)
+                    await self.update_slowly(name)
 
     @contextlib.asynccontextmanager
-    async def _done(self, todo: set[str]) -> Any:
+    async def _marked_on_page(self, todo: set[str]) -> Any:
         """Mark updates as being made, and send the state to the browser when they are made."""
-        self._doing |= todo
+        self._being_made |= todo
         try:
             yield
         finally:
-            self._doing -= todo
+            self._being_made -= todo
             with self.state:
                 self._show_pending()
 
@@ -362,7 +382,9 @@ class Panel(Actions):
 
     def released(self) -> None:
         """Update the slow parts of the page after a change, and end what is undone in one step."""
-        if self._held:  # the images get the scale of what is shown now, as part of the same change
+        if (
+            self._lasting
+        ):  # the images get the scale of what is shown now, as part of the same change
             change = self._change
             self.request("knobs")
             self._change = change
@@ -414,7 +436,7 @@ class Panel(Actions):
         self.request("knobs" if name == "decay_ms" else "window")
 
     def step(self, count: int) -> None:
-        """Move the time window by turns or by its length; set by number, by as many events, found in a thread."""
+        """Move the time window, as :meth:`Actions.step` does. To count events takes long, and is done in a thread."""
         if self.inspector.fixed_count is None:
             super().step(count)
         else:
@@ -431,9 +453,10 @@ class Panel(Actions):
 
     async def _list_hot(self) -> None:
         with self.errors_shown("hot pixels"):
-            found = await self.in_thread(lambda: self.inspector.hot_pixels)
+            hot = await self.in_thread(lambda: self.inspector.hot_pixels)
             rows = [
-                [each.x, each.y, f"{each.rate:,.0f}", f"{100.0 * each.share:.3g}"] for each in found
+                [pixel.x, pixel.y, f"{pixel.rate:,.0f}", f"{100.0 * pixel.share:.3g}"]
+                for pixel in hot
             ]
             with self.state:
                 self.state.hot_rows = rows
@@ -455,10 +478,10 @@ class Panel(Actions):
         self.show_knobs()
         self.request("knobs", change=name)
 
-    def use_card(self, found: bool) -> None:
+    def use_card(self, has_card: bool) -> None:
         """Show more points if the browser has a graphics card to draw them."""
-        self._card = found
-        if found and self.inspector.most_points < WINDOW_POINTS:
+        self._has_card = has_card
+        if has_card and self.inspector.most_points < WINDOW_POINTS:
             self.inspector.most_points = WINDOW_POINTS
             self.request("window")
 
@@ -475,7 +498,7 @@ class Panel(Actions):
             self.view = View(view)
 
     def pick(self, k: int) -> None:
-        """Describe a drawn event, and show its orbit; -1 for none."""
+        """Describe the drawn event with the index ``k``, and show its orbit; -1 for none."""
         known = self.shown is not None and 0 <= k < len(self.shown.events)
         self._picked = int(k) if known else -1
         self.request("look")
@@ -576,10 +599,13 @@ class Panel(Actions):
         state.playing = not state.playing and (self.plays or self.can_play())
         if state.playing and not self.plays:
             self.plays = True
-            work = self._run() if self.inspector.latest is None else self._follow()
+            work = (
+                self._play_recording() if self.inspector.latest is None else self._follow_stream()
+            )
             self.start_job(work).add_done_callback(lambda _: setattr(self, "plays", False))
 
-    async def _run(self) -> None:
+    async def _play_recording(self) -> None:
+        """Move the time window on, by as much as real time has gone on, until playing is stopped."""
         state = self.state
         loop = asyncio.get_running_loop()
         elapsed_s = PLAY_S
@@ -593,7 +619,7 @@ class Panel(Actions):
             elapsed_s = loop.time() - start_s
         self.released()
 
-    async def _follow(self) -> None:
+    async def _follow_stream(self) -> None:
         """Show the current events of a live stream, again and again."""
         await self.until_drawn()  # with the suggested region
         loop = asyncio.get_running_loop()
@@ -611,9 +637,9 @@ class Panel(Actions):
     def record(self) -> None:
         """Save a live stream from now on to a new file in the current folder of the server, or finish the file."""
         if isinstance(self.inspector.latest, WatchedStream):
-            self.start_job(self._record(self.inspector.latest))
+            self.start_job(self._start_or_stop_recording(self.inspector.latest))
 
-    async def _record(self, source: WatchedStream) -> None:
+    async def _start_or_stop_recording(self, source: WatchedStream) -> None:
         with self.errors_shown("recording"):
             if source.is_recording:
                 self.say(f"saved {await self.in_thread(source.stop_recording)}", "success")
@@ -626,7 +652,7 @@ class Panel(Actions):
                 )
         self.state.flush()
 
-    async def _watch(self, source: WatchedStream) -> None:
+    async def _show_stream_figures(self, source: WatchedStream) -> None:
         """Show the figures of a live stream, also while it is not followed, until the page is closed."""
         while True:
             with self.state as state:
@@ -635,6 +661,7 @@ class Panel(Actions):
             await asyncio.sleep(FOLLOW_S)
 
     def _clock_us(self, time_ms: float) -> int:
+        """Return a time of the page, which counts from the first event [ms], on the events' clock [us]."""
         return int(self.inspector.recording.events.t_first) + round(time_ms * 1e3)
 
     async def _count_events(self) -> None:
@@ -655,11 +682,11 @@ class Panel(Actions):
         first_us = self._rates_first_us
         start_us, end_us = (round(1e3 * each) for each in self.state.rate_span)
         own, *others = self._rates
-        _, rates = own.curve(first_us + start_us, first_us + end_us, layout.BINS)
+        _, rates = own.curve(first_us + start_us, first_us + end_us, layout.RATE_BINS)
         off, on = map(page_state.float_bytes, rates)
         rows = []
         for each, counted in zip(self.inspector.besides, others, strict=True):
-            _, rates = counted.curve(each.time_of(start_us), each.time_of(end_us), layout.BINS)
+            _, rates = counted.curve(each.time_of(start_us), each.time_of(end_us), layout.RATE_BINS)
             off_beside, on_beside = map(page_state.float_bytes, rates)
             name = captions.beside_text(each)
             rows.append({"name": name, "on": on_beside, "off": off_beside})
@@ -726,8 +753,8 @@ class Panel(Actions):
         comparable: dict[str, Knobs | None] = {"recorded": None}
         if self.b is not None:
             comparable["B"] = self.b
-        if self.found is not None:
-            comparable["found"] = self.inspector.knobs_of(self.found)
+        if self.calibration_result is not None:
+            comparable["found"] = self.inspector.knobs_of(self.calibration_result)
         truth = self.inspector.truth
         if truth is not None:
             comparable["truth"] = truth
@@ -742,7 +769,7 @@ class Panel(Actions):
     def calibrate(self) -> None:
         """Start a calibration, or cancel the running one."""
         if not self.state.busy:
-            self.found = None
+            self.calibration_result = None
             self.state.update(
                 {
                     "busy": "calibrating",
@@ -765,20 +792,24 @@ class Panel(Actions):
         try:
             find = partial(calibration_job.find_calibration, whole=state.scope != layout.SCOPES[0])
             async with self.device_lock:
-                found = await self.in_thread(_guarded, find, weakref.ref(inspector), progress)
-            if isinstance(found, str):
+                answer = await self.in_thread(
+                    _result_or_error, find, weakref.ref(inspector), progress
+                )
+            if isinstance(answer, str):
                 if progress.cancelled:
                     self.say("calibration cancelled", "info")
                 else:
-                    self.say(found, "error")
+                    self.say(answer, "error")
                 return
-            self.found, text = found
+            self.calibration_result, text = answer
             with state:
                 state.update({"found": text, "against_choices": self._against_choices()})
             async with self.device_lock:
-                draw = partial(cost_surface.cost_surface, found=self.found)
-                self._surface_about = inspector.knobs
-                surface = await self.in_thread(_guarded, draw, weakref.ref(inspector), progress)
+                draw = partial(cost_surface.cost_surface, found=self.calibration_result)
+                self._surface_middle = inspector.knobs
+                surface = await self.in_thread(
+                    _result_or_error, draw, weakref.ref(inspector), progress
+                )
             if not isinstance(surface, str) and self.inspector is inspector:
                 with state:
                     state.surface = surface
@@ -811,11 +842,12 @@ class Panel(Actions):
                 self.server.js_call("page", what, name, words)
         elif what in layout.FILMS:
             if not self.state.busy:
-                self.start_job(self._film(what))
+                self.start_job(self._write_film(what))
         else:
-            self.start_job(self._write(what))
+            self.start_job(self._write_export(what))
 
-    async def _write(self, what: str) -> None:
+    async def _write_export(self, what: str) -> None:
+        """Write a file that is no film, and give it to the browser."""
         from amiwarp.viewer.publish import Page, save_figure
 
         inspector = self.inspector
@@ -829,7 +861,7 @@ class Panel(Actions):
         )
         write: dict[str, Callable[[Path], object]] = {
             **dict.fromkeys(("pdf", "svg"), figure),
-            "values": lambda path: save_values(path, self._pair().after),
+            "values": lambda path: save_values(path, self._make_images().after),
             **dict.fromkeys(("csv", "npz"), partial(downloads.write_table, inspector)),
             "events": partial(downloads.write_events, inspector, compensated=False),
             "compensated": partial(downloads.write_events, inspector, compensated=True),
@@ -844,9 +876,10 @@ class Panel(Actions):
         async with self.device_lock, self.buffers_lock:
             await self._download(what, write[what])
 
-    async def _film(self, what: str) -> None:
-        s = self.state
-        look = self.look.for_clouds([title for _, title in s.titles])
+    async def _write_film(self, what: str) -> None:
+        """Make a film in a thread, with its progress on the page, and give it to the browser."""
+        state = self.state
+        look = self.look.for_clouds([title for _, title in state.titles])
         progress = JobProgress(self._show_progress)
         self._progress = progress
         film = partial(
@@ -857,8 +890,8 @@ class Panel(Actions):
             progress=progress,
             what=what,
             against=self.against,
-            with_orbit=bool(s.orbit_shown),
-            speed=float(s.speed),
+            with_orbit=bool(state.orbit_shown),
+            speed=float(state.speed),
             ended=lambda: progress.ended,
         )
         self._show_progress(f"making the {layout.EXPORTS[what][0]}", 0.0)
@@ -867,8 +900,8 @@ class Panel(Actions):
                 async with self.device_lock:
                     await self._download(what, film)
         finally:
-            with s:
-                s.busy = ""
+            with state:
+                state.busy = ""
 
     async def _download(self, what: str, write: Callable[[Path], object]) -> None:
         """Write a file in a thread, and give it to the browser."""
@@ -913,24 +946,24 @@ class Panel(Actions):
         )
         return history
 
-    async def _apply_steps(self) -> None:
+    async def _apply_history_steps(self) -> None:
         """Show the requested state. Raises :class:`AmiwarpError` if it selects no events."""
         wanted = self.travelled()
         if wanted is None:
             return
         await self.in_thread(view_state.apply_state, self.inspector, wanted)
-        s = self.state
+        state = self.state
         selection = wanted.selection
-        region = list(selection.region or (0, 0, *s.size))
-        kind = s.region_kind
-        if region != s.region_wanted:
-            kind = "whole" if selection.region is None else "drawn"
+        region = list(selection.region or (0, 0, *state.size))
+        region_kind = state.region_kind
+        if region != state.region_wanted:
+            region_kind = "whole" if selection.region is None else "drawn"
         self.time_window = self.inspector.window or self.time_window
-        s.update(
+        state.update(
             {
                 **layout.filter_state(selection),
                 "region_wanted": region,
-                "region_kind": kind,
+                "region_kind": region_kind,
                 "kind": wanted.image.value,
                 "fixed_count": wanted.fixed_count or 0,
                 "decay_ms": wanted.decay_us * 1e-3,
@@ -948,156 +981,176 @@ class Panel(Actions):
 
     # Updates of what the page shows
 
-    async def make(self, todo: set[str]) -> None:
+    async def update_quickly(self, todo: set[str]) -> None:
         """Make quick updates: "newest", "suggestion", "window", "knobs", "look" and "state"."""
-        state = self.state
         if "newest" in todo:  # here, because no other update uses the events that it replaces
-            with self.errors_shown("stream"):
-                await self.in_thread(self.inspector.renew)
-                state.update(layout.source_state(self.inspector))
-                self.time_window = self.newest_window()
+            await self._take_newest()
             todo = {*todo, "window"}
         if self.shown is not None and "state" in todo and len(todo) > 1:
             # What came before an undo can be redone.
-            await self.make(todo - {"state"})
+            await self.update_quickly(todo - {"state"})
             todo = {"state"}
         if todo & {"window", "suggestion"}:
             with self.errors_shown("window"):
-                try:
-                    await self._open(suggest="suggestion" in todo)
-                except AmiwarpError:
-                    # Show again what is still open; playback goes on through a time without events.
-                    if self.inspector.window is not None and not state.playing:
-                        self.time_window = self.inspector.window
-                        state.region_wanted = list(self.inspector.loaded.region)
-                        state.update(layout.filter_state(self.inspector.selection))
-                    raise
+                await self._read_window_or_stay(suggest="suggestion" in todo)
         with self.errors_shown("knobs"):
-            good = self.inspector.knobs, dict(self.inspector.sources)
-            try:
-                if "knobs" in todo:
-                    self.set_knobs()
-                if self.shown is None:
-                    self.remember("")
-                if "state" in todo:
-                    await self._apply_steps()
-                self.show_knobs()
-                self.shown, values = await self.in_thread(self._compute)
-            except AmiwarpError:
-                self.inspector.knobs, self.inspector.sources = good
-                self.show_knobs()
-                raise
-            if self.compensates != bool(state.turn_ms):  # the speed of a prism was set, or set to 0
-                state.axis = (Axis.ANGLE if self.compensates else Axis.TIME).value
-                self.request("look")
-            mark = sliders.knob_values(self.inspector)[state.knob]
-            self._show_old()
-            if state.surface:  # the parameters may have moved on its map
-                marks = cost_surface.surface_marks(
-                    self.inspector,
-                    state.surface["names"],
-                    self._surface_about or self.inspector.knobs,
-                    self.found,
-                )
-                state.surface = {**state.surface, "marks": marks}
-            # A live stream may have got its encoder
-            state.optic = bool(state.optic or self.inspector.has_optic)
-            state.update({**values, "turn_ms": layout.turn_ms(self.inspector), "curve_mark": mark})
-            if not state.playing:
+            values = await self._take_knobs_or_stay(todo)
+            self._show_values(values)
+            if not self.state.playing:
                 self.remember("" if todo & {"suggestion", "state"} else self._change)
             self.announce()
 
+    async def _take_newest(self) -> None:
+        """Take the current events of a live stream."""
+        with self.errors_shown("stream"):
+            await self.in_thread(self.inspector.renew)
+            self.state.update(layout.source_state(self.inspector))
+            self.time_window = self.newest_window()
+
+    async def _read_window_or_stay(self, *, suggest: bool) -> None:
+        """Read the window that the page shows. If it has no events, show again what is still open, and raise the error.
+
+        Playback goes on through a time without events.
+        """
+        try:
+            await self._read_window(suggest=suggest)
+        except AmiwarpError:
+            if self.inspector.window is not None and not self.state.playing:
+                self.time_window = self.inspector.window
+                self.state.region_wanted = list(self.inspector.loaded.region)
+                self.state.update(layout.filter_state(self.inspector.selection))
+            raise
+
+    async def _take_knobs_or_stay(self, todo: set[str]) -> dict[str, Any]:
+        """Set what was requested in the inspector, and return the state variables that show it.
+
+        If it is refused, the parameters stay as they were, and the error is raised.
+        """
+        good = self.inspector.knobs, dict(self.inspector.sources)
+        try:
+            if "knobs" in todo:
+                self.set_knobs()
+            if self.shown is None:
+                self.remember("")
+            if "state" in todo:
+                await self._apply_history_steps()
+            self.show_knobs()
+            self.shown, values = await self.in_thread(self._displayed)
+        except AmiwarpError:
+            self.inspector.knobs, self.inspector.sources = good
+            self.show_knobs()
+            raise
+        return values
+
+    def _show_values(self, values: dict[str, Any]) -> None:
+        """Show state variables of the current parameters, and what depends on them elsewhere on the page."""
+        state = self.state
+        if self.compensates != bool(state.turn_ms):  # the speed of a prism was set, or set to 0
+            state.axis = (Axis.ANGLE if self.compensates else Axis.TIME).value
+            self.request("look")
+        mark = sliders.knob_values(self.inspector)[state.knob]
+        self._show_old()
+        if state.surface:  # the parameters may have moved on its map
+            marks = cost_surface.surface_marks(
+                self.inspector,
+                state.surface["names"],
+                self._surface_middle or self.inspector.knobs,
+                self.calibration_result,
+            )
+            state.surface = {**state.surface, "marks": marks}
+        # A live stream may have got its encoder.
+        state.optic = bool(state.optic or self.inspector.has_optic)
+        state.update({**values, "turn_ms": layout.turn_ms(self.inspector), "curve_mark": mark})
+
     def _show_old(self) -> None:
         """Show which slow parts of the page are still of another window or selection."""
-        chosen = self.inspector.chosen
+        current = self.inspector.window_and_selection
         self.state.old = sorted(
-            name for name, made_for in self._made_for.items() if made_for != chosen
+            name for name, made_for in self._made_for.items() if made_for != current
         )
 
-    async def make_slow(self, name: str) -> None:
-        """Make a slow update: "curve", "picture", "statistics", or "preparation" of the first picture."""
-        inspector = self.inspector.snapshot()  # of which a live stream changes nothing
-        chosen = inspector.chosen
-        await self._make_slow(name, inspector)
+    async def update_slowly(self, name: str) -> None:
+        """Make a slow update: "curve", "picture" (of a slow kind), "statistics" or "preparation" of such a picture."""
+        inspector = self.inspector.snapshot()  # a live stream changes nothing in it
+        made_for = inspector.window_and_selection
+        await self._update_part(name, inspector)
         if name != "preparation":
-            self._made_for[name] = chosen
+            self._made_for[name] = made_for
             self._show_old()
 
-    async def _make_slow(self, name: str, inspector: Inspector) -> None:
+    async def _update_part(self, name: str, inspector: Inspector) -> None:
         if name == "preparation":
             await self.in_thread(images.prepare, inspector)
         elif name == "statistics":
             self.state.statistics = await self.in_thread(inspector.statistics)
         elif name == "curve":
-            await self._curve(inspector)
+            await self._update_curve(inspector)
         elif self.image in SLOW_KINDS and self.shown is not None:
-            self.state.update(await self.in_thread(self._images, self.shown, inspector))
+            self.state.update(await self.in_thread(self._image_state, self.shown, inspector))
 
-    async def _open(self, *, suggest: bool) -> None:
+    async def _read_window(self, *, suggest: bool) -> None:
         """Read the window and the selection that the page shows."""
-        s = self.state
+        state = self.state
         inspector = self.inspector
-        in_thread = self.in_thread
-        if not float(s.length_ms) > 0.0:
-            raise AmiwarpError(f"a window of {s.length_ms:g} ms; give a length above 0")
+        if not float(state.length_ms) > 0.0:
+            raise AmiwarpError(f"a window of {state.length_ms:g} ms; give a length above 0")
         start_us, length_us = self.time_window
         length_us = min(length_us, self.whole_us)
         known_count = inspector.fixed_count
-        inspector.fixed_count = int(s.fixed_count) or None
+        inspector.fixed_count = int(state.fixed_count) or None
         try:
-            await in_thread(inspector.open, start_us, length_us, self._selection())
+            await self.in_thread(inspector.open, start_us, length_us, self._selection())
         except AmiwarpError:
             inspector.fixed_count = known_count
-            s.fixed_count = known_count or 0
+            state.fixed_count = known_count or 0
             raise
         if inspector.fixed_count is not None and inspector.window is not None:
             start_us, length_us = inspector.window
             self.time_window = inspector.window
         if suggest:
-            await in_thread(first_phase.estimate_phase, inspector)
-            region = await in_thread(inspector.suggest_region)
-            s.update({"region_wanted": list(region), "region_kind": "suggested"})
-            await in_thread(inspector.open, start_us, length_us, self._selection())
+            await self.in_thread(first_phase.estimate_phase, inspector)
+            region = await self.in_thread(inspector.suggest_region)
+            state.update({"region_wanted": list(region), "region_kind": "suggested"})
+            await self.in_thread(inspector.open, start_us, length_us, self._selection())
         self._picked = -1
 
     def _selection(self) -> Selection:
         """Return the conditions for events that the page shows."""
-        s = self.state
-        region = tuple(s.region_wanted)
-        whole = (0, 0, *s.size)
+        state = self.state
+        region = tuple(state.region_wanted)
+        whole = (0, 0, *state.size)
         return Selection(
-            polarity={"both": None, "ON": 1, "OFF": 0}[s.polarity],
+            polarity={"both": None, "ON": 1, "OFF": 0}[state.polarity],
             region=None if region == whole else region,
-            hide_hot=bool(s.hide_hot),
-            noise_us=round(1e3 * float(s.noise_ms)) if s.noise_filter else None,
-            refractory_us=round(1e3 * float(s.refractory_ms)),
-            most_per_s=1e6 * float(s.most_mev_s),
-            every=int(s.every),
+            hide_hot=bool(state.hide_hot),
+            noise_us=round(1e3 * float(state.noise_ms)) if state.noise_filter else None,
+            refractory_us=round(1e3 * float(state.refractory_ms)),
+            most_per_s=1e6 * float(state.most_mev_s),
+            every=int(state.every),
         )
 
-    def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
+    def _displayed(self) -> tuple[DisplayedWindow, dict[str, Any]]:
         """Return what is to be shown, and the state variables that show it."""
-        s = self.state
+        state = self.state
         before = self.shown
         against = self.against
         shown = self.inspector.show(against=against)
-        values = page_state.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
+        values = page_state.cloud_state(
+            shown, Colour(state.colour), Axis(state.axis), dark=bool(state.dark)
+        )
         values["image_slow"] = self.image in SLOW_KINDS
         if not values["image_slow"]:
-            values |= self._images(shown)
+            values |= self._image_state(shown)
         lines = orbit_lines.shown_lines(
             self.inspector, shown, self.look.axis, against, self._picked
         )
-        if not lines or not s.orbit_shown:
+        if not lines or not state.orbit_shown:
             lines = (np.zeros(0), np.zeros(0))
         values["orbit"], values["column"] = map(page_state.float_bytes, lines)
         if before is None or shown.span is not before.span:
-            size = self.inspector.recording.events.size
-            counts = iwe(shown.span.events, *size, vote=Vote.NEAREST)
-            values["overview"] = page_state.picture_state(counts, count_scale([counts]))
-            values["beside_counts"] = self.inspector.counts_beside(shown.span)
-        left = "recorded" if against is None else s.against
-        titles = captions.cloud_titles(self.inspector, left, Axis(s.axis))
+            values |= self._span_state(shown)
+        left = "recorded" if against is None else state.against
+        titles = captions.cloud_titles(self.inspector, left, Axis(state.axis))
         picked_text = ""
         if self._picked >= 0:
             picked_text = captions.event_text(shown, self._picked, compensated=self.compensates)
@@ -1117,6 +1170,15 @@ class Panel(Actions):
             "against_choices": self._against_choices(),
         }
 
+    def _span_state(self, shown: DisplayedWindow) -> dict[str, Any]:
+        """Return the state variables of all events of the time window, whatever is selected."""
+        size = self.inspector.recording.events.size
+        counts = iwe(shown.span.events, *size, vote=Vote.NEAREST)
+        return {
+            "overview": page_state.picture_state(counts, count_scale([counts])),
+            "beside_counts": self.inspector.counts_beside(shown.span),
+        }
+
     def _after_title(self, shown: DisplayedWindow) -> str:
         """Return the title of the second image."""
         name = self.inspector.recording.name
@@ -1130,29 +1192,32 @@ class Panel(Actions):
             return "difference"
         return "compensated"
 
-    def _images(self, shown: DisplayedWindow, inspector: Inspector | None = None) -> dict[str, Any]:
+    def _image_state(
+        self, shown: DisplayedWindow, inspector: Inspector | None = None
+    ) -> dict[str, Any]:
         """Return the state variables of the images of the region, or why there are none."""
         try:
-            pair = self._pair(shown, inspector)
+            made = self._make_images(shown, inspector)
         except AmiwarpError as error:
             return {"before": None, "after": None, "image_note": str(error)}
-        after_scale = pair.after_scale or pair.scale
-        self._scales = pair.scale, after_scale
+        after_scale = made.after_scale or made.scale
+        self._scales = made.scale, after_scale
         self._scales_of = self.image
         before = None
-        if pair.before is not None:
-            before = page_state.picture_state(pair.before, pair.scale)
+        if made.before is not None:
+            before = page_state.picture_state(made.before, made.scale)
         return {
             "before": before,
-            "after": page_state.picture_state(pair.after, after_scale),
-            "image_scale": page_state.scale_state(pair.scale),
+            "after": page_state.picture_state(made.after, after_scale),
+            "image_scale": page_state.scale_state(made.scale),
             "after_scale": page_state.scale_state(after_scale),
-            "image_note": pair.note,
+            "image_note": made.note,
         }
 
-    def _pair(
+    def _make_images(
         self, shown: DisplayedWindow | None = None, inspector: Inspector | None = None
     ) -> ShownImages:
+        """Return the images as the page has chosen them, of the tab's inspector or of a snapshot of it."""
         return images.make_images(
             inspector or self.inspector,
             self.image,
@@ -1161,16 +1226,17 @@ class Panel(Actions):
             difference=self.difference,
             decay_us=self.decay_us,
             same_scale=self.same_scale,
-            kept=self._scales if self._held and self._scales_of == self.image else None,
+            kept=self._scales if self._lasting and self._scales_of == self.image else None,
         )
 
-    async def _curve(self, inspector: Inspector) -> None:
-        s = self.state
+    async def _update_curve(self, inspector: Inspector) -> None:
+        """Show on which events a calibration would run, and the sharpness over the chosen parameter."""
+        state = self.state
         name = self.state.knob
-        find = partial(calibration_job.calibrated_events, inspector)
-        _, of_selection = await self.in_thread(find, whole=False)
-        _, of_whole = await self.in_thread(find, whole=True)
-        s.calibrate_on = [of_selection, of_whole]
+        describe = partial(calibration_job.calibrated_events, inspector)
+        _, selection_text = await self.in_thread(describe, whole=False)
+        _, whole_text = await self.in_thread(describe, whole=True)
+        state.calibrate_on = [selection_text, whole_text]
         if not self.compensates:
             return
         values, scores = await self.in_thread(inspector.curve, name)
@@ -1183,7 +1249,7 @@ class Panel(Actions):
         if best in (0, len(x) - 1):
             peak = f"at the edge {peak}"
         now = sliders.knob_values(self.inspector)[name]
-        s.curve = {
+        state.curve = {
             "name": label,
             "title": f"{label} ({unit})",
             "text": f"peak {peak}, now {now:.4g}",
@@ -1191,21 +1257,21 @@ class Panel(Actions):
             "y": scores.tolist(),
             "truth": sliders.truths(self.inspector)[name],
         }
-        s.curve_mark = now
+        state.curve_mark = now
 
 
-def _guarded(
-    call: Callable[..., Any], inspector: weakref.ref[Inspector], progress: Progress
+def _result_or_error(
+    call: Callable[..., Any], reference: weakref.ref[Inspector], progress: Progress
 ) -> Any:
-    """Return the result of a call, or the text of its error; None if the inspector is gone.
+    """Return the result of a call with the inspector of a reference, or the text of its error; None if it is gone.
 
     NLopt keeps the last error, and its traceback would keep all local variables of this call and its callers alive.
     """
-    known = inspector()
+    inspector = reference()
     try:
-        return None if known is None else call(known, progress=progress)
+        return None if inspector is None else call(inspector, progress=progress)
     except (AmiwarpError, JobCancelled) as error:
         traceback.clear_frames(error.__traceback__)
         return str(error)
     finally:
-        known = None
+        inspector = None  # this frame may be kept alive, too

@@ -50,7 +50,7 @@ LETTERS_PER_MM = 0.8
 """Letters of the caption that fit on a line, per width of the figure."""
 RATE_BINS = 100
 """Number of bins of the rates over a time window."""
-FLAT_AXES = {View.XY: (0, 1), View.X_AXIS: (0, 2), View.Y_AXIS: (1, 2)}
+FLAT_AXES = {View.XY: (0, 1), View.X_THIRD: (0, 2), View.Y_THIRD: (1, 2)}
 """Which of a cloud's axes each flat view shows, across and upwards."""
 NOW = "#c8501e"
 TRUTH = ORBIT_COLOUR

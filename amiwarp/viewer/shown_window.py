@@ -54,10 +54,10 @@ class LoadedWindow(DrawnWindow):
     the page, by the speed of a prism without encoder [1/min]; with an encoder, the only key is 0."""
     wrapped: dict[tuple[float, float], NDArray[np.float64]] = field(default_factory=dict)
     """Last prism angles of the drawn events, from 0 to 2π [rad], by speed and drift of the clock offset."""
-    unmoved: list[tuple[NDArray[np.float32], float]] = field(default_factory=list)
-    """Image of the events as recorded and its sharpness, once it is measured."""
-    chosen: list[Picture] = field(default_factory=list)
-    """Reconstructed picture for which the weight of the smoothness prior was chosen last."""
+    as_recorded: list[tuple[NDArray[np.float32], float]] = field(default_factory=list)
+    """Image of the events as recorded and its sharpness; empty until it is measured."""
+    last_picture: list[Picture] = field(default_factory=list)
+    """Reconstructed picture for which the weight of the smoothness prior was chosen last; empty before."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -265,7 +265,7 @@ class WindowActions(Actions):
             self._progress = ""
             return
         with self._job("calibration", "c cancels it"):
-            self.found, text = calibration_job.find_calibration(
+            self.calibration_result, text = calibration_job.find_calibration(
                 self.inspector, progress=self._show_progress
             )
             self.message = f"{text}. Press a to accept"

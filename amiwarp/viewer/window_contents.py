@@ -18,7 +18,7 @@ from amiwarp.viewer.images import SLOW_KINDS, ImageKind, ShownImages, make_image
 from amiwarp.viewer.sliders import UNITS
 from amiwarp.viewer.window_actions import SPEED, WindowActions
 from amiwarp.viewer.window_controls import Slider
-from amiwarp.viewer.window_images import Panel, panels_of
+from amiwarp.viewer.window_images import ImagePanel, panels_of
 from amiwarp.viewer.window_keys import help_rows
 
 
@@ -79,7 +79,7 @@ class WindowContents(WindowActions):
         rate = f"{shown.span.count / shown.span.length_us * 1e6:,.0f} events/s"
         if self._has_controls:
             rate = f"model {self.inspector.knobs.model}, {rate}"
-            notes = layout.notes(self.inspector)
+            notes = layout.what_is_missing(self.inspector)
         steps = [f"{name}: {rates}" for name, rates, _ in step_rows(shown.steps, shown.read_us)]
         both = [", ".join(row) for row in captions.beside_rows(self.inspector, shown)]
         self.sheets.controls.texts = [
@@ -93,7 +93,10 @@ class WindowContents(WindowActions):
             *notes,
         ]
         self.sheets.controls.rows = self._stream
-        self.sheets.statistics_old = self._statistics_of not in (None, self.inspector.chosen)
+        self.sheets.statistics_old = self._statistics_of not in (
+            None,
+            self.inspector.window_and_selection,
+        )
         self.sheets.help_rows = help_rows(
             optic=self._has_controls, depth=self.inspector.depth is not None
         )
@@ -123,7 +126,7 @@ class WindowContents(WindowActions):
         if wanted != self._rates_shown:
             self._rates_shown = wanted
             low, high = (source.t_first + round(each) for each in line.span)
-            edges, line.rates = self._rates.curve(low, high, layout.BINS)
+            edges, line.rates = self._rates.curve(low, high, layout.RATE_BINS)
             # Which a live stream has received since
             line.rates[:, edges[1:] > self._counted_stop_us] = np.nan
             line.edges = np.asarray(edges - source.t_first, np.float64)
@@ -181,7 +184,7 @@ class WindowContents(WindowActions):
         size = self.inspector.recording.events.size
         if not self.compensates and region != (0, 0, *size):
             whole = iwe(self.shown.span.events, *size, vote=Vote.NEAREST)
-            panel = Panel("whole image: count", whole, count_scale([whole]), (0, 0, *size))
+            panel = ImagePanel("whole image: count", whole, count_scale([whole]), (0, 0, *size))
             panels.insert(0, panel)
         self.sheets.show_images(panels, region, images.note)
 
@@ -195,7 +198,7 @@ class WindowContents(WindowActions):
         """Compute statistics, slow images and sharpness curves in steps, so that the window follows its user."""
         if self.statistics_shown:
             self.sheets.show_statistics(self.inspector.statistics())
-            self._statistics_of = self.inspector.chosen
+            self._statistics_of = self.inspector.window_and_selection
             self.sheets_changed()
             yield
         if self.image in SLOW_KINDS:
@@ -205,7 +208,7 @@ class WindowContents(WindowActions):
             yield
         for name in self._curve_names():
             found = []
-            chosen = self.inspector.chosen
+            chosen = self.inspector.window_and_selection
             for point in self.inspector.curve_points(name):
                 found.append(point)
                 yield
@@ -222,5 +225,5 @@ class WindowContents(WindowActions):
         """
         if name in self.sheets.charts and name in self.curves:
             known = sliders.truths(self.inspector)[name], sliders.knob_values(self.inspector)[name]
-            old = self._curves_of[name] != self.inspector.chosen
+            old = self._curves_of[name] != self.inspector.window_and_selection
             self.sheets.show_curve(name, *self.curves[name], known, old=old)

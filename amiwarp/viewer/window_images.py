@@ -56,7 +56,7 @@ def bar_label(scale: Scale) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
+class ImagePanel:
     """One image of the row."""
 
     title: str
@@ -68,14 +68,14 @@ class Panel:
     """Part of the sensor that the image shows."""
 
 
-def panels_of(images: ShownImages, titles: tuple[str, ...], region: Region) -> list[Panel]:
+def panels_of(images: ShownImages, titles: tuple[str, ...], region: Region) -> list[ImagePanel]:
     """Return the images of a region, from the second one backwards as many as there are titles."""
     after_scale = images.after_scale or images.scale
     both = [(images.before, images.scale), (images.after, after_scale)]
     shown = both[-len(titles) :]
     panels = []
     for title, (values, scale) in zip(titles, shown, strict=True):
-        panels.append(Panel(title, values, scale, region))
+        panels.append(ImagePanel(title, values, scale, region))
     return panels
 
 
@@ -86,7 +86,7 @@ class ImageRow:
         """``choose``: shows a region that was drawn; ``changed``: draws the images again."""
         self._choose = choose
         self._changed = changed
-        self.panels: list[Panel] = []
+        self.panels: list[ImagePanel] = []
         self.note = ""
         """What limits the images, or why there are none."""
         self.region: Region = (0, 0, 1, 1)
@@ -216,7 +216,7 @@ class ImageRow:
         paper.text(words, rect.left + em, below - 0.4 * em, up="top")
 
     @staticmethod
-    def _frame_of(panel: Panel, rect: Rect, left: float, wide: float, line: float) -> Rect:
+    def _frame_of(panel: ImagePanel, rect: Rect, left: float, wide: float, line: float) -> Rect:
         """Return the place of an image, as large as the room for it allows, below a line for its title.
 
         ``left``: where it begins; ``wide``: width that there is for it; ``line``: height of a line of text [px].
@@ -243,7 +243,7 @@ class ImageRow:
         room = sum(BAR_EM * em + self._bar_space(scale, em) for scale in bars)
         return max(1.0, (rect.width - em * (1 + count) - room) / max(count, 1))
 
-    def _rgb(self, k: int, panel: Panel, width: float) -> NDArray[np.uint8]:
+    def _rgb(self, k: int, panel: ImagePanel, width: float) -> NDArray[np.uint8]:
         """Return the colours of an image, with about as many pixels as its place in the window."""
         assert panel.values is not None
         step = max(1, math.floor(panel.values.shape[-1] / width))

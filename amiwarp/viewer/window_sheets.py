@@ -16,7 +16,7 @@ from amiwarp.viewer.sliders import SLIDERS
 from amiwarp.viewer.texts import LINE, SMALLEST_PX, text_width
 from amiwarp.viewer.window_charts import INTERVAL_CURVES, MARKS, ORBIT_CURVES, Chart, chart_places
 from amiwarp.viewer.window_controls import Controls, Slider
-from amiwarp.viewer.window_images import ImageRow, Panel
+from amiwarp.viewer.window_images import ImagePanel, ImageRow
 from amiwarp.viewer.window_layout import Places, Rect
 from amiwarp.viewer.window_paper import Paper
 from amiwarp.viewer.window_timeline import Timeline
@@ -133,7 +133,7 @@ class Sheets:
         else:
             mark.update([median, median], chart.y_range)
 
-    def show_images(self, panels: list[Panel], region: Region, note: str = "") -> None:
+    def show_images(self, panels: list[ImagePanel], region: Region, note: str = "") -> None:
         """Show images; the clouds show a region. ``note``: what limits the images, or why there are none."""
         self.images.panels = panels
         self.images.region = region

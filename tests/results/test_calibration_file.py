@@ -8,7 +8,16 @@ from typing import Any
 
 import pytest
 
-from amiwarp import AmiwarpError, Calibration, Camera, ErrorCode, Fisheye, RadialTangential
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    Encoder,
+    ErrorCode,
+    Fisheye,
+    Prism,
+    RadialTangential,
+)
 from amiwarp.optics.camera import camera_from_json, camera_to_json
 from tests.errors import refused
 
@@ -34,6 +43,42 @@ def test_the_representation_is_short_and_in_degrees(calibration: Calibration) ->
     assert first.count(" deg") == 2
     assert f", {calibration.events:,} events" in second
     assert len(first) < 120
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_the_representation_counts_the_warnings(count: int) -> None:
+    warned = {0: "", 1: ", 1 warning", 2: ", 2 warnings"}[count]
+    calibration = _without_encoder(warnings=("the lens is wide",) * count)
+    assert repr(calibration).endswith(f" events{warned})")
+
+
+def test_a_path_found_in_the_events_holds_only_where_it_is_known() -> None:
+    path = Encoder.constant_speed(720.0, 0, 1_000_000)
+    calibration = _without_encoder(path=path, zero_us=0)
+    first, last = path.coverage
+    assert calibration.encoder_for(None, first, last) is path
+    for span in ((first - 1, last), (first, last + 1)):
+        with pytest.raises(AmiwarpError, match="the prism's path for one recording only"):
+            calibration.encoder_for(None, *span)
+
+
+def _without_encoder(**fields: Any) -> Calibration:
+    """Return a calibration of a recording without an encoder."""
+    return Calibration(
+        model_name="exact",
+        camera=Camera.from_fov(64, 48, 1.0),
+        prism=Prism(0.035),
+        parameters={"apex": 0.026, "phase": 0.4},
+        uncertainty={},
+        free=("apex", "phase"),
+        sharpness_name="variance",
+        sharpness_before=1.0,
+        sharpness_after=2.0,
+        stages=(),
+        events=300_000,
+        seconds=1.5,
+        **fields,
+    )
 
 
 @pytest.mark.parametrize(

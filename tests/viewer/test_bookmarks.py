@@ -54,7 +54,7 @@ def another(inspector: Inspector) -> ViewState:
     return replace(
         first, start_us=1234, length_us=50_001, selection=Selection(1, (8, 9, 80, 60), True, 3000),
         knobs=first.knobs.with_values({"apex": 0.0123, "phase": -2.5, "clock_offset": 71.5, "tilt_x": 0.01}),
-        against=first.knobs.with_values({"phase": 0.25}), colour=Colour.TIME, axis=Axis.TIME, view=View.X_AXIS,
+        against=first.knobs.with_values({"phase": 0.25}), colour=Colour.TIME, axis=Axis.TIME, view=View.X_THIRD,
         overlaid=True,
     )  # fmt: skip
 
@@ -231,7 +231,7 @@ def test_the_window_saves_and_opens_bookmarks(window: Window, path: Path) -> Non
     window.key("j")
     assert window.message == "bookmark view 2"
     assert math.degrees(window.inspector.knobs.phase) == pytest.approx(77.0)
-    assert window.view is View.X_AXIS
+    assert window.view is View.X_THIRD
     assert window.state_now().selection == second.selection
     window.key("z")  # undo
     window.turn()

@@ -121,7 +121,7 @@ def test_a_figure_has_the_wanted_size(
 
 
 @pytest.mark.parametrize(
-    ("kind", "across", "up"), [(View.XY, 0, 1), (View.X_AXIS, 0, 2), (View.Y_AXIS, 1, 2)]
+    ("kind", "across", "up"), [(View.XY, 0, 1), (View.X_THIRD, 0, 2), (View.Y_THIRD, 1, 2)]
 )
 def test_points_are_where_the_model_moves_them(
     inspector: Inspector, kind: View, across: int, up: int

@@ -26,7 +26,7 @@ import pytest
 from amiwarp import AmiwarpError, Camera, Prism, Recording, simulate
 from amiwarp.viewer import Inspector
 from amiwarp.viewer import serve as server_module
-from amiwarp.viewer.commands import warning
+from amiwarp.viewer.commands import exposure_warning
 from amiwarp.viewer.host_names import HostNames, address, is_local, reachable
 from amiwarp.viewer.layout import CALLS, SETTABLE
 from amiwarp.viewer.page_messages import MOST_BYTES, MessageFilter
@@ -481,7 +481,7 @@ def test_an_address_that_can_be_opened_is_given() -> None:
     "host", ["0.0.0.0", "::", "[::]", "0", "192.168.1.5", "example.org", "fe80::1"]
 )
 def test_others_can_reach_it_and_that_is_said(host: str) -> None:
-    text = warning(host)
+    text = exposure_warning(host)
     assert text is not None
     assert host in text
     assert "everybody on the network" in text
@@ -492,7 +492,7 @@ def test_others_can_reach_it_and_that_is_said(host: str) -> None:
     "host", ["127.0.0.1", "localhost", "::1", "[::1]", "127.0.0.2", "LocalHost"]
 )
 def test_this_machine_alone_needs_no_warning(host: str) -> None:
-    assert warning(host) is None
+    assert exposure_warning(host) is None
 
 
 @pytest.mark.parametrize(

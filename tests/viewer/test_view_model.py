@@ -63,9 +63,10 @@ from amiwarp.viewer import (
     log_intensity,
     make_images,
     page_state,
+    selected_part,
+    window_statistics,
 )
 from amiwarp.viewer import inspector as viewer
-from amiwarp.viewer.calibration_job import calibrated_events, find_calibration
 from amiwarp.viewer.captions import events_text
 from amiwarp.viewer.cost_surface import cost_surface, surface_marks
 from amiwarp.viewer.downloads import COLUMNS, write_events
@@ -188,7 +189,7 @@ def test_calibration_is_that_of_the_shown_optic(
 
     monkeypatch.setattr(calibration_job, "calibrate", refusing)
     with pytest.raises(AmiwarpError, match="enough"):
-        find_calibration(inspector)
+        calibration_job.find_calibration(inspector)
     assert given == [calibrated] * 2  # the second time by sharpness alone
 
 
@@ -623,6 +624,11 @@ def test_counts_and_polarities_are_those_of_the_window(inspector: Inspector) -> 
     np.testing.assert_array_equal(counts.before, expected[top:bottom, left:right])
     assert two.scale.colours == "polarity"
     assert counts.scale.unit == "per pixel"
+    change = make_images(inspector, ImageKind.COUNT, difference=True)
+    np.testing.assert_array_equal(change.after, counts.after - counts.before)
+    assert change.after_scale is not None
+    assert change.after_scale.high == np.abs(change.after).max()
+    assert change.after_scale.low == -change.after_scale.high
     inspector.open(*inspector.first_window(), Selection(region=region, polarity=1))
     only_on = make_images(inspector, ImageKind.POLARITY).after
     assert not only_on[0].any()
@@ -715,7 +721,7 @@ def test_an_optic_at_rest_has_no_edges_in_phase(inspector: Inspector) -> None:
 def test_the_camera_of_a_part_sees_along_the_same_rays(inspector: Inspector) -> None:
     inspector.open(*inspector.first_window())
     for most, step in ((math.inf, 1), (12_000.0, 2)):
-        part, _, _, found = log_intensity.select_part(
+        part, _, _, found = selected_part.select_part(
             inspector, inspector.loaded, (30, 20, 110, 80), most=most
         )
         assert found == step
@@ -730,10 +736,10 @@ def test_preparing_a_log_intensity_does_not_change_it(
 ) -> None:
     monkeypatch.setattr(images, "_prepared", set())
     expected = make_images(inspector, ImageKind.LOG_INTENSITY).after
-    inspector.loaded.chosen.clear()
+    inspector.loaded.last_picture.clear()
     prepare(inspector)
     assert images._prepared == {"cpu"}
-    assert inspector.loaded.chosen == []
+    assert inspector.loaded.last_picture == []
     np.testing.assert_array_equal(make_images(inspector, ImageKind.LOG_INTENSITY).after, expected)
 
 
@@ -742,18 +748,18 @@ def test_the_smoothness_of_a_log_intensity_is_chosen_again_if_the_residual_chang
 ) -> None:
     inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
     make_images(inspector, ImageKind.LOG_INTENSITY)
-    (first,) = inspector.loaded.chosen
+    (first,) = inspector.loaded.last_picture
     truth = inspector.knobs
     inspector.set(replace(truth, apex=1.01 * truth.apex))
     make_images(inspector, ImageKind.LOG_INTENSITY)
-    assert inspector.loaded.chosen == [first]
+    assert inspector.loaded.last_picture == [first]
     inspector.set(replace(truth, phase=truth.phase + math.pi))
     make_images(inspector, ImageKind.LOG_INTENSITY)
-    (other,) = inspector.loaded.chosen
+    (other,) = inspector.loaded.last_picture
     assert other.residual > 2.0 * first.residual
     inspector.set(truth)
     make_images(inspector, ImageKind.LOG_INTENSITY)
-    (again,) = inspector.loaded.chosen
+    (again,) = inspector.loaded.last_picture
     np.testing.assert_array_equal(again.log, first.log)
 
 
@@ -768,7 +774,7 @@ def test_a_log_intensity_of_a_large_image_uses_a_part_of_its_pixels(
     inspector.open(*inspector.first_window())
     whole = make_images(inspector, ImageKind.LOG_INTENSITY).after
     monkeypatch.setattr(log_intensity, "MOST_WORK", 20_000)
-    monkeypatch.setattr(log_intensity, "MOST_EVENTS", 40_000)
+    monkeypatch.setattr(selected_part, "MOST_EVENTS", 40_000)
     found = make_images(inspector, ImageKind.LOG_INTENSITY)
     assert found.after.shape == whole.shape
     assert "25 % of the pixels" in found.note
@@ -1004,7 +1010,7 @@ def test_a_calibration_uses_what_is_selected(
     inspector.set(replace(truth, apex=0.5 * truth.apex))
     said: list[str] = []
     settings = Settings(model=model, stages=("sharpness",))
-    found, text = find_calibration(
+    found, text = calibration_job.find_calibration(
         inspector, settings, progress=lambda what, share: said.append(what)
     )
     assert said
@@ -1018,7 +1024,7 @@ def test_a_calibration_uses_what_is_selected(
     assert after == pytest.approx(
         inspector.show(replace(truth, model=model)).sharpness_after, rel=0.1
     )
-    scope = calibrated_events(inspector)[1]
+    scope = calibration_job.calibrated_events(inspector)[1]
     assert scope.startswith(f"{inspector.loaded.selected:,} events from 0.020 s to 0.200 s")
     assert ("x 20 to 140, y 10 to 110 px" in scope) is (region is not None)
     assert text.startswith(f"found on {scope}: {model} model, apex {math.degrees(apex):.4g}°")
@@ -1049,7 +1055,7 @@ def test_a_selection_that_the_photometric_stage_refuses_is_calibrated_by_sharpne
     monkeypatch.setattr(calibration_job, "calibrate", refusing)
     truth = inspector.truth
     assert truth is not None
-    found, text = find_calibration(inspector)
+    found, text = calibration_job.find_calibration(inspector)
     assert asked == [("sharpness", "photometric"), ("sharpness",)]
     assert inspector.knobs_of(found).apex == pytest.approx(truth.apex, abs=math.radians(0.12))
     assert (
@@ -1059,21 +1065,21 @@ def test_a_selection_that_the_photometric_stage_refuses_is_calibrated_by_sharpne
     assert "calibrate on the whole recording" in text
     assert "mount it" not in text
     with pytest.raises(AmiwarpError, match="the camera shakes"):
-        find_calibration(inspector, whole=True)
+        calibration_job.find_calibration(inspector, whole=True)
     asked.clear()
-    find_calibration(inspector, Settings(stages=("sharpness",)))
+    calibration_job.find_calibration(inspector, Settings(stages=("sharpness",)))
     assert asked == [("sharpness",)]
 
 
 def test_a_selection_that_determines_nothing_is_refused(inspector: Inspector) -> None:
     start, length = inspector.first_window()
     inspector.open(start, length // 10, Selection(1, (20, 10, 140, 110), noise_us=3000))
-    _, scope = calibrated_events(inspector)
+    _, scope = calibration_job.calibrated_events(inspector)
     assert scope.count(",") >= 3
     assert "ON events" in scope
     assert "without background activity (3 ms)" in scope
     with pytest.raises(AmiwarpError, match=r"quarter turn|too few"):
-        find_calibration(inspector)
+        calibration_job.find_calibration(inspector)
 
 
 def surface_values(surface: dict[str, Any]) -> np.ndarray:
@@ -1346,7 +1352,8 @@ def test_statistics_of_a_region(polarity: int | None) -> None:
     ]  # fmt: skip
     assert found["median"] == pytest.approx(math.log10(np.median(intervals)))
     counts = [
-        sum(low <= each < high for each in intervals) for low, high in pairwise(viewer.INTERVALS_US)
+        sum(low <= each < high for each in intervals)
+        for low, high in pairwise(window_statistics.INTERVALS_US)
     ]
     np.testing.assert_allclose(found["y"], 100.0 * np.array(counts) / len(intervals))
 

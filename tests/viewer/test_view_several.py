@@ -166,13 +166,13 @@ def test_the_page_has_a_row_of_rates_for_each_recording(inspector: Inspector, br
         for row, other in zip(panels[0].state.rate_rows, inspector.besides, strict=True):
             events = other.recording.events.slice(0, 30_000)
             t = events.t - events.t[0] + other.offset_us
-            edges = np.linspace(0, 300_000, layout.BINS + 1)
+            edges = np.linspace(0, 300_000, layout.RATE_BINS + 1)
             for name, polarity in (("on", 1), ("off", 0)):
                 counts, _ = np.histogram(t[events.p == polarity], edges)
-                found = np.frombuffer(row[name], np.float32) * (300_000 / layout.BINS * 1e-6)
+                found = np.frombuffer(row[name], np.float32) * (300_000 / layout.RATE_BINS * 1e-6)
                 np.testing.assert_allclose(found, counts, atol=0.01)
             # where the recording has not started, or has ended
-            assert np.count_nonzero(found == 0.0) >= layout.BINS * 24 // 300
+            assert np.count_nonzero(found == 0.0) >= layout.RATE_BINS * 24 // 300
         assert page.locator("#beside").input_value() == "0"
         page.locator("#beside").select_option("1")
         page.wait_for_function(

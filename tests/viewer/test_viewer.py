@@ -374,8 +374,8 @@ LOOKS = {
     "polarity": (Look(point_size=1.5), View.FREE),
     "dark": (Look(Colour.ANGLE, Axis.TIME, point_size=3.0, dark=True), View.FREE),
     "image": (Look(Colour.DENSITY), View.XY),
-    "side": (Look(Colour.RESIDUAL), View.X_AXIS),
-    "overlaid": (Look(overlaid=True, opacity=0.5), View.Y_AXIS),
+    "side": (Look(Colour.RESIDUAL), View.X_THIRD),
+    "overlaid": (Look(overlaid=True, opacity=0.5), View.Y_THIRD),
 }
 
 

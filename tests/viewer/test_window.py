@@ -913,7 +913,7 @@ def test_calibrate_shows_its_progress_and_is_accepted(window: Window) -> None:
     window.turn()
     window.key("c")
     window.turn()
-    assert window.found is not None
+    assert window.calibration_result is not None
     assert "Press a to accept" in " ".join(said(window).split())
     window.key("a")
     window.turn()
@@ -933,7 +933,7 @@ def test_a_calibration_is_cancelled_by_the_same_key(
     window.key("c")
     window.turn()
     assert "calibration cancelled" in said(window)
-    assert window.found is None
+    assert window.calibration_result is None
 
 
 def test_a_live_stream_is_followed(recording: Recording) -> None:

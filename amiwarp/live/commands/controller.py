@@ -17,11 +17,11 @@ def controller_lines(controller: dict[str, Any] | None) -> list[str]:
 
 def controller_summary(link: Link) -> dict[str, Any]:
     """Return what the controller says about itself; None for all that is unknown."""
-    who = link.identity
+    identity = link.identity
     condition = link.condition
-    told: dict[str, Any] = {
-        "firmware": None if who is None else who.version,
-        "board": None if who is None else who.board_name,
+    summary: dict[str, Any] = {
+        "firmware": None if identity is None else identity.version,
+        "board": None if identity is None else identity.board_name,
         "older_than_1_1": link.older,
         "supply_v": None,
         "host_timeout_s": None,
@@ -29,20 +29,23 @@ def controller_summary(link: Link) -> dict[str, Any]:
         "settings": None,
     }
     if condition is not None:
-        told["supply_v"] = condition.supply_v
-        told["host_timeout_s"], told["host_stops"] = condition.host_timeout_s, condition.host_stops
+        summary["supply_v"] = condition.supply_v
+        summary["host_timeout_s"] = condition.host_timeout_s
+        summary["host_stops"] = condition.host_stops
         known = condition.stored < len(STORED)
-        told["settings"] = STORED[condition.stored] if known else f"unknown ({condition.stored})"
-    return told
+        summary["settings"] = STORED[condition.stored] if known else f"unknown ({condition.stored})"
+    return summary
 
 
-def firmware_text(d: dict[str, Any]) -> str:
-    if d["firmware"] is not None:
-        return f"{d['firmware']} on {d['board'] or 'a board without a name'}"
-    return "older than 1.1" if d["older_than_1_1"] else "unknown: it does not say"
+def firmware_text(summary: dict[str, Any]) -> str:
+    """Return firmware and board of a :func:`controller_summary` as text."""
+    if summary["firmware"] is not None:
+        return f"{summary['firmware']} on {summary['board'] or 'a board without a name'}"
+    return "older than 1.1" if summary["older_than_1_1"] else "unknown: it does not say"
 
 
-def supply_text(d: dict[str, Any]) -> str:
-    if d["supply_v"] is not None:
-        return f"{d['supply_v']:.1f} V"
-    return "unknown" if d["firmware"] is None else "unknown: its pin is not connected"
+def supply_text(summary: dict[str, Any]) -> str:
+    """Return the motor's supply voltage of a :func:`controller_summary` as text."""
+    if summary["supply_v"] is not None:
+        return f"{summary['supply_v']:.1f} V"
+    return "unknown" if summary["firmware"] is None else "unknown: its pin is not connected"

@@ -88,11 +88,8 @@ class AdaptiveOptions:
     ] = None
 
     def __post_init__(self) -> None:
-        if not self.adaptive and (self.least_rpm, self.limit_rpm, self.most_mev_s) != (
-            LEAST_RPM,
-            MOST_RPM,
-            None,
-        ):
+        limits = (self.least_rpm, self.limit_rpm, self.most_mev_s)
+        if not self.adaptive and limits != (LEAST_RPM, MOST_RPM, None):
             raise AmiwarpError(
                 "--least-rpm, --limit-rpm and --most-mev-s apply to --adaptive; add it, or remove them",
                 ErrorCode.OPTIONS,
@@ -111,18 +108,21 @@ class AdaptiveOptions:
             return None
         if model.ANGLES > 1:
             raise AmiwarpError(
-                f"--adaptive sets the speed of one prism, the calibration belongs to a {model.TEXT}"
+                f"--adaptive sets the speed of one prism, the calibration belongs to a {model.TEXT}; "
+                "leave --adaptive out"
             )
         if link is None:
             raise AmiwarpError("--adaptive sets the motor's speed; give the controller's --port")
         rpm = min(max(START_RPM, self.least_rpm), self.limit_rpm)
-        most = float("inf") if self.most_mev_s is None else self.most_mev_s
-        orbit = prism_orbit(model)
-        limits = SpeedController(
-            orbit, rpm, least_rpm=self.least_rpm, most_rpm=self.limit_rpm, most_mev_s=most
+        controller = SpeedController(
+            prism_orbit(model),
+            rpm,
+            least_rpm=self.least_rpm,
+            most_rpm=self.limit_rpm,
+            most_mev_s=math.inf if self.most_mev_s is None else self.most_mev_s,
         )
-        link.set_speed(rpm, limits.ramp_rpm_s)
-        return SpeedKeeper(model, limits, link.set_speed, say)
+        link.set_speed(rpm, controller.ramp_rpm_s)
+        return SpeedKeeper(model, controller, link.set_speed, say)
 
 
 @dataclass(frozen=True)
@@ -283,35 +283,43 @@ def run_live(
     outputs.check(json=common.json)
     pictures.check()
     device = cli.choose_device(common.device)
-    found = Calibration.load(calibration)
+    calibrated = Calibration.load(calibration)
     with contextlib.ExitStack() as resources:
         stop = threading.Event()
         line = resources.enter_context(StatusLine())
         link = resources.enter_context(stream.link())
         opened = stream.open(source, line.say)
         angles = check_angles(opened, link, second_ratio)
-        check_size(found, opened.size, opened.name)
-        check_model(opened, link, angles, found)
+        check_size(calibrated, opened.size, opened.name)
+        check_model(opened, link, angles, calibrated)
         # Before the files: Ctrl-C leaves none unfinished
         resources.enter_context(stopped_by_interrupt(stop))
         receivers = _Receivers(
             outputs,
             opened,
-            found,
+            calibrated,
             encoders=angles,
             offset_us=clock_offset(opened, link),
             resources=resources,
             stop=stop,
             say=line.say,
         )
-        drawn = _picture_stream(
-            pictures, processing, opened, found, link, resources, fast=stream.fast, say=line.say
+        picture_stream = _picture_stream(
+            pictures,
+            processing,
+            opened,
+            calibrated,
+            link,
+            resources,
+            fast=stream.fast,
+            say=line.say,
         )
-        receivers.raw += [] if drawn is None else [drawn]
-        keeper = adaptive.build(found.model, link, line.say)
+        if picture_stream is not None:
+            receivers.raw.append(picture_stream)
+        keeper = adaptive.build(calibrated.model, link, line.say)
         session = _session(
             opened,
-            found,
+            calibrated,
             receivers,
             processing,
             link=link,
@@ -321,19 +329,22 @@ def run_live(
             say=line.say,
         )
         status = _follow(session, stop, stream.seconds, line, receivers)
-        if drawn is not None:
-            drawn.close()
-    data: dict[str, Any] = {
-        "files": [*outputs.files, *([] if pictures.picture is None else [str(pictures.picture)])],
+        if picture_stream is not None:
+            picture_stream.close()
+    files = list(outputs.files)
+    if pictures.picture is not None:
+        files.append(str(pictures.picture))
+    result: dict[str, Any] = {
+        "files": files,
         **session_summary(status, opened),
         "controller": None if link is None else controller_summary(link),
         "latency_ms": status.latency_ms,
-        "pictures": None if drawn is None else _picture_summary(drawn),
-        "model": found.model_name,
+        "pictures": None if picture_stream is None else _picture_summary(picture_stream),
+        "model": calibrated.model_name,
         "device": device,
         "messages": list(line.messages),
     }
-    _print_result(data, common, to_stderr=outputs.use_stdout)
+    _print_result(result, common, to_stderr=outputs.use_stdout)
     check_whole(opened, status)
 
 
@@ -341,7 +352,7 @@ def _picture_stream(
     options: PictureOptions,
     processing: ProcessingOptions,
     source: Source,
-    found: Calibration,
+    calibration: Calibration,
     link: Link | None,
     resources: contextlib.ExitStack,
     *,
@@ -358,8 +369,8 @@ def _picture_stream(
     from amiwarp.reconstruction.phase_camera import PhaseCamera
 
     camera = PhaseCamera(
-        found.model,
-        event_encoder(source, found, link),
+        calibration.model,
+        event_encoder(source, calibration, link),
         rate_hz=options.picture_hz,
         wait_us=cli.microseconds(processing.wait_ms, "ms", "--wait-ms"),
     )
@@ -376,17 +387,17 @@ def _picture_stream(
         for output in outputs:
             output(picture)
 
-    drawn = PictureStream(camera, give, newest=not fast)
-    return resources.enter_context(drawn)
+    picture_stream = PictureStream(camera, give, newest=not fast)
+    return resources.enter_context(picture_stream)
 
 
-def _picture_summary(drawn: PictureStream) -> dict[str, Any]:
+def _picture_summary(pictures: PictureStream) -> dict[str, Any]:
     """Return the numbers of pictures and their latency for ``--json``."""
-    latency = None
-    if drawn.latencies_us:
-        median, slow = np.percentile(drawn.latencies_us, [50, 99]) * 1e-3
-        latency = float(median), float(slow)
-    return {"made": drawn.made, "left_out": drawn.skipped, "latency_ms": latency}
+    latency_ms = None
+    if pictures.latencies_us:
+        median, slow = np.percentile(pictures.latencies_us, [50, 99]) * 1e-3
+        latency_ms = float(median), float(slow)
+    return {"made": pictures.made, "left_out": pictures.skipped, "latency_ms": latency_ms}
 
 
 class _Receivers:
@@ -396,7 +407,7 @@ class _Receivers:
         self,
         options: OutputOptions,
         source: Source,
-        found: Calibration,
+        calibration: Calibration,
         *,
         encoders: int,
         offset_us: float,
@@ -409,19 +420,21 @@ class _Receivers:
         def sink(what: str, address: str | None, encoders: int = 1) -> SocketSink | PipeSink | None:
             if address is None:
                 return None
-            opened = _open_sink(address, found, encoders, resources, stop=stop, say=say)
+            opened = _open_sink(address, calibration, encoders, resources, stop=stop, say=say)
             if opened.address != address:  # for example, the system chose the port
                 say(f"{what} packets are served at {opened.address}")
             return opened
 
-        # first, because a recording that has begun is kept although a viewer's library is missing
-        self.viewers = [resources.enter_context(one) for one in _open_viewers(options, source)]
+        # First, because a recording that has begun is kept although a viewer's library is missing.
+        self.viewers = [
+            resources.enter_context(viewer) for viewer in _open_viewers(options, source)
+        ]
         self.raw: list[RawConsumer] = []
         if options.record is not None:
             writer = _writer(
                 options.record,
                 source,
-                found,
+                calibration,
                 compensated=False,
                 encoders=encoders,
                 offset_us=offset_us,
@@ -432,7 +445,7 @@ class _Receivers:
             self.raw.append(Forward(self.raw_sink))
         self.out = None
         if options.out is not None:
-            writer = _writer(options.out, source, found, compensated=True, encoders=encoders)
+            writer = _writer(options.out, source, calibration, compensated=True, encoders=encoders)
             self.out = resources.enter_context(writer)
         self.sink = sink("compensated", options.to)
         self.raw += self.viewers
@@ -440,12 +453,14 @@ class _Receivers:
     @property
     def sinks(self) -> tuple[Callable[[Compensated], None], ...]:
         """Functions that take compensated packets and send them."""
-        return (*(() if self.sink is None else (_send_to(self.sink),)), *self.viewers)
+        if self.sink is None:
+            return tuple(self.viewers)
+        return (_send_to(self.sink), *self.viewers)
 
 
 def _session(
     source: Source,
-    found: Calibration,
+    calibration: Calibration,
     receivers: _Receivers,
     options: ProcessingOptions,
     *,
@@ -455,11 +470,12 @@ def _session(
     device: str,
     say: Callable[[str], None],
 ) -> Session:
+    """Return the session that compensates the source for the receivers."""
     from amiwarp.live.stream.session import Session
 
     return Session(
         source,
-        found,
+        calibration,
         link=link,
         second_ratio=second_ratio,
         raw=receivers.raw,
@@ -510,18 +526,19 @@ def _print_result(data: dict[str, Any], common: cli.Common, *, to_stderr: bool) 
 
 def _open_sink(
     address: str,
-    found: Calibration,
+    calibration: Calibration,
     encoders: int,
     resources: contextlib.ExitStack,
     *,
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> SocketSink | PipeSink:
+    """Open the sink at an address, which ``resources`` closes; its hello message describes the calibrated camera."""
     from amiwarp.live.stream.sinks import open_sink
     from amiwarp.live.stream.stream_format import encode_hello
 
-    camera = found.model.camera
-    hello = encode_hello(camera.width, camera.height, camera, _prism(found), encoders)
+    camera = calibration.model.camera
+    hello = encode_hello(camera.width, camera.height, camera, _prism(calibration), encoders)
     sink = open_sink(address, hello, stop=stop, say=say)
     resources.push(sink)
     return sink
@@ -539,12 +556,13 @@ def _open_viewers(options: OutputOptions, source: Source) -> Iterator[LiveViewer
         yield foxglove_server(options.foxglove, source.size)
 
 
-def _prism(found: Calibration) -> NominalPrism | None:
+def _prism(calibration: Calibration) -> NominalPrism | None:
     """Return the nominal prism of a calibration; None if its optic has no prism, as a mirror."""
-    return found.prism if found.model.PRISM else None
+    return calibration.prism if calibration.model.PRISM else None
 
 
 def _send_to(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
+    """Return a function that sends a compensated packet to a sink."""
     from amiwarp.live.stream.stream_format import encode_compensated
 
     return lambda packet: sink.send(encode_compensated(packet.events, packet.flags))
@@ -553,24 +571,28 @@ def _send_to(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
 def _writer(
     path: Path,
     source: Source,
-    found: Calibration,
+    calibration: Calibration,
     *,
     compensated: bool,
     encoders: int,
     offset_us: float = 0.0,
 ) -> LiveWriter:
+    """Return the writer of a recording of the source, as it is or ``compensated``.
+
+    ``encoders``: number of encoders whose samples it stores; ``offset_us``: their clock offset [us].
+    """
     width, height = source.size
     metadata = recorded_from(source)
-    if not found.model.PRISM:
-        metadata["optic"] = found.model_name
+    if not calibration.model.PRISM:
+        metadata["optic"] = calibration.model_name
     if compensated:
-        metadata["compensated_with"] = found.model_name
+        metadata["compensated_with"] = calibration.model_name
     return LiveWriter(
         path,
         width=width,
         height=height,
-        camera=found.model.camera,
-        prism=source.prism or _prism(found),
+        camera=calibration.model.camera,
+        prism=source.prism or _prism(calibration),
         metadata=metadata,
         compensated=compensated,
         encoders=encoders,
@@ -578,25 +600,26 @@ def _writer(
     )
 
 
-def _live_lines(d: dict[str, Any]) -> list[str]:
-    marked = [
-        f"{d[key]:,} {what}"
-        for key, what in (
-            ("outside", "outside the image"),
-            ("extrapolated", "with an extrapolated angle"),
-            ("without_angle", "without an angle"),
-            ("dropped", "dropped"),
-            ("late", "late"),
-        )
-        if d[key]
-    ]
-    speed = f"{d['seconds']:.1f} s, {d['mev_per_s']:.3g} Mev/s by the {d['model']} model on {d['device']}"
+def _live_lines(result: dict[str, Any]) -> list[str]:
+    """Return the lines of the result: numbers of events and their marks, speed, clocks, controller, pictures, files."""
+    marks = []
+    for key, meaning in (
+        ("outside", "outside the image"),
+        ("extrapolated", "with an extrapolated angle"),
+        ("without_angle", "without an angle"),
+        ("dropped", "dropped"),
+        ("late", "late"),
+    ):
+        if result[key]:
+            marks.append(f"{result[key]:,} {meaning}")
+    marked = ", ".join(marks) or "all inside the image with a measured angle"
+    speed = f"{result['seconds']:.1f} s, {result['mev_per_s']:.3g} Mev/s"
     return [
-        f"{d['compensated']:,} events ({', '.join(marked) or 'all inside the image with a measured angle'}), {speed}",
-        *_clock_lines(d["clock"]),
-        *controller_lines(d["controller"]),
-        *_picture_lines(d["pictures"], d["seconds"]),
-        *d["files"],
+        f"{result['compensated']:,} events ({marked}), {speed} by the {result['model']} model on {result['device']}",
+        *_clock_lines(result["clock"]),
+        *controller_lines(result["controller"]),
+        *_picture_lines(result["pictures"], result["seconds"]),
+        *result["files"],
     ]
 
 

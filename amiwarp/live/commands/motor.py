@@ -24,7 +24,7 @@ RAMP_RPM_S = 500.0
 """Default of ``--ramp-rpm-s``, the largest change of the speed [turns/min/s]."""
 WAIT_S = 2.5
 """Longest wait for the controller's status, which is sent once a second, and for its clock [s]."""
-TELL_S = 1.0
+SELF_REPORT_S = 1.0
 """Longest wait for what the controller says about itself [s]: firmware of amiwarp 0.1 does not answer the question."""
 POLL_S = 0.02
 """Interval between two readings of the data that the controller has sent [s]."""
@@ -109,28 +109,15 @@ def run_motor(
     says otherwise. Settings change while the prism rests, and hold until the controller's next reset unless saved. A
     check takes about half a minute, ends with a stop, and fails (status 1) if the serial protocol is violated.
     """
-    if action is Action.CHECK:
-        rpm = CHECK_RPM if rpm is None else rpm
-    elif (rpm is None) == (action is Action.SET):
-        raise AmiwarpError(
-            "'amiwarp motor set' needs --rpm, the speed to set; status and stop do not accept it",
-            ErrorCode.OPTIONS,
-        )
+    if action is Action.CHECK and rpm is None:
+        rpm = CHECK_RPM
+    _check_speed(action, rpm, ramp_rpm_s, limit_rpm)
     if (change or as_built or save) and action is not Action.SETTINGS:
         raise AmiwarpError(
-            "--change, --as-built and --save apply to 'amiwarp motor settings'", ErrorCode.OPTIONS
-        )
-    changes = [_parsed_change(text) for text in change or ()]
-    if ramp_rpm_s != RAMP_RPM_S and action is not Action.SET:
-        raise AmiwarpError(
-            "--ramp-rpm-s applies to 'amiwarp motor set'; to stop slowly, set --rpm 0",
+            "--change, --as-built and --save apply to 'amiwarp motor settings'; leave them out",
             ErrorCode.OPTIONS,
         )
-    if rpm is not None and not abs(rpm) <= limit_rpm:
-        raise AmiwarpError(
-            f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; raise --limit-rpm only if prism and mount "
-            "withstand it"
-        )
+    changes = [_parsed_change(text) for text in change or ()]
     if action is Action.CHECK:
         assert rpm is not None
         _check_motor(port, rpm, yes, common)
@@ -152,6 +139,26 @@ def run_motor(
             _report_settings(link, common, saved=save)
             return
     cli.report(common, data, [cli.table(_motor_rows(data)), *data["messages"], *_hint(data)])
+
+
+def _check_speed(action: Action, rpm: float | None, ramp_rpm_s: float, limit_rpm: float) -> None:
+    """Raise :class:`AmiwarpError` for a speed or a ramp that the action does not take, or a speed beyond the limit."""
+    takes_speed = action in (Action.SET, Action.CHECK)
+    if (rpm is not None) != takes_speed:
+        raise AmiwarpError(
+            "'amiwarp motor set' needs --rpm, the speed to set; status and stop do not accept it",
+            ErrorCode.OPTIONS,
+        )
+    if ramp_rpm_s != RAMP_RPM_S and action is not Action.SET:
+        raise AmiwarpError(
+            "--ramp-rpm-s applies to 'amiwarp motor set'; to stop slowly, set --rpm 0",
+            ErrorCode.OPTIONS,
+        )
+    if rpm is not None and not abs(rpm) <= limit_rpm:
+        raise AmiwarpError(
+            f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; raise --limit-rpm only if prism and mount "
+            "withstand it"
+        )
 
 
 def _parsed_change(text: str) -> tuple[str, int]:
@@ -181,14 +188,14 @@ def _report_settings(link: Link, common: cli.Common, *, saved: bool) -> None:
     values = link.settings()
     rows = []
     for setting in SETTINGS:
-        allowed = f"{setting.least:,} to {setting.most:,}" + (", or 0: off" if setting.off else "")
+        allowed = f"{setting.least:,} to {setting.most:,}"
+        if setting.off:
+            allowed += ", or 0: off"
         rows.append((setting.name, f"{values[setting.name]:,}", setting.unit, allowed))
     data = {"port": link.name, "settings": values, "saved": saved}
-    note = (
-        "saved in the controller"
-        if saved
-        else "changes hold until the controller's next reset; --save keeps them"
-    )
+    note = "changes hold until the controller's next reset; --save keeps them"
+    if saved:
+        note = "saved in the controller"
     cli.report(common, data, [cli.table(rows, "setting", "value", "unit", "range"), note])
 
 
@@ -206,12 +213,12 @@ def _check_motor(port: str | None, rpm: float, yes: bool, common: cli.Common) ->
             f"the check turns the motor at {rpm:g} rpm; cover the prism, keep hands away, and add --yes to start it"
         )
 
-    def tell(check: Check) -> None:
+    def say_result(check: Check) -> None:
         say(f"{check.name}: {_VERDICTS[check.passed]}")
 
     wire = SerialWire(port)
     try:
-        checks = check_controller(wire, rpm, tell)
+        checks = check_controller(wire, rpm, say_result)
     except OSError as error:
         raise AmiwarpError(
             f"{wire.name}: the port is gone, {error}; is the motor at rest?", ErrorCode.UNREACHABLE
@@ -237,15 +244,16 @@ def _check_motor(port: str | None, rpm: float, yes: bool, common: cli.Common) ->
 
 def _wait(link: Link, messages: list[str], target: float | None = None) -> None:
     """Wait until the status reports the target speed and the controller's clock is known, or :data:`WAIT_S` passed."""
-    end = time.monotonic() + WAIT_S
-    while time.monotonic() < end:
+    start_s = time.monotonic()
+    while time.monotonic() < start_s + WAIT_S:
         messages += link.poll().messages
         status = link.status
-        reported = status is not None and (
+        has_target = status is not None and (
             target is None or math.isclose(status.target_rpm, target, rel_tol=1e-6)
         )
-        told = link.older or link.condition is not None or time.monotonic() > end - WAIT_S + TELL_S
-        if reported and told and link.clock() is not None:
+        has_reported_itself = link.older or link.condition is not None
+        gives_up_report = time.monotonic() > start_s + SELF_REPORT_S
+        if has_target and (has_reported_itself or gives_up_report) and link.clock() is not None:
             return
         time.sleep(POLL_S)
 
@@ -255,7 +263,7 @@ def _check_target(link: Link, messages: list[str], target: float) -> None:
     status = link.status
     if status is None or math.isclose(status.target_rpm, target, rel_tol=0.01, abs_tol=1.0):
         return
-    faults = [name for bit, name in enumerate(FAULTS) if status.faults >> bit & 1]
+    faults = _fault_names(status.faults)
     details = "; ".join([*messages, *(f"fault: {name}" for name in faults)]) or "was it reset?"
     now_rpm = status.target_rpm
     raise AmiwarpError(
@@ -263,60 +271,76 @@ def _check_target(link: Link, messages: list[str], target: float) -> None:
     )
 
 
+def _fault_names(faults: int) -> list[str]:
+    """Return the names of the faults in a status's bit field."""
+    return [name for bit, name in enumerate(FAULTS) if faults >> bit & 1]
+
+
 def _described(link: Link, messages: list[str]) -> dict[str, Any]:
+    """Return the motor's state and what the controller says about itself, for ``--json``.
+
+    Raises :class:`AmiwarpError` if no status has come.
+    """
     status = link.status
     if status is None:
         details = "; ".join(
             [*messages, "docs/reference/link-protocol.md describes the messages it must send"]
         )
         raise AmiwarpError(f"{link.name}: no status in {WAIT_S:g} s; {details}")
+    state = f"unknown ({status.state})"
+    if status.state < len(STATES):
+        state = STATES[status.state]
     return {
         "port": link.name,
-        "state": STATES[status.state]
-        if status.state < len(STATES)
-        else f"unknown ({status.state})",
+        "state": state,
         "rpm": status.rpm,
         "target_rpm": status.target_rpm,
         "counts_per_turn": status.counts_per_turn,
-        "faults": [name for bit, name in enumerate(FAULTS) if status.faults >> bit & 1],
+        "faults": _fault_names(status.faults),
         "answers": link.clock() is not None,
         **controller_summary(link),
         "messages": messages,
     }
 
 
-def _without_host_text(d: dict[str, Any]) -> str:
-    if d["host_timeout_s"] is None:
-        return "the motor goes on" if d["older_than_1_1"] else "unknown"
-    if not d["host_timeout_s"]:
+def _without_host_text(motor: dict[str, Any]) -> str:
+    """Return what the motor does if no host speaks to the controller."""
+    if motor["host_timeout_s"] is None:
+        return "the motor goes on" if motor["older_than_1_1"] else "unknown"
+    if not motor["host_timeout_s"]:
         return "the motor goes on"
-    stops = f"; stops since the controller's start: {d['host_stops']:,}" if d["host_stops"] else ""
-    return f"the motor stops after {d['host_timeout_s']} s{stops}"
+    stops = (
+        f"; stops since the controller's start: {motor['host_stops']:,}"
+        if motor["host_stops"]
+        else ""
+    )
+    return f"the motor stops after {motor['host_timeout_s']} s{stops}"
 
 
-def _motor_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
+def _motor_rows(motor: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the rows of the printed table."""
+    port = motor["port"]
+    if not motor["answers"]:
+        port += " (sends data, but does not answer commands)"
     return [
-        (
-            "port",
-            d["port"] + ("" if d["answers"] else " (sends data, but does not answer commands)"),
-        ),
-        ("state", d["state"]),
-        ("speed", f"{d['rpm']:.1f} rpm, set to {d['target_rpm']:g} rpm"),
-        ("encoder", f"{d['counts_per_turn']:,} counts per turn"),
-        ("faults", ", ".join(d["faults"]) or "none"),
-        ("firmware", firmware_text(d)),
-        ("supply", supply_text(d)),
-        ("without a host", _without_host_text(d)),
-        ("settings", d["settings"] or "unknown"),
+        ("port", port),
+        ("state", motor["state"]),
+        ("speed", f"{motor['rpm']:.1f} rpm, set to {motor['target_rpm']:g} rpm"),
+        ("encoder", f"{motor['counts_per_turn']:,} counts per turn"),
+        ("faults", ", ".join(motor["faults"]) or "none"),
+        ("firmware", firmware_text(motor)),
+        ("supply", supply_text(motor)),
+        ("without a host", _without_host_text(motor)),
+        ("settings", motor["settings"] or "unknown"),
     ]
 
 
-def _hint(d: dict[str, Any]) -> list[str]:
+def _hint(motor: dict[str, Any]) -> list[str]:
     """Return a line about a motor that turns: how to stop it, or when it stops by itself."""
-    if not d["target_rpm"]:
+    if not motor["target_rpm"]:
         return []
-    if d["host_timeout_s"]:
+    if motor["host_timeout_s"]:
         return [
-            f"the motor stops {d['host_timeout_s']} s after this command ends, if no other host speaks to it"
+            f"the motor stops {motor['host_timeout_s']} s after this command ends, if no other host speaks to it"
         ]
-    return [f"the motor keeps turning; to stop it: amiwarp motor stop --port {d['port']}"]
+    return [f"the motor keeps turning; to stop it: amiwarp motor stop --port {motor['port']}"]

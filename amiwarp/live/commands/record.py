@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -22,9 +22,6 @@ from amiwarp.live.commands.session import (
     session_summary,
     stopped_by_interrupt,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 def run_record(
@@ -62,10 +59,8 @@ def run_record(
             encoders=encoders,
             clock_offset_us=clock_offset(opened, link),
         )
-        with (
-            stopped_by_interrupt(stop),
-            writer,
-        ):  # in this order, so that Ctrl-C leaves no unfinished file
+        # In this order, so that Ctrl-C leaves no unfinished file.
+        with stopped_by_interrupt(stop), writer:
             session = Session(
                 opened, link=link, second_ratio=second_ratio, raw=[writer], say=line.say
             )
@@ -77,20 +72,11 @@ def run_record(
         "controller": controller,
         "messages": list(line.messages),
     }
-    text = (
-        f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"
-    )
-    cli.report(
-        common,
-        data,
-        [
-            text,
-            *controller_lines(controller),
-            *(
-                [f"{status.late:,} events arrived too late to be sorted by time"]
-                if status.late
-                else []
-            ),
-        ],
-    )
+    lines = [
+        f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s",
+        *controller_lines(controller),
+    ]
+    if status.late:
+        lines.append(f"{status.late:,} events arrived too late to be sorted by time")
+    cli.report(common, data, lines)
     check_whole(opened, status)

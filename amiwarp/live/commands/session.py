@@ -170,24 +170,33 @@ class StatusLine:
                 self.say(f"{sink.lost:,} packets were not sent: a receiver is too slow")
 
 
-def describe(s: SessionStatus, width: int = 80) -> str:
+def describe(status: SessionStatus, width: int = 80) -> str:
     """Return the text of the status line: the most important figures that fit into ``width`` characters."""
-    lost = [
-        f"{n:,} {what}"
-        for n, what in ((s.dropped, "dropped"), (s.late, "late"), (s.waiting, "waiting"))
-        if n
-    ]
-    parts = [f"{s.seconds:.1f} s", f"{s.rate_mev_s:.2f} Mev/s", *lost[:2]]
-    if s.done:
-        parts += [f"latency {s.latency_ms[0]:.1f} ms", f"encoder {100.0 * s.covered:.1f} %"]
-    parts += [] if s.rpm is None else [f"{s.rpm:.0f} rpm"]
-    parts += [] if s.sharpness is None else [f"sharpness {s.sharpness:.2f}"]
-    parts += [] if s.coverage is None else [f"edges {100.0 * s.coverage:.0f} %"]
-    parts += [f"{s.events:,} events", *lost[2:]]
-    parts += (
-        [] if s.clock is None else [f"clocks ±{s.clock.offset_std_us:.0f} µs by {s.clock_source}"]
-    )
-    parts += ["clocks unknown"] if s.clock is None and s.clock_source is not None else []
+    losses = []
+    for count, what in (
+        (status.dropped, "dropped"),
+        (status.late, "late"),
+        (status.waiting, "waiting"),
+    ):
+        if count:
+            losses.append(f"{count:,} {what}")
+
+    # The most important figures first: the last ones are left out on a narrow terminal.
+    parts = [f"{status.seconds:.1f} s", f"{status.rate_mev_s:.2f} Mev/s", *losses[:2]]
+    if status.done:
+        parts.append(f"latency {status.latency_ms[0]:.1f} ms")
+        parts.append(f"encoder {100.0 * status.covered:.1f} %")
+    if status.rpm is not None:
+        parts.append(f"{status.rpm:.0f} rpm")
+    if status.sharpness is not None:
+        parts.append(f"sharpness {status.sharpness:.2f}")
+    if status.coverage is not None:
+        parts.append(f"edges {100.0 * status.coverage:.0f} %")
+    parts += [f"{status.events:,} events", *losses[2:]]
+    if status.clock is not None:
+        parts.append(f"clocks ±{status.clock.offset_std_us:.0f} µs by {status.clock_source}")
+    elif status.clock_source is not None:
+        parts.append("clocks unknown")
     while len(", ".join(parts)) > width:
         parts.pop()
     return ", ".join(parts)
@@ -217,27 +226,23 @@ def check_angles(source: Source, link: Link | None, second_ratio: float | None =
     return 2
 
 
-def check_model(source: Source, link: Link | None, angles: int, found: Calibration) -> None:
+def check_model(source: Source, link: Link | None, angles: int, calibration: Calibration) -> None:
     """Raise :class:`AmiwarpError` unless the number of angles that a session has is the calibrated model's."""
-    if angles == found.model.ANGLES:
+    model = calibration.model
+    if angles == model.ANGLES:
         return
-    if found.model.ANGLES == 1:
+    if model.ANGLES == 1:
         raise AmiwarpError(
-            f"{source.name}: there are two prism angles, but the calibrated model, {found.model_name}, has one; give a "
-            "calibration of a pair of prisms or of a mirror, made from a recording with both encoders"
+            f"{source.name}: there are two prism angles, but the calibrated model, {calibration.model_name}, has one; "
+            "give a calibration of a pair of prisms or of a mirror, made from a recording with both encoders"
         )
-    what = f"the calibration belongs to a {found.model.TEXT}"
-    other = (
-        "leave --port out to take the samples of the source"
-        if source.encoders == 2
-        else (
-            "give a source with the samples of both encoders ('encoders' in docs/reference/stream-format.md)"
-        )
-    )
+    remedy = "give a source with the samples of both encoders ('encoders' in docs/reference/stream-format.md)"
+    if source.encoders == 2:
+        remedy = "leave --port out to take the samples of the source"
     name = source.name if link is None else link.name
     raise AmiwarpError(
-        f"{name}: there are samples of one encoder, but {what}, which has two angles; {other}, or --second-ratio if "
-        "both are geared"
+        f"{name}: there are samples of one encoder, but the calibration belongs to a {model.TEXT}, which has two "
+        f"angles; {remedy}, or --second-ratio if both are geared"
     )
 
 
@@ -254,29 +259,29 @@ def check_whole(source: Source, status: SessionStatus) -> None:
     raise AmiwarpError(f"{source.name}: the stream broke off: {problem}; {kept}{hint}")
 
 
-def session_summary(s: SessionStatus, source: Source) -> dict[str, Any]:
+def session_summary(status: SessionStatus, source: Source) -> dict[str, Any]:
     """Return the counts of a session for ``--json``."""
     return {
-        "seconds": s.seconds,
-        "events": s.events,
-        "mev_per_s": s.events / max(s.seconds, 1e-9) / 1e6,
-        "compensated": s.done,
-        "outside": s.outside,
-        "extrapolated": s.guessed,
-        "without_angle": s.unknown,
-        "dropped": s.dropped,
-        "late": s.late,
+        "seconds": status.seconds,
+        "events": status.events,
+        "mev_per_s": status.events / max(status.seconds, 1e-9) / 1e6,
+        "compensated": status.done,
+        "outside": status.outside,
+        "extrapolated": status.guessed,
+        "without_angle": status.unknown,
+        "dropped": status.dropped,
+        "late": status.late,
         "returns": getattr(source, "returns", 0),
         "lost_usb_packets": getattr(source, "lost", 0),
         "broke_off": getattr(source, "problem", None),
-        "clock": None if s.clock_source is None else _clock_summary(s),
+        "clock": None if status.clock_source is None else _clock_summary(status),
     }
 
 
-def _clock_summary(s: SessionStatus) -> dict[str, Any]:
+def _clock_summary(status: SessionStatus) -> dict[str, Any]:
     """Return how the clocks of controller and camera are related, and within what [us]."""
-    source = str(s.clock_source)
-    clock = s.clock
+    source = str(status.clock_source)
+    clock = status.clock
     if clock is None:
         return {"from": source, "uncertainty_us": None, "pulses": 0}
     return {"from": source, "uncertainty_us": clock.offset_std_us, "pulses": clock.pairs}

@@ -38,9 +38,12 @@ BY_CHANCE = 1e-6
 DOUBTFUL = 1e-3
 """The same for another shift, below which two shifts are possible and none is taken."""
 JUDGED = 16
+"""Number of latest pulses in the time of known triggers by which the map is judged."""
 FEWEST_MET = 5
-"""Number of latest pulses in the time of known triggers, and smallest number of them that must meet one. Below it, the
-map is discarded: one of the clocks has jumped."""
+"""Smallest number of the judged pulses that must meet a trigger. Below it, the map is discarded: one of the clocks has
+jumped."""
+MOST_OTHERS = 3
+"""Number of other shifts that are compared with the best one."""
 NO_PULSES_US = 3_000_000
 NO_TRIGGERS_US = 6_500_000
 """Time without a pulse of the controller, and time with pulses but without a trigger of the camera, whose reports may
@@ -149,10 +152,11 @@ class CameraClock:
         :attr:`source` says how it is known. ``host``: map from the host's clock to the controller's, used without
         pulses. The result then has an unknown error: the shortest delay of the camera's packets.
         """
-        found, self.source = self._known(host)
-        return found
+        clock, self.source = self._map_and_source(host)
+        return clock
 
-    def _known(self, host: ClockMap | None) -> tuple[ClockMap | None, ClockSource]:
+    def _map_and_source(self, host: ClockMap | None) -> tuple[ClockMap | None, ClockSource]:
+        """Return the map from the controller's clock to the camera's, if there is one, and how it is known."""
         if self._map is not None:
             drift_us = UNSTEADY * abs(self._newest_sync_us - self._pairs[-1][0])
             now = replace(self._map, offset_std_us=math.hypot(self._map.offset_std_us, drift_us))
@@ -163,20 +167,26 @@ class CameraClock:
             return None, ClockSource.UNKNOWN
         if host is None or len(self._delays) < FEWEST_PAIRS:
             return None, ClockSource.UNKNOWN
-        delays = np.array(self._delays)
-        shortest = int(delays.min())
-        spread = float(np.median(delays) - shortest)
-        at = host.at_us + round(host.offset_us)
-        arrival = replace(
+        return self._map_by_arrival(host), ClockSource.ARRIVAL
+
+    def _map_by_arrival(self, host: ClockMap) -> ClockMap:
+        """Return the map from the controller's clock to the camera's, as if the shortest delay of packets were none.
+
+        It goes by the host's clock: ``host`` backwards, then less the delay. The spread of the delays is its error.
+        """
+        delays_us = np.array(self._delays)
+        shortest_us = int(delays_us.min())
+        spread_us = float(np.median(delays_us) - shortest_us)
+        return replace(
             host,
-            at_us=at,
-            offset_us=-host.offset_us - shortest,
+            at_us=host.at_us + round(host.offset_us),
+            offset_us=-host.offset_us - shortest_us,
             drift=-host.drift,
-            offset_std_us=math.hypot(host.offset_std_us, spread),
+            offset_std_us=math.hypot(host.offset_std_us, spread_us),
         )
-        return arrival, ClockSource.ARRIVAL
 
     def _saw(self, host_us: int) -> None:
+        """Note the host time of the latest data, and of the first ones since the clocks are unknown [us]."""
         self._now_us = max(self._now_us, host_us)
         if self._since_us is None:
             self._since_us = host_us
@@ -193,7 +203,9 @@ class CameraClock:
         return self._now_us - self._since_us >= patience
 
     def _forget_map(self) -> None:
-        self.relation += self._map is not None
+        """Discard the map and all pairs that it was fitted to."""
+        if self._map is not None:
+            self.relation += 1
         self._pairs.clear()
         self._met.clear()
         self._map = None
@@ -203,31 +215,28 @@ class CameraClock:
         """Store the pulses that match as pairs: by the map, or by the search for the shift between the clocks."""
         if not (self._sync and self._trigger):
             return
-        trigger, sync = (np.array(pulses, np.int64) for pulses in (self._trigger, self._sync))
-        pairs = (
-            self._first_pairs(trigger, sync)
-            if self._map is None
-            else self._next_pairs(trigger[:, 0], sync[:, 0])
-        )
+        trigger = np.array(self._trigger, np.int64)
+        sync = np.array(self._sync, np.int64)
+        find = self._first_pairs if self._map is None else self._next_pairs
+        pairs = find(trigger, sync)
         if not len(pairs):
             return
         self._pairs.extend((int(sync[j, 0]), int(trigger[i, 0])) for i, j in pairs)
+
+        # Pulses before the last pair will not meet any more.
         last_trigger, last_sync = pairs.max(axis=0).tolist()
-        for pulses, last in (
-            (self._trigger, trigger[last_trigger, 0]),
-            (self._sync, sync[last_sync, 0]),
-        ):
-            while pulses and pulses[0][0] <= last:
-                pulses.popleft()
-        own, other = np.array(self._pairs).T
-        if len(own) >= FEWEST_PAIRS:
-            found = fit_to_pulses(own, other)
-            if self._regular:  # the shift may be wrong by whole intervals
-                found = replace(
-                    found, offset_std_us=max(found.offset_std_us, float(np.diff(own).min()))
-                )
-            self.relation += self._map is None
-            self._map = found
+        _drop_until(self._trigger, trigger[last_trigger, 0])
+        _drop_until(self._sync, sync[last_sync, 0])
+        sync_us, trigger_us = np.array(self._pairs).T
+        if len(sync_us) < FEWEST_PAIRS:
+            return
+        fitted = fit_to_pulses(sync_us, trigger_us)
+        if self._regular:  # the shift may be wrong by whole intervals
+            interval_us = float(np.diff(sync_us).min())
+            fitted = replace(fitted, offset_std_us=max(fitted.offset_std_us, interval_us))
+        if self._map is None:
+            self.relation += 1
+        self._map = fitted
 
     def _first_pairs(
         self, trigger: NDArray[np.int64], sync: NDArray[np.int64]
@@ -236,19 +245,24 @@ class CameraClock:
         self._regular = are_multiples(sync[:, 0])
         if self._regular:
             return _pairs_by_arrival(trigger, sync) if len(sync) >= FEWEST_REGULAR else NO_PAIRS
-        found = find_shift(trigger[:, 0], sync[:, 0])
-        return NO_PAIRS if found is None else found.pairs
+        shift = find_shift(trigger[:, 0], sync[:, 0])
+        return NO_PAIRS if shift is None else shift.pairs
 
-    def _next_pairs(self, trigger: NDArray[np.int64], sync: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _next_pairs(
+        self, triggers: NDArray[np.int64], syncs: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
         """Return the pulses that match by the map. Without most of the latest ones, the map is discarded."""
         assert self._map is not None
+        trigger = triggers[:, 0]
+        sync = syncs[:, 0]
         expected = self._map(sync)
         reach = self._reach_us(sync)
         pairs = _nearest_pairs(np.abs(trigger[:, None] - expected[None, :]), reach)
         met = np.zeros(len(sync), np.bool_)
         met[pairs[:, 1]] = True
         # A pulse between two triggers that wait was either seen, or will never be.
-        judged = met | (expected - reach >= trigger.min()) & (expected + reach <= trigger.max())
+        is_between = (expected - reach >= trigger.min()) & (expected + reach <= trigger.max())
+        judged = met | is_between
         self._met.extend(met[judged].tolist())
         missed = set(sync[judged & ~met].tolist())
         self._sync = deque((pulse for pulse in self._sync if pulse[0] not in missed), MOST_UNPAIRED)
@@ -286,35 +300,32 @@ def find_shift(trigger_us: NDArray[np.int64], sync_us: NDArray[np.int64]) -> Fou
     """
     if min(len(trigger_us), len(sync_us)) < FEWEST_FOUND:
         return None
-    shift = (trigger_us[:, None] - sync_us[None, :]).ravel()
-    order = np.sort(shift)
-    first = np.searchsorted(order, order - MATCH_US, side="left")
-    last = np.searchsorted(order, order + MATCH_US, side="right")
-    meeting = last - first
-    best: FoundShift | None = None
-    others: list[FoundShift] = []
-    # The most crowded shifts, each with its own neighbourhood.
-    for k in np.argsort(-meeting, kind="stable"):
-        if meeting[k] < FEWEST_PAIRS:
-            break
-        middle = float(np.median(order[first[k] : last[k]]))
-        if any(
-            abs(middle - known.shift_us) <= 4.0 * MATCH_US
-            for known in (*others, *([best] if best else []))
-        ):
-            continue
-        found = _meeting_at(middle, trigger_us, sync_us)
-        if best is None or found.by_chance < best.by_chance:
-            best, found = found, best
-        if found is not None:
-            others.append(found)
-        if len(others) >= 3:
-            break
-    if best is None or best.by_chance > BY_CHANCE or len(best.pairs) < FEWEST_FOUND:
+    candidates = _crowded_shifts(trigger_us, sync_us)
+    if not candidates:
+        return None
+    best = min(candidates, key=lambda shift: shift.by_chance)
+    others = [shift for shift in candidates if shift is not best]
+    if best.by_chance > BY_CHANCE or len(best.pairs) < FEWEST_FOUND:
         return None
     if any(other.by_chance < DOUBTFUL for other in others):
         return None
     return best
+
+
+def _crowded_shifts(trigger_us: NDArray[np.int64], sync_us: NDArray[np.int64]) -> list[FoundShift]:
+    """Return the shifts under which most pulses meet, the most crowded first, each with its own neighbourhood."""
+    order = np.sort((trigger_us[:, None] - sync_us[None, :]).ravel())
+    first = np.searchsorted(order, order - MATCH_US, side="left")
+    last = np.searchsorted(order, order + MATCH_US, side="right")
+    meeting = last - first
+    shifts: list[FoundShift] = []
+    for k in np.argsort(-meeting, kind="stable"):
+        if meeting[k] < FEWEST_PAIRS or len(shifts) > MOST_OTHERS:
+            break
+        middle_us = float(np.median(order[first[k] : last[k]]))
+        if all(abs(middle_us - known.shift_us) > 4.0 * MATCH_US for known in shifts):
+            shifts.append(_meeting_at(middle_us, trigger_us, sync_us))
+    return shifts
 
 
 def _meeting_at(
@@ -325,10 +336,8 @@ def _meeting_at(
     pairs = _nearest_pairs(distance, np.full(len(sync_us), MATCH_US))
     if not len(pairs):
         return FoundShift(shift_us, pairs, math.inf)
-    (first_trigger, first_sync), (last_trigger, last_sync) = (
-        pairs.min(axis=0).tolist(),
-        pairs.max(axis=0).tolist(),
-    )
+    first_trigger, first_sync = pairs.min(axis=0).tolist()
+    last_trigger, last_sync = pairs.max(axis=0).tolist()
     span_us = max(int(trigger_us[last_trigger] - trigger_us[first_trigger]), 1)
     # A pulse at a random time meets one of the triggers with this chance. Controllers count whole milliseconds, so
     # that pulses meet at random more often than their spread tells.
@@ -338,6 +347,12 @@ def _meeting_at(
     met = len(pairs) - 1
     expected = len(trigger_us) * len(sync_us) * _binomial_tail(tried, met, chance)
     return FoundShift(shift_us, pairs, expected)
+
+
+def _drop_until(pulses: deque[tuple[int, int]], last_us: int) -> None:
+    """Remove the pulses up to a time on their own clock [us]."""
+    while pulses and pulses[0][0] <= last_us:
+        pulses.popleft()
 
 
 def _binomial_tail(tried: int, met: int, chance: float) -> float:
@@ -380,11 +395,15 @@ def _pairs_by_arrival(trigger: NDArray[np.int64], sync: NDArray[np.int64]) -> ND
     if min(len(trigger), len(sync)) < FEWEST_PAIRS:
         return NO_PAIRS
     reach = min(np.diff(trigger[:, 0]).min(), np.diff(sync[:, 0]).min()) / 2.0
-    delays = trigger[:, 1] - trigger[:, 0], sync[:, 1] - sync[:, 0]
-    if any(np.count_nonzero(some <= some.min() + reach) < FEWEST_PAIRS for some in delays):
-        return NO_PAIRS
+    trigger_delays = trigger[:, 1] - trigger[:, 0]
+    sync_delays = sync[:, 1] - sync[:, 0]
+    for delays in (trigger_delays, sync_delays):
+        if np.count_nonzero(delays <= delays.min() + reach) < FEWEST_PAIRS:
+            return NO_PAIRS
     shift = trigger[:, None, 0] - sync[None, :, 0]
-    disagreement = np.abs(shift - (delays[1].min() - delays[0].min()))
+    disagreement = np.abs(shift - (sync_delays.min() - trigger_delays.min()))
     i, j = np.unravel_index(disagreement.argmin(), shift.shape)
     pairs = _nearest_pairs(np.abs(shift - shift[i, j]), np.full(len(sync), MATCH_US))
-    return pairs if disagreement[i, j] <= reach and len(pairs) >= FEWEST_PAIRS else NO_PAIRS
+    if disagreement[i, j] > reach or len(pairs) < FEWEST_PAIRS:
+        return NO_PAIRS
+    return pairs

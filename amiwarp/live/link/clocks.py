@@ -84,7 +84,8 @@ def fit_to_pulses(own_us: ArrayLike, other_us: ArrayLike, sigma_us: float = 1.0)
     deviation of a time stamp. The fit is a least-squares line without pairs beyond :data:`OUTLIER_STD`. Raises
     :class:`AmiwarpError` for fewer than three pairs, or different lengths.
     """
-    own, other = (np.asarray(t, np.int64) for t in (own_us, other_us))
+    own = np.asarray(own_us, np.int64)
+    other = np.asarray(other_us, np.int64)
     if own.shape != other.shape or own.ndim != 1 or len(own) < FEWEST_PAIRS:
         expected = f"give the times of the same pulses on both clocks, at least {FEWEST_PAIRS}"
         raise AmiwarpError(f"clock map: {own.size} and {other.size} pulses; {expected}")
@@ -98,20 +99,21 @@ def fit_to_round_trips(sent_us: ArrayLike, other_us: ArrayLike, received_us: Arr
     clock [us]; shape ``(n,)`` each. An answer is placed at the middle of its round trip; its error is uniform over the
     round trip. Raises :class:`AmiwarpError` for fewer than three round trips, or an answer before its request.
     """
-    sent, other, received = (np.asarray(t, np.int64) for t in (sent_us, other_us, received_us))
+    sent = np.asarray(sent_us, np.int64)
+    other = np.asarray(other_us, np.int64)
+    received = np.asarray(received_us, np.int64)
     duration = (received - sent).astype(np.float64)
     if len(duration) < FEWEST_PAIRS or (duration < 0).any():
         shortest = duration.min(initial=0.0)
         raise AmiwarpError(
             f"{len(duration)} round trips, the shortest {shortest:g} us; give {FEWEST_PAIRS} or more, none negative"
         )
-    short = duration <= max(
-        SHORT_TRIP * duration.min(), np.partition(duration, FEWEST_PAIRS - 1)[FEWEST_PAIRS - 1]
-    )
+    # The short round trips, or the three shortest.
+    third_shortest = np.partition(duration, FEWEST_PAIRS - 1)[FEWEST_PAIRS - 1]
+    short = duration <= max(SHORT_TRIP * duration.min(), third_shortest)
     middle = sent + (received - sent) // 2
-    return _fit_line(
-        middle[short], other[short], np.maximum(duration[short], 1.0) / math.sqrt(12.0)
-    )
+    sigma = np.maximum(duration[short], 1.0) / math.sqrt(12.0)  # of a uniform error
+    return _fit_line(middle[short], other[short], sigma)
 
 
 def _fit_line(
@@ -121,23 +123,24 @@ def _fit_line(
     difference = (other - own).astype(np.float64)
     kept = np.ones(len(own), np.bool_)
     for rounds in range(MOST_ROUNDS):
-        at = int(np.rint(np.average(own[kept] - own[0], weights=sigma[kept] ** -2.0))) + int(own[0])
+        # A weighted least-squares line about the mean time; about a median, so that float64 keeps microseconds.
+        weight = sigma[kept] ** -2.0
+        at = int(np.rint(np.average(own[kept] - own[0], weights=weight))) + int(own[0])
         x = (own - at).astype(np.float64)
         base = float(np.median(difference[kept]))
-        weight = sigma[kept] ** -2.0
-        slope_weight = float(np.sum(weight * x[kept] ** 2))
         offset = float(np.average(difference[kept] - base, weights=weight))
-        drift = float(
-            np.sum(weight * x[kept] * (difference[kept] - base - offset))
-            / max(slope_weight, 1e-300)
-        )
+        rest = difference[kept] - base - offset
+        slope_weight = float(np.sum(weight * x[kept] ** 2))
+        drift = float(np.sum(weight * x[kept] * rest) / max(slope_weight, 1e-300))
+
+        # Pairs far from the line, by a standard deviation that outliers hardly change, are left out.
         residual = (difference - base - offset - drift * x) / sigma
         spread = max(1.0, 1.4826 * float(np.median(np.abs(residual[kept]))))
-        again = np.abs(residual) <= OUTLIER_STD * spread
-        last = rounds == MOST_ROUNDS - 1
-        if last or again.sum() < FEWEST_PAIRS or np.array_equal(again, kept):
+        near = np.abs(residual) <= OUTLIER_STD * spread
+        is_last = rounds == MOST_ROUNDS - 1
+        if is_last or near.sum() < FEWEST_PAIRS or np.array_equal(near, kept):
             break  # the line is of the pairs that are kept
-        kept = again
+        kept = near
     scale = max(1.0, math.sqrt(float(np.mean(residual[kept] ** 2))))
     std = scale / math.sqrt(float(np.sum(weight)))
     drift_std = scale / math.sqrt(max(slope_weight, 1e-300))

@@ -151,7 +151,8 @@ class Follower:
         """Convert a sample. An implausible text line is accepted only once the next line continues it."""
         if text and self._per_turn is None:
             self._decide_counts(self._given_per_turn)
-        suspect, self._epoch.suspect = self._epoch.suspect, None
+        suspect = self._epoch.suspect
+        self._epoch.suspect = None
         if text and self._discontinuity(raw_t, raw_count, host_us):
             if suspect is None or not self._continues(suspect, raw_t, raw_count):
                 self._epoch.suspect = raw_t, raw_count
@@ -163,12 +164,8 @@ class Follower:
         if text and epoch.unreferenced is not None and self._per_turn is not None:
             self.say(f"{self.name}: lines of text have no index pulse: {FROM_FIRST}")
             self._release()
-        if (
-            not text
-            and self._per_turn is None
-            and epoch.unscaled
-            and t - epoch.unscaled[0][0] > STATUS_US
-        ):
+        waits_for_counts = not text and self._per_turn is None and bool(epoch.unscaled)
+        if waits_for_counts and t - epoch.unscaled[0][0] > STATUS_US:
             self._decide_counts(self._given_per_turn)
         self._convert(t, count, pulse=False)
 

@@ -177,12 +177,13 @@ class Link(BackgroundLoop):
         ``protocol.SETTINGS`` has the names and units. Raises :class:`AmiwarpError` for another name, for a value
         out of its range, or if the controller refuses.
         """
-        found = {setting.name: (key, setting) for key, setting in enumerate(protocol.SETTINGS)}
-        if name not in found:
+        keys = {setting.name: key for key, setting in enumerate(protocol.SETTINGS)}
+        if name not in keys:
             raise AmiwarpError(
-                f"setting {name!r}: there is none of this name; give one of {', '.join(found)}"
+                f"setting {name!r}: there is none of this name; give one of {', '.join(keys)}"
             )
-        key, setting = found[name]
+        key = keys[name]
+        setting = protocol.SETTINGS[key]
         if not setting.contains(value):
             off = "0 (off), or " if setting.off else ""
             unit = f" {setting.unit}" if setting.unit else ""
@@ -315,7 +316,8 @@ class Link(BackgroundLoop):
 
     def _close_port(self) -> None:
         with self._writing:
-            port, self._port = self._port, None
+            port = self._port
+            self._port = None
         with contextlib.suppress(OSError):
             port.close()
 

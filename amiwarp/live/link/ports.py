@@ -32,7 +32,7 @@ def open_port(where: str | None) -> Any:
     if match is None:
         return _open(where)
     wanted = int(match[1], 16), int(match[2], 16)
-    names = [p.device for p in _ports() if (p.vid, p.pid) == wanted]
+    names = [port.device for port in _ports() if (port.vid, port.pid) == wanted]
     if len(names) != 1:
         remedy = ", give a port by name" if names else ""
         raise AmiwarpError(
@@ -45,25 +45,33 @@ def open_port(where: str | None) -> Any:
 def usb_id(name: str) -> str | None:
     """Return ``VID:PID`` of a port, or None if it has none or shares it with another port."""
     ports = _ports()
-    ids = [(p.vid, p.pid) for p in ports if p.device == name and p.vid is not None]
-    if len(ids) != 1 or sum((p.vid, p.pid) == ids[0] for p in ports) != 1:
+    ids = [(port.vid, port.pid) for port in ports if port.device == name and port.vid is not None]
+    if len(ids) != 1:
         return None
-    return f"{ids[0][0]:04x}:{ids[0][1]:04x}"
+    own_id = ids[0]
+    if sum((port.vid, port.pid) == own_id for port in ports) != 1:
+        return None
+    vendor, product = own_id
+    return f"{vendor:04x}:{product:04x}"
 
 
 def _ports() -> list[Any]:
+    """Return the serial ports of this machine, sorted by name; ``vid`` and ``pid`` are None without a USB id."""
     from serial.tools import list_ports
 
-    return sorted(list_ports.comports(), key=lambda p: p.device)
+    return sorted(list_ports.comports(), key=lambda port: port.device)
 
 
 def _available() -> str:
     """Return which ports there are, for messages."""
     listed = []
-    for p in _ports():
-        known = [] if p.vid is None else [f"{p.vid:04x}:{p.pid:04x}"]
-        known += [p.product] if p.product else []
-        listed.append(f"{p.device} ({' '.join(known)})" if known else p.device)
+    for port in _ports():
+        known = []
+        if port.vid is not None:
+            known.append(f"{port.vid:04x}:{port.pid:04x}")
+        if port.product:
+            known.append(port.product)
+        listed.append(f"{port.device} ({' '.join(known)})" if known else port.device)
     if not listed:
         return "there is no serial port; is the controller plugged in?"
     return f"there are {', '.join(listed)}"

@@ -476,13 +476,10 @@ def _checked(held: bytes) -> bytes | None:
         return None
     body = packet[: -_CRC.size]
     check = packet[-_CRC.size :]
-    if (
-        len(body) < _HEADER.size
-        or len(check) < _CRC.size
-        or zlib.crc32(body) != _CRC.unpack(check)[0]
-    ):
+    if len(body) < _HEADER.size or len(check) < _CRC.size:
         return None
-    return body
+    (checksum,) = _CRC.unpack(check)
+    return body if zlib.crc32(body) == checksum else None
 
 
 def _message(kind: int, payload: bytes) -> Message | None:
@@ -492,7 +489,7 @@ def _message(kind: int, payload: bytes) -> Message | None:
             return None
         pairs = list(_SAMPLE.iter_unpack(payload))
         return Samples(tuple(t for t, _ in pairs), tuple(c for _, c in pairs))
-    found = _PLAIN.get(kind)
-    if found is None or len(payload) != found.LAYOUT.size:
+    message = _PLAIN.get(kind)
+    if message is None or len(payload) != message.LAYOUT.size:
         return None
-    return found(*found.LAYOUT.unpack(payload))
+    return message(*message.LAYOUT.unpack(payload))

@@ -96,60 +96,74 @@ class PropheseeSource(CameraSource):
 
     def _apply(self, model: str) -> None:
         """Check the settings and give them to the camera."""
-        facilities = self._facilities
-        hal = self._hal
+        can = [name for name, facility in self._facilities.items() if facility is not None]
+        refuse_others(self.name, model, self.settings, can, {})
+        masks = self._facilities["masked"].get_pixel_masks() if "masked" in can else ()
+        self._check(model, can, len(masks))
+        self._set_biases(model)
+        self._set_region()
+        for mask, (x, y) in zip(masks, self.settings.masked, strict=False):
+            self._accepted("masked", mask.set_mask(x, y, True))
+        self._set_limits()
+        if "trigger" in can:
+            trigger = self._facilities["trigger"]
+            switch = trigger.disable if self.settings.trigger is False else trigger.enable
+            self._accepted("trigger", switch(self._hal.I_TriggerIn.Channel.MAIN))
+
+    def _check(self, model: str, can: list[str], most_masked: int) -> None:
+        """Raise :class:`AmiwarpError` for settings out of the camera's ranges, before any is set.
+
+        ``can``: names of the settings that the camera has; ``most_masked``: number of pixels that it can mask.
+        """
         settings = self.settings
-        can = [name for name, facility in facilities.items() if facility is not None]
-        refuse_others(self.name, model, settings, can, {})
-        masks = facilities["masked"].get_pixel_masks() if "masked" in can else ()
-        check_on_sensor(self.name, settings, self.size, len(masks))
+        check_on_sensor(self.name, settings, self.size, most_masked)
         if settings.most_per_s:
-            limiter = facilities["most_per_s"]
+            limiter = self._facilities["most_per_s"]
             lowest = limiter.get_min_supported_cd_event_rate()
             highest = limiter.get_max_supported_cd_event_rate()
             check_rate(self.name, settings.most_per_s, lowest, highest)
         if settings.flicker_hz is not None:
-            filter_ = facilities["flicker_hz"]
-            lowest = filter_.get_min_supported_frequency()
-            highest = filter_.get_max_supported_frequency()
+            flicker_filter = self._facilities["flicker_hz"]
+            lowest = flicker_filter.get_min_supported_frequency()
+            highest = flicker_filter.get_max_supported_frequency()
             check_band(self.name, settings.flicker_hz, lowest, highest)
         if settings.counts_per_turn and "trigger" not in can:
             raise AmiwarpError(
                 f"{self.name}: {model} has no trigger input; leave counts_per_turn out"
             )
-        self._set_biases(model)
-        if settings.region is not None:
-            left, top, right, bottom = settings.region
-            window = hal.I_ROI.Window(left, top, right - left, bottom - top)
-            self._accepted("region", facilities["region"].set_mode(hal.I_ROI.Mode.ROI))
-            self._accepted("region", facilities["region"].set_window(window))
-            self._accepted("region", facilities["region"].enable(True))
-        for mask, (x, y) in zip(masks, settings.masked, strict=False):
-            self._accepted("masked", mask.set_mask(x, y, True))
+
+    def _set_region(self) -> None:
+        """Let only a part of the sensor send events, if the settings say so."""
+        if self.settings.region is None:
+            return
+        left, top, right, bottom = self.settings.region
+        roi = self._hal.I_ROI
+        window = roi.Window(left, top, right - left, bottom - top)
+        region = self._facilities["region"]
+        self._accepted("region", region.set_mode(roi.Mode.ROI))
+        self._accepted("region", region.set_window(window))
+        self._accepted("region", region.enable(True))
+
+    def _set_limits(self) -> None:
+        """Limit the event rate and remove flicker, if the settings say so."""
+        settings = self.settings
         if settings.most_per_s:
+            limiter = self._facilities["most_per_s"]
             self._accepted("most_mev_s", limiter.set_cd_event_rate(settings.most_per_s))
             self._accepted("most_mev_s", limiter.enable(True))
         if settings.flicker_hz is not None:
-            band_stop = hal.I_AntiFlickerModule.AntiFlickerMode.BandStop
-            self._accepted("flicker_hz", filter_.set_frequency_band(*settings.flicker_hz))
-            self._accepted("flicker_hz", filter_.set_filtering_mode(band_stop))
-            self._accepted("flicker_hz", filter_.enable(True))
-        if "trigger" in can:
-            switch = (
-                facilities["trigger"].disable
-                if settings.trigger is False
-                else facilities["trigger"].enable
-            )
-            self._accepted("trigger", switch(hal.I_TriggerIn.Channel.MAIN))
+            flicker_filter = self._facilities["flicker_hz"]
+            band_stop = self._hal.I_AntiFlickerModule.AntiFlickerMode.BandStop
+            self._accepted("flicker_hz", flicker_filter.set_frequency_band(*settings.flicker_hz))
+            self._accepted("flicker_hz", flicker_filter.set_filtering_mode(band_stop))
+            self._accepted("flicker_hz", flicker_filter.enable(True))
 
     def _set_biases(self, model: str) -> None:
         """Check the biases and set them. Their names may lack the library's prefix ``bias_``."""
         facility = self._facilities["biases"]
-        known = (
-            {}
-            if facility is None
-            else {str(name): int(value) for name, value in facility.get_all_biases().items()}
-        )
+        known: dict[str, int] = {}
+        if facility is not None:
+            known = {str(name): int(value) for name, value in facility.get_all_biases().items()}
         given = {
             name if name in known else f"bias_{name.removeprefix('bias_')}": value
             for name, value in self.settings.biases.items()
@@ -167,6 +181,7 @@ class PropheseeSource(CameraSource):
             self._accepted(name, facility.set(name, value))
 
     def _accepted(self, setting: str, accepted: bool) -> None:
+        """Raise :class:`AmiwarpError` if the library says that the camera did not take a setting."""
         if not accepted:
             raise AmiwarpError(
                 f"{self.name}: the camera did not accept the setting {setting}; leave it out"
@@ -175,38 +190,45 @@ class PropheseeSource(CameraSource):
     def _reported(self) -> CameraSettings:
         """Return the settings that the camera has. The library does not report the region."""
         facilities = self._facilities
+        biases: dict[str, int] = {}
+        bias_facility = facilities["biases"]
+        if bias_facility is not None:
+            for name, value in bias_facility.get_all_biases().items():
+                if bias_facility.get_bias_info(name).is_modifiable():
+                    biases[str(name)] = int(value)
+
         masked: tuple[tuple[int, int], ...] = ()
         if facilities["masked"] is not None:
             states = [mask.get_mask() for mask in facilities["masked"].get_pixel_masks()]
             masked = tuple((int(x), int(y)) for x, y, enabled in states if enabled)
-        biases = facilities["biases"]
+
+        most_per_s = 0
         limiter = facilities["most_per_s"]
-        filter_ = facilities["flicker_hz"]
-        limited = limiter is not None and limiter.is_enabled()
-        filtering = filter_ is not None and filter_.is_enabled()
-        band = (
-            (int(filter_.get_band_low_frequency()), int(filter_.get_band_high_frequency()))
-            if filtering
-            else None
-        )
+        if limiter is not None and limiter.is_enabled():
+            most_per_s = int(limiter.get_cd_event_rate())
+
+        flicker_hz = None
+        flicker_filter = facilities["flicker_hz"]
+        if flicker_filter is not None and flicker_filter.is_enabled():
+            low = int(flicker_filter.get_band_low_frequency())
+            high = int(flicker_filter.get_band_high_frequency())
+            flicker_hz = (low, high)
+
+        has_trigger = None
         trigger = facilities["trigger"]
-        channel = self._hal.I_TriggerIn.Channel.MAIN
+        if trigger is not None:
+            has_trigger = bool(trigger.is_enabled(self._hal.I_TriggerIn.Channel.MAIN))
         return replace(
             self.settings,
-            biases={}
-            if biases is None
-            else {
-                str(name): int(value)
-                for name, value in biases.get_all_biases().items()
-                if biases.get_bias_info(name).is_modifiable()
-            },
+            biases=biases,
             masked=masked,
-            most_per_s=int(limiter.get_cd_event_rate()) if limited else 0,
-            flicker_hz=band,
-            trigger=None if trigger is None else bool(trigger.is_enabled(channel)),
+            most_per_s=most_per_s,
+            flicker_hz=flicker_hz,
+            trigger=has_trigger,
         )
 
     def _rising(self) -> NDArray[np.int64]:
+        """Return the times of the rising edges since the last call, on the camera's clock [us], shape ``(n,)``."""
         reader = self._iterator.reader
         edges = reader.get_ext_trigger_events()
         rising = np.array(edges["t"][edges["p"] == 1], np.int64) if len(edges) else NO_TIMES

@@ -175,13 +175,13 @@ def parse_camera(spec: str) -> CameraRequest:
 
 def _parse_settings(parts: Sequence[str]) -> CameraSettings:
     """Return the settings of these texts NAME=VALUE. A later one replaces an earlier one."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     biases: dict[str, int] = {}
     for part in parts:
         name, _, value = part.partition("=")
         if name == "settings":
             saved = saved_settings(value)
-            found |= {each.name: getattr(saved, each.name) for each in fields(saved)}
+            values |= {each.name: getattr(saved, each.name) for each in fields(saved)}
             biases |= saved.biases
             continue
         field_name, read, form = FORMS.get(
@@ -192,10 +192,10 @@ def _parse_settings(parts: Sequence[str]) -> CameraSettings:
         except (ValueError, OverflowError) as error:
             raise AmiwarpError(f"setting {part!r}; write {form}") from error
         if field_name:
-            found[field_name] = content
+            values[field_name] = content
         else:
             biases[name] = content
-    return CameraSettings(**(found | {"biases": biases}))
+    return CameraSettings(**(values | {"biases": biases}))
 
 
 def saved_settings(path: str) -> CameraSettings:
@@ -213,7 +213,8 @@ def _number(text: str) -> int:
 
 
 def _counts(text: str) -> int:
-    if not (counts := _number(text)):
+    counts = _number(text)
+    if not counts:
         raise ValueError(text)
     return counts
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import import_module
-from math import tau as TWO_PI
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,7 @@ class CameraSource:
         self.lost = 0
         """Number of USB packets that were lost, because the computer was too slow."""
         self._count = 0
+        """Number of rising edges at the trigger input so far, if they are counts of an encoder."""
 
     def packets(self) -> Iterator[Packet]:
         """Yield packets, see :meth:`Source.packets`. Ends when the camera stops; :attr:`problem` then says why."""
@@ -81,7 +82,8 @@ class CameraSource:
         self.serial = serial
         self.name = self.request.name(serial)
         self.metadata = {"camera_name": model, SAVED: str(applied), f"{SAVED}_from": reported}
-        if changed := difference(self.settings, applied):
+        changed = difference(self.settings, applied)
+        if changed:
             self._say(f"{self.name}: the camera has {changed}")
 
     def _make_packet(self, events: Events | None, rising: NDArray[np.int64]) -> Packet:
@@ -92,9 +94,8 @@ class CameraSource:
             rising = rising[:0]
         if not counts:
             return make_packet(now, events, rising)
-        angle = np.arange(self._count, self._count + rising.size, dtype=np.float64) * (
-            TWO_PI / counts
-        )
+        numbers = np.arange(self._count, self._count + rising.size, dtype=np.float64)
+        angle = numbers * (math.tau / counts)
         self._count += rising.size
         return make_packet(now, events, rising, rising, angle)
 

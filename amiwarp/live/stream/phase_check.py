@@ -16,12 +16,11 @@ from amiwarp.results.calibration import Calibration
 SEARCH_RAD = math.radians(20.0)
 """Half width of the search about the calibrated phase [rad]. A phase outside is found at the edge of this range, and
 reported."""
-CHANGE_RAD, OFFSET_RAD = math.radians(1.5), math.radians(5.0)
-"""Smallest reported change of the phase since the first estimate, and smallest reported offset from the calibrated
-phase [rad].
-
-The bias of the estimate, beyond that in the calibration, is up to 3 deg.
-"""
+CHANGE_RAD = math.radians(1.5)
+"""Smallest reported change of the phase since the first estimate [rad]."""
+OFFSET_RAD = math.radians(5.0)
+"""Smallest reported offset from the calibrated phase [rad]. The estimate has a bias of up to 3 deg,
+beyond the bias of the calibration."""
 FEWEST_EVENTS = 20_000
 """Smallest number of events for an estimate of the phase. The events must also cover half a turn."""
 MOST_CHECK_BYTES = 1 << 24
@@ -59,10 +58,8 @@ class PhaseCheck:
 
         ``every_s``: interval between estimates [s]; ``say`` is called with a message if the phase changed.
         """
-        # Takes long to load, and ``record`` does not need it
-        from amiwarp.calib.calibration import (
-            calibrate,
-        )
+        # Here, because it takes long to load, and ``record`` does not need it.
+        from amiwarp.calib.calibration import calibrate
 
         self._calibration = calibration
         self._every_s = every_s
@@ -73,9 +70,8 @@ class PhaseCheck:
         self._recent: deque[Events] = deque()
         self.held_bytes = 0
         """Memory of the latest events that are kept for an estimate [bytes]."""
-        self._thread: threading.Thread | None = (
-            None  # a daemon: the process may end while an estimate runs
-        )
+        # A daemon: the process may end while an estimate runs.
+        self._thread: threading.Thread | None = None
         self._names = PHASES[: calibration.model.ANGLES]
         photometric = calibration.photometric
         sharp = {} if photometric is None else photometric.sharpness_parameters
@@ -90,7 +86,8 @@ class PhaseCheck:
 
         Of two phases, return the larger offset.
         """
-        if estimates := self.result():
+        estimates = self.result()
+        if estimates:
             self._first_estimate = self._first_estimate or estimates
             self._offset = max((estimate.offset for estimate in estimates), key=abs)
             for estimate, first in zip(estimates, self._first_estimate, strict=True):
@@ -104,7 +101,8 @@ class PhaseCheck:
 
         ``sure``: whether the clocks of controller and camera are known. A wrong one turns the phase, too.
         """
-        changed, phase = estimate.offset - first.offset, estimate.name.replace("_", " ")
+        changed = estimate.offset - first.offset
+        phase = estimate.name.replace("_", " ")
         wrong_clock = ""
         if not sure:
             wrong_clock = (
@@ -139,19 +137,25 @@ class PhaseCheck:
 
         Returns False if an estimate is running or the data do not suffice.
         """
-        last = encoder.last
-        if self._closed or self._thread is not None or last is None or not self._recent:
+        last_us = encoder.last
+        if self._closed or self._thread is not None or last_us is None or not self._recent:
             return False
         events = Events.concatenate(list(self._recent))
-        events = events[: int(events.t.searchsorted(last, side="right"))]
+        events = events[: int(events.t.searchsorted(last_us, side="right"))]
         if len(events) < FEWEST_EVENTS:
             return False
+
+        # The events of the last turn, and of a little more.
         samples = encoder.over(int(events.t[0]), int(events.t[-1]))
-        speed = abs(samples.rpm) * math.tau / 60e6
-        begin = int(events.t[-1]) - round(1.2 * math.tau / speed) if speed else int(events.t[0])
-        events = events[int(events.t.searchsorted(begin)) :]
-        swept = speed * float(events.t[-1] - events.t[0]) if len(events) else 0.0
-        if len(events) < FEWEST_EVENTS or swept < math.tau / 2.0 or encoder.guessed(events.t).any():
+        rad_per_us = abs(samples.rpm) * math.tau / 60e6
+        begin_us = int(events.t[0])
+        if rad_per_us:
+            begin_us = int(events.t[-1]) - round(1.2 * math.tau / rad_per_us)
+        events = events[int(events.t.searchsorted(begin_us)) :]
+        if len(events) < FEWEST_EVENTS:
+            return False
+        swept = rad_per_us * float(events.t[-1] - events.t[0])
+        if swept < math.tau / 2.0 or encoder.guessed(events.t).any():
             return False
         self._thread = threading.Thread(
             target=self._estimate, args=(events, samples), name="amiwarp-phase-check", daemon=True
@@ -178,8 +182,10 @@ class PhaseCheck:
     def _estimate(self, events: Events, encoder: Encoder) -> None:
         """Estimate the phases by a calibration in which all other parameters are fixed."""
         known = self._calibration
-        names = self._names
-        bounds = {n: (self._usual[n] - SEARCH_RAD, self._usual[n] + SEARCH_RAD) for n in names}
+        bounds = {}
+        for name in self._names:
+            usual = self._usual[name]
+            bounds[name] = (usual - SEARCH_RAD, usual + SEARCH_RAD)
         recording = Recording(
             MemoryEvents(events, known.camera.width, known.camera.height),
             known.camera,
@@ -187,16 +193,14 @@ class PhaseCheck:
             known.prism,
             name="the stream",
         )
-        start = {
-            n: x
-            for n, x in {**known.parameters, **self._usual}.items()
-            if n not in ("clock_offset", "rpm")
-        }
+        start = {**known.parameters, **self._usual}
+        for name in ("clock_offset", "rpm"):  # the encoder has them
+            start.pop(name, None)
         try:
-            found = self._calibrate(
+            calibration = self._calibrate(
                 recording,
                 model=known.model_name,
-                free=names,
+                free=self._names,
                 start=start,
                 stages=("sharpness",),
                 events=100_000,
@@ -207,7 +211,8 @@ class PhaseCheck:
             )
         except AmiwarpError:
             return  # for example without texture: a later estimate may succeed
-        self._estimated = [
-            PhaseEstimate(n, found.parameters[n] - self._usual[n], found.uncertainty[n])
-            for n in names
-        ]
+        estimated = []
+        for name in self._names:
+            offset = calibration.parameters[name] - self._usual[name]
+            estimated.append(PhaseEstimate(name, offset, calibration.uncertainty[name]))
+        self._estimated = estimated

@@ -51,16 +51,17 @@ class PictureFilm(BackgroundLoop):
         frames = 0
         while not (self._ended.is_set() and self._waiting.empty()):
             with contextlib.suppress(queue.Empty):
-                found = self._waiting.get(timeout=STEP_S)
-                first_us = found.end_us if first_us is None else first_us
-                wanted = round((found.end_us - first_us) * 1e-6 * self._fps)
-                for _ in range(wanted - frames):
+                live = self._waiting.get(timeout=STEP_S)
+                if first_us is None:
+                    first_us = live.end_us
+                frame = round((live.end_us - first_us) * 1e-6 * self._fps)  # of this picture
+                for _ in range(frame - frames):
                     assert last is not None
                     yield last
-                if wanted >= frames:
-                    yield found.picture
-                frames = max(frames, wanted + 1)
-                last = found.picture
+                if frame >= frames:
+                    yield live.picture
+                frames = max(frames, frame + 1)
+                last = live.picture
         if last is None:
             raise AmiwarpError(
                 f"{self._path}: there is no picture: the stream ended before the prism had made a whole turn"

@@ -46,8 +46,8 @@ class PicturePage:
             raise AmiwarpError(
                 f"{address}: is not an address; give HOST:PORT, for example 127.0.0.1:8000"
             )
-        listening, found = listen(f"tcp:{address}")
-        self.address = f"http://{found.removeprefix('tcp:')}/"
+        listening, actual = listen(f"tcp:{address}")
+        self.address = f"http://{actual.removeprefix('tcp:')}/"
         """Address of the page, with the port that the system chose if 0 was given."""
         self._levels = SteadyLevels()
         self._picture = b""
@@ -72,13 +72,13 @@ class PicturePage:
 
     def __call__(self, picture: LivePicture) -> None:
         """Show a picture."""
-        found = picture.picture
-        between = self._levels.follow(*limits(found))
+        scene = picture.picture
+        between = self._levels.follow(*limits(scene))
         with self._changed:
             if not self._clients:
                 self._picture = b""
                 return
-        grey = np.rint(255.0 * tones(found, Tone.MAPPED, between=between)).astype(np.uint8)
+        grey = np.rint(255.0 * tones(scene, Tone.MAPPED, between=between)).astype(np.uint8)
         data = _jpeg(grey)
         with self._changed:
             self._picture = data
@@ -160,8 +160,8 @@ class _Answer(BaseHTTPRequestHandler):
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
             number = 0
-            while (found := page.next_picture(number)) is not None:
-                number, data = found
+            while (newer := page.next_picture(number)) is not None:
+                number, data = newer
                 head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                 self.wfile.write(head.encode() + data + b"\r\n")
             self.wfile.write(f"--{BOUNDARY}--\r\n".encode())

@@ -29,11 +29,11 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import NominalPrism
 
 SECONDS = 2.0
+"""Duration of the latest events that are kept [s]."""
 MOST_BYTES = 1 << 27
-"""Limits of the latest events that are kept: their duration [s] and their memory [bytes], about eight million events.
-
-Encoder samples have a memory limit of the same size.
-"""
+"""Memory limit of the kept events, about eight million, and of the kept encoder samples [bytes]."""
+NO_TIME_US = -(2**62)
+"""Time before all events [us]."""
 LONGEST_WAIT_S = 10.0
 """Longest time for which events are kept that are newer than all encoder samples [s]."""
 SEEN_US = 20_000
@@ -90,15 +90,19 @@ class RecentEvents:
         a recording runs already, or the file cannot be made.
         """
         with self._lock:
-            since = int(self._events[-1].t[-1]) - SEEN_US if self._events else -(2**62)
-            known = [
-                (bool(k), (t[t >= since], angle[t >= since]))
-                for k in range(2)
-                for t, angle in self._samples[k]
-            ]
-            self.recorder.start(path, [(second, pair) for second, pair in known if len(pair[0])])
+            since_us = NO_TIME_US
+            if self._events:
+                since_us = int(self._events[-1].t[-1]) - SEEN_US
+            known = []
+            for second, samples in zip((False, True), self._samples, strict=True):
+                for t_us, angle in samples:
+                    is_later = t_us >= since_us
+                    if is_later.any():
+                        known.append((second, (t_us[is_later], angle[is_later])))
+            self.recorder.start(path, known)
 
     def _writer(self, path: Path) -> LiveWriter:
+        """Return the writer of a recording of this stream."""
         width, height = self._size
         encoders = 1 if self.link is not None else max(self._encoders, 1)
         return LiveWriter(
@@ -116,21 +120,29 @@ class RecentEvents:
         with self._lock:
             self.recorder.append(events)
             self._arrived_s = time.monotonic()
-            newest = int(events.t[-1])
-            self._delay_us = 1e6 * self._arrived_s - newest
-            self._least_delay_us = (
-                min(self._least_delay_us, self._delay_us) if self._events else self._delay_us
-            )
+            newest_us = int(events.t[-1])
+            self._delay_us = 1e6 * self._arrived_s - newest_us
+            if self._events:
+                self._least_delay_us = min(self._least_delay_us, self._delay_us)
+            else:
+                self._least_delay_us = self._delay_us
             self._events.append(events)
             self.event_bytes += held_bytes(events)
-            # events whose encoder samples have not come yet are kept for longer
-            sampled = [int(samples[-1][0][-1]) for samples in self._samples if samples]
-            awaited = min([newest, *sampled]) - round(1e6 * SECONDS) if sampled else -(2**62)
-            since = max(awaited, newest - round(1e6 * max(SECONDS, LONGEST_WAIT_S)))
+
+            # Events whose encoder samples have not come yet are kept for longer.
+            since_us = newest_us - round(1e6 * max(SECONDS, LONGEST_WAIT_S))
+            sampled_us = self._latest_samples_us()
+            if sampled_us:
+                both_known_us = min([newest_us, *sampled_us])
+                since_us = max(since_us, both_known_us - round(1e6 * SECONDS))
             while len(self._events) > 1 and (
-                self.event_bytes > MOST_BYTES or self._events[0].t[-1] < since
+                self.event_bytes > MOST_BYTES or self._events[0].t[-1] < since_us
             ):
                 self.event_bytes -= held_bytes(self._events.popleft())
+
+    def _latest_samples_us(self) -> list[int]:
+        """Return the time of the latest sample of each encoder that has sent some [us]."""
+        return [int(samples[-1][0][-1]) for samples in self._samples if samples]
 
     def append_encoder(
         self,
@@ -153,14 +165,14 @@ class RecentEvents:
                 samples = self._samples[second]
                 samples.append((t_us, angle))
                 self.sample_bytes += OVERHEAD + t_us.nbytes + angle.nbytes
-                since = int(t_us[-1]) - round(2e6 * SECONDS)
+                since_us = int(t_us[-1]) - round(2e6 * SECONDS)
                 if self._events:  # samples are kept until their events come, however late these are
-                    since = min(since, int(self._events[0].t[0]) - round(1e6 * SECONDS))
+                    since_us = min(since_us, int(self._events[0].t[0]) - round(1e6 * SECONDS))
                 while len(samples) > 1 and (
-                    self.sample_bytes > MOST_BYTES or samples[0][0][-1] < since
+                    self.sample_bytes > MOST_BYTES or samples[0][0][-1] < since_us
                 ):
-                    t_us, angle = samples.popleft()
-                    self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
+                    old_t_us, old_angle = samples.popleft()
+                    self.sample_bytes -= OVERHEAD + old_t_us.nbytes + old_angle.nbytes
 
     def restart(self) -> None:
         """Forget all events and encoder samples: those that follow may be on another clock, and end a recording."""
@@ -171,7 +183,7 @@ class RecentEvents:
                 samples.clear()
             self.event_bytes = self.sample_bytes = 0
             self.ended = ""
-            self.segment = self.segment + 1
+            self.segment += 1
             self._arrived_s = self._sampled_s = time.monotonic()
 
     @property
@@ -188,9 +200,9 @@ class RecentEvents:
         with self._lock:
             if not self._events:
                 return 0.0
-            newest = int(self._events[-1].t[-1])
-            behind = [int(samples[-1][0][-1]) - newest for samples in self._samples if samples]
-            return max(0.0, 1e-6 * max([self._delay_us - self._least_delay_us, *behind]))
+            newest_us = int(self._events[-1].t[-1])
+            behind_us = [sampled_us - newest_us for sampled_us in self._latest_samples_us()]
+            return max(0.0, 1e-6 * max([self._delay_us - self._least_delay_us, *behind_us]))
 
     @property
     def silence(self) -> str:
@@ -215,24 +227,35 @@ class RecentEvents:
         newest part without one in which they cover a turn. :attr:`turn_share` belongs to the newest part with events.
         """
         with self._lock:
-            events, samples = list(self._events), [list(each) for each in self._samples]
-        first, second = (_runs(each, int(events[0].t[0])) if events else [] for each in samples)
-        pair = self._encoders == 2 and self.link is None
+            events = list(self._events)
+            samples = [list(each) for each in self._samples]
+        if not events:
+            self.turn_share = 0.0
+            return None
+        first_us = int(events[0].t[0])
+        first_runs, second_runs = (_runs(each, first_us) for each in samples)
+        needs_second = self._encoders == 2 and self.link is None
+        if needs_second and not second_runs:
+            self.turn_share = 0.0
+            return None
+
         newest_share: float | None = None
-        found = None
-        for encoder in first if second or not pair else []:
-            encoder = replace(encoder, second=second[0] if second else None)
+        recording = None
+        for run in first_runs:
+            encoder = replace(run, second=second_runs[0] if second_runs else None)
             covered = _covered(events, encoder)
             if not len(covered):  # its events have not come yet
                 continue
-            share = min(float(np.ptp(encoder.angle_at(covered.t[[0, -1]]))) / math.tau, 1.0)
-            newest_share = share if newest_share is None else newest_share
+            turned = float(np.ptp(encoder.angle_at(covered.t[[0, -1]])))
+            share = min(turned / math.tau, 1.0)
+            if newest_share is None:
+                newest_share = share
             if share >= 1.0:
                 source = MemoryEvents(covered, *self._size)
-                found = Recording(source, self._camera, encoder, self._prism, name=self._name)
+                recording = Recording(source, self._camera, encoder, self._prism, name=self._name)
                 break
         self.turn_share = newest_share or 0.0
-        return found
+        return recording
 
 
 def _covered(events: list[Events], encoder: Encoder) -> Events:
@@ -255,18 +278,20 @@ def _runs(
     if not samples:
         return []
     t, angle = (np.concatenate(column) for column in zip(*samples, strict=True))
-    starts = [*starts_of_runs(t, angle), len(t)]
-    found = []
-    for start, stop in reversed([*pairwise(starts)]):
-        since = start + max(
-            min(int(np.searchsorted(t[start:stop], t_first)) - 2, stop - start - 2), 0
-        )
-        if stop - since >= 2:
-            found.append(Encoder(t[since:stop], angle[since:stop]))
-    return found
+    edges = [*starts_of_runs(t, angle), len(t)]
+    encoders = []
+    for start, stop in reversed([*pairwise(edges)]):
+        # Two samples before the first time, but at least two samples in all.
+        before_first = int(np.searchsorted(t[start:stop], t_first)) - 2
+        skipped = max(min(before_first, stop - start - 2), 0)
+        first = start + skipped
+        if stop - first >= 2:
+            encoders.append(Encoder(t[first:stop], angle[first:stop]))
+    return encoders
 
 
 def _silence(what: str, seconds: float) -> str:
+    """Return that nothing arrives, if that is so for longer than :data:`SILENT_S`; else an empty text."""
     return f"no {what} for {seconds:.0f} s" if seconds > SILENT_S else ""
 
 
@@ -312,56 +337,77 @@ class LiveSource:
         The speed is the mean of the last turn of the shown events; the latency is their age if they are shown now.
         """
         recent = self._recent
-        problem = self._recent.silence
-        status = self._recent.status
-        last = self._last.events.t_last
-        encoder = self._last.encoder
-        no_angles = "" if problem else recent.encoder_silence
-        turn_us = 2e6 if encoder is None else min(2e6, 60e6 / max(abs(encoder.rpm), 1.0))
-        rpm = None if encoder is None else rpm_between(encoder, round(last - turn_us), last)
-        said = self._messages[-1] if self._messages else ""
-        speed = "unknown" if rpm is None else f"{rpm:.1f} rpm"
-        angles = not (problem or no_angles)
-        rate = 0.0 if problem else status.rate_mev_s
-        lag_s = 0.0 if problem else recent.lag_s
-        fresh = angles and recent.turn_share >= 1.0
-        latency_ms = 1e3 * recent.age_s
-        rows = [
-            ("events", "interrupted, last ones shown" if problem else "receiving", problem),
-            ("prism angles", "receiving" if angles else "interrupted, last turn shown", not angles),
-            ("rate", f"{rate:.2f} million events/s", False),
-            (
-                "latency",
-                "–" if problem else f"{latency_ms:.0f} ms",
-                not problem and latency_ms > 1e3,
-            ),
-            ("lag", "–" if problem else f"{lag_s:.1f} s", lag_s > LATE_S),
-            ("turn covered", f"{100.0 * recent.turn_share:.0f} %", recent.turn_share < 1.0),
-            (
-                "speed of the prism",
-                speed if fresh else f"{speed}, last measured",
-                rpm is None or not fresh,
-            ),
-            ("lost events", f"{status.dropped:,}", status.dropped),
-            ("out of order", f"{status.late:,}", status.late),
-        ]
-        if recent.recorder.text or recent.recorder.problem:
-            words = recent.recorder.text or f"ended: {recent.recorder.problem}"
-            rows.append(("recording", words, not recent.recorder.text))
-        if recent.segment > 1:
-            rows.append(("segment", f"{recent.segment}, since the source came back", False))
-        if said and not problem:
-            rows.append(("last message", said, False))
-        message = "" if said == problem else said
-        note = f"The stream is interrupted: {problem}. {message}".strip() if problem else ""
-        if no_angles:
+        interruption = recent.silence
+        no_angles = "" if interruption else recent.encoder_silence
+        lag_s = 0.0 if interruption else recent.lag_s
+        message = self._messages[-1] if self._messages else ""
+        rows = self._rows(interruption, no_angles, lag_s)
+        if message and not interruption:
+            rows.append(("last message", message, False))
+
+        note = ""
+        if interruption:
+            further = "" if message == interruption else message
+            note = f"The stream is interrupted: {interruption}. {further}".strip()
+        elif no_angles:
             note = f"No prism angles arrive: {no_angles}. The last turn before it is shown, until they return."
-        if lag_s > LATE_S and not note:
+        elif lag_s > LATE_S:
             note = (
                 f"The events are {lag_s:.1f} s late: this computer, or the one that sends them, is slower than the "
                 "stream. The newest whole turn that has come is shown."
             )
-        return [[name, text, "bad" if bad else ""] for name, text, bad in rows], note
+        return [[name, text, "bad" if is_bad else ""] for name, text, is_bad in rows], note
+
+    def _rows(self, interruption: str, no_angles: str, lag_s: float) -> list[tuple[str, str, bool]]:
+        """Return the figures as rows of name, value and whether it is bad.
+
+        ``interruption``, ``no_angles``: why no events or no encoder samples arrive; empty if they do. ``lag_s``: lag of
+        the events [s].
+        """
+        recent = self._recent
+        status = recent.status
+        receives = not interruption
+        has_angles = receives and not no_angles
+        is_fresh = has_angles and recent.turn_share >= 1.0
+
+        rpm = self._rpm()
+        speed = "unknown" if rpm is None else f"{rpm:.1f} rpm"
+        if not is_fresh:
+            speed += ", last measured"
+        latency_ms = 1e3 * recent.age_s
+        latency = f"{latency_ms:.0f} ms" if receives else "–"
+        lag = f"{lag_s:.1f} s" if receives else "–"
+        rate_mev_s = status.rate_mev_s if receives else 0.0
+        events = "receiving" if receives else "interrupted, last ones shown"
+        angles = "receiving" if has_angles else "interrupted, last turn shown"
+        rows = [
+            ("events", events, not receives),
+            ("prism angles", angles, not has_angles),
+            ("rate", f"{rate_mev_s:.2f} million events/s", False),
+            ("latency", latency, receives and latency_ms > 1e3),
+            ("lag", lag, lag_s > LATE_S),
+            ("turn covered", f"{100.0 * recent.turn_share:.0f} %", recent.turn_share < 1.0),
+            ("speed of the prism", speed, rpm is None or not is_fresh),
+            ("lost events", f"{status.dropped:,}", status.dropped > 0),
+            ("out of order", f"{status.late:,}", status.late > 0),
+        ]
+        saved = recent.recorder.text
+        if saved:
+            rows.append(("recording", saved, False))
+        elif recent.recorder.problem:
+            rows.append(("recording", f"ended: {recent.recorder.problem}", True))
+        if recent.segment > 1:
+            rows.append(("segment", f"{recent.segment}, since the source came back", False))
+        return rows
+
+    def _rpm(self) -> float | None:
+        """Return the mean speed of the last turn of the shown events [turns/min]; None if it is unknown."""
+        encoder = self._last.encoder
+        if encoder is None:
+            return None
+        last_us = self._last.events.t_last
+        turn_us = min(2e6, 60e6 / max(abs(encoder.rpm), 1.0))
+        return rpm_between(encoder, round(last_us - turn_us), last_us)
 
 
 @contextlib.contextmanager
@@ -378,7 +424,10 @@ def followed(
     segment; it returns None if there is none, or once its event is set. Raises :class:`AmiwarpError` if the first turn
     does not come in time, or the error of the source.
     """
-    over, stop, failures, recent.link = threading.Event(), threading.Event(), [], link
+    over = threading.Event()  # set when the block is left
+    stop = threading.Event()  # of the session that runs, which sets it at its end, too
+    failures: list[Exception] = []
+    recent.link = link
 
     def report(status: SessionStatus) -> None:
         recent.status = replace(status)
@@ -389,15 +438,18 @@ def followed(
 
     def follow(part: Source) -> None:
         nonlocal stop
-        stop = threading.Event()  # a session sets it at its end
+        stop = threading.Event()
         if over.is_set():
-            return part.close()
+            part.close()
+            return
         session = Session(part, link=link, raw=[recent], policy=Policy.DROP_OLDEST, say=say)
         try:
-            ended = session.run(stop, report)
+            status = session.run(stop, report)
             problem = getattr(part, "problem", None)
             how = "has ended" if problem is None else f"broke off: {problem}"
-            end(f"{part.name}: the stream {how}; the last of its {ended.events:,} events are shown")
+            end(
+                f"{part.name}: the stream {how}; the last of its {status.events:,} events are shown"
+            )
         except Exception as error:
             failures.append(error)
             end(str(error))
@@ -415,26 +467,24 @@ def followed(
                 follow(part)
             else:
                 part.close()
-                now, before = (
-                    f"{s.size[0]}x{s.size[1]} pixels and {s.encoders} encoders"
-                    for s in (part, source)
-                )
                 end(
-                    f"{part.name}: is back with a camera of {now}, before it had {before}; start the command again"
+                    f"{part.name}: is back with a camera of {_shape(part)}, before it had {_shape(source)}; "
+                    "start the command again"
                 )
 
     # No BackgroundLoop: the session has its own stop event, and its end is shown as text while the block runs.
     thread = threading.Thread(target=run, name="amiwarp-follow", daemon=True)
     thread.start()
     try:
-        until = time.monotonic() + FIRST_S
+        until_s = time.monotonic() + FIRST_S
         while recent.recording() is None:
-            if not thread.is_alive() or time.monotonic() > until:
+            if not thread.is_alive() or time.monotonic() > until_s:
+                if failures:
+                    raise failures[0]
                 how = f"in {FIRST_S:g} s" if thread.is_alive() else "before the stream ended"
                 problem = getattr(source, "problem", None)
                 why = "" if problem is None else f": it broke off, {problem}"
-                what = f"{source.name}: delivered less than one full turn {how}{why}"
-                raise failures[0] if failures else AmiwarpError(what)
+                raise AmiwarpError(f"{source.name}: delivered less than one full turn {how}{why}")
             time.sleep(0.05)
         yield
     finally:
@@ -442,3 +492,9 @@ def followed(
         stop.set()
         thread.join()
         recent.recorder.stop()
+
+
+def _shape(source: Source) -> str:
+    """Return numbers of pixels and of encoders of a source, for messages."""
+    width, height = source.size
+    return f"{width}x{height} pixels and {source.encoders} encoders"

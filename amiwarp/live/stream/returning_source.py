@@ -83,10 +83,10 @@ class ReturningSource:
         self.returns = 0
         """Number of times that the sender returned."""
         self._events = 0
-        self._last: tuple[int, int] | None = (
-            None  # latest event time, and the host's time of its arrival [us]
-        )
+        self._last: tuple[int, int] | None = None
+        """Latest event time, and the host's time of its arrival [us]; None before the first event."""
         self._shift_us = 0
+        """What is added to the times of a camera whose clock began anew [us]."""
 
     def packets(self) -> Iterator[Packet]:
         """Yield packets, see :meth:`Source.packets`."""
@@ -117,19 +117,23 @@ class ReturningSource:
 
     def _part(self) -> Iterator[Packet]:
         """Yield packets of one connection until the stream ends or breaks off."""
-        fresh = unchecked = self.returns > 0
+        fresh = self.returns > 0
+        unchecked = fresh
         lost_before = self.lost
         for packet in self._source.packets():
             self.lost = lost_before + getattr(self._source, "lost", 0)
             if self._restarts:
-                packet, unchecked = self._shifted(packet, unchecked), unchecked and packet.empty
+                packet = self._shifted(packet, unchecked)
+                unchecked = unchecked and packet.empty
             if len(packet.events):
                 if unchecked:
                     self._check_clock(packet)
                     unchecked = False
                 self._events += len(packet.events)
-                newest = int(packet.events.t.max())
-                self._last = max(newest, self._last[0] if self._last else newest), packet.arrived_us
+                newest_us = int(packet.events.t.max())
+                if self._last is not None:
+                    newest_us = max(newest_us, self._last[0])
+                self._last = newest_us, packet.arrived_us
             yield replace(packet, returned=True) if fresh else packet
             fresh = False
 
@@ -141,9 +145,9 @@ class ReturningSource:
         """Return the packet on the clock of the packets before the break. ``first``: none came since the return."""
         times = np.concatenate([packet.events.t, packet.triggers])
         if first and times.size and self._last is not None:
-            last, then = self._last
-            by_host = last + packet.arrived_us - then - int(times.max())
-            self._shift_us = max(by_host, last + 1 - int(times.min()))
+            last_us, arrived_us = self._last
+            by_host_us = last_us + packet.arrived_us - arrived_us - int(times.max())
+            self._shift_us = max(by_host_us, last_us + 1 - int(times.min()))
         if not (self._shift_us and times.size):
             return packet
         events = Events(
@@ -157,18 +161,23 @@ class ReturningSource:
         )
 
     def _check_clock(self, packet: Packet) -> None:
+        """Compare the first events after a break with the last ones before it.
+
+        Raises :class:`AmiwarpError` if the sender's clock restarted; warns if the gap has another length on its clock.
+        """
         if self._last is None:
             return
-        (last, then), first = self._last, int(packet.events.t.min())
-        if first < last - LATE_US:
-            what = f"its clock restarted ({first:,} us, the last event before was at {last:,} us)"
+        last_us, arrived_us = self._last
+        first_us = int(packet.events.t.min())
+        if first_us < last_us - LATE_US:
+            what = f"its clock restarted ({first_us:,} us, the last event before was at {last_us:,} us)"
             raise AmiwarpError(
                 f"{self.name}: is back, but {what}; record the new events to another file"
             )
-        gap = first - last
-        passed = packet.arrived_us - then
-        if abs(gap - passed) > CLOCK_US:
-            what = f"{gap * 1e-6:.1f} s passed on the camera's clock, {passed * 1e-6:.1f} s on the host's"
+        gap_us = first_us - last_us
+        passed_us = packet.arrived_us - arrived_us
+        if abs(gap_us - passed_us) > CLOCK_US:
+            what = f"{gap_us * 1e-6:.1f} s passed on the camera's clock, {passed_us * 1e-6:.1f} s on the host's"
             self._say(
                 f"{self.name}: {what}: its clock may have restarted, times across the gap may be wrong"
             )
@@ -185,14 +194,11 @@ class ReturningSource:
         with contextlib.closing(again) as attempts:
             for reopen in attempts:
                 if reopen is not None:
-                    try:
-                        left = max(until - time.monotonic(), 1.0)
-                        self._continue_with(reopen(hello_s=min(HELLO_S, left)))
+                    # A sender may leave before its hello message: then wait for its next connection.
+                    with contextlib.suppress(Unreachable):
+                        left_s = max(until - time.monotonic(), 1.0)
+                        self._continue_with(reopen(hello_s=min(HELLO_S, left_s)))
                         return
-                    except (
-                        Unreachable
-                    ):  # the sender left before its hello message: wait for its next connection
-                        pass
                 if time.monotonic() >= until:
                     return
                 yield make_packet(monotonic_us())

@@ -63,7 +63,7 @@ class IntervalFigures:
     """Event rate, latency, and coverage by encoder samples, all since the last report."""
 
     def __init__(self, began_us: int) -> None:
-        # at the last report: time [us]; numbers of events received, compensated, without a measured angle
+        # At the last report: time [us], and numbers of events received, compensated, and without a measured angle.
         self._reported = (began_us, 0, 0, 0)
         self._latencies: list[float] = []
 
@@ -79,12 +79,13 @@ class IntervalFigures:
 
     def report(self, now_us: int, status: SessionStatus) -> None:
         """Write the figures since the last report into the status, and start the next interval."""
-        then_us, events, done, unsure_then = self._reported
+        before_us, events_before, done_before, unsure_before = self._reported
         unsure = status.guessed + status.unknown
-        status.rate_mev_s = (status.events - events) / max(now_us - then_us, 1)
-        status.covered = (
-            1.0 - (unsure - unsure_then) / (status.done - done) if status.done > done else 1.0
-        )
+        done = status.done - done_before
+        status.rate_mev_s = (status.events - events_before) / max(now_us - before_us, 1)
+        status.covered = 1.0
+        if done > 0:
+            status.covered = 1.0 - (unsure - unsure_before) / done
         self._reported = (now_us, status.events, status.done, unsure)
         if self._latencies:
             median, slow = np.percentile(self._latencies, [50, 99]) * 1e-3

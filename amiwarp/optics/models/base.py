@@ -525,18 +525,18 @@ def _wanted(angles: int) -> str:
     return "(n,)" if angles == 1 else f"(n, {angles})"
 
 
-Made = TypeVar("Made", bound=Model)
+AnyModel = TypeVar("AnyModel", bound=Model)
 
 
 def model_of(
-    kind: type[Made],
+    model_class: type[AnyModel],
     camera: Camera,
     prism: Prism | Plate,
     values: Mapping[str, float],
-) -> Made:
+) -> AnyModel:
     """Create a model as :meth:`Model.from_values` does, but without its checks of types: a search calls it often."""
-    check_given(values, kind.FREE[:2])
-    return kind._of_values(camera, prism, values)
+    check_given(values, model_class.FREE[:2])
+    return model_class._of_values(camera, prism, values)
 
 
 def check_given(values: Mapping[str, float], names: Iterable[str]) -> None:

@@ -13,6 +13,13 @@ from amiwarp.optics.models.base import Model
 from amiwarp.schema.calls import guarded
 from amiwarp.validation import whole
 
+ANGLES = 36
+"""Number of prism angles over one turn at which models are compared."""
+LAGS = 24
+"""Number of lags over one turn from which the search for the best one starts."""
+LAG_REACH = 0.3
+"""How far the best lag may be from the start of the search [rad]: more than the distance between two starts."""
+
 
 def rms(moved: NDArray[np.float64]) -> float:
     """Return the root mean square length of displacements [px], shape (n, 2), without those that are not finite."""
@@ -75,7 +82,7 @@ def predicted_error(
     columns = max(2, round(grid * camera.width / camera.height))
     x = np.round(np.linspace(0, camera.width - 1, columns))
     y = np.round(np.linspace(0, camera.height - 1, max(2, grid)))
-    theta = np.arange(36) * (2.0 * np.pi / 36)
+    theta = np.arange(ANGLES) * (2.0 * np.pi / ANGLES)
     of_x, of_y, of_theta = np.meshgrid(x, y, theta, indexing="ij")
     mesh = np.stack([of_x.ravel(), of_y.ravel(), of_theta.ravel()], axis=1)
     pixels = mesh[:, :2]
@@ -96,16 +103,17 @@ def predicted_error(
         )
     lag = 0.0
     if remove_lag:
-        # The distance may have several minima within a turn: start from the lowest of 24 lags.
-        lags = np.arange(-12, 12) * (np.pi / 12)
+        # The distance may have several minima within a turn: start from the lag with the smallest one.
+        lags = np.arange(-LAGS // 2, LAGS // 2) * (2.0 * np.pi / LAGS)
         start = min(lags, key=rms_distance)
-        found = minimize_scalar(
+        minimum = minimize_scalar(
             rms_distance,
-            bounds=(start - 0.3, start + 0.3),
+            bounds=(start - LAG_REACH, start + LAG_REACH),
             method="bounded",
             options={"xatol": 1e-6},
         )
-        if rms_distance(float(found.x)) < rms_distance(0.0):
-            lag = float(found.x)
+        best = float(minimum.x)
+        if rms_distance(best) < rms_distance(0.0):
+            lag = best
     largest = float(distances(lag).max())
     return ModelError(rms_distance(lag), largest, lag)

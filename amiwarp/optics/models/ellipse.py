@@ -10,7 +10,7 @@ from typing import Any, Self, cast
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.ellipse import EllipseParams, fit_harmonics
@@ -168,40 +168,16 @@ class EllipseModel(Model):
         AmiwarpError
             If the pairs do not determine all coefficients, or a pixel is over 65,536 px away.
         """
-        xy = np.asarray(xy, dtype=np.float64)
-        theta = np.asarray(theta, dtype=np.float64)
-        compensated = np.asarray(compensated, dtype=np.float64)
         degree = whole(degree, "degree", 0, 20)
-        pixels_fit = xy.ndim == 2 and xy.shape[1] == 2 and compensated.shape == xy.shape
-        if not pixels_fit or theta.shape != xy.shape[:1]:
-            given = (
-                f"xy has shape {xy.shape}, theta {theta.shape} and compensated {compensated.shape}"
-            )
-            raise AmiwarpError(f"{given}; give (n, 2), (n,) and (n, 2)")
-
-        shift = compensated - xy
-        valid = np.isfinite(shift).all(axis=1) & np.isfinite(theta)
-        if not valid.any():
-            raise AmiwarpError(
-                f"{len(xy)} pairs hold no finite values; give measured pairs of pixels"
-            )
-        farthest_seen = np.abs(xy[valid]).max()
-        farthest_compensated = np.abs(compensated[valid]).max()
-        farthest = float(max(farthest_seen, farthest_compensated))
-        if farthest > LARGEST_SIZE:
-            raise AmiwarpError(
-                f"a pair of pixels lies {farthest:g} px from the origin; give pixels within {LARGEST_SIZE} px, or NaN "
-                "for points outside the image"
-            )
+        pixels, angle, shift = _finite_pairs(xy, theta, compensated)
 
         # The displacement is linear in the coefficients: each table's polynomial, times 1, cos and sin of the angle.
-        basis = _polynomials(camera, xy[valid], degree)
-        angle = theta[valid][:, None]
-        by_cosine = basis * np.cos(angle)
-        by_sine = basis * np.sin(angle)
+        basis = _polynomials(camera, pixels, degree)
+        by_cosine = basis * np.cos(angle)[:, None]
+        by_sine = basis * np.sin(angle)[:, None]
         design = np.hstack([basis, by_cosine, by_sine])
         count = design.shape[1]
-        solution, _, rank, _ = np.linalg.lstsq(design, shift[valid], rcond=None)
+        solution, _, rank, _ = np.linalg.lstsq(design, shift, rcond=None)
         if rank < count:
             raise AmiwarpError(
                 f"{len(design)} pairs determine {rank} of {count} coefficients; "
@@ -209,8 +185,8 @@ class EllipseModel(Model):
             )
 
         rows, columns = np.mgrid[: camera.height, : camera.width]
-        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-        at_pixels = _polynomials(camera, pixels, degree)
+        all_pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+        at_pixels = _polynomials(camera, all_pixels, degree)
         shape = (camera.height, camera.width, 2)
         tables = []
         for coefficients in np.split(solution, 3):
@@ -235,6 +211,36 @@ class EllipseModel(Model):
             on_device = wp.array(table, dtype=float, device=device)
             self._params[name] = struct_of(EllipseParams, [*phase, on_device])
         return self._params[name]
+
+
+def _finite_pairs(
+    xy: ArrayLike, theta: ArrayLike, compensated: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return pixels [px], shape (n, 2), angles [rad], (n,), and displacements [px], (n, 2), of the finite pairs.
+
+    Raises :class:`AmiwarpError` for other shapes, and if there are no finite pairs, or some beyond any image.
+    """
+    xy = np.asarray(xy, dtype=np.float64)
+    theta = np.asarray(theta, dtype=np.float64)
+    compensated = np.asarray(compensated, dtype=np.float64)
+    are_pairs = xy.ndim == 2 and xy.shape[1] == 2 and compensated.shape == xy.shape
+    if not are_pairs or theta.shape != xy.shape[:1]:
+        given = f"xy has shape {xy.shape}, theta {theta.shape} and compensated {compensated.shape}"
+        raise AmiwarpError(f"{given}; give (n, 2), (n,) and (n, 2)")
+
+    shift = compensated - xy
+    finite = np.isfinite(shift).all(axis=1) & np.isfinite(theta)
+    if not finite.any():
+        raise AmiwarpError(f"{len(xy)} pairs hold no finite values; give measured pairs of pixels")
+    farthest_seen = np.abs(xy[finite]).max()
+    farthest_compensated = np.abs(compensated[finite]).max()
+    farthest = float(max(farthest_seen, farthest_compensated))
+    if farthest > LARGEST_SIZE:
+        raise AmiwarpError(
+            f"a pair of pixels lies {farthest:g} px from the origin; give pixels within {LARGEST_SIZE} px, or NaN "
+            "for points outside the image"
+        )
+    return xy[finite], theta[finite], shift[finite]
 
 
 def _polynomials(camera: Camera, xy: NDArray[np.float64], degree: int) -> NDArray[np.float64]:

@@ -14,7 +14,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.mirror import MirrorParams
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import two_commands
@@ -25,7 +24,7 @@ from amiwarp.optics.models.structs import struct_of
 from amiwarp.optics.models.two_commands import LARGEST_PX
 from amiwarp.optics.prism import Plate, Prism, check_phase
 from amiwarp.schema.calls import guarded
-from amiwarp.validation import array, instance, one_of, real
+from amiwarp.validation import instance, one_of, real
 
 LARGEST_TILT = 0.2
 """Upper limit of the amplitude of a tilt [rad]. Larger values are mistakes, such as angles in degrees."""
@@ -105,13 +104,8 @@ class MirrorModel(Model):
 
     def __post_init__(self) -> None:
         instance(self.camera, Camera, "camera")
-        hint = " rad; is it given in degrees?"
-        for name in ("amplitude", "second_amplitude"):
-            amplitude = real(getattr(self, name), name, 0.0, LARGEST_TILT, hint)
-            object.__setattr__(self, name, amplitude)
-        for name in ("phase", "second_phase", "direction", "second_direction", "fold"):
-            object.__setattr__(self, name, check_phase(getattr(self, name), name))
-        object.__setattr__(self, "ratio", real(self.ratio, "ratio", -1e6, 1e6))
+        two_commands.check_motions(self, LARGEST_TILT)
+        object.__setattr__(self, "fold", check_phase(self.fold, "fold"))
         incidence = real(self.incidence, "incidence", 0.0, LARGEST_INCIDENCE, " rad, 0 .. 80 deg")
         object.__setattr__(self, "incidence", incidence)
 
@@ -202,15 +196,8 @@ class MirrorModel(Model):
         """
         from scipy.spatial.transform import Rotation
 
-        theta = array(theta, "theta")
-        if theta.ndim != 2 or theta.shape[1] != 2:
-            raise AmiwarpError(
-                f"theta has shape {theta.shape}; give the angles of both commands, shape (n, 2)"
-            )
-        phases = np.array([self.phase, self.second_phase])
         amplitudes = np.array([self.amplitude, self.second_amplitude])
-        angles = np.where(np.isfinite(theta), theta, np.nan) + phases
-        tilts = np.cos(angles) * amplitudes
+        tilts = two_commands.both_cosines(theta, self.phase, self.second_phase) * amplitudes
         return np.asarray(Rotation.from_rotvec(-2.0 * tilts @ self.axes).as_matrix())
 
     def kernel_values(self) -> tuple[Any, ...]:

@@ -57,6 +57,11 @@ def alternatives(name: str) -> dict[str, type[Model]]:
 def build_model(
     model: str, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]
 ) -> Model:
-    """Build the optical model of the parameter values; ``camera`` and ``prism`` give all other values."""
-    kind = MODELS[one_of(model, MODELS, "model")]
-    return model_of(kind, with_lens(camera, values), prism, values)
+    """Build the optical model of the parameter values.
+
+    ``model``: its name. ``values``: parameters by name, in their units, of the model and of the camera's lens.
+    ``camera`` and ``prism`` give what the values do not contain. Raises :class:`AmiwarpError` for an unknown model, or
+    if size or phase is missing.
+    """
+    model_class = MODELS[one_of(model, MODELS, "model")]
+    return model_of(model_class, with_lens(camera, values), prism, values)

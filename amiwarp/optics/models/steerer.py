@@ -14,7 +14,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.steerer import SteererParams
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import two_commands
@@ -22,9 +21,9 @@ from amiwarp.optics.models.angles import both_angles
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.models.structs import struct_of
 from amiwarp.optics.models.two_commands import LARGEST_PX
-from amiwarp.optics.prism import Plate, Prism, check_phase
+from amiwarp.optics.prism import Plate, Prism
 from amiwarp.schema.calls import guarded
-from amiwarp.validation import array, instance, one_of, real
+from amiwarp.validation import instance, one_of
 
 LARGEST_DEFLECTION = 0.2
 """Upper limit of the amplitude of a deflector [rad]. Larger values are mistakes, such as angles in degrees."""
@@ -90,13 +89,7 @@ class SteererModel(Model):
 
     def __post_init__(self) -> None:
         instance(self.camera, Camera, "camera")
-        hint = " rad; is it given in degrees?"
-        for name in ("amplitude", "second_amplitude"):
-            amplitude = real(getattr(self, name), name, 0.0, LARGEST_DEFLECTION, hint)
-            object.__setattr__(self, name, amplitude)
-        for name in ("phase", "second_phase", "direction", "second_direction"):
-            object.__setattr__(self, name, check_phase(getattr(self, name), name))
-        object.__setattr__(self, "ratio", real(self.ratio, "ratio", -1e6, 1e6))
+        two_commands.check_motions(self, LARGEST_DEFLECTION)
 
     @classmethod
     def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
@@ -154,14 +147,8 @@ class SteererModel(Model):
         AmiwarpError
             If ``theta`` has another shape.
         """
-        theta = array(theta, "theta")
-        if theta.ndim != 2 or theta.shape[1] != 2:
-            raise AmiwarpError(
-                f"theta has shape {theta.shape}; give the angles of both commands, shape (n, 2)"
-            )
-        phases = np.array([self.phase, self.second_phase])
-        angles = np.where(np.isfinite(theta), theta, np.nan) + phases
-        return np.asarray(np.cos(angles) @ self.vectors)
+        cosines = two_commands.both_cosines(theta, self.phase, self.second_phase)
+        return np.asarray(cosines @ self.vectors)
 
     def kernel_values(self) -> tuple[Any, ...]:
         return self.phase, self.second_phase, self.ratio, *self.vectors

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.optics.models.base import Model
 from amiwarp.optics.models.pair import RATIO, SECOND_PHASE
 from amiwarp.optics.models.parameter import AMPLITUDE, PHASE, Parameter
-from amiwarp.validation import real
+from amiwarp.optics.prism import check_phase
+from amiwarp.validation import array, real
 
 LARGEST_PX = 24.0
 """Largest displacement of the image by one command that is searched [px]."""
@@ -32,6 +38,41 @@ TOGETHER = (
 """Names that each step of the global search finds."""
 FREED = tuple(name for names in TOGETHER for name in names)
 """Names that a calibration finds by default."""
+
+
+def check_motions(model: Model, largest_amplitude: float) -> None:
+    """Check amplitudes, phases, directions and ratio of a new model, and set them in their plain types.
+
+    Raises :class:`AmiwarpError` for an amplitude out of 0 .. ``largest_amplitude`` [rad], or an unusable value.
+    """
+    hint = " rad; is it given in degrees?"
+    for name in ("amplitude", "second_amplitude"):
+        _set_real(model, name, 0.0, largest_amplitude, hint)
+    for name in ("phase", "second_phase", "direction", "second_direction"):
+        object.__setattr__(model, name, check_phase(getattr(model, name), name))
+    _set_real(model, "ratio", -1e6, 1e6)
+
+
+def _set_real(model: Model, name: str, low: float, high: float, hint: str = "") -> None:
+    """Check a number of a new model, and set it as a float. Raises :class:`AmiwarpError` outside low .. high."""
+    value = real(getattr(model, name), name, low, high, hint)
+    object.__setattr__(model, name, value)
+
+
+def both_cosines(
+    theta: NDArray[np.float64], phase: float, second_phase: float
+) -> NDArray[np.float64]:
+    """Return the cosines of both commands' angles, phases included, shape (n, 2); NaN for NaN and infinite angles.
+
+    ``theta``: angles of both commands [rad], shape (n, 2). Raises :class:`AmiwarpError` for another shape.
+    """
+    theta = array(theta, "theta")
+    if theta.ndim != 2 or theta.shape[1] != 2:
+        raise AmiwarpError(
+            f"theta has shape {theta.shape}; give the angles of both commands, shape (n, 2)"
+        )
+    angles = np.where(np.isfinite(theta), theta, np.nan) + np.array([phase, second_phase])
+    return np.asarray(np.cos(angles))
 
 
 def freed_at(ratio: float | None, names: tuple[str, ...]) -> tuple[str, ...]:
