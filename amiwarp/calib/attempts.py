@@ -79,6 +79,9 @@ def calibrated(calibrator: Calibrator) -> Calibration:
         found = replace(found, path=last.mended)
     if last.mended_words:
         found = with_warnings(found, last.mended_words)
+    if found.photometric is not None and found.photometric.deviation_px is not None:
+        hidden_px = {**found.photometric.hidden_px, **last.hidden_px}
+        found = replace(found, photometric=replace(found.photometric, hidden_px=hidden_px))
     if not tried.accepted:
         raise _rejected(found, calibrator.recording.name)
 

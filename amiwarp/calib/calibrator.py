@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -131,6 +131,8 @@ class Calibrator:
     """Angles instead of the recording's encoder, if it was wrong; they are in the recording already."""
     mended_words: str = ""
     """What was wrong with them, in words."""
+    hidden_px: Mapping[str, float] = field(default_factory=dict)
+    """By how much a cause that no attempt looks for may move events [px rms], by its words."""
     turned: RotationPath | None = None
     """Rotation of the camera as a gyroscope measured it; its bias stays free."""
 

@@ -56,6 +56,11 @@ TOLERANCE_PX = 0.001
 """Length of a step at which the path has converged [px rms]."""
 LONGEST_EXTRAPOLATION = 3.0
 """Largest factor by which a step is extended, because the steps before shrank slowly."""
+RIDGE = 1e-4
+RIDGE_OF_TWO = 1e-2
+"""Weight of the squares of the spline's coefficients, relative to the median weight that the events give them. Two
+angles can shift the whole picture together, by turns that grow without bound where both move it the same way. With
+1e-3 a pair turned by twice as much as it had hunted, with 1e-2 by 1.1 times."""
 SEARCH_STEPS = 10
 SEARCH_TOLERANCE = 0.03
 """Largest number of conjugate-gradient steps for the spline's coefficients, and the residual at which they end."""
@@ -92,6 +97,8 @@ class _Correction:
     """Its coefficients."""
     px: float
     """How far events move per angle [px rms/rad]."""
+    direction: NDArray[np.complex128]
+    """Direction in which the first event of each pair moves with the angle, of size 1."""
 
     def at_first_events(self, coefficients: Vector) -> Vector:
         """Return the correction at the first event of each pair [rad], from the coefficients of all angles."""
@@ -122,11 +129,12 @@ class PathFit:
         pairs: int = PAIRS,
         tiles: int = TILES,
         angles: Sequence[int] | None = None,
+        knots_per_turn: float = KNOTS_PER_TURN,
     ) -> None:
         """Collect about ``pairs`` pairs at the answer of ``search``, and solve the map.
 
         The encoder of ``search`` is the first path: a constant speed, or the encoder of the recording if it has one.
-        The paths of ``angles`` are fitted, which are their numbers; by default those of all.
+        The paths of ``angles`` are fitted, which are their numbers; by default those of all. They share the knots.
         Raises :class:`AmiwarpError` for too few pairs.
         """
         space = search.space
@@ -162,23 +170,28 @@ class PathFit:
         self._azimuth = self._pairs.arrays.azimuth.numpy().reshape(4, -1).copy()
         if angles is None:
             angles = range(MODELS[space.model].ANGLES)
-        self._corrections = self._splines_of(angles)
+        self._corrections = self._splines_of(angles, knots_per_turn)
         # Coefficients of the corrections that are applied [rad]
         self._found = np.zeros(self._corrections[-1].own.stop)
         # How far events move per coefficient [px rms/rad]
         self._px = np.zeros(len(self._found))
         for each in self._corrections:
             self._px[each.own] = each.px
+        self.std_px = math.inf
+        """Standard deviation of the paths by the scatter of the residuals [px rms]; infinite before a step."""
         # The last change of these coefficients and of the sizes [px]
         self._last: Vector | None = None
 
-    def _splines_of(self, angles: Sequence[int]) -> list[_Correction]:
+    def _splines_of(self, angles: Sequence[int], knots_per_turn: float) -> list[_Correction]:
         """Return the splines that correct some angles, given by their numbers."""
+        space = self._cost.space
+        values = space.to_values(self._v)
         first = self._recording.events.t_first
         last = self._recording.events.t_last
         paths = each_encoder(self._first)
         times = np.arange(0, last - first + 1, SAMPLE_US, dtype=np.int64)
-        most_per_turn = KNOTS_PER_TURN / len(angles)
+        first_events = np.rint(self._t[0]).astype(np.int64) + first
+        most_per_turn = knots_per_turn / len(angles)
         knots_of_angle = len(self._pairs) / len(angles) / PAIRS_PER_KNOT
         found: list[_Correction] = []
         place = 0
@@ -192,6 +205,8 @@ class PathFit:
             at_second = spline_matrix(knots, self._t[1])
             own = slice(place, place + at_first.shape[1])
             place = own.stop
+            _, phase = MODELS[space.model].ORBITS[angle]
+            turned = path.angle_at(first_events) + values[phase]
             found.append(
                 _Correction(
                     angle=angle,
@@ -199,35 +214,35 @@ class PathFit:
                     knots=knots,
                     ends=(at_first, at_second),
                     own=own,
-                    px=px_per_rad(self._cost.space, self._v, angle),
+                    px=px_per_rad(space, self._v, angle),
+                    direction=1j * np.exp(1j * turned),
                 )
             )
         return found
 
-    def deviates(self) -> bool:
-        """Return whether the paths deviate significantly from the first ones, which have a constant speed.
+    def deviates(self, least_px: float = LEAST_DEVIATION_PX) -> bool:
+        """Return whether the paths deviate significantly from the first ones, and by at least ``least_px``.
 
         A step is repeated only if the first one finds a notable part of the deviation.
         """
         for k in range(GATE_STEPS):
-            _, std_px = self._improve(k)
+            self._improve(k)
             found_share = FIRST_SHARE if k == 0 else 1.0
-            least_px = max(found_share * LEAST_DEVIATION_PX, SIGNIFICANT * std_px)
-            if self._deviation_px() < least_px:
+            least = max(found_share * least_px, SIGNIFICANT * self.std_px)
+            if self.deviation_px() < least:
                 return False
         return True
 
-    def run(self) -> tuple[Encoder, float]:
-        """Improve the paths and the sizes until the steps are short; return the path and its deviation [px rms].
+    def run(self) -> Encoder:
+        """Improve the paths and the sizes until the steps are short; return the path.
 
-        The deviation is measured from constant speed, or from the recording's encoder.
         Raises :class:`AmiwarpError` if the events do not determine the path.
         """
         for k in range(MOST_STEPS):
-            moved_px, std_px = self._improve(k)
+            moved_px = self._improve(k)
             if k > FIRST_STEPS and moved_px < TOLERANCE_PX:
                 break
-        error_px = max(moved_px, std_px)
+        error_px = max(moved_px, self.std_px)
         if not error_px <= LARGEST_ERROR_PX:
             raise AmiwarpError(
                 f"{self._recording.name}: the prism's speed varies, and the events determine the path of its angle to "
@@ -238,7 +253,7 @@ class PathFit:
         paths = [*each_encoder(self._first)]
         for each in self._corrections:
             paths[each.angle] = self._corrected(each)
-        return together(paths), self._deviation_px()
+        return together(paths)
 
     def _corrected(self, each: _Correction) -> Encoder:
         """Return the path of an angle with its correction."""
@@ -246,20 +261,21 @@ class PathFit:
         t_first = self._recording.events.t_first
         t = path.t - round(path.clock_offset_us) - t_first
         spline = spline_matrix(each.knots, t.astype(np.float64))
-        theta = path.angle + spline @ self._found[each.own]
-        if self._recording.encoder is not None:  # it keeps its zero: the correction has no mean
+        mean = float(np.mean(each.at_first_events(self._found)))  # part of the phase
+        theta = path.angle + spline @ self._found[each.own] - mean
+        if self._recording.encoder is not None:
             return replace(path, angle=theta)
         theta -= np.interp(middle_time(self._recording) - t_first, t, theta)
         return Encoder(path.t, theta)
 
-    def _improve(self, k: int) -> tuple[float, float]:
-        """Take step number ``k``; return its length and the standard deviation of the paths [px rms]."""
+    def _improve(self, k: int) -> float:
+        """Take step number ``k``; return its length [px rms]."""
         scale = PLAIN_SCALE
         if k >= FIRST_STEPS:
             median = self._cost.brightness.residuals.median()
             scale = max(0.1, 1.5 * median)
         self._cost.set_scale(scale)
-        change, sizes_px, std_px = self._step()
+        change, sizes_px, self.std_px = self._step()
         step = np.append(change * self._px, sizes_px)
         if not np.isfinite(step).all():
             raise self._undetermined()
@@ -274,17 +290,30 @@ class PathFit:
         count = len(self._found)
         change = step[:count] / self._px
         self._move(change, step[count:])
-        return self._motion_px(change), std_px
+        return self._motion_px(change)
 
     def _motion_px(self, coefficients: Vector) -> float:
-        """Return how far the corrections with some coefficients move events [px rms]."""
-        moved_px = []
-        for each in self._corrections:
-            turned = each.at_first_events(coefficients)
-            moved_px.append(each.px * float(np.std(turned)))
-        return math.hypot(*moved_px)
+        """Return how far the corrections with some coefficients move events against each other [px rms].
 
-    def _deviation_px(self) -> float:
+        What a shift of the whole picture, or constant phases and sizes, explain does not count. Two angles can turn so
+        that they shift the picture.
+        """
+        ones = np.ones(len(self._pairs))
+        explained = [ones, 1j * ones]
+        moved = np.zeros(len(ones), np.complex128)
+        for each in self._corrections:
+            moved += each.px * each.at_first_events(coefficients) * each.direction
+            explained += [each.direction, 1j * each.direction]
+
+        # The smallest rest, as two real numbers for each pair
+        columns = np.array(explained)
+        products = (columns.conj() @ columns.T).real
+        sums = (columns.conj() @ moved).real
+        factors, *_ = np.linalg.lstsq(products, sums, rcond=1e-9)
+        rest = moved - factors @ columns
+        return float(np.sqrt(np.mean(np.abs(rest) ** 2)))
+
+    def deviation_px(self) -> float:
         """Return the deviation of the present paths from constant speed, or from the encoder [px rms]."""
         if self._recording.encoder is not None:
             return self._motion_px(self._found)
@@ -306,7 +335,8 @@ class PathFit:
         equations = self._equations()
         columns = equations.columns
         normal: Vector = (columns.T @ diags(equations.weight) @ columns).toarray()
-        ridge = 1e-4 * float(np.median(np.diag(normal))) + 1e-12
+        share = RIDGE if len(self._corrections) == 1 else RIDGE_OF_TWO
+        ridge = share * float(np.median(np.diag(normal))) + 1e-12
         try:
             factor = cho_factor(normal + ridge * np.eye(len(normal)))
         except np.linalg.LinAlgError as error:  # knots without events
@@ -314,12 +344,8 @@ class PathFit:
 
         x = self._solve(equations, factor, ridge)
         of_paths = len(self._found)
-        change = x[:of_paths]
-        # A mean is part of the phase.
-        for each in self._corrections:
-            change[each.own] -= float(np.mean(each.at_first_events(change)))
         std_px = self._std_px(equations, factor)
-        return change, x[of_paths:], std_px
+        return x[:of_paths], x[of_paths:], std_px
 
     def _equations(self) -> _Equations:
         """Return the equations of the pairs for the splines' coefficients and the sizes, on the map as it is."""
@@ -352,7 +378,9 @@ class PathFit:
         )
 
     def _solve(self, equations: _Equations, factor: Any, ridge: float) -> Vector:
-        """Return the coefficients and sizes that minimise the residuals, by conjugate gradients.
+        """Return the changes of coefficients and sizes that minimise the residuals, by conjugate gradients.
+
+        The smallest corrections count of those that fit as well, so that steps do not add up to large ones.
 
         They are preconditioned by the normal equations for a fixed map, of which ``factor`` is the Cholesky factor.
         """
@@ -362,6 +390,7 @@ class PathFit:
         weight = equations.weight
         self._cost.brightness.prepare_projection()
         left = -(columns.T @ (weight * self._unexplained(equations.residual)))
+        left[: len(self._found)] -= ridge * self._found
         x = np.zeros(len(left))
         direction = cho_solve(factor, left)
         first_power = float(left @ direction)

@@ -63,12 +63,13 @@ def with_path(recording: Recording, search: Search) -> Search:
         # Few pairs are enough to see that a speed is constant.
         if not varies and not PathFit(recording, start, GATE_PAIRS, GATE_TILES).deviates():
             return search
-        path, deviation_px = PathFit(recording, start).run()
+        fit = PathFit(recording, start)
+        path = fit.run()
     except AmiwarpError:
         if varies:
             raise
         return search
-    if not varies and deviation_px < LEAST_DEVIATION_PX:
+    if not varies and fit.deviation_px() < LEAST_DEVIATION_PX:
         return search
     found = search_on(path, search)
     return found.run(found.best)

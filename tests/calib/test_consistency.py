@@ -367,7 +367,11 @@ def outcome(**values: Any) -> Consistency:
     }
     covariance = np.zeros((2, 2))
     return Consistency(
-        step=np.zeros(2), systematic=covariance, method=covariance, **{**none, **values}
+        step=np.zeros(2),
+        systematic=covariance,
+        method=covariance,
+        of_map=covariance,
+        **{**none, **values},
     )
 
 

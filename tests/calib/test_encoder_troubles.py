@@ -24,6 +24,7 @@ from amiwarp import (
 )
 from amiwarp.calib import checks, encoder_attempts
 from amiwarp.calib.calibrator import Calibrator
+from amiwarp.calib.encoder_attempts import BETWEEN_PULSES
 from amiwarp.calib.lost_counts import Step, changes_of_mean, lost_counts, without_steps
 from amiwarp.calib.photometric import limits
 from amiwarp.calib.photometric.losses import step_if_missing
@@ -231,11 +232,57 @@ def test_the_angle_between_pulses_is_found(
     assert "the encoder gives pulses only" in found.warnings[-1]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "hz"), [(0.02, 9.0), (0.06, 50.0)], ids=["slow", "fast"])
+def test_a_swing_between_pulses_leaves_little(share: float, hz: float) -> None:
+    trouble = encoder_troubles.pulses_only(recorded(SIZE, hunting(share, hz), seconds=0.8))
+    found = calibrate(trouble.recording, model="exact")
+    assert compensation_error(trouble, found)[0] < 0.006  # px; 0.04 and 0.03 without a path
+    assert "the encoder gives pulses only" in found.warnings[-1]
+
+
 def test_even_pulses_keep_their_angles() -> None:
     trouble = encoder_troubles.pulses_only(recorded(SIZE, steady(), seconds=0.4))
     found = found_in(trouble)
     assert found.path is None
     assert found.warnings == ()
+    assert found.photometric is not None
+    assert 0.0 < found.photometric.hidden_px[BETWEEN_PULSES] < 0.02
+
+
+@pytest.mark.slow
+def test_what_is_not_found_between_pulses_is_bounded() -> None:
+    trouble = encoder_troubles.pulses_only(recorded(SIZE, hunting(0.004, 9.0), seconds=0.8))
+    found = calibrate(trouble.recording, model="exact")
+    error_px = compensation_error(trouble, found)[0]
+    assert found.path is None
+    assert found.photometric is not None
+    assert error_px < found.photometric.hidden_px[BETWEEN_PULSES] < 3.0 * error_px
+
+
+def test_a_shift_of_the_picture_is_no_deviation_of_a_path() -> None:
+    rng = np.random.default_rng(3)
+    first = 1j * np.exp(1j * np.linspace(0.0, 20.0, 400))
+    second = 1j * np.exp(1j * np.linspace(1.0, -13.0, 400))
+    px = (2.0, 3.0)
+    fit = object.__new__(PathFit)
+    fit._pairs = np.zeros(400)
+
+    def moved_px(*turned: np.ndarray) -> float:
+        fit._corrections = [
+            SimpleNamespace(px=size, direction=along, at_first_events=lambda _, turn=turn: turn)
+            for size, along, turn in zip(px, (first, second), turned, strict=True)
+        ]
+        return fit._motion_px(np.zeros(0))
+
+    # Turns of both angles that move the picture by the same at all times
+    both = np.array([px[0] * first, px[1] * second])
+    columns = np.moveaxis(np.array([both.real, both.imag]), 2, 0)
+    turns = np.linalg.solve(columns, np.full((400, 2, 1), 0.2))[..., 0]
+    assert moved_px(*turns.T) == pytest.approx(0.0, abs=1e-9)
+    assert moved_px(np.full(400, 0.1), np.zeros(400)) == pytest.approx(0.0, abs=1e-9)
+    noise = rng.normal(0.0, 0.01, 400)
+    assert moved_px(noise, np.zeros(400)) == pytest.approx(0.02, rel=0.1)
 
 
 @pytest.mark.parametrize(

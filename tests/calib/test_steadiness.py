@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 import amiwarp
-from amiwarp.calib.photometric.findings import UnsteadyMotion
+from amiwarp.calib.photometric import steadiness
+from amiwarp.calib.photometric.findings import StatedError, UnsteadyMotion
 from amiwarp.calib.photometric.verdicts import refused
 
 CAMERA = amiwarp.Camera.from_fov(160, 120, math.radians(32.2))
 HZ, AMPLITUDE, DURATION_S = 100.0, 0.0144, 0.12
 """Frequency, amplitude [rad] of 4 px, and duration."""
+SMALL_SHARE = 0.012
+"""A change of the amplitude that is not refused."""
 SETTINGS = amiwarp.PhotometricSettings(
     pairs=100_000, sensor=amiwarp.SensorTiming(refractory_us=100.0)
 )
@@ -58,6 +61,10 @@ def swelling(t: np.ndarray) -> np.ndarray:
     return np.asarray(ellipse(t) * (1.0 + 0.15 * np.sin(math.tau * 19.0 * t)))
 
 
+def swelling_a_little(t: np.ndarray) -> np.ndarray:
+    return np.asarray(ellipse(t) * (1.0 + SMALL_SHARE * np.sin(math.tau * 19.0 * t)))
+
+
 def wavering(t: np.ndarray) -> np.ndarray:
     return ellipse(t + 0.15 / (math.tau * HZ) * np.sin(math.tau * 19.0 * t))
 
@@ -95,6 +102,17 @@ def test_a_steady_ellipse_is_accepted() -> None:
     found = amiwarp.calibrate(recorded(ellipse), model="vibration", photometric=SETTINGS)
     assert abs(found.parameters["rpm"]) == pytest.approx(60.0 * HZ, rel=2e-5)
     assert found.parameters["amplitude"] == pytest.approx(0.67 * AMPLITUDE, rel=0.01)
+    assert found.photometric is not None
+    assert found.photometric.hidden_px.get(steadiness.AMPLITUDE, 0.0) < 0.01
+
+
+@pytest.mark.slow
+def test_a_small_change_of_the_amplitude_is_bounded() -> None:
+    found = amiwarp.calibrate(recorded(swelling_a_little), model="vibration", photometric=SETTINGS)
+    assert found.photometric is not None
+    size_px = CAMERA.fx * AMPLITUDE * math.hypot(0.67, 0.33)
+    true_px = SMALL_SHARE * size_px / math.sqrt(2.0)
+    assert true_px < found.photometric.hidden_px[steadiness.AMPLITUDE] < 2.0 * true_px
 
 
 @pytest.mark.parametrize(
@@ -102,7 +120,24 @@ def test_a_steady_ellipse_is_accepted() -> None:
     [("harmonics", "three harmonics"), ("amplitude", "the amplitude"), ("speed", "the frequency")],
 )
 def test_each_kind_has_words_and_a_remedy(kind: str, said: str) -> None:
-    words = refused(UnsteadyMotion(kind, 0.0913, 0.2))
+    words = refused(
+        UnsteadyMotion(kind, moved_px=0.0913, std_px=0.001, significance=90.0, gain=0.2)
+    )
     assert said in words
     assert "0.09 px or more" in words
     assert ("record while it is steady" in words) == (kind != "harmonics")
+
+
+@pytest.mark.parametrize(
+    ("largest", "said"),
+    [
+        ("thresholds", "lower the sensor's thresholds"),
+        ("refractory", "--refractory-us"),
+        ("events", "record for longer"),
+    ],
+)
+def test_a_large_stated_error_names_its_largest_part(largest: str, said: str) -> None:
+    words = refused(StatedError(0.05, largest))
+    assert "within 0.05 px only" in words
+    assert said in words
+    assert words.count(":") == 2

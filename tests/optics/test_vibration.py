@@ -240,7 +240,7 @@ def calibrated(shaken: amiwarp.Recording) -> amiwarp.Calibration:
 @pytest.mark.slow
 def test_an_unknown_refractory_period_is_refused_with_the_remedy(shaken: amiwarp.Recording) -> None:
     with pytest.raises(
-        amiwarp.AmiwarpError, match=r"within 0\.0\d+ px only.*give the sensor's refractory period"
+        amiwarp.AmiwarpError, match=r"within 0\.0\d+ px only.*give it by --refractory-us"
     ):
         amiwarp.calibrate(
             shaken, model="vibration", events=25_000, photometric=replace(COARSE, pairs=10_000)

@@ -117,6 +117,8 @@ class Consistency(Finding):
     """Covariance of the errors that do not scatter from place to place [px²], shape (n, n)."""
     method: Vector
     """The part of it that is the method's own: it is an error of the motion, whatever the lens [px²], shape (n, n)."""
+    of_map: Vector
+    """The part of it by the map, whose errors are a share of the contrast threshold [px²], shape (n, n)."""
     hidden_px: Mapping[str, float]
     """By how much each cause that was looked for may still change the motion [px rms], by its words."""
     likely: tuple[LikelyCause, ...]
@@ -186,6 +188,7 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         step=fit.fit(space.names).change,
         systematic=of_gaps + least_errors(space) + of_map + of_lens,
         method=of_gaps + of_map / BOUND_VARIANCE,
+        of_map=of_map,
         hidden_px=hidden | _clock_bound(space, best, fit),
         likely=tuple(likely),
         drift=_drift(space, best, fit),

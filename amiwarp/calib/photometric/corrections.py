@@ -271,7 +271,14 @@ def judge_the_consistency(state: Refinement) -> Refinement:
     # an answer with a free speed is found again at that speed
     if MODELS[space.model].PRISM or "rpm" in space.names:
         return state
-    return state.noticing(StatedError(stated_px(space, v, covariance)))
+    parts = {
+        "thresholds": check.of_map,
+        "refractory": np.outer(doubt, doubt),
+        "events": state.answer.covariance,
+    }
+    error_px = stated_px(space, v, covariance)
+    largest = max(parts, key=lambda name: stated_px(space, v, parts[name]))
+    return state.noticing(StatedError(error_px, largest))
 
 
 def motion_error(state: Refinement, check: Consistency, v: Vector) -> MotionError:

@@ -97,6 +97,10 @@ class UnsteadyMotion(Finding):
     """What: ``harmonics``, ``amplitude`` or ``speed``."""
     moved_px: float
     """Motion of events by it, as far as a linearised fit finds it [px rms]."""
+    std_px: float
+    """Its standard deviation [px rms]."""
+    significance: float
+    """Distance from none [standard deviations]."""
     gain: float
     """Share of the squared residuals that it explains."""
 
@@ -183,6 +187,8 @@ class StatedError(Finding):
 
     error_px: float
     """The error [px rms]."""
+    largest: str
+    """Its largest part: ``thresholds``, ``refractory`` or ``events``."""
 
 
 @dataclass(frozen=True)

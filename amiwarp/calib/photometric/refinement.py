@@ -13,7 +13,7 @@ from amiwarp.brightness.sensor_timing import SensorTiming
 from amiwarp.calib.photometric.answers import Answer, AnswerSearch
 from amiwarp.calib.photometric.consistency import Consistency
 from amiwarp.calib.photometric.equations import Equations, Problem, collect_equations
-from amiwarp.calib.photometric.findings import Finding, MotionError
+from amiwarp.calib.photometric.findings import Finding
 from amiwarp.calib.photometric.verdicts import refusal
 from amiwarp.results.parameters import ParameterSpace
 
@@ -63,6 +63,8 @@ class Refinement:
     """Differences between the answers of rival explanations [px], each of shape (n,)."""
     findings: tuple[Finding, ...] = ()
     """What was noticed, in order: causes, corrections, doubts. Warnings and refusals are made from these alone."""
+    hidden_px: Mapping[str, float] = field(default_factory=dict)
+    """By how much causes that a step looked for may still move events [px rms], by their words."""
     finished: bool = False
     """Whether later steps are pointless."""
 
@@ -87,13 +89,7 @@ class Refinement:
 
     def hiding(self, words: str, bound_px: float) -> Refinement:
         """Return the state with a further cause, given in words, that could hide, and how far it may move events."""
-        findings = tuple(
-            replace(each, hidden_px={**each.hidden_px, words: bound_px})
-            if isinstance(each, MotionError)
-            else each
-            for each in self.findings
-        )
-        return replace(self, findings=findings)
+        return replace(self, hidden_px={**self.hidden_px, words: bound_px})
 
     def ending(self) -> Refinement:
         """Return the state as the last one: no further step is taken."""

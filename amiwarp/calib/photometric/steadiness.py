@@ -19,6 +19,7 @@ from amiwarp.calib.photometric.distances import px_per_rad
 from amiwarp.calib.photometric.findings import UnsteadyMotion
 from amiwarp.calib.photometric.linear_fit import linear_fit, telling
 from amiwarp.calib.photometric.refinement import Refinement
+from amiwarp.calib.photometric.stated_errors import BOUND
 from amiwarp.optics.models.registry import MODELS
 
 if TYPE_CHECKING:
@@ -38,10 +39,16 @@ LEAST_GAIN = 0.015
 0.004, an amplitude that varied by 15 % 0.16, a triangle 0.12."""
 LEAST_PX = 0.01
 """Motion of events by it above which an answer is refused [px rms]."""
+FIRST_LOOK = 0.3
+"""Share of this gain above which a group of unknowns is fitted, to bound what it hides."""
+AMPLITUDE = "an amplitude of the vibration that changes"
+"""Words of what could hide if the amplitude is not found to change, or little."""
+AMPLITUDE_SHARE = 0.4
+"""Share of a change of the amplitude that a fit finds at least. It was 0.45 to 0.58 of changes by 1.1 %."""
 
 
 def refuse_unsteady_motion(state: Refinement) -> Refinement:
-    """Note what a vibration does beyond its model."""
+    """Note what a vibration does beyond its model, and how much a change of its amplitude could hide."""
     if MODELS[state.space.model].PRISM or not state.are_angles_examined:
         return state
     if state.problem.recording.encoder is not None:
@@ -49,13 +56,24 @@ def refuse_unsteady_motion(state: Refinement) -> Refinement:
     cost = state.search.cost
     cost.converge(state.answer.x)
     found = find_unsteady(cost, state.answer.x)
-    if found is None:
+    for each in found:
+        if each.kind == "amplitude":
+            bound_px = (each.moved_px + BOUND * each.std_px) / AMPLITUDE_SHARE
+            state = state.hiding(AMPLITUDE, bound_px)
+    certain = [each for each in found if _is_certain(each)]
+    if not certain:
         return state
-    return state.noticing(found)
+    return state.noticing(max(certain, key=lambda each: each.gain))
 
 
-def find_unsteady(cost: Cost, best: Vector) -> UnsteadyMotion | None:
-    """Return what a vibration does beyond its model at the answer ``best`` [px]; None if it keeps to it.
+def _is_certain(found: UnsteadyMotion) -> bool:
+    """Return whether an answer is refused because of what a vibration does beyond its model."""
+    is_there = found.significance >= SIGNIFICANT and found.gain >= LEAST_GAIN
+    return is_there and found.moved_px >= LEAST_PX
+
+
+def find_unsteady(cost: Cost, best: Vector) -> list[UnsteadyMotion]:
+    """Return what a vibration seems to do beyond its model at the answer ``best`` [px]; nothing if it keeps to it.
 
     The map must be solved at ``best``, whose speed is known.
     """
@@ -65,13 +83,13 @@ def find_unsteady(cost: Cost, best: Vector) -> UnsteadyMotion | None:
         "speed": _speed(cost, best),
     }
     # Only some groups are worth a fit.
-    told = telling(cost, list(all_groups.values()), LEAST_GAIN)
+    told = telling(cost, list(all_groups.values()), FIRST_LOOK * LEAST_GAIN)
     groups = {}
     for kind, group in all_groups.items():
         if any(group is each for each in told):
             groups[kind] = group
     if not groups:
-        return None
+        return []
 
     names = cost.space.names
     columns = slopes(cost, cost.space, best, names)
@@ -82,11 +100,17 @@ def find_unsteady(cost: Cost, best: Vector) -> UnsteadyMotion | None:
     for kind, group in groups.items():
         estimate, significance, gain = fit.adding(names, tuple(group))
         change = estimate.change[len(names) :]
-        moved_px = _moved_px(cost, best, kind, change)
-        is_there = significance >= SIGNIFICANT and gain >= LEAST_GAIN
-        if is_there and moved_px >= LEAST_PX:
-            found.append(UnsteadyMotion(kind, moved_px, gain))
-    return max(found, key=lambda each: each.gain, default=None)
+        deviations = np.sqrt(np.diag(estimate.covariance)[len(names) :])
+        found.append(
+            UnsteadyMotion(
+                kind=kind,
+                moved_px=_moved_px(cost, best, kind, change),
+                std_px=_moved_px(cost, best, kind, deviations),
+                significance=significance,
+                gain=gain,
+            )
+        )
+    return found
 
 
 def _moved_px(cost: Cost, best: Vector, kind: str, change: Vector) -> float:

@@ -106,7 +106,7 @@ def summarised(state: Refinement) -> tuple[PhotometricSummary, StageSummary, Par
         harmonics=harmonics[0] if harmonics else (),
         moving=moving[0] if moving else (),
         deviation_px=stated[0].deviation_px if stated else None,
-        hidden_px=stated[0].hidden_px if stated else {},
+        hidden_px={**stated[0].hidden_px, **state.hidden_px} if stated else {},
         warnings=warnings(state.findings),
     )
     summary = StageSummary.of(

@@ -466,9 +466,17 @@ def _(found: StatedError) -> Sequence[str]:
 
 
 def _stated_in_words(found: StatedError) -> str:
+    causes = {
+        "thresholds": (
+            "the scene's brightness changes by few contrast thresholds where the image moves: lower the sensor's "
+            "thresholds, or show a scene with more contrast"
+        ),
+        "refractory": "the sensor's refractory period is not known well: give it by --refractory-us",
+        "events": "there are few events: show a scene with more texture, or record for longer",
+    }
     return (
-        f"the events determine the motion of the image within {found.error_px:.2g} px only: give the sensor's "
-        "refractory period by --refractory-us if it is not given, show a scene with more texture, or record for longer"
+        f"the events determine the motion of the image within {found.error_px:.2g} px only: "
+        f"{causes[found.largest]}"
     )
 
 
