@@ -24,7 +24,6 @@ from amiwarp import (
 )
 from amiwarp.calib import checks, encoder_attempts
 from amiwarp.calib.calibrator import Calibrator
-from amiwarp.calib.encoder_attempts import BETWEEN_PULSES
 from amiwarp.calib.lost_counts import Step, changes_of_mean, lost_counts, without_steps
 from amiwarp.calib.photometric import limits
 from amiwarp.calib.photometric.losses import step_if_missing
@@ -49,6 +48,7 @@ SIZE = (160, 120)
 LOST_AT = 337_300
 """Time at which the encoder loses counts [us]."""
 STEP = math.radians(100 * 360 / 4096)
+BETWEEN_PULSES = "a speed that varies between pulses"
 
 
 @pytest.fixture(scope="module")
@@ -258,6 +258,39 @@ def test_what_is_not_found_between_pulses_is_bounded() -> None:
     assert found.path is None
     assert found.photometric is not None
     assert error_px < found.photometric.hidden_px[BETWEEN_PULSES] < 3.0 * error_px
+
+
+@pytest.mark.parametrize(
+    ("cost", "doubtful", "taken"),
+    [(0.0098, True, True), (0.0104, False, True), (0.0104, True, False), (0.0106, False, False)],
+    ids=["lower", "hardly higher", "with a warning", "higher"],
+)
+def test_a_path_may_cost_a_little_more(
+    monkeypatch: pytest.MonkeyPatch, still: Trouble, cost: float, doubtful: bool, taken: bool
+) -> None:
+    pulses = encoder_troubles.pulses_only(still).recording
+    given = Calibrator(pulses, Settings(model="exact"), "cpu", None)
+    mended = replace(given, mended=pulses.encoder)
+    between = SimpleNamespace(calibrator=mended, deviation_px=0.05, std_px=0.003)
+    space = SimpleNamespace(sized=True)
+    tried: Any = SimpleNamespace(
+        cost=0.01, search=SimpleNamespace(space=space), unexplained=False, camera_turned=False
+    )
+    again = SimpleNamespace(
+        accepted=True,
+        calibration=True,
+        cost=cost,
+        doubtful=doubtful,
+        unexplained=False,
+        camera_turned=False,
+    )
+    monkeypatch.setattr(encoder_attempts, "between_pulses", lambda *_: between)
+    monkeypatch.setattr(Calibrator, "attempt", lambda _: again)
+    calibrator, attempt = encoder_attempts.with_mended_encoder(given, tried)
+    assert (attempt is again) == taken
+    left_px = math.sqrt(0.05**2 - 0.003**2)
+    hidden_px = 0.006 if taken else left_px + 0.006
+    assert calibrator.hidden_px == {BETWEEN_PULSES: pytest.approx(hidden_px)}
 
 
 def test_a_shift_of_the_picture_is_no_deviation_of_a_path() -> None:
