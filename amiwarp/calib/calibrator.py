@@ -20,8 +20,10 @@ from amiwarp.calib import checks, plate
 from amiwarp.calib.events_ahead import upload_ahead
 from amiwarp.calib.photometric import limits
 from amiwarp.calib.photometric.equations import Problem
+from amiwarp.calib.photometric.findings import ParameterCorrected
+from amiwarp.calib.photometric.lens_at_depths import LensStep, is_explained, next_lens
+from amiwarp.calib.photometric.refinement import Refinement
 from amiwarp.calib.photometric.steps import refine, summarised
-from amiwarp.calib.photometric.verdicts import refused
 from amiwarp.calib.preparation import prepare
 from amiwarp.calib.settings import Settings
 from amiwarp.calib.sharpness_search import Search, bound_warnings
@@ -36,7 +38,7 @@ from amiwarp.calib.without_encoder import (
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import MemoryEvents, Recording
-from amiwarp.optics.camera import LENS, with_lens
+from amiwarp.optics.camera import LENS, given_lens, with_lens
 from amiwarp.optics.models.registry import MODELS
 from amiwarp.optics.prism import Plate
 from amiwarp.optics.rotation_path import RotationPath
@@ -47,6 +49,8 @@ from amiwarp.results.calibration import (
 from amiwarp.results.parameters import CHANGES, GROWTH, MOTION, ParameterSpace
 from amiwarp.tasks import Progress
 
+MOST_LENSES = 3
+"""Largest number of times that depths are found again through a corrected lens."""
 DEPTHS_ALONE = "depths explain the events, but one brightness map of the scene does not"
 """Verdict on a plate whose angles were not examined."""
 
@@ -176,8 +180,6 @@ class Calibrator:
 
                 if "photometric" in self.settings.stages:
                     through_plate = MODELS[self.settings.model].GLASS is Plate
-                    if through_plate:
-                        found, search = _at_each_depth(recording, search, found)
                     problem = Problem(
                         recording,
                         search,
@@ -189,7 +191,7 @@ class Calibrator:
                         if self.host_work is None
                         else partial(self.host_work, found),
                     )
-                    finish = _examined if through_plate else _by_brightness
+                    finish = _at_depths if through_plate else _by_brightness
                     found = finish(problem, found)
                 else:
                     found = with_warnings(found, *bound_warnings(search.space, found.parameters))
@@ -244,18 +246,44 @@ def _sharpest(
     )
 
 
-def _at_each_depth(
-    recording: Recording, search: Search, sharpest: Calibration
-) -> tuple[Calibration, Search]:
-    """Return the calibration of a plate with its phase, and the search with the depth of what each pixel sees.
+def _at_depths(problem: Problem, sharpest: Calibration) -> Calibration:
+    """Return the calibration of a plate: its phase and depths, and what the photometric stage says of them.
 
-    Raises :class:`AmiwarpError` as :func:`plate.refine_phase` does.
+    If the lens is wrong, phase and depths are found again through the corrected one, and the answer with the lower cost
+    counts. Raises :class:`AmiwarpError` as :func:`plate.refine_phase` does.
     """
+    found, search = _at_each_depth(problem, sharpest)
+    state = refine(replace(problem, sharp=search))
+    as_given = found, state
+    given = given_lens(found.camera)["k1"]
+    last: LensStep | None = None
+    corrected: list[ParameterCorrected] = []
+    for _ in range(MOST_LENSES):
+        last = next_lens(state, last)
+        if last is None:
+            break
+        k1 = given_lens(found.camera)["k1"] + last.step
+        corrected = [ParameterCorrected("k1", given, k1, last.deviation)]
+        camera = with_lens(found.camera, {"k1": k1})
+        phase = {"phase": found.parameters["phase"]}
+        again = replace(sharpest, camera=camera, parameters={**sharpest.parameters, **phase})
+        through = replace(problem, sharp=problem.sharp.through(camera))
+        found, search = _at_each_depth(through, again)
+        state = refine(replace(through, sharp=search))
+
+    if corrected and state.answer.cost >= as_given[1].answer.cost:
+        return _examined(as_given[1], as_given[0])
+    return _examined(state.noticing(*corrected), found)
+
+
+def _at_each_depth(problem: Problem, sharpest: Calibration) -> tuple[Calibration, Search]:
+    """Return the calibration of a plate with its phase, and the search with the depth of what each pixel sees."""
+    search = problem.sharp
 
     def report(share: float) -> None:
         search.report("photometric", share)
 
-    found, depths = plate.refine_phase(sharpest, recording, search.device, report)
+    found, depths = plate.refine_phase(sharpest, problem.recording, search.device, report)
     space = replace(search.space, depths=depths).holding(found.parameters)
     full_space = replace(search.full_space, depths=depths).holding(found.parameters)
     at_depths = replace(search, space=space, full_space=full_space)
@@ -283,18 +311,15 @@ def _by_brightness(problem: Problem, sharpest: Calibration) -> Calibration:
     return with_warnings(found, *bound_warnings(space, summary.parameters))
 
 
-def _examined(problem: Problem, found: Calibration) -> Calibration:
+def _examined(state: Refinement, found: Calibration) -> Calibration:
     """Return the calibration of a plate with what the photometric stage says of its angles and of its error.
 
-    Its phase stays: it was found together with the depths. If the stage does not explain the events at these depths,
-    nothing is said: they are noisy, or the camera turns slowly, which pairs of events with short gaps hardly show.
+    If the stage does not explain the events at the depths that were found, nothing is said: they are noisy, or the
+    camera turns slowly, which pairs of events with short gaps hardly show.
     """
-    state = refine(problem)
     summary, stage, _ = summarised(state)
     found = replace(found, stages=(*found.stages, stage))
-    turned = summary.rotation_gain > limits.LARGEST_ROTATION_GAIN
-    unexplained = summary.cost > limits.LARGEST_EXAMINED_COST
-    if turned or unexplained or refused(state.answer.optimum):
+    if not is_explained(state):
         silent = replace(summary, accepted=True, verdict=DEPTHS_ALONE, warnings=(), harmonics=())
         return replace(found, photometric=replace(silent, deviation_px=None, hidden_px={}))
     if summary.deviation_px is not None:

@@ -100,7 +100,12 @@ def with_mended_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibra
 def _explains_more(again: Attempt, tried: Attempt) -> bool:
     """Return whether an attempt with other angles than ``tried`` explains the events better."""
     still = not (again.unexplained or again.camera_turned)
-    holds = again.accepted and again.cost < tried.cost and still
+    examined = again.accepted
+    if any(map(lost_counts, each_encoder(encoder))):
+        # no prism makes such steps: what else is wrong is looked for next
+        still |= tried.unexplained or tried.camera_turned
+        examined |= again.photometric is not None and bool(again.photometric.harmonics)
+    holds = examined and again.cost < tried.cost and still
     much_better = again.cost <= limits.LARGEST_COST_RATIO * tried.cost
     return again.calibration is not None and (holds or much_better)
 

@@ -30,6 +30,7 @@ from amiwarp.calib.settings import AUTO, PHASE, SEARCH_IF_UNCLEAR, Settings, sta
 from amiwarp.calib.sharpness_objective import Objective, finite_differences, padding
 from amiwarp.choices import SearchCost, Sharpness
 from amiwarp.errors import AmiwarpError
+from amiwarp.optics.camera import Camera
 from amiwarp.optics.models.registry import MODELS
 from amiwarp.results.calibration import StageSummary
 from amiwarp.results.parameters import (
@@ -131,6 +132,12 @@ class Search:
     def at(self, values: Mapping[str, float], stages: tuple[StageSummary, ...] = ()) -> Search:
         """Return the search with an answer that is known from elsewhere, and the stages that led to it."""
         return replace(self, answer=Sharpest(dict(values), math.nan), stages=stages)
+
+    def through(self, camera: Camera) -> Search:
+        """Return the search for the same events through another lens."""
+        space = replace(self.space, camera=camera)
+        full_space = replace(self.full_space, camera=camera)
+        return replace(self, space=space, full_space=full_space)
 
     def _objective_by_parts(self, kind: Sharpness) -> Objective:
         """Return an objective that measures disjoint parts of the events separately."""

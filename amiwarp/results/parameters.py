@@ -23,7 +23,7 @@ from amiwarp.optics.models.base import Model, check_given
 from amiwarp.optics.models.exact import ExactModel
 from amiwarp.optics.models.pair import RisleyModel
 from amiwarp.optics.models.parameter import PHASE, Parameter
-from amiwarp.optics.models.plate import LARGEST_INVERSE_DEPTH, PlateModel
+from amiwarp.optics.models.plate import LARGEST_INVERSE_DEPTH, PlateModel, depth_factors
 from amiwarp.optics.models.registry import MODELS, build_model, size_names
 from amiwarp.optics.prism import NominalPrism, Plate, Prism, UnsizedPrism
 from amiwarp.optics.rotation_path import RotationPath
@@ -139,7 +139,7 @@ class ParameterSpace:
     """Known part of the camera's rotation, from a gyroscope. The rates then stand for its bias."""
     depths: NDArray[np.float64] | None = field(default=None, repr=False, compare=False)
     """Inverse depth of what each pixel sees through a plate, relative to the parameter, shape ``(height, width)``; None
-    for the same one everywhere."""
+    for the same one everywhere. They hold for the nominal camera: with another lens, they follow the orbits."""
 
     @property
     def size_name(self) -> str:
@@ -326,6 +326,10 @@ class ParameterSpace:
         if self.depths is None or not isinstance(model, PlateModel):
             return model
         inverse_depths = self.depths * model.inverse_depth
+        if model.camera != self.camera:
+            # orbits were seen, not depths: through another lens, other depths have them
+            given = replace(model, camera=self.camera)
+            inverse_depths = inverse_depths * depth_factors(given, model)
         return model.with_depths(np.minimum(inverse_depths, LARGEST_INVERSE_DEPTH))
 
     def camera_rotation(self, values: Mapping[str, float]) -> CameraRotation:

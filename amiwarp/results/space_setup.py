@@ -17,7 +17,7 @@ from amiwarp.optics.models.base import Model
 from amiwarp.optics.models.comparison import rms
 from amiwarp.optics.models.registry import MODELS, build_model, size_names
 from amiwarp.optics.models.several import compensate_by_each
-from amiwarp.optics.prism import Plate, Prism, as_wedge
+from amiwarp.optics.prism import Plate, Prism
 from amiwarp.optics.rotation_path import RotationPath
 from amiwarp.results.parameters import (
     CHANGES,
@@ -156,7 +156,7 @@ def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
     They start at their present values. Raises :class:`AmiwarpError` if one of them moves no event.
     """
     camera = space.camera
-    given = {**given_lens(camera), "index": as_wedge(space.prism).index}
+    given = {**given_lens(camera), "index": space.prism.index}
     values = {**{name: given.get(name, 0.0) for name in names}, **space.start}
 
     # Half widths of the bounds.

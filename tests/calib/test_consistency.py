@@ -31,13 +31,11 @@ from amiwarp import (
     truth_model,
 )
 from amiwarp.calib import encoder_attempts
-from amiwarp.calib.photometric import angles, limits
+from amiwarp.calib.photometric import angles, limits, systematic
 from amiwarp.calib.photometric.causes import FACES, FOCAL_LENGTH, SEAT, SIDE
 from amiwarp.calib.photometric.consistency import CLOCK, LEAST_GAIN, Consistency, LikelyCause
 from amiwarp.calib.photometric.findings import RivalCauses
-from amiwarp.calib.photometric.limits import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST
 from amiwarp.calib.photometric.linear_fit import LinearFit
-from amiwarp.calib.photometric.systematic import MAP_ERROR, lens_errors, map_errors
 from amiwarp.calib.photometric.verdicts import likeliest, refused, rivals_in_words, warned
 from amiwarp.results import make_space
 from amiwarp.studies.stability.scenes import polygons
@@ -268,9 +266,9 @@ def test_a_slow_rotation_of_the_camera_is_noticed(texture: np.ndarray, wide: Rec
     )
     assert still is not None
     assert moved is not None
-    assert still.rotation_gain < 0.2 * LARGEST_ROTATION_GAIN
-    assert moved.rotation_gain > LARGEST_ROTATION_GAIN
-    assert moved.cost < LARGEST_STILL_COST
+    assert still.rotation_gain < 0.2 * limits.LARGEST_ROTATION_GAIN
+    assert moved.rotation_gain > limits.LARGEST_ROTATION_GAIN
+    assert moved.cost < limits.LARGEST_STILL_COST
 
 
 def test_a_camera_that_shakes_with_the_prism_is_refused(texture: np.ndarray) -> None:
@@ -328,19 +326,23 @@ def seen(curvatures: dict[str, float]) -> tuple[ParameterSpace, np.ndarray, Line
 
 def test_a_lens_that_the_events_do_not_tell_is_a_part_of_the_apex() -> None:
     space, v, fit = seen({"apex": 1.0, "phase": 1.0, "focal_length": 1e-6})
-    std = space.deviations(v, lens_errors(space, v, fit, LEAST_GAIN))
+    std = space.deviations(v, systematic.lens_errors(space, v, fit, LEAST_GAIN))
     assert 0.01 < std["apex"] / PRISM.apex < 0.03
     assert std["phase"] < 0.002
     space, v, fit = seen({"apex": 1.0, "phase": 1.0, "focal_length": 1e6})
-    told = space.deviations(v, lens_errors(space, v, fit, LEAST_GAIN))
+    told = space.deviations(v, systematic.lens_errors(space, v, fit, LEAST_GAIN))
     assert told["apex"] < 0.01 * std["apex"]
 
 
 def test_errors_of_the_map_are_shared_by_all_pairs() -> None:
     space, v, fit = seen({"apex": 400.0, "phase": 400.0})
-    coarse, fine = (space.deviations(v, map_errors(space, v, fit, 40_000, d)) for d in (1.0, 2.0))
+    coarse, fine = (
+        space.deviations(v, systematic.map_errors(space, v, fit, 40_000, d)) for d in (1.0, 2.0)
+    )
     px_per_rad = float(np.linalg.norm(v))
-    assert coarse["phase"] * px_per_rad == pytest.approx(MAP_ERROR["phase"] * 10.0, rel=1e-3)
+    assert coarse["phase"] * px_per_rad == pytest.approx(
+        systematic.MAP_ERROR["phase"] * 10.0, rel=1e-3
+    )
     assert coarse["phase"] == pytest.approx(4.0 * fine["phase"])
     assert coarse["apex"] / PRISM.apex == pytest.approx(coarse["phase"] * 0.008 / 0.03, rel=1e-3)
 

@@ -473,6 +473,51 @@ def test_a_path_between_pulses_that_explains_little_is_said(
     assert encoder_attempts.with_mended_encoder(calibrator, tried)[1] is tried
 
 
+@pytest.mark.parametrize(
+    ("accepted", "harmonics", "turned", "cost", "is_taken"),
+    [
+        (True, (), (False, False), 0.09, True),
+        (False, (0.0, 0.01), (False, False), 0.09, True),  # corrected next
+        (False, (), (False, False), 0.09, False),
+        (True, (), (True, True), 0.09, True),  # the camera turns with the counts and without them
+        (True, (), (False, True), 0.09, False),
+        (True, (), (True, True), 0.11, False),
+    ],
+)
+def test_counts_are_put_back_although_something_else_is_wrong_too(
+    still: Trouble,
+    monkeypatch: pytest.MonkeyPatch,
+    accepted: bool,
+    harmonics: tuple[float, ...],
+    turned: tuple[bool, bool],
+    cost: float,
+    is_taken: bool,
+) -> None:
+    """A step of the samples is no motion of a prism. ``turned``: whether the camera turned, before and after."""
+    recording = replace(still.recording, encoder=samples(steady(), 100, index=False))
+    calibrator = Calibrator(recording, Settings(model="exact"), "cpu", None)
+    before, after = turned
+    tried: Any = SimpleNamespace(
+        search=SimpleNamespace(space=SimpleNamespace(sized=True)),
+        cost=0.1,
+        unexplained=False,
+        camera_turned=before,
+        doubtful=False,
+    )
+    again = SimpleNamespace(
+        accepted=accepted,
+        cost=cost,
+        unexplained=False,
+        camera_turned=after,
+        calibration=SimpleNamespace(),
+        photometric=SimpleNamespace(harmonics=harmonics),
+    )
+    monkeypatch.setattr(Calibrator, "attempt", lambda *_, **__: again)
+    found, kept = encoder_attempts.with_mended_encoder(calibrator, tried)
+    assert (kept is again) == is_taken
+    assert ("steps by" in found.mended_words) == is_taken
+
+
 def test_a_path_that_is_not_determined_between_pulses_is_said(
     still: Trouble, monkeypatch: pytest.MonkeyPatch
 ) -> None:

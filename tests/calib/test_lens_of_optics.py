@@ -63,6 +63,16 @@ def test_only_a_single_prism_has_a_flat_side_to_be_turned() -> None:
     assert causes_of("circle") == []
 
 
+def test_depths_of_a_plate_make_up_for_the_focal_length() -> None:
+    plate = amiwarp.Plate(0.01, math.radians(45.0))
+    space = make_space(
+        "plate", CAMERA, plate, free=None, start={}, bounds={}, rad_per_us=1e-3, duration_us=1e5
+    )
+    assert causes_to_test(space) == OF_LENS
+    at_depths = replace(space, depths=np.ones((CAMERA.height, CAMERA.width)))
+    assert causes_to_test(at_depths) == [CENTER, DISTORTION, ASPECT]
+
+
 def of_pair(texture: np.ndarray, camera: amiwarp.Camera) -> amiwarp.Recording:
     return amiwarp.simulate(
         texture, camera, PAIR, duration_s=0.2, motion=TURNING, sensor=PROMPT, seed=2

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,8 +19,10 @@ from amiwarp.calib.photometric.causes import (
     ASPECT,
     CAUSES,
     CENTER,
+    DISTORTION,
     FACES,
     FLAT_SIDE,
+    FOCAL_LENGTH,
     GATED,
     INDEX,
     SCREENED,
@@ -134,6 +136,9 @@ class Consistency(Finding):
     center_px: tuple[float, float] | None = None
     """Correction of the principal point, and its standard deviation, as displacements of events [px rms]; None if it is
     free or cannot be tested."""
+    distortion: tuple[float, float] | None = None
+    """Change of the distortion k1 that a linearised fit finds at found depths, and its standard deviation; None without
+    such depths."""
     shake_px: float = 0.0
     """Least amplitude of a rotation of the camera that repeats every turn [px], if the camera seems to shake so; else
     0."""
@@ -155,9 +160,12 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
     causes = testable(space)
     # a lens that was given wrongly once may be wrong in more than one way: then everything is examined at once
     doubtful = not set(LENS).isdisjoint(space.names)
-    least_gain = LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN
+    # found depths have absorbed a part of what a wrong lens leaves
+    little = doubtful or space.depths is not None
+    least_gain = LEAST_FURTHER_GAIN if little else LEAST_GAIN
+    # where depths make up for the focal length, nothing resembles the other causes
     screened = causes
-    if not doubtful:
+    if not doubtful and space.depths is None:
         screened = [cause for cause in causes if cause in SCREENED]
     columns = _screened_columns(cost, best, screened, least_gain)
     fit = linear_fit(cost, columns)
@@ -169,7 +177,7 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
                 columns |= by_cause(cost, best, cause)
         columns |= by_shake(cost, best)
         fit = linear_fit(cost, columns)
-        likely = _likely(cost, best, fit, causes, LEAST_GAIN)
+        likely = _likely(cost, best, fit, causes, least_gain)
         shake_px = _shake(space, fit)
 
     of_lens = lens_errors(space, best, fit, least_gain)
@@ -196,6 +204,7 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         rotation_gain=_rotation_gain(space, fit),
         untold_px=_untold(space, best, fit),
         center_px=_center(space, best, fit),
+        distortion=_distortion(space, best, fit),
         shake_px=shake_px,
     )
 
@@ -320,6 +329,17 @@ def _center(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float,
     return size * change, size * math.sqrt(variance)
 
 
+def _distortion(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, float] | None:
+    """Return the change of k1 at found depths and its standard deviation; None if it was not examined there."""
+    if space.depths is None or "k1" not in fit.names:
+        return None
+    estimate = fit.fit((*space.names, "k1"))
+    wide, _ = with_cause(space, DISTORTION, space.to_values(best))
+    px_per_unit = wide.pixels["k1"]
+    std = math.sqrt(float(estimate.covariance[-1, -1]))
+    return float(estimate.change[-1]) / px_per_unit, std / px_per_unit
+
+
 def testable(space: ParameterSpace) -> list[Cause]:
     """Return the causes that can be tested: of what the model has, and what is neither free nor found before."""
     kind = MODELS[space.model]
@@ -332,6 +352,9 @@ def testable(space: ParameterSpace) -> list[Cause]:
     causes = []
     for cause in CAUSES:
         names = {*cause.names}
+        # only the size of orbits tells the focal length, and the depth of each pixel makes up for that
+        if cause == FOCAL_LENGTH and space.depths is not None:
+            continue
         # a third harmonic is given or was found by an earlier attempt
         known = cause == THIRD and names & {*space.start}
         if names <= adjustable and not names & free and not known:
@@ -377,8 +400,10 @@ def _corrected(
         return share * distance(there, here), v
     low, high = wide.bounds()
     v = np.clip(v + change, low, high)
-    there = wide.build(wide.to_values(v))
-    return distance(there, here), v
+    # found depths follow the lens, and would hide a part of the change
+    plane = replace(wide, depths=None)
+    there = plane.build(plane.to_values(v))
+    return distance(there, replace(space, depths=None).build(values)), v
 
 
 def _drift(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, float]:

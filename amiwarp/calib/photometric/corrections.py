@@ -101,6 +101,8 @@ def correct_camera_and_prism(given: Refinement) -> Refinement:
     """
     if given.answer.cost > limits.LARGEST_EXAMINED_COST or not given.space.sized:
         return given
+    if given.space.depths is not None:  # they must be found anew for another lens
+        return _checked(given)
     state = given
     tied: list[tuple[Corrected, Corrected]] = []
     for left in range(MOST_CORRECTIONS, -1, -1):

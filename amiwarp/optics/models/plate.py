@@ -18,6 +18,7 @@ from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models.base import Model, model_camera
 from amiwarp.optics.models.parameter import PHASE, Parameter
+from amiwarp.optics.models.several import compensate_by_each
 from amiwarp.optics.models.structs import phase_values, points_on_host, struct_of
 from amiwarp.optics.prism import Plate, Prism, check_angles, check_phase
 from amiwarp.schema.calls import guarded
@@ -27,6 +28,10 @@ NOMINAL_INVERSE_DEPTH = 2.0
 """Inverse depth with which a search starts [1/m]."""
 LARGEST_INVERSE_DEPTH = 20.0
 """Upper limit of inverse depths [1/m]."""
+FACTOR_COLUMNS = 13
+FACTOR_ROWS = 10
+FACTOR_ANGLES = 8
+"""Numbers of columns and rows of pixels, and of angles of a turn, at which orbits through two lenses are compared."""
 LARGEST_WEDGE = math.radians(0.5)
 """Default bound of the angle between a plate's faces [rad]. Stock windows have 1 arcmin or less."""
 
@@ -216,3 +221,49 @@ class PlateModel(Model):
         inputs = [self._plate_params(), model_camera(self, "cpu"), pixels, angles, depths]
         launch(plate_kernels.compensate_at_depths, len(out), inputs, [out], device="cpu")
         return np.asarray(out.numpy(), np.float64)
+
+
+def depth_factors(given: PlateModel, other: PlateModel) -> NDArray[np.float64]:
+    """Return by which factor the inverse depth of each pixel differs if its orbit is as large through another lens.
+
+    Parameters
+    ----------
+    given : PlateModel
+        Model with the lens for which inverse depths are known, and with their mean.
+    other : PlateModel
+        The same model with the other lens.
+
+    Returns
+    -------
+    numpy.ndarray
+        The factors, shape ``(height, width)``; 1 near pixels that have no ray in one of the lenses.
+    """
+    # A few orbits suffice: a lens changes them smoothly over the image.
+    camera = given.camera
+    columns = np.linspace(0.0, camera.width - 1.0, FACTOR_COLUMNS)
+    rows = np.linspace(0.0, camera.height - 1.0, FACTOR_ROWS)
+    x, y = np.meshgrid(columns, rows)
+    knots = np.stack([x.ravel(), y.ravel()], axis=1)
+    turn = np.arange(FACTOR_ANGLES) * (math.tau / FACTOR_ANGLES)
+    xy = np.repeat(knots, FACTOR_ANGLES, axis=0)
+    theta = np.tile(turn, len(knots))
+    planes = [replace(model, depths=None, wedge=(0.0, 0.0)) for model in (given, other)]
+    moved = compensate_by_each(planes, xy, theta)
+    by_knot = moved.reshape(2, len(knots), FACTOR_ANGLES, 2)
+    orbits = by_knot - by_knot.mean(axis=2, keepdims=True)
+
+    # The factor that makes the other orbit most like the given one.
+    likeness, square = np.sum(orbits * orbits[1], axis=(2, 3))
+    known = np.isfinite(likeness) & (square > 0.0)
+    factors = np.divide(likeness, square, out=np.ones(len(knots)), where=known)
+    table = factors.reshape(FACTOR_ROWS, FACTOR_COLUMNS)
+    by_row = _linear_weights(camera.height, FACTOR_ROWS)
+    by_column = _linear_weights(camera.width, FACTOR_COLUMNS)
+    return np.asarray(by_row @ table @ by_column.T)
+
+
+def _linear_weights(count: int, knots: int) -> NDArray[np.float64]:
+    """Return the weights of evenly spaced knots at pixels, for linear interpolation, shape ``(count, knots)``."""
+    place = np.linspace(0.0, knots - 1.0, count)
+    distance = np.abs(place[:, None] - np.arange(knots))
+    return np.maximum(0.0, 1.0 - distance)
