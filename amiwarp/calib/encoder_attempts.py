@@ -94,11 +94,14 @@ def with_mended_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibra
     if mended is None:
         return calibrator, tried
     again = mended.attempt()
-    return (mended, again) if _explains_more(again, tried) else (calibrator, tried)
+    return (mended, again) if _explains_more(again, tried, encoder) else (calibrator, tried)
 
 
-def _explains_more(again: Attempt, tried: Attempt) -> bool:
-    """Return whether an attempt with other angles than ``tried`` explains the events better."""
+def _explains_more(again: Attempt, tried: Attempt, encoder: Encoder) -> bool:
+    """Return whether an attempt with other angles than ``tried`` explains the events better.
+
+    ``encoder`` is the one of the recording, with whose angles ``tried`` was made.
+    """
     still = not (again.unexplained or again.camera_turned)
     examined = again.accepted
     if any(map(lost_counts, each_encoder(encoder))):
@@ -138,7 +141,7 @@ def _with_path_between_pulses(
 
     mended = replace(mended, hidden_px={BETWEEN_PULSES: untold_px})
     again = mended.attempt()
-    if _explains_more(again, tried):
+    if _explains_more(again, tried, encoder):
         return mended, again
     if not again.accepted:
         return calibrator, tried
