@@ -129,15 +129,16 @@ def test_each_kind_has_words_and_a_remedy(kind: str, said: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("largest", "said"),
+    ("part", "said"),
     [
         ("thresholds", "lower the sensor's thresholds"),
         ("refractory", "--refractory-us"),
         ("events", "record for longer"),
     ],
 )
-def test_a_large_stated_error_names_its_largest_part(largest: str, said: str) -> None:
-    words = refused(findings.StatedError(0.05, largest))
+def test_a_large_stated_error_names_its_large_parts(part: str, said: str) -> None:
+    words = refused(findings.StatedError(0.05, (part,)))
     assert "within 0.05 px only" in words
     assert said in words
     assert words.count(":") == 2
+    assert said in refused(findings.StatedError(0.05, ("thresholds", "refractory", "events")))

@@ -61,6 +61,8 @@ NOISE_PX = 0.15
 a cost of 0.25, the amplitudes of a mirror were 0.03 px too small, and the motion was 0.038 px off."""
 RIVAL_STD = 0.5
 """Systematic standard deviation of an answer with a rival explanation: a share of the difference of their answers."""
+LARGE_PART = 0.5
+"""Share of the largest part of a stated error above which another part is named too."""
 SAME_COST = 1.05
 """Largest ratio of the costs of two answers that count as equal. Two maps of the same scene differ by less."""
 LARGEST_LAST_STEP_PX = 0.01
@@ -273,14 +275,18 @@ def judge_the_consistency(state: Refinement) -> Refinement:
     # an answer with a free speed is found again at that speed
     if MODELS[space.model].PRISM or "rpm" in space.names:
         return state
-    parts = {
+    error_px = stated_px(space, v, covariance)
+    if error_px < limits.NOTABLE_STATED_PX:
+        return state.noticing(StatedError(error_px, ()))
+    covariances = {
         "thresholds": check.of_map,
         "refractory": np.outer(doubt, doubt),
         "events": state.answer.covariance,
     }
-    error_px = stated_px(space, v, covariance)
-    largest = max(parts, key=lambda name: stated_px(space, v, parts[name]))
-    return state.noticing(StatedError(error_px, largest))
+    parts_px = {name: stated_px(space, v, part) for name, part in covariances.items()}
+    least_px = LARGE_PART * max(parts_px.values())
+    large = tuple(name for name, px in parts_px.items() if px >= least_px)
+    return state.noticing(StatedError(error_px, large))
 
 
 def motion_error(state: Refinement, check: Consistency, v: Vector) -> MotionError:

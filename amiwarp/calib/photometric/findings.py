@@ -187,8 +187,8 @@ class StatedError(Finding):
 
     error_px: float
     """The error [px rms]."""
-    largest: str
-    """Its largest part: ``thresholds``, ``refractory`` or ``events``."""
+    parts: tuple[str, ...]
+    """Its large parts, of ``thresholds``, ``refractory`` and ``events``; empty if the error is not notable."""
 
 
 @dataclass(frozen=True)

@@ -474,9 +474,9 @@ def _stated_in_words(found: StatedError) -> str:
         "refractory": "the sensor's refractory period is not known well: give it by --refractory-us",
         "events": "there are few events: show a scene with more texture, or record for longer",
     }
+    named = "; and ".join(causes[part] for part in found.parts)
     return (
-        f"the events determine the motion of the image within {found.error_px:.2g} px only: "
-        f"{causes[found.largest]}"
+        f"the events determine the motion of the image within {found.error_px:.2g} px only: {named}"
     )
 
 
