@@ -23,6 +23,7 @@ from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.device_events import read_between
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
+from amiwarp.optics.models.comparison import rms
 from amiwarp.optics.models.plate import PlateModel
 from amiwarp.optics.prism import Plate
 from amiwarp.results.calibration import Calibration
@@ -281,8 +282,8 @@ def hidden_by_faces(found: Calibration) -> dict[str, float]:
         replace(model, wedge=(along, across + largest["wedge_y"])),
     ]
     here, *there = displacements([model, *by_each])
-    changes = np.array(there) - here
-    px = math.sqrt(float(np.sum(changes**2)) / (here.size / 2.0))
+    # through a wide lens, no ray passes at the border of the image
+    px = math.hypot(*(rms((each - here).reshape(-1, 2)) for each in there))
     return {"faces that are not parallel": px} if px > 0.0 else {}
 
 

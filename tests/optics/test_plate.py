@@ -350,6 +350,10 @@ def test_what_faces_hide_is_how_far_they_move_points(calibration: amiwarp.Calibr
     assert stock == pytest.approx(moved_px((math.radians(1.0 / 60.0), 0.0)), rel=0.1)
     given = replace(calibration, uncertainty={"phase": 0.01})
     assert hidden_by_faces(given) == {}
+    # Beyond 90 degrees from the normal of the faces, no ray passes the plate.
+    wide = replace(sure, camera=amiwarp.Camera.from_fov(96, 72, math.radians(85.0)))
+    (of_wide,) = hidden_by_faces(wide).values()
+    assert of_wide > stock
 
 
 def plate_space() -> Any:
