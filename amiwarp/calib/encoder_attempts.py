@@ -104,11 +104,13 @@ def _explains_more(again: Attempt, tried: Attempt, encoder: Encoder) -> bool:
     """
     still = not (again.unexplained or again.camera_turned)
     examined = again.accepted
+    most_cost = tried.cost
     if any(map(lost_counts, each_encoder(encoder))):
-        # no prism makes such steps: what else is wrong is looked for next
+        # no prism makes such steps: they need no lower cost, and what else is wrong is looked for next
+        most_cost *= LARGEST_STRAIGHT_COST_RATIO
         still |= tried.unexplained or tried.camera_turned
         examined |= again.photometric is not None and bool(again.photometric.harmonics)
-    holds = examined and again.cost < tried.cost and still
+    holds = examined and again.cost < most_cost and still
     much_better = again.cost <= limits.LARGEST_COST_RATIO * tried.cost
     return again.calibration is not None and (holds or much_better)
 

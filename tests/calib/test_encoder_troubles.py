@@ -481,7 +481,14 @@ def test_a_path_between_pulses_that_explains_little_is_said(
         (False, (), (False, False), 0.09, False),
         (True, (), (True, True), 0.09, True),  # the camera turns with the counts and without them
         (True, (), (False, True), 0.09, False),
-        (True, (), (True, True), 0.11, False),
+        (
+            True,
+            (),
+            (False, False),
+            0.104,
+            True,
+        ),  # depths that are found anew make as much of a difference
+        (True, (), (False, False), 0.106, False),
     ],
 )
 def test_counts_are_put_back_although_something_else_is_wrong_too(
