@@ -285,7 +285,8 @@ class PhaseReconstruction:
             Picture of each window.
         """
         count = self.count(start_us, length_us, step_us=step_us)
-        starts = [start_us + round(k * step_us) for k in range(count)]
+        # One at a time: a recording may have any number of windows
+        starts = (start_us + round(k * step_us) for k in range(count))
         if self.device.is_cuda:
             yield from self._streamed(starts, length_us)
             return
