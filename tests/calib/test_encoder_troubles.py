@@ -449,26 +449,33 @@ def test_a_path_between_pulses_that_explains_little_is_said(
     recording = replace(still.recording, encoder=pulses)
     calibrator = Calibrator(recording, Settings(model="exact"), "cpu", None)
     sized = SimpleNamespace(space=SimpleNamespace(sized=True))
-    tried: Any = SimpleNamespace(search=sized, cost=0.25)
+    tried: Any = SimpleNamespace(search=sized, cost=0.25, unexplained=True, camera_turned=False)
     again = SimpleNamespace(
         accepted=True,
         cost=ratio * 0.25,
+        doubtful=True,
         unexplained=True,
         camera_turned=False,
         calibration=SimpleNamespace(),
     )
-    other = SimpleNamespace(attempt=lambda: again)
+    path = Encoder(pulses.t, pulses.angle + 0.01)
+    between = SimpleNamespace(
+        calibrator=replace(calibrator, mended=path), deviation_px=0.05, std_px=0.003
+    )
     monkeypatch.setattr(encoder_attempts, "confirmed_by", lambda *_: False)
-    monkeypatch.setattr(encoder_attempts, "between_pulses", lambda *_: other)
+    monkeypatch.setattr(encoder_attempts, "between_pulses", lambda *_: between)
+    monkeypatch.setattr(Calibrator, "attempt", lambda _: again)
     found, kept = encoder_attempts.with_mended_encoder(calibrator, tried)
     assert kept is tried
     assert found.mended is None
     assert ("gives pulses only" in found.mended_words) == said
     monkeypatch.setattr(
-        encoder_attempts, "confirmed_by", lambda by, given: by is other and given is pulses
+        encoder_attempts,
+        "confirmed_by",
+        lambda by, given: by.mended is path and given is pulses,
     )
     found, kept = encoder_attempts.with_mended_encoder(calibrator, tried)
-    assert (found is other, kept is again) == (said, said)
+    assert (found.mended is path, kept is again) == (said, said)
     again.camera_turned = True
     assert encoder_attempts.with_mended_encoder(calibrator, tried)[1] is tried
 
