@@ -25,7 +25,7 @@ from amiwarp.imaging.phase_ring import PhaseRing, PhaseUpdate
 from amiwarp.optics.models.base import Model
 from amiwarp.reconstruction.image_in_phase import AROUND_PX, mean_around
 from amiwarp.reconstruction.phase_lag import lag_of
-from amiwarp.reconstruction.phase_window import harmonics_for
+from amiwarp.reconstruction.phase_window import harmonics_for, picture_of
 from amiwarp.reconstruction.picture import Picture
 from amiwarp.reconstruction.picture_in_phase import joined_picture, motion_of, phase_picture
 from amiwarp.schema.calls import guarded
@@ -143,12 +143,7 @@ class PhaseCamera:
         count = harmonics_for(model) if harmonics is None else harmonics
         self._ring = PhaseRing(camera.width, camera.height, harmonics=count)
         # Refuses the model, or loads kernels and tables before the stream needs them
-        shape = (camera.height, camera.width)
-        none = np.zeros(shape, np.int32)
-        nothing = PhaseSums(
-            np.zeros((self._ring.harmonics, *shape), np.complex64), none, none, 1.0, 1.0
-        )
-        phase_picture(nothing, model)
+        phase_picture(_nothing(self._ring), model)
         self._queue: deque[tuple[Events, int]] = deque()
         self.waiting = 0
         """Number of events in the queue, which wait for encoder samples."""
@@ -321,19 +316,9 @@ class PhaseCamera:
         self._before = sums, ground
         self._drawn_bin = self._ring.newest
         start_us, end_us = self._ring.span_us(bins)
-        picture = Picture(
-            log=log,
-            known=sums.values[0] != 0,
-            start_us=start_us,
-            length_us=end_us - start_us,
-            pairs=0,
-            off_excess=sums.off_ratio - 1.0,
-            smoothness=0.0,
-            residual=0.0,
-            hot=0,
-            seconds=time.perf_counter() - began,
-            unknowns=np.zeros(0, np.float32),
-        )
+        known = sums.values[0] != 0
+        length_us = end_us - start_us
+        picture = picture_of(log, known, sums.off_ratio, start_us, length_us, began)
         return LivePicture(picture, misfit, moved, bins / BINS, sums.events)
 
     def _find_lag(self, sums: PhaseSums) -> None:
