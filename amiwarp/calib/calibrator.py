@@ -323,7 +323,11 @@ def _examined(state: Refinement, found: Calibration) -> Calibration:
         silent = replace(summary, accepted=True, verdict=DEPTHS_ALONE, warnings=(), harmonics=())
         return replace(found, photometric=replace(silent, deviation_px=None, hidden_px={}))
     if summary.deviation_px is not None:
-        hidden_px = {**summary.hidden_px, **plate.hidden_by_faces(found)}
+        hidden_px = {
+            **summary.hidden_px,
+            **plate.hidden_by_faces(found),
+            **plate.hidden_by_plate(found),
+        }
         summary = replace(summary, hidden_px=hidden_px)
     found = with_warnings(replace(found, photometric=summary), *summary.warnings)
     if not summary.accepted:

@@ -226,6 +226,18 @@ def scale_doubt(plate: Plate) -> float:
     return math.hypot(THICKNESS_SHARE, by_tilt, by_index)
 
 
+def hidden_by_plate(found: Calibration) -> dict[str, float]:
+    """Return by how much another thickness, tilt or glass of the plate may move points [px rms], by words.
+
+    It is the motion at depths that are known from elsewhere: found depths make up for it, so that no event shows it.
+    """
+    model = found.model
+    assert isinstance(model, PlateModel)
+    motion = displacements([model])
+    motion_px = rms(motion.reshape(-1, 2))
+    return {"the plate's thickness, tilt and glass": BOUND * scale_doubt(model.plate) * motion_px}
+
+
 def check_known_phase(std: float, name: str) -> None:
     """Raise :class:`AmiwarpError` if the standard deviation of the phase [rad] leaves it unknown."""
     if std > LARGEST_STD_RAD:

@@ -283,9 +283,11 @@ def test_the_error_of_a_good_plate_is_stated(calibration: amiwarp.Calibration) -
     assert calibration.warnings == ()
     assert stage.deviation_px is not None
     assert 0.002 <= stage.deviation_px < 0.01
-    assert {"faces that are not parallel", "an error that repeats with the encoder's angle"} <= {
-        *stage.hidden_px
-    }
+    assert {
+        "faces that are not parallel",
+        "an error that repeats with the encoder's angle",
+        "the plate's thickness, tilt and glass",
+    } <= {*stage.hidden_px}
 
 
 @pytest.mark.slow
@@ -354,6 +356,32 @@ def test_what_faces_hide_is_how_far_they_move_points(calibration: amiwarp.Calibr
     wide = replace(sure, camera=amiwarp.Camera.from_fov(96, 72, math.radians(85.0)))
     (of_wide,) = hidden_by_faces(wide).values()
     assert of_wide > stock
+
+
+def test_what_another_plate_hides_covers_its_tolerances(calibration: amiwarp.Calibration) -> None:
+    """At known depths, a plate that is thicker by twice the tolerance moves points by the share more."""
+    model = calibration.model
+    assert isinstance(model, amiwarp.PlateModel)
+    columns, rows = np.linspace(0, CAMERA.width - 1, 15), np.linspace(0, CAMERA.height - 1, 11)
+    xy = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    theta = np.arange(24) * (math.tau / 24)
+
+    def away_px(plate: amiwarp.Plate) -> float:
+        places = []
+        for each in (plate, model.plate):
+            through = replace(model, plate=each)
+            at = through.compensate_points(np.repeat(xy, 24, axis=0), np.tile(theta, len(xy)))
+            by_pixel = at.reshape(len(xy), 24, 2)
+            places.append(by_pixel - by_pixel.mean(axis=1, keepdims=True))
+        return float(np.sqrt(np.mean(np.sum((places[0] - places[1]) ** 2, axis=2))))
+
+    thicker = replace(model.plate, thickness=1.06 * model.plate.thickness)
+    tilted = replace(model.plate, tilt=model.plate.tilt + math.radians(2.0))
+    of_other_glass = replace(model.plate, index=model.plate.index + 0.02)
+    each_px = [away_px(plate) for plate in (thicker, tilted, of_other_glass)]
+    assert calibration.photometric is not None
+    stated_px = calibration.photometric.hidden_px["the plate's thickness, tilt and glass"]
+    assert stated_px == pytest.approx(math.hypot(*each_px), rel=0.1)
 
 
 def plate_space() -> Any:
