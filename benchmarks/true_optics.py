@@ -9,6 +9,9 @@ twenty troubles that no code was chosen with. ``--events`` keeps the simulated e
 The error is the distance between where the calibration puts the events and where they belong, over the image and the
 recording, in px rms. One constant lag of all events and one constant rotation of the camera are removed first: neither
 can be seen. ``shift_removed_px`` is the error if only a shift of the picture is removed in place of the rotation.
+
+``named`` is what the stability study calls so: a warning or a refusal has a word of the trouble's cause, or the stated
+bound of that cause is at least as large as the error.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ from scipy.optimize import minimize_scalar
 
 import amiwarp
 from amiwarp import Camera, Encoder, Events, MemoryEvents, Plate, Prism, Recording
+from amiwarp.studies.stability.causes import could_hide, has_word
 from benchmarks.moving_optics import rows_of
 from reference import optics as oracle
 from reference.second_simulator import Pixels, Place, dead_leaves, events_of
@@ -66,9 +70,13 @@ class Rig:
     inverse_depth: Callable[[Array], Array] | None = None
     """Inverse depth of what pixels without the optic see [1/m], for a plate."""
     needs: tuple[str, ...] = ()
-    """Words, one of which a warning or a refusal must have to name the trouble's cause."""
+    """Words in small letters, one of which a warning, a refusal or a stated bound must have to name the cause."""
 
 
+ANGLE = "angle is wrong", "repeats with"
+"""Words that name an error of an encoder that repeats with its angle."""
+SHAPE = "cylinder", "evenness", "uneven", "wobble", "seat"
+"""Words that name the shape of a prism or its seat, which move the image nearly alike."""
 Angle = Callable[[Array], Array]
 """Function that returns an angle [rad] at times [s]."""
 
@@ -154,15 +162,17 @@ def wedge(rng: np.random.Generator, trouble: str) -> Rig:
     if trouble == "none":
         return rig
     if trouble == "encoder off centre":
-        return replace(rig, encoder=read(wrong(angle, off_centre(rng, 1.0, 5.0)), one.duration_s))
+        off = read(wrong(angle, off_centre(rng, 1.0, 5.0)), one.duration_s)
+        return replace(rig, encoder=off, needs=ANGLE)
     if trouble == "wobble":
         one.shape = {"wobble": tuple(np.radians(rng.uniform(-1.0, 1.0, 2)))}
-        return replace(rig, place=one.place(angle))
+        return replace(rig, place=one.place(angle), needs=SHAPE)
     if trouble == "cylinder":
         one.shape = {"cylinder": tuple(np.radians(rng.uniform(-0.1, 0.1, 2)))}
-        return replace(rig, place=one.place(angle), needs=("cylinder",))
+        return replace(rig, place=one.place(angle), needs=SHAPE)
     if trouble == "noise events":
-        return replace(rig, pixels=replace(pixels, background_hz=rng.uniform(10.0, 25.0)))
+        noisy = replace(pixels, background_hz=rng.uniform(10.0, 25.0))
+        return replace(rig, pixels=noisy, needs=("noise",))
     if trouble == "time stamps of 1 ms":
         return replace(rig, pixels=replace(pixels, stamp_us=1000), needs=("time stamp",))
     if trouble == "OFF events late":
@@ -203,16 +213,14 @@ def wedge(rng: np.random.Generator, trouble: str) -> Rig:
         return replace(
             rig,
             encoder=read(wrong(angle, off_centre(rng, 1.0, 1.0, 3)), one.duration_s),
-            needs=("encoder",),
+            needs=ANGLE,
         )
     if trouble == "encoder's clock drifts":
         drifting = lambda t: angle(1.002 * np.asarray(t))  # noqa: E731
-        return replace(
-            rig, encoder=read(drifting, one.duration_s), needs=("clock", "encoder", "scale")
-        )
+        return replace(rig, encoder=read(drifting, one.duration_s), needs=("clock", "scale"))
     if trouble == "encoder of 64 counts":
         counted = lambda t: np.floor(angle(t) * 64.0 / math.tau) * math.tau / 64.0  # noqa: E731
-        return replace(rig, encoder=read(counted, one.duration_s), needs=("encoder", "count"))
+        return replace(rig, encoder=read(counted, one.duration_s), needs=("coarse", *ANGLE))
     if trouble == "speed changes by 10 % halfway":
         half_s = 0.5 * one.duration_s
         stepped = lambda t: angle(t) + 0.1 * angle(np.maximum(0.0, np.asarray(t) - half_s))  # noqa: E731
@@ -231,7 +239,7 @@ def wedge(rng: np.random.Generator, trouble: str) -> Rig:
         )
     if trouble == "another glass":
         one.index = 1.62
-        return replace(rig, place=one.place(angle), needs=("index",))
+        return replace(rig, place=one.place(angle), needs=("index", "nominal prism"))
     if trouble == "lens that was not given":
         lens = replace(CAMERA, distortion=amiwarp.RadialTangential(k1=-0.06))
         return replace(rig, place=one.place(angle, lens), needs=("k1", "lens"))
@@ -241,10 +249,11 @@ def wedge(rng: np.random.Generator, trouble: str) -> Rig:
         return replace(
             rig,
             encoder=Encoder.from_angles(whole.t[keep], whole.angle[keep]),
-            needs=("gap", "encoder"),
+            needs=("gap", "silent", *ANGLE),
         )
     assert trouble == "faint scene in noise", trouble
-    return replace(rig, contrast=0.3, pixels=replace(pixels, background_hz=8.0, noise=0.03))
+    noisy = replace(pixels, background_hz=8.0, noise=0.03)
+    return replace(rig, contrast=0.3, pixels=noisy, needs=("noise", "contrast", "few events"))
 
 
 def hunting(rpm: float, share: float, hz: float) -> Angle:
@@ -311,10 +320,10 @@ def pair(rng: np.random.Generator, trouble: str) -> Rig:
     if trouble == "one encoder off centre":
         k = int(rng.integers(0, 2))
         reads[k] = read(wrong((a, b)[k], off_centre(rng, 1.0, 3.0)), duration_s)
-        needs = ("encoder",)
+        needs = ANGLE
     elif trouble == "both encoders off centre":
         reads = [read(wrong(x, off_centre(rng, 1.0, 3.0)), duration_s) for x in (a, b)]
-        needs = ("encoder",)
+        needs = ANGLE
     elif trouble == "encoders swapped":
         reads = reads[::-1]
         needs = ("swap", "exchange")
@@ -322,7 +331,7 @@ def pair(rng: np.random.Generator, trouble: str) -> Rig:
         reads[1] = read(lambda t: b(np.asarray(t) - 1e-3), duration_s)
     elif trouble == "third harmonic of the second encoder":
         reads[1] = read(wrong(b, off_centre(rng, 1.5, 1.5, 3)), duration_s)
-        needs = ("encoder",)
+        needs = ANGLE
     elif trouble == "axes 1 deg apart":
         place = place_of(oracle.rotation((math.radians(1.0), 0.0)))
         needs = ("axis", "tilt")
@@ -427,6 +436,7 @@ def vibration(rng: np.random.Generator, trouble: str) -> Rig:
         values |= {"roll_x": math.radians(0.2)}
     elif trouble == "frequency drifts by 1 %":
         drift = 0.01
+        needs = ("frequency",)
     elif trouble == "another vibration of 0.1 px":
         other = 0.1 / CAMERA.fx
         needs = ("vibration", "harmonic", "frequency")
@@ -472,10 +482,12 @@ def plate(rng: np.random.Generator, trouble: str) -> Rig:
         needs = ("parallel", "wedge")
     elif trouble == "another thickness":
         nominal = replace(glass, thickness=0.0105)
+        needs = ("thickness",)
     elif trouble == "another glass":
         nominal = replace(glass, index=1.6)
+        needs = ("glass",)
     elif trouble == "encoder off centre":
-        needs = ("encoder",)
+        needs = ANGLE
     else:
         assert trouble == "none", trouble
 
@@ -715,9 +727,20 @@ def measure(
         }
         row["total_px"] = total_px(row["stated_px"], row["hidden_px"])
     row["seconds"] = time.perf_counter() - began
-    row["named"] = any(word in text for word in rig.needs for text in said)
+    row["named"] = is_named(row["error_px"], said, row.get("hidden_px", {}), rig.needs)
     row["said"] = said
     return row
+
+
+def is_named(
+    error_px: float | None,
+    said: list[str],
+    hidden_px: dict[str, float],
+    needs: tuple[str, ...],
+) -> bool:
+    """Return whether the cause of a trouble is said, or stated to hide at least the error [px rms], if there is one."""
+    hiding = [] if error_px is None else could_hide(hidden_px, error_px)
+    return has_word([*said, *hiding], needs)
 
 
 def drawn(seeds: range, optics: list[str]) -> list[tuple[str, str, int]]:

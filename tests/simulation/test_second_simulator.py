@@ -167,6 +167,22 @@ def test_errors_leave_out_a_lag_and_a_rotation_of_the_camera_but_no_phase_of_one
     assert errors(magnified, 1.0, 0.4)[0] > 0.08
 
 
+def test_a_trouble_is_named_by_a_warning_or_by_a_bound_that_covers_the_error() -> None:
+    said = ["the first encoder's angle is wrong by 2 deg once a turn: it was corrected"]
+    assert true_optics.is_named(0.05, said, {}, true_optics.ANGLE)
+    assert not true_optics.is_named(0.05, said, {}, true_optics.SHAPE)
+    # The clock of an encoder is not its angle, and an error that is no cause has no words.
+    clock = ["the scale or the clock of the encoder is wrong"]
+    assert not true_optics.is_named(0.05, clock, {}, true_optics.ANGLE)
+    assert not true_optics.is_named(0.05, said, {}, ())
+    bounds = {"the evenness of the prism's faces": 0.06, "the plate's thickness": 0.04}
+    assert true_optics.is_named(0.06, [], bounds, true_optics.SHAPE)
+    assert not true_optics.is_named(0.061, [], bounds, true_optics.SHAPE)
+    assert not true_optics.is_named(0.05, [], bounds, ("thickness",))
+    assert not true_optics.is_named(None, [], bounds, true_optics.SHAPE)  # a refusal
+    assert true_optics.is_named(None, ["No EVENNESS"], {}, true_optics.SHAPE)
+
+
 def test_the_summary_counts_what_is_neither_named_nor_stated() -> None:
     def row(
         error: float, stated: float, hidden: float, *, named: bool = False, refused: bool = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 CAUSES: dict[str, tuple[str, ...]] = {
     "eccentric_deg": ("encoder's angle is wrong", "repeats with"),
@@ -29,6 +29,24 @@ not its angle, and events that the sensor lost are no counts."""
 
 def names_cause(texts: Sequence[str], troubles: Sequence[str]) -> bool:
     """Return whether a text names the cause of one of the troubles, which are fields of the condition."""
-    return any(
-        word in text.lower() for name in troubles for word in CAUSES.get(name, ()) for text in texts
-    )
+    words: list[str] = []
+    for name in troubles:
+        words += CAUSES.get(name, ())
+    return has_word(texts, words)
+
+
+def has_word(texts: Sequence[str], words: Sequence[str]) -> bool:
+    """Return whether one of the texts has one of the words."""
+    return any(word in text.lower() for word in words for text in texts)
+
+
+def could_hide(hidden_px: Mapping[str, float], error_px: float) -> list[str]:
+    """Return a text for each stated cause that may hide an error as large as this one [px rms].
+
+    ``hidden_px`` are the stated bounds [px rms] by the words of their causes.
+    """
+    texts: list[str] = []
+    for words, px in hidden_px.items():
+        if px >= error_px:
+            texts.append(f"could hide: {words} {px:.2g} px")
+    return texts

@@ -25,7 +25,7 @@ from amiwarp.optics.models.exact import ExactModel
 from amiwarp.optics.models.registry import build_model
 from amiwarp.results.calibration import Calibration
 from amiwarp.studies.stability import placing_error
-from amiwarp.studies.stability.causes import names_cause
+from amiwarp.studies.stability.causes import could_hide, names_cause
 from amiwarp.studies.stability.condition import Cell, Condition, troubles_of
 from amiwarp.studies.stability.recordings import OpticSample, SimulatedSample
 from amiwarp.validation import real
@@ -244,18 +244,15 @@ def judge_optic(
     error_px = placing_error.error_px(sample.rig, sample.recording, calibration)
     error_px = min(error_px, LARGEST_PX)
 
-    # Causes that may hide an error as large as this one
-    could_hide = []
+    hiding: list[str] = []
     stated_px = None
     if stage is not None:
-        for words, px in stage.hidden_px.items():
-            if px >= error_px:
-                could_hide.append(f"could hide: {words} {px:.2g} px")
+        hiding = could_hide(stage.hidden_px, error_px)
         if stage.deviation_px is not None:
             stated_px = min(stage.deviation_px, LARGEST_PX)
 
     outcome = Outcome.SILENT
-    messages = [*calibration.warnings, *could_hide]
+    messages = [*calibration.warnings, *hiding]
     if error_px <= OPTIC_LIMIT_PX:
         outcome = Outcome.SUCCESS
         messages = [*calibration.warnings]
