@@ -23,8 +23,9 @@ import numpy as np
 
 from amiwarp.calib import checks
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
-from amiwarp.calib.calibrator import Attempt, Calibrator, with_warnings
+from amiwarp.calib.calibrator import Attempt, Calibrator, hiding, with_warnings
 from amiwarp.calib.camera_attempts import with_gyroscope, with_rotation, without_rotation
+from amiwarp.calib.coarse_encoder import hidden_by_rounding, rounding_in_words
 from amiwarp.calib.encoder_attempts import (
     with_mended_encoder,
     with_order_examined,
@@ -79,9 +80,7 @@ def calibrated(calibrator: Calibrator) -> Calibration:
         found = replace(found, path=last.mended)
     if last.mended_words:
         found = with_warnings(found, last.mended_words)
-    if found.photometric is not None and found.photometric.deviation_px is not None:
-        hidden_px = {**found.photometric.hidden_px, **last.hidden_px}
-        found = replace(found, photometric=replace(found.photometric, hidden_px=hidden_px))
+    found = hiding(found, last.hidden_px)
     if not tried.accepted:
         raise _rejected(found, calibrator.recording.name)
 

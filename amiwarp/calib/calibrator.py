@@ -152,6 +152,7 @@ class Calibrator:
         """
         began = time.perf_counter()
         search = None
+        hidden_px: dict[str, float] = {}
         try:
             recording = rotation_window(self.recording, self.settings)
             searches = prepare(
@@ -169,7 +170,7 @@ class Calibrator:
                 search = max(found_in_senses, key=lambda each: each.score)
                 search = in_larger_sense(recording, search)
                 if recording.encoder is None and self.path is None and path_is_examined(search):
-                    search = with_path(recording, search)
+                    search, hidden_px = with_path(recording, search)
 
                 most_cost = math.inf
                 if rival is not None:
@@ -197,6 +198,7 @@ class Calibrator:
                     found = with_warnings(found, *bound_warnings(search.space, found.parameters))
         except AmiwarpError as error:
             return Attempt(None, error, search)
+        found = hiding(found, hidden_px)
         return Attempt(replace(found, seconds=time.perf_counter() - began), search=search)
 
     def turning(self, rival: Attempt | None, *, fast: bool = False) -> Attempt:
@@ -375,6 +377,14 @@ def _refined(
         free=tuple(name for name in space.names if name not in lens),
         sharpness_after=search.sharpness_in(space, summary.parameters),
     )
+
+
+def hiding(found: Calibration, hidden_px: Mapping[str, float]) -> Calibration:
+    """Return the calibration with further causes that could hide, by words [px rms], if it states an error at all."""
+    stage = found.photometric
+    if stage is None or stage.deviation_px is None:
+        return found
+    return replace(found, photometric=replace(stage, hidden_px={**stage.hidden_px, **hidden_px}))
 
 
 def with_warnings(found: Calibration, *said: str) -> Calibration:

@@ -66,8 +66,8 @@ SEARCH_TOLERANCE = 0.03
 """Largest number of conjugate-gradient steps for the spline's coefficients, and the residual at which they end."""
 MAP_STEPS = 12
 """Number of conjugate-gradient steps that find the part of a derivative that a change of the map explains."""
-LEAST_DEVIATION_PX = 0.02
-"""Smallest deviation from constant speed that is corrected [px rms]."""
+LEAST_DEVIATION_PX = 0.01
+"""Smallest deviation from constant speed that is corrected [px rms]: half of an error that counts."""
 GATE_STEPS = 2
 FIRST_SHARE = 0.5
 """Number of steps that tell whether the speed varies, and the share of a deviation that the first one finds, as the map

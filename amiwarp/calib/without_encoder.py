@@ -8,8 +8,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 from amiwarp.calib.calibration_events import CalibrationEvents
+from amiwarp.calib.photometric.stated_errors import BOUND
 from amiwarp.calib.preparation import prepare
-from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit
+from amiwarp.calib.prism_path import (
+    FIRST_SHARE,
+    GATE_PAIRS,
+    GATE_TILES,
+    LEAST_DEVIATION_PX,
+    PathFit,
+)
 from amiwarp.calib.sharpness_search import Search
 from amiwarp.calib.thinning import middle_time
 from amiwarp.errors import AmiwarpError
@@ -19,6 +26,9 @@ from amiwarp.optics.models.registry import MODELS
 from amiwarp.results.calibration import (
     constant_speed,
 )
+
+VARYING_SPEED = "a speed that varies"
+"""Words of what could hide in the angle of a recording without an encoder."""
 
 
 def zero_time(recording: Recording, search: Search) -> int | None:
@@ -50,8 +60,11 @@ def path_is_examined(search: Search) -> bool:
     return space.cartesian and not space.moving
 
 
-def with_path(recording: Recording, search: Search) -> Search:
-    """Return the search with the path of the prism's angle, or unchanged if a constant speed explains the events."""
+def with_path(recording: Recording, search: Search) -> tuple[Search, dict[str, float]]:
+    """Return the search with the path of the prism's angle, or unchanged if a constant speed explains the events.
+
+    Also return by how much the path may still move events [px rms], by words; nothing if it was not examined.
+    """
     varies = _on_path(search)
     encoder = search.calibration_events.encoder
     if not varies:
@@ -61,18 +74,28 @@ def with_path(recording: Recording, search: Search) -> Search:
     try:
         start = search_on(encoder, search)
         # Few pairs are enough to see that a speed is constant.
-        if not varies and not PathFit(recording, start, GATE_PAIRS, GATE_TILES).deviates():
-            return search
+        if not varies:
+            quick = PathFit(recording, start, GATE_PAIRS, GATE_TILES)
+            if not quick.deviates():
+                return search, _hidden_by_speed(quick)
         fit = PathFit(recording, start)
         path = fit.run()
     except AmiwarpError:
         if varies:
             raise
-        return search
+        return search, {}
     if not varies and fit.deviation_px() < LEAST_DEVIATION_PX:
-        return search
+        return search, _hidden_by_speed(fit)
     found = search_on(path, search)
-    return found.run(found.best)
+    return found.run(found.best), {VARYING_SPEED: BOUND * fit.std_px}
+
+
+def _hidden_by_speed(fit: PathFit) -> dict[str, float]:
+    """Return by how much a path that is not corrected may move events [px rms], by words.
+
+    A fit that ended with its first step found a part of the deviation.
+    """
+    return {VARYING_SPEED: fit.deviation_px() / FIRST_SHARE + BOUND * fit.std_px}
 
 
 def in_larger_sense(recording: Recording, search: Search) -> Search:

@@ -191,6 +191,21 @@ def test_a_constant_speed_stays_one_number(texture: np.ndarray) -> None:
     assert found.warnings == ()
     assert found.parameters["rpm"] == pytest.approx(720.0, rel=1e-3)
     assert error_px(recording, motion, found) < 0.02
+    # What the first look leaves open
+    assert found.photometric is not None
+    assert 0.002 < found.photometric.hidden_px["a speed that varies"] < 0.06
+
+
+@pytest.mark.slow
+def test_a_speed_that_changes_by_one_percent_is_found(texture: np.ndarray) -> None:
+    """A constant speed leaves 0.02 px. With the path, what could hide is what its scatter leaves open."""
+    recording, motion = simulated(texture, lambda t: 720.0 * (1.0 + 0.008 * t / SECONDS))
+    found = calibrate(recording, photometric=COARSE, model="exact")
+    assert found.path is not None
+    assert error_px(recording, motion, found) < 0.015
+    assert any("speed is not constant" in w for w in found.warnings)
+    assert found.photometric is not None
+    assert 0.001 < found.photometric.hidden_px["a speed that varies"] < 0.02
 
 
 def test_repetition_gives_the_path_of_a_ramp(spun_up: tuple[Recording, PrismMotion]) -> None:
