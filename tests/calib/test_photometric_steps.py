@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import FrozenInstanceError, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,16 @@ from amiwarp import (
     Settings,
     simulate,
 )
-from amiwarp.calib.photometric import angles, losses, sectors, steps, timing
-from amiwarp.calib.photometric.answers import AnswerSearch
-from amiwarp.calib.photometric.causes import FOCAL_LENGTH, SIDE
+from amiwarp.calib.photometric import (
+    angles,
+    corrections,
+    losses,
+    sectors,
+    steps,
+    timing,
+    verdicts,
+)
+from amiwarp.calib.photometric.causes import FACES, FOCAL_LENGTH, SIDE
 from amiwarp.calib.photometric.equations import Problem
 from amiwarp.calib.photometric.findings import (
     BlindTime,
@@ -37,7 +45,6 @@ from amiwarp.calib.photometric.findings import (
 )
 from amiwarp.calib.photometric.refinement import Refinement, first_answer
 from amiwarp.calib.photometric.verdicts import (
-    refractory_doubt_us,
     refusal,
     refused,
     warned,
@@ -232,7 +239,7 @@ def test_a_refractory_period_of_0_is_known(
 ) -> None:
     sensor = SensorTiming(refractory_us=refractory_us)
     assert sensor.pause_us == (refractory_us or 0.0)
-    assert refractory_doubt_us(sensor) == pytest.approx(std_us)
+    assert verdicts.refractory_doubt_us(sensor) == pytest.approx(std_us)
     assert said in refused(RefractoryDoubt(sensor, 0.02))
 
 
@@ -243,8 +250,7 @@ def kinds(base: type) -> Iterator[type]:
 
 
 def test_every_finding_is_said_or_refused() -> None:
-    from amiwarp.calib.photometric import verdicts
-    from amiwarp.calib.photometric.findings import Finding, MotionError
+    from amiwarp.calib.photometric.findings import Finding
 
     for kind in {*kinds(Finding)} - {MotionError}:  # which the result itself states
         assert (refused.dispatch(kind) is not refused.dispatch(object)) == (
@@ -254,6 +260,58 @@ def test_every_finding_is_said_or_refused() -> None:
             kind in verdicts.SAID_IN_ORDER
         )
         assert kind in (*verdicts.REFUSED_IN_ORDER, *verdicts.SAID_IN_ORDER)
+
+
+@pytest.mark.parametrize(
+    ("likely", "rotation_gain", "is_kept"),
+    [((), 0.0, True), (("x",), 0.0, False), ((), 0.2, False)],
+)
+def test_a_correction_of_noisy_events_is_kept_if_nothing_else_is_left(
+    first: Refinement,
+    monkeypatch: pytest.MonkeyPatch,
+    likely: tuple[str, ...],
+    rotation_gain: float,
+    is_kept: bool,
+) -> None:
+    """The cost stays high by noise. With another cause or a turning camera left, the given camera is taken again."""
+    optimum = replace(first.answer.optimum, cost=0.27)
+    given = replace(first, answer=replace(first.answer, optimum=optimum))
+    search = first.search.with_cause(FACES, first.answer.x)
+    shape = {"cylinder_x": 1e-3, "cylinder_y": 2e-3}
+    moved = search.space.to_vector({**search.space.start, **first.answer.parameters, **shape})
+    answer = replace(
+        first.answer,
+        optimum=replace(optimum, cost=0.24),
+        stage=replace(first.answer.stage, x=moved),
+        parameters=search.space.to_values(moved),
+    )
+    best = corrections.Corrected(FACES, search, answer, 0.24)
+    corrected = iter([best])
+    monkeypatch.setattr(corrections, "_best_correction", lambda _: next(corrected, None))
+    check: Any = SimpleNamespace(
+        likely=likely, rotation_gain=rotation_gain, shake_px=0.0, step=np.zeros(4)
+    )
+    monkeypatch.setattr(corrections, "_checked", lambda state: replace(state, check=check))
+    found = corrections.correct_camera_and_prism(given)
+    assert (found.answer.cost == 0.24) == ("cylinder_x" in found.space.names) == is_kept
+    assert (found.answer.cost == 0.27) != is_kept
+
+
+def test_harmonics_that_explain_what_sectors_leave_are_given(
+    first: Refinement, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are no reason to refuse an answer: the calibration is tried again with them."""
+    third = (0.0, 0.0, 0.0, 0.0, 0.02, 0.0)
+    offsets = np.tile([0.05, -0.05], sectors.SECTORS // 2)[None]
+    monkeypatch.setattr(sectors, "find_high_harmonics", lambda *_: third)
+    seen = losses.see_what_can_be_examined(first)
+    for ratio, expected in ((2.0, ()), (9.0, third)):
+        ratios = np.array([ratio])
+        monkeypatch.setattr(sectors, "sector_offsets", lambda *_, by=ratios: (offsets, by))
+        noted = sectors.note_what_sectors_leave(seen)
+        assert noted.refusal == ""
+        result, *_ = steps.summarised(noted)
+        assert result.harmonics == expected
 
 
 def test_sectors_are_not_examined_where_pixels_are_slow(
