@@ -34,9 +34,11 @@ from amiwarp.calib.encoder_attempts import (
 )
 from amiwarp.calib.photometric import causes, limits
 from amiwarp.calib.prism_path import speed_in_words
+from amiwarp.calib.sharpness_search import Search
 from amiwarp.calib.thinning import middle_time
 from amiwarp.calib.uneven_prism import with_rival_shape
 from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.events.encoder import Encoder
 from amiwarp.optics.models.registry import MODELS, size_names
 from amiwarp.optics.prism import Plate, Prism
 from amiwarp.results.calibration import (
@@ -93,8 +95,12 @@ def _with_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, A
 
     Return the calibrator with what they found of the encoder and of bad pixels, and the attempt that holds.
     """
+    given = calibrator.recording.encoder
+    search = tried.search
     calibrator, tried = with_mended_encoder(calibrator, tried)
     calibrator, tried = with_straight_angles(calibrator, tried)
+    if given is not None and search is not None and calibrator.mended is None:
+        calibrator = with_rounding_named(calibrator, search, given)
     if MODELS[calibrator.settings.model].GLASS is Plate:
         return calibrator, tried  # its depths are found from a camera at rest
     if tried.unexplained:
@@ -108,6 +114,18 @@ def _with_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, A
         turning = with_rotation(calibrator, tried)
         tried = _with_turning_named(tried) if turning is tried else turning
     return calibrator, tried
+
+
+def with_rounding_named(calibrator: Calibrator, search: Search, encoder: Encoder) -> Calibrator:
+    """Return the calibrator with what the steps of a coarse encoder hide, and a warning of them.
+
+    ``encoder`` is the one of the recording as it was given.
+    """
+    if not search.space.sized:
+        return calibrator
+    hidden_px = {**calibrator.hidden_px, **hidden_by_rounding(search, encoder)}
+    said = [*filter(None, [calibrator.mended_words]), *rounding_in_words(search, encoder)]
+    return replace(calibrator, hidden_px=hidden_px, mended_words="; ".join(said))
 
 
 def _with_turning_named(tried: Attempt) -> Attempt:

@@ -22,7 +22,7 @@ from amiwarp import (
     Settings,
     calibrate,
 )
-from amiwarp.calib import checks, encoder_attempts
+from amiwarp.calib import checks, coarse_encoder, encoder_attempts
 from amiwarp.calib.calibrator import Calibrator
 from amiwarp.calib.lost_counts import Step, changes_of_mean, lost_counts, without_steps
 from amiwarp.calib.photometric import limits
@@ -577,6 +577,71 @@ def test_what_a_correction_of_the_angles_leaves_is_corrected_too(
     both = (0.021, 0.01, 0.0, 0.005)
     assert tried_with == [first, pytest.approx(both)]
     assert found.harmonics == pytest.approx(both if further_cost < 0.1 else first)
+
+
+@pytest.mark.parametrize(
+    ("accepted", "cost", "is_taken"),
+    [(True, 0.09, True), (True, 0.11, False), (False, 0.05, False)],
+)
+def test_a_correction_of_an_accepted_answer_must_be_accepted_and_lower_the_cost(
+    still: Trouble, monkeypatch: pytest.MonkeyPatch, accepted: bool, cost: float, is_taken: bool
+) -> None:
+    """Of third harmonics, which an answer is not refused for."""
+    third = (0.0, 0.0, 0.0, 0.0, 0.02, 0.0)
+    of_stage = SimpleNamespace(harmonics=(), parameters={})
+    again: Any = SimpleNamespace(
+        accepted=accepted, cost=cost, photometric=of_stage, calibration=SimpleNamespace()
+    )
+    monkeypatch.setattr(Calibrator, "attempt", lambda *_, **__: again)
+    said: list[str] = []
+    monkeypatch.setattr(encoder_attempts, "with_warnings", lambda _, *words: said.extend(words))
+    calibrator = Calibrator(still.recording, Settings(model="exact"), "cpu", None)
+    tried: Any = SimpleNamespace(
+        photometric=SimpleNamespace(harmonics=third, parameters={}), cost=0.1, accepted=True
+    )
+    found, kept = encoder_attempts.with_straight_angles(calibrator, tried)
+    assert (found.harmonics == third) == (kept is not tried) == is_taken
+    corrected = "the encoder's angle is wrong by 1.1 deg three times a turn: it was corrected"
+    assert said == [corrected] * is_taken
+
+
+def coarse(counts: int, rpm: float, sample_us: int, seconds: float = 0.7) -> Encoder:
+    """Return an encoder that rounds its angles down to few counts a turn."""
+    t = np.arange(-5_000, round(seconds * 1e6), sample_us)
+    angle = t * (rpm * math.tau / 60e6)
+    return Encoder(t, np.floor(angle * counts / math.tau) * math.tau / counts)
+
+
+def test_the_step_of_a_coarse_encoder() -> None:
+    assert coarse_encoder.step_rad(coarse(64, 700.0, 1000)) == pytest.approx(math.tau / 64)
+    assert coarse_encoder.step_rad(coarse(64, -100.0, 1000)) == pytest.approx(math.tau / 64)
+    # Without a sample that repeats an angle, steps of several sizes may be the motion's own.
+    assert coarse_encoder.step_rad(coarse(64, 700.0, 5000)) == 0.0
+    steady_angles = Encoder(np.arange(0, 90_000, 1000), np.linspace(0.0, 7.0, 90))
+    assert coarse_encoder.step_rad(steady_angles) == 0.0
+    at_rest = replace(steady_angles, angle=np.zeros(90))
+    assert coarse_encoder.step_rad(at_rest) == 0.0
+    starting = replace(steady_angles, angle=np.maximum(0.0, np.linspace(-1.0, 1.0, 90)) ** 3)
+    assert coarse_encoder.step_rad(starting) == 0.0
+
+
+def test_a_coarse_encoder_is_named(still: Trouble) -> None:
+    """Half of the time of a count, its angle is 0.05 rad early or late."""
+    recording = replace(still.recording, encoder=coarse(64, 720.0, 1000))
+    found = calibrate(recording, photometric=COARSE, model="exact")
+    [said] = [w for w in found.warnings if "coarse" in w]
+    orbit_px = float(
+        np.linalg.norm(
+            found.model.compensate_points([[80, 60]], [0.0])
+            - found.model.compensate_points([[80, 60]], [math.pi])
+        )
+    )
+    error_px = 0.5 * orbit_px * math.tau / 64.0 / math.sqrt(12.0)
+    assert said.startswith("the encoder is coarse: its angles are multiples of 5.6 deg")
+    assert f"moves events by {error_px:.2f} px rms" in said
+    assert found.photometric is not None
+    stated_px = found.photometric.hidden_px["the steps of a coarse encoder"]
+    assert stated_px == pytest.approx(2.0 * error_px, rel=0.15)
 
 
 def test_pulses_confirm_a_path_that_bends_between_them() -> None:
