@@ -16,6 +16,7 @@ from amiwarp.calib import checks, first_guess
 from amiwarp.calib.calibrator import Attempt, Calibrator, with_warnings
 from amiwarp.calib.lost_counts import Step, lost_counts, steps_in_words, without_steps
 from amiwarp.calib.photometric import limits
+from amiwarp.calib.photometric.angles import sum_of_harmonics
 from amiwarp.calib.photometric.distances import px_per_rad
 from amiwarp.calib.photometric.stated_errors import BOUND
 from amiwarp.calib.photometric.verdicts import angle_names, harmonics_in_words
@@ -328,11 +329,12 @@ def with_straight_angles(calibrator: Calibrator, tried: Attempt) -> tuple[Calibr
     for _ in range(MORE_CORRECTIONS):
         # a large error of one angle hides a smaller one of the other, or a part of its own
         left = () if again.photometric is None else again.photometric.harmonics
-        if again.accepted or len(left) != len(found.harmonics):
+        if not left:
             break
         assert corrected.harmonics is not None
-        both = zip(corrected.harmonics, left, strict=True)
-        further = _with_harmonics(calibrator, tuple(known + more for known, more in both))
+        angles = MODELS[calibrator.settings.model].ANGLES
+        both = sum_of_harmonics(corrected.harmonics, left, angles)
+        further = _with_harmonics(calibrator, both)
         next_attempt = further.attempt()
         if next_attempt.cost >= again.cost:
             break
@@ -342,6 +344,8 @@ def with_straight_angles(calibrator: Calibrator, tried: Attempt) -> tuple[Calibr
     holds = again.accepted and again.cost <= limits.LARGEST_STILL_COST
     hardly_worse = again.cost <= LARGEST_STRAIGHT_COST_RATIO * tried.cost
     if again.calibration is None or not (holds or hardly_worse):
+        return calibrator, tried
+    if tried.accepted and not (again.accepted and again.cost < tried.cost):
         return calibrator, tried
 
     # A very wrong camera looks like both errors.

@@ -32,6 +32,7 @@ from amiwarp.validation import (
     check_ascending,
     instance,
     real,
+    shown,
     vector,
     whole,
 )
@@ -47,11 +48,39 @@ LARGEST_ANGLE = 1e10
 """Largest accepted magnitude of a prism angle [rad]: 1.6e9 turns. Up to this angle float64 resolves 2e-6 rad."""
 
 
+FACTORS = (4, 6, 8)
+"""Numbers of factors of an angle's error: a cosine and a sine for each of two, three or four harmonics."""
+
+
 def periodic(angle: Vector, factors: Sequence[float]) -> Vector:
-    """Return the sum of cos, sin, cos 2 and sin 2 of the angles [rad], each with its factor."""
-    twice = 2.0 * angle
-    waves = [np.cos(angle), np.sin(angle), np.cos(twice), np.sin(twice)]
+    """Return the sum of cos e, sin e, cos 2e, sin 2e, and so on, of the angles e [rad], each with its factor."""
+    waves: list[Vector] = []
+    for harmonic in range(1, len(factors) // 2 + 1):
+        multiple = harmonic * angle
+        waves += [np.cos(multiple), np.sin(multiple)]
     return np.asarray(np.array(factors) @ np.stack(waves))
+
+
+def factors_by_angle(harmonics: ArrayLike, angles: int) -> list[tuple[float, ...]]:
+    """Return the factors of an error that repeats every turn, of each angle that has one.
+
+    For two angles, four factors belong to the first one. Raises :class:`AmiwarpError` for another number of factors.
+    """
+    count = 0
+    if isinstance(harmonics, np.ndarray):
+        count = harmonics.size
+    elif isinstance(harmonics, list | tuple):
+        count = len(harmonics)
+    sharing = angles if count > FACTORS[0] else 1
+    counts = [sharing * each for each in FACTORS]
+    if count not in counts:
+        *others, last = counts
+        raise AmiwarpError(
+            f"harmonics is {shown(harmonics)}; expected {', '.join(map(str, others))} or {last} numbers"
+        )
+    factors = vector(harmonics, count, "harmonics", real)
+    of_angle = count // sharing
+    return [factors[first : first + of_angle] for first in range(0, count, of_angle)]
 
 
 @guarded
@@ -380,8 +409,9 @@ class Encoder:
         Parameters
         ----------
         harmonics : array_like
-            Factors of cos e, sin e, cos 2e and sin 2e in the correction of the angle e [rad], shape (4,). For a pair
-            of prisms or a mirror, the same for the second angle may follow, shape (8,).
+            Factors of cos e, sin e, cos 2e, sin 2e, and so on up to 4e, in the correction of the angle e [rad], shape
+            (4,), (6,) or (8,). For a pair of prisms or a mirror, as many for the second angle may follow, shape (8,),
+            (12,) or (16,).
 
         Returns
         -------
@@ -391,7 +421,7 @@ class Encoder:
         Raises
         ------
         AmiwarpError
-            If there are not four finite numbers for one or both angles.
+            If there are not four, six or eight finite numbers for one or both angles.
 
         Examples
         --------
@@ -399,13 +429,13 @@ class Encoder:
         >>> encoder.with_harmonics([0.0, 0.1, 0.0, 0.0]).angle_at([1000]).round(4)
         array([1.5997])
         """
-        if self.second is not None and np.size(harmonics) == 8:
-            first, second = np.split(np.ravel(harmonics), 2)
-            corrected = self.with_harmonics(first)
-            return dataclasses.replace(corrected, second=self.second.with_harmonics(second))
-        factors = vector(harmonics, 4, "harmonics", real)
+        angles = 1 if self.second is None else 2
+        first, *of_second = factors_by_angle(harmonics, angles)
         t, angle = _in_short_steps(*self._extended())
-        return dataclasses.replace(self, t=t, angle=angle + periodic(angle, factors))
+        second = self.second
+        if second is not None and of_second:
+            second = second.with_harmonics(of_second[0])
+        return dataclasses.replace(self, t=t, angle=angle + periodic(angle, first), second=second)
 
     def _extended(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the samples, with one more at each end whose step is to be divided.

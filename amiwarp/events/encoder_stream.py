@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.command_signal import LONGEST_TURN, CommandAngles, command_samples
-from amiwarp.events.encoder import LARGEST_ANGLE, Encoder, event_times
+from amiwarp.events.encoder import LARGEST_ANGLE, Encoder, event_times, factors_by_angle
 from amiwarp.schema.calls import guarded
-from amiwarp.validation import array, as_times, real, vector, whole
+from amiwarp.validation import array, as_times, real, whole
 
 LARGEST_RATIO = 1e6
 """Largest accepted magnitude of a stream's speed of the second prism relative to the first."""
@@ -85,10 +85,9 @@ class EncoderStream:
         capacity: int = 1 << 16,
     ) -> None:
         capacity = whole(capacity, "capacity", 16, 1 << 28, " samples")
-        self._harmonics = None
+        self._harmonics = harmonics
         if harmonics is not None:
-            count = 8 if second is not None and np.size(harmonics) == 8 else 4
-            self._harmonics = vector(harmonics, count, "harmonics", real)
+            factors_by_angle(harmonics, 1 if second is None else 2)
         self.clock_offset_us = real(clock_offset_us, "clock_offset_us")
         self.second = _second_stream(second, self.clock_offset_us)
         """Stream of the second encoder, or the speed of the second prism relative to the first; None for one prism."""

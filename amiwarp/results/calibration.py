@@ -327,8 +327,8 @@ class Calibration:
     """Evidence for the choice of the model; None if the settings named a model."""
     harmonics: tuple[float, ...] | None = None
     """Correction of the encoder's angle e by an error that repeats every turn: the factors of cos e, sin e, cos 2e and
-    sin 2e [rad], for a pair of prisms or a mirror four for each of its angles (see
-    :meth:`amiwarp.Encoder.with_harmonics`); None for no correction."""
+    sin 2e [rad], and the factors of 3e and 4e if it has them, for a pair of prisms or a mirror as many for each of its
+    angles (see :meth:`amiwarp.Encoder.with_harmonics`); None for no correction."""
     path: Encoder | None = None
     """Path of the prism's angle that was found in the events. Without an encoder, the path of a speed that is not
     constant. With one, the angles instead of its own, on its clock, if these were wrong: after counts that were lost,

@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,7 @@ from amiwarp import (
 )
 from amiwarp.brightness.event_table import EventTable
 from amiwarp.calib.photometric import angles, sectors
+from amiwarp.calib.photometric.answers import AnswerSearch
 from amiwarp.calib.photometric.cost import Cost
 from amiwarp.calib.photometric.derivatives import shifted
 from amiwarp.calib.photometric.equations import Problem, collect_equations
@@ -185,6 +188,99 @@ def test_a_refusal_names_the_angle() -> None:
     assert said.startswith("the angle of the first command is wrong by 1.7 deg once a period")
 
 
+def test_three_and_four_times_a_turn_are_said() -> None:
+    third = (0.0, 0.0, 0.0, 0.0, 0.03, 0.0, 0.0, 0.03)
+    assert refused(AngleError("exact", third, (0.0, 0.0), 0.0)).startswith(
+        "the encoder's angle is wrong by 1.7 deg three times a turn and 1.7 deg four times a turn,"
+    )
+    of_second = (*[0.0] * 10, 0.03, 0.0)
+    assert refused(AngleError("risley", of_second, (0.0, 0.0), 0.0)).startswith(
+        "the second encoder's angle is wrong by 1.7 deg three times a turn,"
+    )
+
+
+def test_factors_are_those_of_the_angles_in_turn(solved: tuple[Cost, np.ndarray]) -> None:
+    space = solved[0].space
+    errors = {"sin 1 of angle 0": 0.01, "cos 2 of angle 1": 0.02, "skew x": 1e-3}
+    assert angles.harmonics_in(space, errors) == (0.0, 0.01, 0.0, 0.0, 0.0, 0.0, 0.02, 0.0)
+    third = {**errors, "cos 3 of angle 1": 0.03, "sin 4 of angle 0": 0.0}
+    expected = (*(0.0, 0.01, 0.0, 0.0, 0.0, 0.0), *(0.0, 0.0, 0.02, 0.0, 0.03, 0.0))
+    assert angles.harmonics_in(space, third) == expected
+    further = angles.harmonics_in(space, {**third, "sin 4 of angle 0": 0.04})
+    assert further[:8] == (0.0, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04)
+    total = angles.sum_of_harmonics(expected, (0.1, *[0.0] * 6, 0.2), 2)
+    assert total == pytest.approx((0.1, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.02, 0.2, 0.03, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("significance", "gain", "found_px", "is_told"),
+    [
+        (5.5, 0.02, 0.001, True),
+        (4.5, 0.02, 0.02, False),
+        (5.5, 0.008, 0.02, False),
+        (8.0, 0.002, 0.006, True),
+        (8.0, 0.002, 0.004, False),
+        (6.5, 0.002, 0.006, False),
+    ],
+)
+def test_a_small_share_of_the_residuals_counts_if_it_is_certain_and_moves_events(
+    solved: tuple[Cost, np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+    significance: float,
+    gain: float,
+    found_px: float,
+    is_told: bool,
+) -> None:
+    """As much noise leaves large residuals. Of the two angles, only the second one is wrong."""
+    cost, v = solved
+    second = angles.harmonics_of(1)
+    unit_px = angles.moved_px(cost.space, v, dict.fromkeys(second, 1.0))
+
+    def adding(_: Any, names: Any, group: Any) -> tuple[Any, float, float]:
+        change = np.full(len(names) + 4, found_px / unit_px)
+        is_wrong = group == second
+        return SimpleNamespace(change=change), significance * is_wrong, gain * is_wrong
+
+    def fit(_: Any, names: Any) -> Any:
+        return SimpleNamespace(change=np.arange(float(len(names))))
+
+    fitted = SimpleNamespace(adding=partial(adding, None), fit=partial(fit, None))
+    monkeypatch.setattr(angles, "telling", lambda *_: [1])
+    monkeypatch.setattr(angles, "linear_fit", lambda *_: fitted)
+    found = angles.fit_angles(cost, v)
+    assert (found is not None) == is_told
+    assert found is None or tuple(found) == second
+
+
+@pytest.mark.parametrize(("wrong", "harmonic"), [(0, 3), (1, 4)])
+def test_a_high_harmonic_is_found_with_its_sign_and_whole_size(
+    solved: tuple[Cost, np.ndarray], wrong: int, harmonic: int
+) -> None:
+    """The correction has the sign opposite to the error; right angles have none."""
+    cost, v = solved
+    search = AnswerSearch(cost, cost.space.to_values(v), 0.9, PhotometricSettings(), lambda _: None)
+    cost.converge(v)
+    assert angles.find_high_harmonics(search, v) == ()
+    azimuth = cost.brightness.pairs.arrays.azimuth
+    given = azimuth.numpy().copy()
+    changed = given.reshape(2, 2, -1).copy()
+    changed[:, wrong] += 0.05 * np.cos(harmonic * changed[:, wrong])
+    azimuth.assign(changed.ravel())
+    cost.renew(v)
+    cost.converge(v)
+    read = azimuth.numpy().copy()
+    found = angles.find_high_harmonics(search, v)
+    np.testing.assert_array_equal(azimuth.numpy(), read)
+    azimuth.assign(given)
+    cost.renew(v)
+    cost.residuals(v)
+    assert len(found) == 4 * harmonic
+    of_wrong, of_right = np.reshape(found, (2, -1))[[wrong, 1 - wrong]]
+    assert of_wrong[2 * harmonic - 2] == pytest.approx(-0.05, rel=0.2)
+    assert np.abs(of_right).max() == 0.0
+    assert np.abs(np.delete(of_wrong, 2 * harmonic - 2)).max() < 0.012
+
+
 BOTH = (0.02, 0.0, 0.0, -0.01, 0.0, 0.03, 0.01, 0.0)
 
 
@@ -203,7 +299,7 @@ def test_an_encoder_takes_harmonics_of_both_angles() -> None:
         one.angles_at(at), np.stack([expected[0], second.angle_at(at)], axis=1)
     )
     with pytest.raises(AmiwarpError, match="harmonics"):
-        first.with_harmonics(BOTH)
+        first.with_harmonics((*BOTH, *BOTH))
     seconds = EncoderStream()
     stream = EncoderStream(second=seconds, harmonics=BOTH)
     stream.append(t, 7.5e-5 * t)
@@ -212,7 +308,7 @@ def test_an_encoder_takes_harmonics_of_both_angles() -> None:
         stream.over(100, 99_000).angles_at(at), both.angles_at(at), atol=1e-9
     )
     with pytest.raises(AmiwarpError, match="harmonics"):
-        EncoderStream(harmonics=BOTH)
+        EncoderStream(harmonics=(*BOTH, *BOTH))
 
 
 def error_px(found: Calibration, recording: Recording, true: Any, angle: Any) -> float:

@@ -571,7 +571,7 @@ def test_what_a_correction_of_the_angles_leaves_is_corrected_too(
     monkeypatch.setattr(encoder_attempts, "with_warnings", lambda found, *_: found)
     calibrator = Calibrator(still.recording, Settings(model="exact"), "cpu", None)
     tried: Any = SimpleNamespace(
-        photometric=SimpleNamespace(harmonics=first, parameters={}), cost=0.25
+        photometric=SimpleNamespace(harmonics=first, parameters={}), cost=0.25, accepted=False
     )
     found, _ = encoder_attempts.with_straight_angles(calibrator, tried)
     both = (0.021, 0.01, 0.0, 0.005)

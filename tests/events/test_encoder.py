@@ -136,8 +136,29 @@ def test_an_error_that_repeats_every_turn_is_corrected(interval_us):
     bent = encoder.with_harmonics(HARMONICS)
     assert np.abs(bent.angle_at(t) - true).max() < 4e-4  # between samples, 1/64 turn apart at most
     assert bent.covers(*encoder.coverage)
-    with pytest.raises(AmiwarpError, match="harmonics"):
-        encoder.with_harmonics((0.1, 0.2))
+    for few in ((0.1, 0.2), (0.1, 0.2, 0.3, 0.4, 0.5), (0.1,) * 10):
+        with pytest.raises(AmiwarpError, match="expected 4, 6 or 8 numbers"):
+            encoder.with_harmonics(few)
+
+
+def test_further_harmonics_are_corrected_too() -> None:
+    encoder = Encoder.constant_speed(720.0, 0, 300_000)
+    t = np.arange(0, 300_000, 37)
+    read = encoder.angle_at(t)
+    third = read + 0.01 * np.cos(3 * read) - 0.02 * np.sin(3 * read)
+    fourth = third - 0.03 * np.cos(4 * read) + 0.01 * np.sin(4 * read)
+    of_third = (0.0, 0.0, 0.0, 0.0, 0.01, -0.02)
+    assert np.abs(encoder.with_harmonics(of_third).angle_at(t) - third).max() < 3e-4
+    of_both = encoder.with_harmonics((*of_third, -0.03, 0.01))
+    assert np.abs(of_both.angle_at(t) - fourth).max() < 8e-4
+
+    pair = encoder.with_second(-1.0)
+    of_second = (0.0, 0.0, 0.0, 0.0, 0.0, 0.03)
+    found = pair.with_harmonics((*of_third, *of_second)).angles_at(t)
+    assert np.array_equal(found[:, 0], encoder.with_harmonics(of_third).angle_at(t))
+    assert np.abs(found[:, 1] + read + 0.03 * np.sin(3 * read)).max() < 3e-4
+    with pytest.raises(AmiwarpError, match="expected 8, 12 or 16 numbers"):
+        pair.with_harmonics(of_third)
 
 
 def test_a_stream_corrects_its_angles_too():

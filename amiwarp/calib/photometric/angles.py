@@ -9,7 +9,7 @@ u + k/2 sin 2u, to first order in k; one with a square error the tilt by u + k s
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,14 +34,28 @@ if TYPE_CHECKING:
 
     Vector = NDArray[np.float64]
 
-HARMONICS = ("cos 1", "sin 1", "cos 2", "sin 2")
-"""Names of the unknown factors of cos e, sin e, cos 2e and sin 2e in the error of an angle e."""
+LOW = (1, 2)
+"""Harmonics that the error of an angle is examined for in each answer."""
+HIGH = (3, 4)
+"""Further harmonics that are examined where residuals are left in sectors of an angle."""
 SKEW = ("skew x", "skew y")
 """Names of the unknown changes of the prism's angle from column to column and from row to row [rad/px]."""
 LEAST_ANGLE_GAIN = 0.01
 """Smallest share that an error of an angle must remove. Right angles leave 0.003 at most."""
+CERTAIN = 7.0
+LEAST_CERTAIN_PX = 0.005
+"""Number of standard deviations above which an error of an angle is certain, and how far it must move events then, by a
+linearised fit [px rms]. Much noise makes the share of the residuals small: at a cost of 0.26, errors of both encoders
+that left 0.08 px had shares of 0.007 and 0.002, at 11 and 8 standard deviations. Right angles were within 6, and moved
+events by 0.0015 px."""
+LEAST_SEEN_GAIN = 0.004
+"""Share that decides, at a first look at the gradient alone, whether the angles are examined."""
 FIRST_LOOK = 0.5
 """Share of what is asked of an error of the angle that it must have before all that may look like it is examined."""
+LEAST_HIGH_GAIN = 0.001
+LEAST_HIGH_PX = 0.005
+"""Smallest share that a further harmonic must remove, and how far it must move events by a linearised fit [px rms]. The
+interpolation of the map repeats four times a turn too: a right encoder at 160x120 seemed to move them by 0.001 px."""
 MOST_ANGLE_FITS = 6
 """Largest number of linearised fits of the errors of the angles."""
 FIRST_SHARE = 0.5
@@ -51,9 +65,15 @@ LEAST_ANGLE_PX = 0.003
 """Length of a correction of the angles below which the search ends [px rms]."""
 
 
-def harmonics_of(angle: int) -> tuple[str, ...]:
-    """Return the names of the harmonics in the error of an angle of the model, by its number."""
-    return tuple(f"{name} of angle {angle}" for name in HARMONICS)
+def harmonics_of(angle: int, harmonics: Sequence[int] = LOW) -> tuple[str, ...]:
+    """Return the names of the unknown factors of cos k e and sin k e in the error of an angle e, for harmonics k.
+
+    The angle is given by its number.
+    """
+    names: list[str] = []
+    for k in harmonics:
+        names += [f"cos {k} of angle {angle}", f"sin {k} of angle {angle}"]
+    return tuple(names)
 
 
 def examined_errors(kind: type[Model]) -> tuple[tuple[str, ...], ...]:
@@ -100,10 +120,7 @@ def _without_angle_errors(state: Refinement) -> Refinement:
 
 def _as_finding(state: Refinement, errors: dict[str, float]) -> AngleError:
     """Return errors of the angles, given by name, as a finding."""
-    harmonics: list[float] = []
-    for angle in range(MODELS[state.space.model].ANGLES):
-        for name in harmonics_of(angle):
-            harmonics.append(errors.get(name, 0.0))
+    harmonics = harmonics_in(state.space, errors)
 
     # A change of the angle from column to column, and from row to row, is a delay of their read-out.
     skew = {name: errors.get(name, 0.0) for name in SKEW}
@@ -111,29 +128,83 @@ def _as_finding(state: Refinement, errors: dict[str, float]) -> AngleError:
     late_x, late_y = (-each / rad_per_us for each in skew.values())
     return AngleError(
         model=state.space.model,
-        harmonics=tuple(harmonics) if any(harmonics) else (),
+        harmonics=harmonics if any(harmonics) else (),
         late_us=(late_x, late_y),
         late_px=moved_px(state.space, state.answer.x, skew),
     )
 
 
+def harmonics_in(space: ParameterSpace, errors: Mapping[str, float]) -> tuple[float, ...]:
+    """Return the factors of the harmonics among errors of the angles, given by name, for each angle in turn.
+
+    All angles have as many: the first two, or up to the highest one that is not 0.
+    """
+    angles = range(MODELS[space.model].ANGLES)
+    highest = max(LOW)
+    for k in HIGH:
+        if any(errors.get(name) for angle in angles for name in harmonics_of(angle, (k,))):
+            highest = k
+    factors: list[float] = []
+    for angle in angles:
+        for name in harmonics_of(angle, range(1, highest + 1)):
+            factors.append(errors.get(name, 0.0))
+    return tuple(factors)
+
+
+def sum_of_harmonics(
+    known: Sequence[float], more: Sequence[float], angles: int
+) -> tuple[float, ...]:
+    """Return the sum of two corrections of angles, in the form of :attr:`Calibration.harmonics`.
+
+    One of them may have more harmonics than the other.
+    """
+    of_angle = max(len(known), len(more)) // angles
+    total = np.zeros((angles, of_angle))
+    for factors in (known, more):
+        count = len(factors) // angles
+        total[:, :count] += np.reshape(factors, (angles, count))
+    return tuple(total.ravel().tolist())
+
+
 def find_angle_errors(search: AnswerSearch, v: Vector) -> dict[str, float] | None:
     """Return the corrections of the angles that the events ask for, by name; None for none.
 
-    A linearised fit finds a share of the errors only, because the map absorbs the other part; the next fit tells how
-    large the share was. The pairs' angles are the given ones again afterwards; the map is left at the corrected ones.
+    The pairs' angles are the given ones again afterwards; the map is left at the corrected ones.
     """
     cost = search.cost
     cost.converge(v)
     found = fit_angles(cost, v)
     if found is None or moved_px(cost.space, v, found) < LEAST_MOVE_PX:
         return None
+    return _whole_errors(search, v, found)
+
+
+def find_high_harmonics(search: AnswerSearch, v: Vector) -> tuple[float, ...]:
+    """Return the corrections of the angles if one of them has a third or fourth harmonic; empty if none has.
+
+    They have the form of :attr:`Calibration.harmonics`. The map must be solved at ``v``, and is so afterwards.
+    """
+    found = _fit_high_harmonics(search.cost, v)
+    if found is None:
+        return ()
+    errors = _whole_errors(search, v, found)
+    search.cost.renew(v)
+    return harmonics_in(search.space, errors)
+
+
+def _whole_errors(search: AnswerSearch, v: Vector, found: dict[str, float]) -> dict[str, float]:
+    """Return the whole errors of the angles, of which a first linearised fit found a part, by name.
+
+    A linearised fit finds a share of the errors only, because the map absorbs the other part; the next fit tells how
+    large the share was.
+    """
+    cost = search.cost
     names = tuple(found)
     angles = MODELS[cost.space.model].ANGLES
     azimuth = cost.brightness.pairs.arrays.azimuth
     given = wp.clone(azimuth)
     patterns = {}
-    for name, pattern in patterns_of(cost).items():
+    for name, pattern in patterns_of(cost, _harmonics_among(names)).items():
         patterns[name] = pattern.numpy().reshape(2, -1)
     total = np.zeros(len(names))
     share = FIRST_SHARE
@@ -164,7 +235,13 @@ def find_angle_errors(search: AnswerSearch, v: Vector) -> dict[str, float] | Non
     return dict(zip(names, total.tolist(), strict=True))
 
 
-def patterns_of(cost: Cost) -> dict[str, Any]:
+def _harmonics_among(names: Sequence[str]) -> tuple[int, ...]:
+    """Return the harmonics whose patterns errors of the angles need, given by name."""
+    some_high = any(name in harmonics_of(_angle_of(name), HIGH) for name in names)
+    return (*LOW, *HIGH) if some_high else LOW
+
+
+def patterns_of(cost: Cost, harmonics: Sequence[int] = LOW) -> dict[str, Any]:
     """Return the change of an angle at both events of each pair for each unit of an error, by name.
 
     They are on the device, each of shape (2 · padded pairs,).
@@ -172,21 +249,25 @@ def patterns_of(cost: Cost) -> dict[str, Any]:
     pairs = cost.brightness.pairs
     camera = cost.space.camera
     angles = MODELS[cost.space.model].ANGLES
+    found: dict[str, Any] = {}
+    # First and second events, both angles, or cosine and sine of one
+    stored = pairs.arrays.azimuth.numpy().reshape(2, 2, -1).astype(np.float64)
+    of_angles = [stored[:, k] for k in range(angles)]
     if angles == 1:
         middle = (0.5 * camera.width, 0.5 * camera.height)
         rows = pairs.angle_patterns(middle)
-        names = (*harmonics_of(0), *SKEW)
-        return {name: rows[k] for k, name in enumerate(names)}
-    found: dict[str, Any] = {}
-    # First and second events, both angles
-    stored = pairs.arrays.azimuth.numpy().reshape(2, angles, -1)
-    for k in range(angles):
-        angle = stored[:, k].astype(np.float64)
-        twice = 2.0 * angle
-        waves = (np.cos(angle), np.sin(angle), np.cos(twice), np.sin(twice))
-        for name, wave in zip(harmonics_of(k), waves, strict=True):
-            values = wave.ravel().astype(np.float32)
-            found[name] = wp.array(values, dtype=float, device=pairs.device)
+        for k, name in enumerate((*harmonics_of(0), *SKEW)):
+            found[name] = rows[k]
+        of_angles = [np.arctan2(stored[:, 1], stored[:, 0])]
+    for k, angle in enumerate(of_angles):
+        for harmonic in harmonics:
+            multiple = harmonic * angle
+            waves = (np.cos(multiple), np.sin(multiple))
+            for name, wave in zip(harmonics_of(k, (harmonic,)), waves, strict=True):
+                if name in found:
+                    continue
+                values = wave.ravel().astype(np.float32)
+                found[name] = wp.array(values, dtype=float, device=pairs.device)
     return found
 
 
@@ -247,7 +328,7 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> dict[st
     explains does not count.
     """
     space = cost.space
-    errors = _by_errors(cost, best)
+    errors = _by_errors(cost, best, _harmonics_among(names))
     if not errors:
         return None
     groups = []
@@ -256,12 +337,12 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> dict[st
             groups.append({name: errors[name] for name in group})
 
     # Two quick looks, because most angles are right.
-    if not names and not telling(cost, groups, LEAST_ANGLE_GAIN):
+    if not names and not telling(cost, groups, LEAST_SEEN_GAIN):
         return None
     given = slopes(cost, space, best, space.names)
     if not names:
         quick = linear_fit(cost, given | errors)
-        if not _told(quick, list(given), groups, FIRST_LOOK):
+        if not _told(cost, best, quick, list(given), groups, FIRST_LOOK):
             return None
 
     # Beyond what a rotation of the camera, or a wrong camera or prism explains.
@@ -272,7 +353,42 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> dict[st
     if not names:
         others = _by_camera_and_prism(cost, best, given)
     fit = linear_fit(cost, given | errors | others)
-    names = names or _told(fit, [*given, *others], groups)
+    names = names or _told(cost, best, fit, [*given, *others], groups)
+    if not names:
+        return None
+    estimate = fit.fit((*given, *names))
+    changes = estimate.change[len(given) :]
+    return dict(zip(names, changes.tolist(), strict=True))
+
+
+def _fit_high_harmonics(cost: Cost, best: Vector) -> dict[str, float] | None:
+    """Return the corrections of the angles that have a third or fourth harmonic; None if none has.
+
+    The first two harmonics of such an angle are corrected too: a part of them may be left. What a slow rotation of the
+    camera, a wrong camera or prism, or another error of the angles explains does not count.
+    """
+    errors = _by_errors(cost, best, (*LOW, *HIGH))
+    given = slopes(cost, cost.space, best, cost.space.names)
+    given |= by_rotation(cost, best)
+    if set(ASPECT.names).isdisjoint(cost.space.names):
+        given |= by_cause(cost, best, ASPECT)
+    others = _by_camera_and_prism(cost, best, given)
+    fit = linear_fit(cost, given | errors | others)
+
+    names: list[str] = []
+    for angle in range(MODELS[cost.space.model].ANGLES):
+        high: list[str] = []
+        for harmonic in HIGH:
+            group = harmonics_of(angle, (harmonic,))
+            rest = tuple(name for name in fit.names if name not in group)
+            estimate, significance, gain = fit.adding(rest, group)
+            factors = estimate.change[-len(group) :].tolist()
+            found_px = moved_px(cost.space, best, dict(zip(group, factors, strict=True)))
+            is_there = significance >= SIGNIFICANT and gain >= LEAST_HIGH_GAIN
+            if is_there and found_px >= LEAST_HIGH_PX:
+                high += group
+        if high:
+            names += [*harmonics_of(angle), *high]
     if not names:
         return None
     estimate = fit.fit((*given, *names))
@@ -295,24 +411,33 @@ def _by_camera_and_prism(cost: Cost, best: Vector, given: Container[str]) -> dic
     return found
 
 
-def _by_errors(cost: Cost, best: Vector) -> dict[str, Any]:
+def _by_errors(cost: Cost, best: Vector, harmonics: Sequence[int]) -> dict[str, Any]:
     """Return the derivatives of the residuals by errors of the angles, by name, for a still camera."""
     space = cost.space
     drifts = cost.brightness.pairs.arrays.slope.shape[0] > 0
     if space.moving or drifts or not orbit_of(space):
         return {}
-    patterns = patterns_of(cost)
+    kind = MODELS[space.model]
+    patterns = patterns_of(cost, harmonics)
+    names: list[str] = []
+    for group in examined_errors(kind):
+        names += group
+    high = [k for k in harmonics if k not in LOW]
+    for angle in range(kind.ANGLES):
+        if harmonics_of(angle) in examined_errors(kind):
+            names += harmonics_of(angle, high)
     columns = {}
-    for group in examined_errors(MODELS[space.model]):
-        for name in group:
-            columns[name] = shifted(cost, best, patterns[name], _angle_of(name))
+    for name in names:
+        columns[name] = shifted(cost, best, patterns[name], _angle_of(name))
     return columns
 
 
 def _told(
+    cost: Cost,
+    best: Vector,
     fit: LinearFit,
     others: Sequence[str],
-    groups: Sequence[Iterable[str]],
+    groups: Sequence[Collection[str]],
     share: float = 1.0,
 ) -> tuple[str, ...]:
     """Return the names of those groups of errors of the angles that are significant beyond the columns ``others``.
@@ -325,7 +450,12 @@ def _told(
         for other in groups:
             if other is not group:
                 rest += other
-        _, significance, gain = fit.adding((*others, *rest), tuple(group))
-        if significance >= share * SIGNIFICANT and gain >= share * LEAST_ANGLE_GAIN:
+        estimate, significance, gain = fit.adding((*others, *rest), tuple(group))
+        changes = estimate.change[-len(group) :]
+        found = dict(zip(group, changes.tolist(), strict=True))
+        found_px = moved_px(cost.space, best, found)
+        is_large = significance >= share * SIGNIFICANT and gain >= share * LEAST_ANGLE_GAIN
+        is_certain = significance >= share * CERTAIN and found_px >= share * LEAST_CERTAIN_PX
+        if is_large or is_certain:
             names += group
     return tuple(names)

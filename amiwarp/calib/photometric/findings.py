@@ -67,6 +67,9 @@ class SectorError(Finding):
     """Angle at which it is largest [rad]."""
     moved_px: float
     """How far it moves events [px rms]."""
+    harmonics: tuple[float, ...] = ()
+    """Correction of each angle by harmonics that explain it, in the form of :attr:`Calibration.harmonics`; empty for
+    none."""
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,13 @@ in some sectors of the angle.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.photometric.angles import examined_errors, harmonics_of
+from amiwarp.calib.photometric.angles import examined_errors, find_high_harmonics, harmonics_of
 from amiwarp.calib.photometric.cost import Cost
 from amiwarp.calib.photometric.distances import px_per_rad
 from amiwarp.calib.photometric.findings import SectorError
@@ -68,6 +69,8 @@ def note_what_sectors_leave(state: Refinement) -> Refinement:
     if not found:
         return state
     largest = max(found, key=lambda each: each.moved_px)
+    if space.depths is None:
+        largest = replace(largest, harmonics=find_high_harmonics(state.search, v))
     return state.noticing(largest)
 
 

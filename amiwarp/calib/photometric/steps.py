@@ -21,7 +21,12 @@ from amiwarp.calib.photometric.fast_motion import (
     bound_what_blind_pixels_hide,
     weigh_the_refractory_doubt,
 )
-from amiwarp.calib.photometric.findings import AngleError, MotionError, MovingParts
+from amiwarp.calib.photometric.findings import (
+    AngleError,
+    MotionError,
+    MovingParts,
+    SectorError,
+)
 from amiwarp.calib.photometric.losses import (
     count_lost_events,
     give_up_a_worse_answer,
@@ -82,7 +87,11 @@ def summarised(state: Refinement) -> tuple[PhotometricSummary, StageSummary, Par
     space = state.space
     check = state.check
     reason = state.refusal
-    harmonics = [found.harmonics for found in state.findings if isinstance(found, AngleError)]
+    harmonics = [
+        found.harmonics
+        for found in state.findings
+        if isinstance(found, AngleError | SectorError) and found.harmonics
+    ]
     stated = [found for found in state.findings if isinstance(found, MotionError)]
     moving = [found.parts for found in state.findings if isinstance(found, MovingParts)]
     result = PhotometricSummary(

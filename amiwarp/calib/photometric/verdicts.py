@@ -71,6 +71,8 @@ SAID_IN_ORDER: tuple[type[Finding], ...] = (
     BlindTime,
 )
 """Findings that warnings may be made from, in the order of the warnings."""
+HOW_OFTEN = ("once", "twice", "three times", "four times")
+"""How often the harmonics of an angle's error repeat, in words."""
 
 
 def refusal(findings: Iterable[Finding]) -> str:
@@ -198,12 +200,12 @@ def harmonics_in_words(kind: type[Model], harmonics: Sequence[float]) -> str:
     """Return the error of the angles of a model in words: its size, and how often it repeats."""
     turn = "turn" if kind.PRISM else "period"
     said = []
-    for name, of_angle in zip(angle_names(kind), np.reshape(harmonics, (-1, 4)), strict=False):
-        sizes = [math.degrees(math.hypot(*of_angle[:2])), math.degrees(math.hypot(*of_angle[2:]))]
-        often = (f"once a {turn}", f"twice a {turn}")
+    of_angles = np.reshape(harmonics, (kind.ANGLES, -1, 2))
+    for name, of_angle in zip(angle_names(kind), of_angles, strict=True):
+        sizes = np.degrees(np.linalg.norm(of_angle, axis=1)).tolist()
         named = [
-            f"{x:.2g} deg {how}"
-            for x, how in zip(sizes, often, strict=True)
+            f"{x:.2g} deg {how} a {turn}"
+            for x, how in zip(sizes, HOW_OFTEN, strict=False)
             if x and x >= 0.2 * max(sizes)
         ]
         if named:
