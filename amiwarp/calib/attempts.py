@@ -95,12 +95,13 @@ def _with_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, A
 
     Return the calibrator with what they found of the encoder and of bad pixels, and the attempt that holds.
     """
-    given = calibrator.recording.encoder
+    given = calibrator
     search = tried.search
     calibrator, tried = with_mended_encoder(calibrator, tried)
     calibrator, tried = with_straight_angles(calibrator, tried)
-    if given is not None and search is not None and calibrator.mended is None:
-        calibrator = with_rounding_named(calibrator, search, given)
+    if search is not None and calibrator.mended is None:
+        assert given.recording.encoder is not None
+        calibrator = with_rounding_named(calibrator, search, given.recording.encoder)
     if MODELS[calibrator.settings.model].GLASS is Plate:
         return calibrator, tried  # its depths are found from a camera at rest
     if tried.unexplained:
@@ -193,6 +194,8 @@ def with_straight_path(calibrator: Calibrator, tried: Attempt) -> Attempt:
     straight = replace(path, angle=path.angle - zero)
     again = replace(calibrator, path=straight).attempt()
     if again.calibration is None or again.cost > tried.cost:
+        return tried
+    if tried.accepted and not again.accepted:
         return tried
     return again
 

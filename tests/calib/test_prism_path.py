@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +26,7 @@ from amiwarp import (
     compensate_events,
     simulate,
 )
-from amiwarp.calib.prism_path import speed_in_words
+from amiwarp.calib import attempts
 from amiwarp.calib.repetition_path import varying_paths
 from amiwarp.calib.start_burst import reaching_back
 from amiwarp.optics.models.several import compensate_by_each
@@ -208,6 +210,44 @@ def test_a_speed_that_changes_by_one_percent_is_found(texture: np.ndarray) -> No
     assert 0.001 < found.photometric.hidden_px["a speed that varies"] < 0.02
 
 
+@pytest.mark.parametrize(
+    ("was_accepted", "is_accepted", "cost", "is_taken"),
+    [
+        (False, False, 0.09, True),
+        (True, True, 0.09, True),
+        (True, False, 0.09, False),
+        (True, True, 0.11, False),
+    ],
+)
+def test_a_path_without_the_error_of_each_turn_must_be_as_good(
+    was_accepted: bool, is_accepted: bool, cost: float, is_taken: bool
+) -> None:
+    """An answer with a third harmonic is accepted; a correction that is refused does not replace it."""
+    path = Encoder.constant_speed(720.0, 0, 400_000)
+    of_stage = SimpleNamespace(harmonics=(0.0, 0.0, 0.0, 0.0, 0.01, 0.0))
+    found = SimpleNamespace(path=path, photometric=of_stage)
+    tried: Any = SimpleNamespace(calibration=found, accepted=was_accepted, cost=0.1)
+    again: Any = SimpleNamespace(calibration=found, accepted=is_accepted, cost=cost)
+
+    @dataclass(frozen=True)
+    class Calibrator:
+        recording: Any
+        path: Encoder | None = None
+
+        def attempt(self) -> Any:
+            """Return the attempt with the third harmonic taken out, which leaves the middle at 0."""
+            assert self.path is not None
+            bent = self.path.angle - path.angle_at(self.path.t)
+            assert float(np.ptp(bent)) == pytest.approx(0.02, rel=0.05)
+            assert self.path.angle_at([200_000])[0] == pytest.approx(0.0, abs=1e-9)
+            return again
+
+    events = SimpleNamespace(t_first=0, t_last=400_000)
+    calibrator: Any = Calibrator(SimpleNamespace(events=events))
+    kept = attempts.with_straight_path(calibrator, tried)
+    assert kept is (again if is_taken else tried)
+
+
 def test_repetition_gives_the_path_of_a_ramp(spun_up: tuple[Recording, PrismMotion]) -> None:
     recording, motion = spun_up
     forward, backward = varying_paths(recording)
@@ -230,7 +270,7 @@ def test_events_that_do_not_repeat_have_no_path() -> None:
 
 def test_speeds_are_told_in_words() -> None:
     t = np.arange(0, 1_000_000, 1000)
-    assert "rose from" in speed_in_words(Encoder(t, 20.0 * (t * 1e-6) ** 2))
-    assert "fell from" in speed_in_words(Encoder(t, -20.0 * (1.0 - t * 1e-6) ** 2))
+    assert "rose from" in attempts.speed_in_words(Encoder(t, 20.0 * (t * 1e-6) ** 2))
+    assert "fell from" in attempts.speed_in_words(Encoder(t, -20.0 * (1.0 - t * 1e-6) ** 2))
     swing = Encoder(t, 100.0 * t * 1e-6 + np.sin(50.0 * t * 1e-6))
-    assert "varied between" in speed_in_words(swing)
+    assert "varied between" in attempts.speed_in_words(swing)
