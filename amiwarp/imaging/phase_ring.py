@@ -28,11 +28,10 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
-from amiwarp.imaging.phase import BINS, HARMONICS, PhaseSums
+from amiwarp.imaging.phase import BINS, HARMONICS, PhaseSums, shared_pairs
 from amiwarp.imaging.phase_tables import LEAST_RATIO, bin_attenuation
 from amiwarp.kernels import phase_ring as kernels
-from amiwarp.kernels.launch import launch
-from amiwarp.kernels.loading import load
+from amiwarp.kernels.launch import RecordedLaunch, launch
 from amiwarp.schema.calls import guarded
 from amiwarp.validation import array, real, whole
 
@@ -132,7 +131,8 @@ class PhaseRing:
         self.newest = 0
         """Number of the newest bin, which is not complete, counted from the angle 0 in the direction of the optic."""
         self._farthest = -math.inf
-        load(kernels.add_to_plane, wp.get_device("cpu"))
+        inputs = [0, 0, 0, 0, self.width, 0, 0]
+        self._count = RecordedLaunch(kernels.add_to_plane, inputs, [], device="cpu")
 
     @property
     def bins(self) -> int:
@@ -226,12 +226,14 @@ class PhaseRing:
         self._on[slot] += on
         self._off[slot] += len(events) - on
         columns = [
-            wp.array(column, dtype=kind, device="cpu", copy=False)
-            for column, kind in ((events.x, wp.uint16), (events.y, wp.uint16), (events.p, wp.uint8))
+            np.ascontiguousarray(column, kind)
+            for column, kind in ((events.x, np.uint16), (events.y, np.uint16), (events.p, np.uint8))
         ]
-        plane = wp.array(self._planes[slot], dtype=wp.uint16, device="cpu", copy=False)
-        inputs = [*columns, len(events), self.width]
-        launch(kernels.add_to_plane, 1, inputs, [plane], device="cpu", smallest=1)
+        for k, column in enumerate(columns):
+            self._count.set(k, column.ctypes.data)
+        self._count.set(3, len(events))
+        self._count.set(5, self._planes[slot].ctypes.data)
+        self._count.repeat()
 
     def add(self, events: Events, angles: Encoder | NDArray[np.float64]) -> None:
         """Count the events of a packet.
@@ -361,7 +363,8 @@ class PhaseRing:
             rows.append(_rows(of_prior))
             expected = values.view(np.float32).reshape(self.harmonics, pixels, 2)
         ratio = self._off_ratio()
-        values_out = wp.empty((self.harmonics, pixels), dtype=wp.vec2, device="cpu")
+        # NumPy's memory, which has large pages
+        values_out = np.empty((self.harmonics, pixels), np.complex64)
         on = wp.empty(pixels, dtype=int, device="cpu")
         off = wp.empty(pixels, dtype=int, device="cpu")
         changed = wp.empty((2, pixels), dtype=float, device="cpu")
@@ -372,13 +375,13 @@ class PhaseRing:
             ratio,
             wp.array(expected, dtype=wp.vec2, device="cpu", copy=False),
         ]
-        outputs = [values_out, on, off, changed]
+        outputs = [shared_pairs(values_out), on, off, changed]
         blocks = -(-pixels // kernels.BLOCK)
         launch(kernels.sum_planes, blocks, inputs, outputs, device="cpu", smallest=1)
 
         shape = (self.height, self.width)
         sums = PhaseSums(
-            values_out.numpy().view(np.complex64).reshape(self.harmonics, *shape),
+            values_out.reshape(self.harmonics, *shape),
             on.numpy().reshape(shape),
             off.numpy().reshape(shape),
             len(numbers) / BINS,
@@ -431,12 +434,13 @@ def _shares(weights: Sequence[float] | None, turns: int) -> NDArray[np.float64]:
 
 
 def _rows(factors: NDArray[np.complex128]) -> NDArray[np.float32]:
-    """Return factors of each harmonic as rows for a kernel, filled up to a multiple of the rows it takes together."""
+    """Return factors of each harmonic as rows for a kernel, filled up to a multiple of the columns it takes at once."""
     harmonics, count = factors.shape
-    rows = np.zeros((-(-count // kernels.TOGETHER) * kernels.TOGETHER, harmonics, 2), np.float32)
-    rows[:count, :, 0] = factors.real.T
-    rows[:count, :, 1] = factors.imag.T
-    return rows.reshape(len(rows), 2 * harmonics)
+    columns = -(-2 * harmonics // kernels.TOGETHER) * kernels.TOGETHER
+    rows = np.zeros((count, columns), np.float32)
+    rows[:, 0 : 2 * harmonics : 2] = factors.real.T
+    rows[:, 1 : 2 * harmonics : 2] = factors.imag.T
+    return rows
 
 
 def _unmixing(

@@ -26,10 +26,7 @@ from amiwarp.kernels.phase_slopes import write_divergence, write_slopes
 from amiwarp.optics.models.base import Model
 from amiwarp.reconstruction.phase_lag import FINEST, LAGS, LEAST_GAIN, TILES
 from amiwarp.reconstruction.phase_tiles import plan_of, tile_starts
-from amiwarp.reconstruction.picture_in_phase import LONG_WAVES, long_wave_filters, pixel_motion
-
-LEAST_SHARE = 2.0**-24
-"""Smallest share of a wave that comes from the gradient: the picture's float32 numbers would not show less."""
+from amiwarp.reconstruction.picture_in_phase import long_wave_filters, pixel_motion
 
 
 class DevicePictures:
@@ -122,15 +119,10 @@ class DevicePictures:
         self._forward = self._pairs(motion.forward.ravel())
         self._backward = self._pairs(motion.backward.ravel())
         self._slopes = self._empty((height, width), wp.vec2)
-
-        # Above this spatial frequency the gradient has no share [rad/px]
-        finest = math.sqrt(-2.0 * math.log(LEAST_SHARE)) * LONG_WAVES / motion.radius
-        lines = min(height, math.ceil(finest / math.pi * height) + 1)
-        columns = min(width, math.ceil(finest / math.pi * width) + 1)
         filters = long_wave_filters(height, width, motion.radius)
-        used = np.s_[:lines, :columns]
-        self._by_divergence = self._floats(filters.by_divergence[used])
-        self._share = self._floats(filters.share[used])
+        lines, columns = filters.share.shape
+        self._by_divergence = self._floats(filters.by_divergence)
+        self._share = self._floats(filters.share)
         along_y = cosines(height, lines)
         along_x = cosines(width, columns)
         self._to_lines = self._floats(along_y)

@@ -11,8 +11,10 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -21,22 +23,34 @@ from amiwarp.events.device_events import check_sensor
 from amiwarp.events.encoder_stream import EncoderStream, check_prisms
 from amiwarp.events.recording import Events
 from amiwarp.imaging.phase import BINS, PhaseSums
-from amiwarp.imaging.phase_ring import PhaseRing, PhaseUpdate
+from amiwarp.imaging.phase_ring import BIN, PhaseRing, PhaseUpdate
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.phase_misfit import write_misfit
 from amiwarp.optics.models.base import Model
-from amiwarp.reconstruction.image_in_phase import AROUND_PX, mean_around
 from amiwarp.reconstruction.phase_lag import lag_of
+from amiwarp.reconstruction.phase_tiles import scene_of_tiles
 from amiwarp.reconstruction.phase_window import harmonics_for, picture_of
 from amiwarp.reconstruction.picture import Picture
-from amiwarp.reconstruction.picture_in_phase import joined_picture, motion_of, phase_picture
+from amiwarp.reconstruction.picture_in_phase import (
+    joined_picture,
+    motion_of,
+    picture_of_slopes,
+)
 from amiwarp.schema.calls import guarded
 from amiwarp.validation import TIME_LIMIT, real, whole
 
+GATHERED = 1 << 15
+"""Number of events that are counted together, unless a picture is due: each count takes some time of its own."""
+GATHERED_US = 5_000
+"""Longest time of them [us]."""
 LAG_TURNS = 8
 """Number of turns after which the lag of events is found again: it changes with the speed of the optic."""
 MOVED = 0.5
 """Misfit over which something has moved at a pixel."""
 LEAST_EVENTS = 60
 """Number of events in the square around a pixel below which its misfit is weakened: some are few by chance."""
+LEAST_ROWS = 64
+"""Fewest rows of an image for which a thread is worth its start."""
 RIM_PX = 25
 """Side of the square around a moved pixel that counts as moved [px]: events show edges, not what lies between."""
 
@@ -142,11 +156,10 @@ class PhaseCamera:
         camera = model.camera
         count = harmonics_for(model) if harmonics is None else harmonics
         self._ring = PhaseRing(camera.width, camera.height, harmonics=count)
-        # Refuses the model, or loads kernels and tables before the stream needs them
-        phase_picture(_nothing(self._ring), model)
         self._queue: deque[tuple[Events, int]] = deque()
         self.waiting = 0
         """Number of events in the queue, which wait for encoder samples."""
+        self._gathered: list[Events] = []
         self._last_us = -(2**62)
         self._before: tuple[PhaseSums, NDArray[np.float32]] | None = None
         self._lag = 0.0
@@ -158,6 +171,10 @@ class PhaseCamera:
         """Number of pictures that :meth:`take` left out, because there was a newer one already."""
         self.left_out = 0
         """Number of events without an angle, which are in no picture."""
+        # Refuses the model, or loads kernels and tables before the stream needs them
+        nothing = _nothing(self._ring)
+        self._picture(nothing)
+        self._find_lag(nothing)
 
     def put(self, events: Events, now_us: int) -> None:
         """Queue a packet. The packet is kept, not copied.
@@ -208,23 +225,31 @@ class PhaseCamera:
         AmiwarpError
             If a packet is not sorted or has events outside the sensor.
         """
-        packets = self._ready(now_us)
-        until_us = int(packets[-1].t[-1]) if packets else 0
-        out: list[LivePicture] = []
-        for events in packets:
+        for events in self._ready(now_us):
             known = self._with_angle(events)
-            if not len(known):
+            if len(known):
+                self._gathered.append(known)
+        if not self._gathered:
+            return []
+        first_us = int(self._gathered[0].t[0])
+        until_us = int(self._gathered[-1].t[-1])
+        count = sum(len(events) for events in self._gathered)
+        enough = count >= GATHERED or until_us - first_us >= GATHERED_US
+        if not enough and not self._may_be_due(until_us):
+            return []
+        known = Events.concatenate(self._gathered)
+        self._gathered = []
+        out: list[LivePicture] = []
+        encoder = self.encoder.over(first_us, until_us)
+        for part in self._ring.split(known, encoder):
+            self._ring.add_part(part)
+            begins_us = int(part.events.t[0])
+            if not self._is_due(begins_us):
                 continue
-            encoder = self.encoder.over(int(known.t[0]), int(known.t[-1]))
-            for part in self._ring.split(known, encoder):
-                self._ring.add_part(part)
-                first_us = int(part.events.t[0])
-                if not self._is_due(first_us):
-                    continue
-                if newest and first_us + self._interval_us() <= until_us:
-                    self.skipped += 1
-                else:
-                    out.append(self._draw())
+            if newest and begins_us + self._interval_us() <= until_us:
+                self.skipped += 1
+            else:
+                out.append(self._draw())
         return out
 
     def flush(self) -> list[LivePicture]:
@@ -260,6 +285,16 @@ class PhaseCamera:
         self.left_out += unknown
         return events[unknown:]
 
+    def _may_be_due(self, until_us: int) -> bool:
+        """Return whether a picture may be due in the events up to ``until_us``: if not, they can wait for more."""
+        ring = self._ring
+        if ring.bins < BINS:
+            return True
+        if self._step_us is not None:
+            return until_us >= self._due_us
+        angle = self.encoder.over(until_us, until_us).angle_at(np.array([until_us]))
+        return math.floor(ring.direction * float(angle[0]) / BIN) >= self._next_bin
+
     def _is_due(self, now_us: int) -> bool:
         """Return whether a picture is due after the last complete bin, and note when the next one is."""
         ring = self._ring
@@ -293,26 +328,26 @@ class PhaseCamera:
         if self._before is None:
             sums = self._ring.sums()
             self._find_lag(sums)
-            log = phase_picture(sums, self.model, lag=self._lag)
+            log, slopes = self._picture(sums)
+            ground = log
             misfit = np.zeros(log.shape, np.float32)
             moved = np.zeros(log.shape, np.bool_)
-            ground = log
         else:
             bins = min(max(self._ring.newest - self._drawn_bin, self._bins), BINS)
-            prior, ground = self._before
+            prior, before = self._before
             update = self._ring.update(prior, bins / BINS)
             sums = update.sums
             misfit = _misfit(update)
             moved = ndimage.maximum_filter(misfit > MOVED, RIM_PX)
             if self._ring.newest - self._lag_bin >= LAG_TURNS * BINS:
                 self._find_lag(sums)
-            log = phase_picture(sums, self.model, lag=self._lag)
+            log, slopes = self._picture(sums)
+            ground = log
             if moved.any():
-                ground = self._without_moved(log, sums, moved, ground)
+                wrong = _difference(before, slopes, moved)
+                ground = log + picture_of_slopes(wrong, self.model)
                 log = np.where(moved, log, ground)
                 log -= np.median(log)
-            else:
-                ground = log
         self._before = sums, ground
         self._drawn_bin = self._ring.newest
         start_us, end_us = self._ring.span_us(bins)
@@ -326,19 +361,28 @@ class PhaseCamera:
         self._lag = lag_of(sums, self.model)
         self._lag_bin = self._ring.newest
 
-    def _without_moved(
-        self,
-        log: NDArray[np.float32],
-        sums: PhaseSums,
-        moved: NDArray[np.bool_],
-        before: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
-        """Return the picture with the gradient of the picture before in the long waves of what moved."""
-        rows, columns = np.gradient(before)
+    def _picture(self, sums: PhaseSums) -> tuple[NDArray[np.float32], NDArray[np.complex64]]:
+        """Return the picture of sums, and its gradient."""
         slopes = motion_of(sums, self.model).gradient(sums.values[0], self._lag)
-        wrong = np.where(moved, columns + 1j * rows - slopes, 0.0)
-        nothing = np.zeros_like(log)
-        return log + joined_picture(nothing, wrong.astype(np.complex64), self.model)
+        detail = scene_of_tiles(sums, self.model, self._lag, with_rest=False).detail
+        return joined_picture(detail, slopes, self.model), slopes
+
+
+def _difference(
+    before: NDArray[np.float32], slopes: NDArray[np.complex64], where: NDArray[np.bool_]
+) -> NDArray[np.complex64]:
+    """Return how the gradient of the picture before differs from ``slopes`` at some pixels, and 0 at the others."""
+    height, width = before.shape
+    y, x = np.nonzero(where)
+    above = np.maximum(y - 1, 0)
+    below = np.minimum(y + 1, height - 1)
+    left = np.maximum(x - 1, 0)
+    right = np.minimum(x + 1, width - 1)
+    found = np.zeros_like(slopes)
+    along_x = (before[y, right] - before[y, left]) / (right - left)
+    along_y = (before[below, x] - before[above, x]) / (below - above)
+    found[y, x] = along_x + 1j * along_y - slopes[y, x]
+    return found
 
 
 def _nothing(ring: PhaseRing) -> PhaseSums:
@@ -354,9 +398,11 @@ def _misfit(update: PhaseUpdate) -> NDArray[np.float32]:
     Events at random angles add the same to the squares of the change and of the newest part; the expected sums have as
     much noise.
     """
-    events = update.sums.on + update.sums.off_ratio**2 * update.sums.off
-    noise = update.noise * events.astype(np.float32)
-    change = mean_around(update.change - 2.0 * noise)
-    size = mean_around(update.size - noise)
-    least = update.noise * LEAST_EVENTS / AROUND_PX**2
-    return np.clip(0.5 * change / np.maximum(size, least), 0.0, 1.0)
+    sums = update.sums
+    parts = (update.change, update.size, sums.on, sums.off)
+    inputs: list[Any] = [wp.array(part.ravel(), device="cpu", copy=False) for part in parts]
+    inputs += [update.noise, sums.off_ratio**2, update.noise * LEAST_EVENTS]
+    misfit = np.empty(sums.on.shape, np.float32)
+    outputs = [wp.array(misfit, device="cpu", copy=False)]
+    launch(write_misfit, len(misfit), inputs, outputs, device="cpu", smallest=LEAST_ROWS)
+    return misfit
