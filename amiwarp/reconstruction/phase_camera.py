@@ -10,32 +10,24 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
 from amiwarp.events.encoder_stream import EncoderStream, check_prisms
 from amiwarp.events.recording import Events
-from amiwarp.imaging.phase import BINS, PhaseSums
-from amiwarp.imaging.phase_ring import BIN, PhaseRing, PhaseUpdate
-from amiwarp.kernels.launch import launch
-from amiwarp.kernels.phase_misfit import write_misfit
+from amiwarp.imaging.phase import BINS
+from amiwarp.imaging.phase_ring import BIN
 from amiwarp.optics.models.base import Model
-from amiwarp.reconstruction.phase_lag import lag_of
-from amiwarp.reconstruction.phase_tiles import scene_of_tiles
 from amiwarp.reconstruction.phase_window import harmonics_for, picture_of
 from amiwarp.reconstruction.picture import Picture
-from amiwarp.reconstruction.picture_in_phase import (
-    joined_picture,
-    motion_of,
-    picture_of_slopes,
-)
+from amiwarp.reconstruction.stream_pictures import pictures_on
 from amiwarp.schema.calls import guarded
 from amiwarp.validation import TIME_LIMIT, real, whole
 
@@ -45,14 +37,6 @@ GATHERED_US = 5_000
 """Longest time of them [us]."""
 LAG_TURNS = 8
 """Number of turns after which the lag of events is found again: it changes with the speed of the optic."""
-MOVED = 0.5
-"""Misfit over which something has moved at a pixel."""
-LEAST_EVENTS = 60
-"""Number of events in the square around a pixel below which its misfit is weakened: some are few by chance."""
-LEAST_ROWS = 64
-"""Fewest rows of an image for which a thread is worth its start."""
-RIM_PX = 25
-"""Side of the square around a moved pixel that counts as moved [px]: events show edges, not what lies between."""
 
 
 @guarded
@@ -112,6 +96,8 @@ class PhaseCamera:
         The same while fewer than two encoder samples have arrived [us].
     most_waiting : int, optional
         Largest number of events that wait.
+    device : str or warp.Device, default "cpu"
+        Device that counts the events and makes the pictures, such as ``"cuda"``.
 
     Raises
     ------
@@ -142,6 +128,7 @@ class PhaseCamera:
         wait_us: int = 10_000,
         start_us: int = 5_000_000,
         most_waiting: int = 1 << 24,
+        device: Any = "cpu",
     ) -> None:
         check_prisms(encoder, model.ANGLES)
         self.model = model
@@ -153,16 +140,15 @@ class PhaseCamera:
         self._step_us = None
         if rate_hz is not None:
             self._step_us = 1e6 / real(rate_hz, "rate_hz", 0.001, 1e5, " Hz")
-        camera = model.camera
         count = harmonics_for(model) if harmonics is None else harmonics
-        self._ring = PhaseRing(camera.width, camera.height, harmonics=count)
+        self._pictures = pictures_on(wp.get_device(device), model, count)
+        self._ring = self._pictures.ring
         self._queue: deque[tuple[Events, int]] = deque()
         self.waiting = 0
         """Number of events in the queue, which wait for encoder samples."""
         self._gathered: list[Events] = []
         self._last_us = -(2**62)
-        self._before: tuple[PhaseSums, NDArray[np.float32]] | None = None
-        self._lag = 0.0
+        self._awaits_turn = True
         self._lag_bin = 0
         self._drawn_bin = 0
         self._next_bin = 0
@@ -171,10 +157,6 @@ class PhaseCamera:
         """Number of pictures that :meth:`take` left out, because there was a newer one already."""
         self.left_out = 0
         """Number of events without an angle, which are in no picture."""
-        # Refuses the model, or loads kernels and tables before the stream needs them
-        nothing = _nothing(self._ring)
-        self._picture(nothing)
-        self._find_lag(nothing)
 
     def put(self, events: Events, now_us: int) -> None:
         """Queue a packet. The packet is kept, not copied.
@@ -240,6 +222,7 @@ class PhaseCamera:
         known = Events.concatenate(self._gathered)
         self._gathered = []
         out: list[LivePicture] = []
+        begun: deque[Callable[[], LivePicture]] = deque()
         encoder = self.encoder.over(first_us, until_us)
         for part in self._ring.split(known, encoder):
             self._ring.add_part(part)
@@ -248,9 +231,12 @@ class PhaseCamera:
                 continue
             if newest and begins_us + self._interval_us() <= until_us:
                 self.skipped += 1
-            else:
-                out.append(self._draw())
-        return out
+                continue
+            # On a GPU a picture is begun before the one before it is waited for
+            begun.append(self._begin())
+            if len(begun) > 1:
+                out.append(begun.popleft()())
+        return out + [finish() for finish in begun]
 
     def flush(self) -> list[LivePicture]:
         """Return the pictures of all events that still wait, with extrapolated angles if necessary.
@@ -299,7 +285,7 @@ class PhaseCamera:
         """Return whether a picture is due after the last complete bin, and note when the next one is."""
         ring = self._ring
         if ring.bins < BINS:  # also after the optic turned back
-            self._before = None
+            self._awaits_turn = True
             self._next_bin = ring.newest
             self._due_us = now_us
             return False
@@ -321,88 +307,24 @@ class PhaseCamera:
         start_us, end_us = self._ring.span_us(self._bins)
         return float(end_us - start_us)
 
-    def _draw(self) -> LivePicture:
-        """Return the picture up to the last complete bin."""
+    def _begin(self) -> Callable[[], LivePicture]:
+        """Begin with the picture up to the last complete bin, and return what waits for it."""
         began = time.perf_counter()
-        bins = BINS
-        if self._before is None:
-            sums = self._ring.sums()
-            self._find_lag(sums)
-            log, slopes = self._picture(sums)
-            ground = log
-            misfit = np.zeros(log.shape, np.float32)
-            moved = np.zeros(log.shape, np.bool_)
-        else:
-            bins = min(max(self._ring.newest - self._drawn_bin, self._bins), BINS)
-            prior, before = self._before
-            update = self._ring.update(prior, bins / BINS)
-            sums = update.sums
-            misfit = _misfit(update)
-            moved = ndimage.maximum_filter(misfit > MOVED, RIM_PX)
-            if self._ring.newest - self._lag_bin >= LAG_TURNS * BINS:
-                self._find_lag(sums)
-            log, slopes = self._picture(sums)
-            ground = log
-            if moved.any():
-                wrong = _difference(before, slopes, moved)
-                ground = log + picture_of_slopes(wrong, self.model)
-                log = np.where(moved, log, ground)
-                log -= np.median(log)
-        self._before = sums, ground
-        self._drawn_bin = self._ring.newest
-        start_us, end_us = self._ring.span_us(bins)
-        known = sums.values[0] != 0
-        length_us = end_us - start_us
-        picture = picture_of(log, known, sums.off_ratio, start_us, length_us, began)
-        return LivePicture(picture, misfit, moved, bins / BINS, sums.events)
+        ring = self._ring
+        first = self._awaits_turn
+        bins = BINS if first else min(max(ring.newest - self._drawn_bin, self._bins), BINS)
+        find_lag = first or ring.newest - self._lag_bin >= LAG_TURNS * BINS
+        if find_lag:
+            self._lag_bin = ring.newest
+        wait = self._pictures.begin(bins, first=first, find_lag=find_lag)
+        self._awaits_turn = False
+        self._drawn_bin = ring.newest
+        start_us, end_us = ring.span_us(bins)
 
-    def _find_lag(self, sums: PhaseSums) -> None:
-        """Find the lag of events anew."""
-        self._lag = lag_of(sums, self.model)
-        self._lag_bin = self._ring.newest
+        def finish() -> LivePicture:
+            made = wait()
+            length_us = end_us - start_us
+            picture = picture_of(made.log, made.known, made.off_ratio, start_us, length_us, began)
+            return LivePicture(picture, made.misfit, made.moved, bins / BINS, made.events)
 
-    def _picture(self, sums: PhaseSums) -> tuple[NDArray[np.float32], NDArray[np.complex64]]:
-        """Return the picture of sums, and its gradient."""
-        slopes = motion_of(sums, self.model).gradient(sums.values[0], self._lag)
-        detail = scene_of_tiles(sums, self.model, self._lag, with_rest=False).detail
-        return joined_picture(detail, slopes, self.model), slopes
-
-
-def _difference(
-    before: NDArray[np.float32], slopes: NDArray[np.complex64], where: NDArray[np.bool_]
-) -> NDArray[np.complex64]:
-    """Return how the gradient of the picture before differs from ``slopes`` at some pixels, and 0 at the others."""
-    height, width = before.shape
-    y, x = np.nonzero(where)
-    above = np.maximum(y - 1, 0)
-    below = np.minimum(y + 1, height - 1)
-    left = np.maximum(x - 1, 0)
-    right = np.minimum(x + 1, width - 1)
-    found = np.zeros_like(slopes)
-    along_x = (before[y, right] - before[y, left]) / (right - left)
-    along_y = (before[below, x] - before[above, x]) / (below - above)
-    found[y, x] = along_x + 1j * along_y - slopes[y, x]
-    return found
-
-
-def _nothing(ring: PhaseRing) -> PhaseSums:
-    """Return the sums of no events."""
-    shape = (ring.height, ring.width)
-    none = np.zeros(shape, np.int32)
-    return PhaseSums(np.zeros((ring.harmonics, *shape), np.complex64), none, none, 1.0, 1.0)
-
-
-def _misfit(update: PhaseUpdate) -> NDArray[np.float32]:
-    """Return the share of the newest brightness around each pixel that was not expected, 0 where nothing happens.
-
-    Events at random angles add the same to the squares of the change and of the newest part; the expected sums have as
-    much noise.
-    """
-    sums = update.sums
-    parts = (update.change, update.size, sums.on, sums.off)
-    inputs: list[Any] = [wp.array(part.ravel(), device="cpu", copy=False) for part in parts]
-    inputs += [update.noise, sums.off_ratio**2, update.noise * LEAST_EVENTS]
-    misfit = np.empty(sums.on.shape, np.float32)
-    outputs = [wp.array(misfit, device="cpu", copy=False)]
-    launch(write_misfit, len(misfit), inputs, outputs, device="cpu", smallest=LEAST_ROWS)
-    return misfit
+        return finish
