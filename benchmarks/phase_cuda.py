@@ -50,7 +50,8 @@ from amiwarp import (
     Simulation,
     phase_picture,
 )
-from amiwarp.imaging.phase import copied_sums, sum_turns
+from amiwarp.imaging.phase import BINS, copied_sums, sum_turns
+from amiwarp.imaging.phase_device import DeviceSums
 from amiwarp.reconstruction.device_picture import DevicePictures, captured
 from amiwarp.reconstruction.phase_lag import lag_of
 from amiwarp.reconstruction.phase_tiles import scene_of_tiles
@@ -115,15 +116,17 @@ class Comparison:
         source = self.work.recording.events
         assert isinstance(source, DeviceMemoryEvents)
         self.events = source.between_on_device(START_US, stop_us)
-        self.pictures = DevicePictures(self.work.model, self.work.harmonics, device)
+        size = source.size
+        self.there = DeviceSums(*size, self.work.harmonics, BINS, device, extremes=True)
+        self.pictures = DevicePictures(self.work.model, self.there.values)
 
     def sum(self) -> None:
         """Sum the events on the device."""
-        sum_turns(self.pictures.sums, self.events, self.work.encoder, self.turns)
+        sum_turns(self.there, self.events, self.work.encoder, self.turns)
 
     def order(self) -> None:
         """Order the words of the events by pixels, again: the sort takes as long as the first time."""
-        self.pictures.sums._order()
+        self.there._order()
 
     def result(self) -> dict[str, Any]:
         """Return how the pictures differ, and how they resemble the scene."""
@@ -134,7 +137,7 @@ class Comparison:
         self.sum()
         self.pictures.run()
         found = self.pictures.log()
-        there = copied_sums(self.pictures.sums)
+        there = copied_sums(self.there)
         window = self.work.window(*self.span).log
         largest = float(np.abs(found - log).max())
         row = {

@@ -28,16 +28,17 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
-from amiwarp.imaging.phase import BINS, HARMONICS, PhaseSums
+from amiwarp.imaging.phase import BINS, HARMONICS, PhaseSums, shared_pairs
 from amiwarp.imaging.phase_tables import LEAST_RATIO, bin_attenuation
 from amiwarp.kernels import phase_ring as kernels
-from amiwarp.kernels.launch import launch
-from amiwarp.kernels.loading import load
+from amiwarp.kernels.launch import RecordedLaunch, launch
 from amiwarp.schema.calls import guarded
 from amiwarp.validation import array, real, whole
 
 MOST_TURNS = 16
 """Largest number of turns that a ring keeps."""
+LEAST_EVENTS = 60
+"""Number of events in the square around a pixel below which its misfit is weakened: some are few by chance."""
 WEIGHT_OF_PRIOR = 0.3
 """Weight λ of expected sums, relative to the sums of a whole turn."""
 BACKWARDS = math.tau / 4.0
@@ -121,18 +122,39 @@ class PhaseRing:
         self.height = whole(height, "height", 1, 1 << 15, " px")
         self.harmonics = whole(harmonics, "harmonics", 1, (BINS - 1) // 2)
         self._kept = BINS * whole(turns, "turns", 1, MOST_TURNS)
-        slots = self._kept + 1  # with the bin that is not complete
-        self._planes = np.zeros((slots, self.width * self.height), np.uint16)
-        self._on = np.zeros(slots, np.int64)
-        self._off = np.zeros(slots, np.int64)
-        self._began_us = np.zeros(slots, np.int64)
+        self._slots = self._kept + 1  # with the bin that is not complete
+        self._on = np.zeros(self._slots, np.int64)
+        self._off = np.zeros(self._slots, np.int64)
+        self._began_us = np.zeros(self._slots, np.int64)
         self.direction = 0
         """Direction of the optic, 1 or -1; 0 before it is known."""
         self._first: int | None = None
         self.newest = 0
         """Number of the newest bin, which is not complete, counted from the angle 0 in the direction of the optic."""
         self._farthest = -math.inf
-        load(kernels.add_to_plane, wp.get_device("cpu"))
+        self._make_planes()
+
+    def _make_planes(self) -> None:
+        """Make room for the counts of all bins."""
+        self._planes = np.zeros((self._slots, self.width * self.height), np.uint16)
+        inputs = [0, 0, 0, 0, self.width, 0, 0]
+        self._count = RecordedLaunch(kernels.add_to_plane, inputs, [], device="cpu")
+
+    def _clear_plane(self, slot: int) -> None:
+        """Set the counts of a bin to 0."""
+        self._planes[slot] = 0
+
+    def _add_to_plane(self, slot: int, events: Events) -> None:
+        """Add events to the counts of a bin."""
+        columns = [
+            np.ascontiguousarray(column, kind)
+            for column, kind in ((events.x, np.uint16), (events.y, np.uint16), (events.p, np.uint8))
+        ]
+        for k, column in enumerate(columns):
+            self._count.set(k, column.ctypes.data)
+        self._count.set(3, len(events))
+        self._count.set(5, self._planes[slot].ctypes.data)
+        self._count.repeat()
 
     @property
     def bins(self) -> int:
@@ -208,30 +230,22 @@ class PhaseRing:
         part : RingPart
             A part by :meth:`split`.
         """
-        slots = len(self._planes)
-        if self._first is None or part.number - self.newest >= slots:
+        if self._first is None or part.number - self.newest >= self._slots:
             self._first = part.number
             self.newest = part.number - 1
         for number in range(self.newest + 1, part.number + 1):
-            slot = number % slots
-            self._planes[slot] = 0
+            slot = number % self._slots
+            self._clear_plane(slot)
             self._on[slot] = 0
             self._off[slot] = 0
             self._began_us[slot] = part.events.t[0]
         self.newest = part.number
 
-        slot = part.number % slots
-        events = part.events
-        on = int(np.count_nonzero(events.p))
+        slot = part.number % self._slots
+        on = int(np.count_nonzero(part.events.p))
         self._on[slot] += on
-        self._off[slot] += len(events) - on
-        columns = [
-            wp.array(column, dtype=kind, device="cpu", copy=False)
-            for column, kind in ((events.x, wp.uint16), (events.y, wp.uint16), (events.p, wp.uint8))
-        ]
-        plane = wp.array(self._planes[slot], dtype=wp.uint16, device="cpu", copy=False)
-        inputs = [*columns, len(events), self.width]
-        launch(kernels.add_to_plane, 1, inputs, [plane], device="cpu", smallest=1)
+        self._off[slot] += len(part.events) - on
+        self._add_to_plane(slot, part.events)
 
     def add(self, events: Events, angles: Encoder | NDArray[np.float64]) -> None:
         """Count the events of a packet.
@@ -264,9 +278,8 @@ class PhaseRing:
         tuple of int
             Time of the first event, and of the first event after them [us].
         """
-        slots = len(self._planes)
-        first = (self.newest - bins) % slots
-        return int(self._began_us[first]), int(self._began_us[self.newest % slots])
+        first = (self.newest - bins) % self._slots
+        return int(self._began_us[first]), int(self._began_us[self.newest % self._slots])
 
     def sums(self, turns: float = 1.0, *, weights: Sequence[float] | None = None) -> PhaseSums:
         """Return the sums in phase over the last turns, or the last part of a turn.
@@ -292,7 +305,7 @@ class PhaseRing:
         numbers = self._last_bins(turns)
         shares = _shares(weights, max(1, len(numbers) // BINS))
         weight = 0.0 if len(numbers) >= BINS else WEIGHT_OF_PRIOR
-        factors, _ = _unmixing(self._angles(numbers[-BINS:]), self.harmonics, weight)
+        factors, _ = unmixing(self._angles(numbers[-BINS:]), self.harmonics, weight)
         shared = np.tile(factors, len(shares)) * np.repeat(shares[::-1], factors.shape[1])
         return self._weighted(numbers, shared, None).sums
 
@@ -327,7 +340,7 @@ class PhaseRing:
                 f"the prior has the shape {prior.values.shape}, the ring has {self.harmonics} harmonics of "
                 f"{self.width}x{self.height} px; give sums of this ring"
             )
-        factors, expected = _unmixing(self._angles(numbers), self.harmonics, weight)
+        factors, expected = unmixing(self._angles(numbers), self.harmonics, weight)
         return self._weighted(numbers, factors, (prior.values, expected))
 
     def _last_bins(self, turns: float) -> NDArray[np.int64]:
@@ -361,37 +374,36 @@ class PhaseRing:
             rows.append(_rows(of_prior))
             expected = values.view(np.float32).reshape(self.harmonics, pixels, 2)
         ratio = self._off_ratio()
-        values_out = wp.empty((self.harmonics, pixels), dtype=wp.vec2, device="cpu")
+        # NumPy's memory, which has large pages
+        values_out = np.empty((self.harmonics, pixels), np.complex64)
         on = wp.empty(pixels, dtype=int, device="cpu")
         off = wp.empty(pixels, dtype=int, device="cpu")
         changed = wp.empty((2, pixels), dtype=float, device="cpu")
         inputs = [
             wp.array(self._planes, dtype=wp.uint16, device="cpu", copy=False),
-            wp.array(numbers % len(self._planes), dtype=int, device="cpu"),
+            wp.array(numbers % self._slots, dtype=int, device="cpu"),
             wp.array(np.concatenate(rows), dtype=float, device="cpu"),
             ratio,
             wp.array(expected, dtype=wp.vec2, device="cpu", copy=False),
         ]
-        outputs = [values_out, on, off, changed]
+        outputs = [shared_pairs(values_out), on, off, changed]
         blocks = -(-pixels // kernels.BLOCK)
         launch(kernels.sum_planes, blocks, inputs, outputs, device="cpu", smallest=1)
 
         shape = (self.height, self.width)
         sums = PhaseSums(
-            values_out.numpy().view(np.complex64).reshape(self.harmonics, *shape),
+            values_out.reshape(self.harmonics, *shape),
             on.numpy().reshape(shape),
             off.numpy().reshape(shape),
             len(numbers) / BINS,
             ratio,
         )
         change, size = changed.numpy().reshape(2, *shape)
-        per_event = float((np.abs(factors) ** 2).sum(axis=0).mean())
-        return PhaseUpdate(sums, change, size, per_event)
+        return PhaseUpdate(sums, change, size, square_of_event(factors))
 
     def _off_ratio(self) -> float:
         """Return ON events divided by OFF events over the last whole turn, or what there is of it."""
-        slots = len(self._planes)
-        used = np.arange(self.newest - min(self.bins, BINS), self.newest) % slots
+        used = np.arange(self.newest - min(self.bins, BINS), self.newest) % self._slots
         on = int(self._on[used].sum())
         off = int(self._off[used].sum())
         if not on or not off:
@@ -431,15 +443,21 @@ def _shares(weights: Sequence[float] | None, turns: int) -> NDArray[np.float64]:
 
 
 def _rows(factors: NDArray[np.complex128]) -> NDArray[np.float32]:
-    """Return factors of each harmonic as rows for a kernel, filled up to a multiple of the rows it takes together."""
+    """Return factors of each harmonic as rows for a kernel, filled up to a multiple of the columns it takes at once."""
     harmonics, count = factors.shape
-    rows = np.zeros((-(-count // kernels.TOGETHER) * kernels.TOGETHER, harmonics, 2), np.float32)
-    rows[:count, :, 0] = factors.real.T
-    rows[:count, :, 1] = factors.imag.T
-    return rows.reshape(len(rows), 2 * harmonics)
+    columns = -(-2 * harmonics // kernels.TOGETHER) * kernels.TOGETHER
+    rows = np.zeros((count, columns), np.float32)
+    rows[:, 0 : 2 * harmonics : 2] = factors.real.T
+    rows[:, 1 : 2 * harmonics : 2] = factors.imag.T
+    return rows
 
 
-def _unmixing(
+def square_of_event(factors: NDArray[np.complex128]) -> float:
+    """Return the mean square that an event at a random angle adds to the sums, by its factors [thresholds²]."""
+    return float((np.abs(factors) ** 2).sum(axis=0).mean())
+
+
+def unmixing(
     angles: NDArray[np.float64], harmonics: int, weight: float
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Return the factors with which bins at some angles, and expected sums, make the sums of a whole turn.

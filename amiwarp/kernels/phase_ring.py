@@ -8,48 +8,46 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-BLOCK = 256
+BLOCK = 128
 """Number of pixels whose sums a thread keeps in the cache."""
-TOGETHER = 4
-"""Number of planes that are added to the sums at a time."""
+TOGETHER = 6
+"""Number of columns of the table that are taken at a time, in a processor's registers."""
 
 
 @wp.func_native("""
-    const uint16_t* __restrict__ at_x = (const uint16_t*)x.data;
-    const uint16_t* __restrict__ at_y = (const uint16_t*)y.data;
-    const uint8_t* __restrict__ on = (const uint8_t*)p.data;
-    uint16_t* __restrict__ counts = (uint16_t*)plane.data;
+    const uint16_t* __restrict__ at_x = (const uint16_t*)x;
+    const uint16_t* __restrict__ at_y = (const uint16_t*)y;
+    const uint8_t* __restrict__ on = (const uint8_t*)p;
+    uint16_t* __restrict__ counts = (uint16_t*)plane;
     for (int i = 0; i < count; ++i) {
         uint16_t* word = counts + (int)at_y[i] * width + (int)at_x[i];
-        // a count that is full stays full
-        if (on[i])
-            *word += *word < 0xff00 ? 0x100 : 0;
-        else
-            *word += (*word & 0xff) < 0xff;
+        const int before = *word;
+        // a count that is full stays full; no branch, since polarities cannot be predicted
+        const int shift = on[i] ? 8 : 0;
+        *word = (uint16_t)(before + ((int)(((before >> shift) & 0xff) != 0xff) << shift));
     }
 """)
 def add_to_counts(
-    x: wp.array(dtype=wp.uint16),
-    y: wp.array(dtype=wp.uint16),
-    p: wp.array(dtype=wp.uint8),
-    count: int,
-    width: int,
-    plane: wp.array(dtype=wp.uint16),
+    x: wp.uint64, y: wp.uint64, p: wp.uint64, count: int, width: int, plane: wp.uint64
 ):
     """Add events to the counts of a plane."""
 
 
 @wp.kernel
 def add_to_plane(
-    x: wp.array(dtype=wp.uint16),
-    y: wp.array(dtype=wp.uint16),
-    p: wp.array(dtype=wp.uint8),
+    x: wp.uint64,
+    y: wp.uint64,
+    p: wp.uint64,
     count: int,
     width: int,
+    plane: wp.uint64,
     start: int,
-    plane: wp.array(dtype=wp.uint16),
 ):
-    """Add events to the counts of a plane, in one thread."""
+    """Add events to the counts of a plane, in one thread.
+
+    Columns of events and the plane are given by their addresses: to make an array of each takes longer than to add some
+    thousand events.
+    """
     if wp.tid() + start == 0:
         add_to_counts(x, y, p, count, width, plane)
 
@@ -63,72 +61,86 @@ def add_to_plane(
     int32_t* __restrict__ to_on = (int32_t*)on.data;
     int32_t* __restrict__ to_off = (int32_t*)off.data;
     float* __restrict__ to_changed = (float*)changed.data;
-    const int first = block * 256;
-    const int count = pixels - first < 256 ? pixels - first : 256;
-    const int own_rows = (used + 3) / 4 * 4;
-    const int rows = own_rows + (parts + 3) / 4 * 4;
-    float sums[64 * 256];
-    float weights[4 * 256];
-    float change[256];
-    float size[256];
-    int32_t ons[256];
-    int32_t offs[256];
-    for (int c = 0; c < columns * 256; ++c) sums[c] = 0.0f;
-    for (int i = 0; i < 4 * 256; ++i) weights[i] = 0.0f;
-    for (int i = 0; i < 256; ++i) { ons[i] = 0; offs[i] = 0; change[i] = 0.0f; size[i] = 0.0f; }
-    for (int row = 0; row <= rows; row += 4) {
-        if (row == own_rows)  // the sums of the planes alone
-            for (int c = 0; c < columns; ++c)
-                for (int i = 0; i < 256; ++i)
-                    size[i] += sums[c * 256 + i] * sums[c * 256 + i];
-        if (row == rows) break;
-        for (int k = 0; k < 4; ++k) {
-            float* __restrict__ weight = weights + k * 256;
-            const int r = row + k;
-            const int part = r - own_rows;
-            if (part >= 0 && part < parts) {
-                const float* __restrict__ from = before + 2 * ((int64_t)(part / 2) * pixels + first) + part % 2;
-                for (int i = 0; i < count; ++i) weight[i] = from[2 * i];
-            } else if (r < used) {
-                const uint16_t* __restrict__ from = words + (int64_t)which[r] * pixels + first;
-                for (int i = 0; i < count; ++i) {
-                    const int32_t ones = from[i] >> 8;
-                    const int32_t others = from[i] & 0xff;
-                    ons[i] += ones;
-                    offs[i] += others;
-                    weight[i] = (float)ones - off_ratio * (float)others;
+    const int first = block * 128;
+    const int count = pixels - first < 128 ? pixels - first : 128;
+    float weights[64 * 128];
+    float sums[66 * 128];
+    float change[128] = {};
+    float size[128] = {};
+    int32_t ons[128] = {};
+    int32_t offs[128] = {};
+    for (int i = 0; i < 128 * columns; ++i) sums[i] = 0.0f;
+    if (count < 128)
+        for (int i = 0; i < 64 * 128; ++i) weights[i] = 0.0f;
+    // adds rows of weights to the sums, by the factors from a row of the table on
+    auto add_rows = [&](int row, int rows) {
+#if !defined(__CUDA_ARCH__)
+#pragma clang fp contract(fast)
+        typedef float Eight __attribute__((vector_size(32), aligned(4), may_alias));
+        for (int c = 0; c < columns; c += 6)
+            for (int i = 0; i < count; i += 16) {
+                Eight sum[6][2];
+#pragma unroll
+                for (int k = 0; k < 6; ++k) {
+                    sum[k][0] = *(const Eight*)(sums + (c + k) * 128 + i);
+                    sum[k][1] = *(const Eight*)(sums + (c + k) * 128 + i + 8);
                 }
-            } else {
-                for (int i = 0; i < count; ++i) weight[i] = 0.0f;
+                for (int r = 0; r < rows; ++r) {
+                    const Eight one = *(const Eight*)(weights + r * 128 + i);
+                    const Eight other = *(const Eight*)(weights + r * 128 + i + 8);
+                    const float* factor = factors + (row + r) * columns + c;
+#pragma unroll
+                    for (int k = 0; k < 6; ++k) {
+                        sum[k][0] += factor[k] * one;
+                        sum[k][1] += factor[k] * other;
+                    }
+                }
+#pragma unroll
+                for (int k = 0; k < 6; ++k) {
+                    *(Eight*)(sums + (c + k) * 128 + i) = sum[k][0];
+                    *(Eight*)(sums + (c + k) * 128 + i + 8) = sum[k][1];
+                }
+            }
+#endif
+    };
+    for (int row = 0; row < used; row += 64) {
+        const int rows = used - row < 64 ? used - row : 64;
+        for (int r = 0; r < rows; ++r) {
+            const uint16_t* __restrict__ from = words + (int64_t)which[row + r] * pixels + first;
+            float* __restrict__ weight = weights + r * 128;
+            for (int i = 0; i < count; ++i) {
+                const int32_t ones = from[i] >> 8;
+                const int32_t others = from[i] & 0xff;
+                ons[i] += ones;
+                offs[i] += others;
+                weight[i] = (float)ones - off_ratio * (float)others;
             }
         }
-        const float* __restrict__ w0 = weights;
-        const float* __restrict__ w1 = weights + 256;
-        const float* __restrict__ w2 = weights + 512;
-        const float* __restrict__ w3 = weights + 768;
-        for (int c = 0; c < columns; ++c) {
-            const float f0 = factors[row * columns + c];
-            const float f1 = factors[(row + 1) * columns + c];
-            const float f2 = factors[(row + 2) * columns + c];
-            const float f3 = factors[(row + 3) * columns + c];
-            float* __restrict__ sum = sums + c * 256;
-            for (int i = 0; i < 256; ++i)
-                sum[i] += f0 * w0[i] + f1 * w1[i] + f2 * w2[i] + f3 * w3[i];
-        }
+        add_rows(row, rows);
     }
-    for (int m = 0; m < columns / 2; ++m)
-        for (int i = 0; i < count; ++i) {
-            float* pair = to + 2 * ((int64_t)m * pixels + first + i);
-            pair[0] = sums[2 * m * 256 + i];
-            pair[1] = sums[(2 * m + 1) * 256 + i];
+    if (parts) {  // the sums of the planes alone, then what is expected
+        for (int c = 0; c < parts; ++c)
+            for (int i = 0; i < count; ++i)
+                size[i] += sums[c * 128 + i] * sums[c * 128 + i];
+        for (int m = 0; m < parts / 2; ++m) {
+            const float* __restrict__ from = before + 2 * ((int64_t)m * pixels + first);
+            float* __restrict__ real = weights + 2 * m * 128;
+            float* __restrict__ imaginary = real + 128;
+            for (int i = 0; i < count; ++i) { real[i] = from[2 * i]; imaginary[i] = from[2 * i + 1]; }
         }
-    for (int m = 0; m < parts / 2; ++m)
-        for (int i = 0; i < count; ++i) {
-            const float* old = before + 2 * ((int64_t)m * pixels + first + i);
-            const float real = sums[2 * m * 256 + i] - old[0];
-            const float imaginary = sums[(2 * m + 1) * 256 + i] - old[1];
-            change[i] += real * real + imaginary * imaginary;
-        }
+        add_rows(used, parts);
+        for (int c = 0; c < parts; ++c)
+            for (int i = 0; i < count; ++i) {
+                const float differs = sums[c * 128 + i] - weights[c * 128 + i];
+                change[i] += differs * differs;
+            }
+    }
+    for (int m = 0; m < harmonics; ++m) {
+        float* __restrict__ pair = to + 2 * ((int64_t)m * pixels + first);
+        const float* __restrict__ real = sums + 2 * m * 128;
+        const float* __restrict__ imaginary = real + 128;
+        for (int i = 0; i < count; ++i) { pair[2 * i] = real[i]; pair[2 * i + 1] = imaginary[i]; }
+    }
     for (int i = 0; i < count; ++i) {
         to_on[first + i] = ons[i];
         to_off[first + i] = offs[i];
@@ -147,6 +159,7 @@ def sum_block(
     used: int,
     parts: int,
     columns: int,
+    harmonics: int,
     out: wp.array2d(dtype=wp.vec2),
     on: wp.array(dtype=int),
     off: wp.array(dtype=int),
@@ -170,10 +183,10 @@ def sum_planes(
 ):
     """Write the weighted sums over the planes ``chosen`` for a block of pixels, and the number of their events.
 
-    ``table`` has rows for the planes, then rows for real and imaginary part of each of the sums ``expected``, both
-    filled up to a multiple of :data:`TOGETHER`: real and imaginary part of what an ON event adds to each sum, and of
-    what the expected sums add. An OFF event adds ``off_ratio`` times the negative. ``changed`` has two rows: the
-    squares of the sums less the expected ones, and the squares of what the planes alone add.
+    ``table`` has rows for the planes, then rows for real and imaginary part of each of the sums ``expected``. Its
+    columns are real and imaginary part of what an ON event adds to each sum, and of what the expected sums add, filled
+    up to a multiple of :data:`TOGETHER`. An OFF event adds ``off_ratio`` times the negative. ``changed`` has two rows:
+    the squares of the sums less the expected ones, and the squares of what the planes alone add.
     """
     used = chosen.shape[0]
     size = planes.shape[1]
@@ -191,6 +204,7 @@ def sum_planes(
         used,
         parts,
         columns,
+        out.shape[0],
         out,
         on,
         off,

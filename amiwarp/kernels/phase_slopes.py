@@ -47,3 +47,40 @@ def write_divergence(gradient: wp.array2d(dtype=wp.vec2), start: int, out: wp.ar
     if y > 0:
         total -= 0.5 * (here[1] + gradient[y - 1, x][1])
     out[y, x] = total
+
+
+# As write_divergence, in a form that compilers vectorise
+@wp.func_native("""
+    const float* __restrict__ pairs = (const float*)gradient.data + 2 * (int64_t)y * width;
+    const float* __restrict__ above = y > 0 ? pairs - 2 * (int64_t)width : pairs;
+    const float* __restrict__ below = y + 1 < height ? pairs + 2 * (int64_t)width : pairs;
+    float* __restrict__ to = (float*)out.data + (int64_t)y * width;
+    const float into = y > 0 ? 0.5f : 0.0f;
+    const float from = y + 1 < height ? 0.5f : 0.0f;
+    for (int x = 0; x < width; ++x) {
+        const float here = pairs[2 * x + 1];
+        to[x] = from * (below[2 * x + 1] + here) - into * (here + above[2 * x + 1]);
+    }
+    if (width > 1) {
+        to[0] += 0.5f * (pairs[2] + pairs[0]);
+        to[width - 1] -= 0.5f * (pairs[2 * width - 2] + pairs[2 * width - 4]);
+    }
+    for (int x = 1; x + 1 < width; ++x)
+        to[x] += 0.5f * (pairs[2 * x + 2] - pairs[2 * x - 2]);
+""")
+def divergence_of_line(
+    gradient: wp.array2d(dtype=wp.vec2),
+    y: int,
+    width: int,
+    height: int,
+    out: wp.array2d(dtype=float),
+):
+    """Write the divergence of a gradient along a line."""
+
+
+@wp.kernel
+def write_divergence_lines(
+    gradient: wp.array2d(dtype=wp.vec2), start: int, out: wp.array2d(dtype=float)
+):
+    """Write what :func:`write_divergence` does, for the pixels of a line; for CPUs."""
+    divergence_of_line(gradient, wp.tid() + start, out.shape[1], out.shape[0], out)

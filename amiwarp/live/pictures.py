@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from amiwarp.live.items import LiveItems, closed_on_error, open_rig
 from amiwarp.live.queues import Policy
@@ -31,6 +32,7 @@ def pictures_live(
     wait_for_source_s: float = 0.0,
     wait_ms: float = 10.0,
     policy: Policy = Policy.BLOCK,
+    device: Any = "cpu",
     say: Callable[[str], None] = print,
 ) -> Iterator[Iterator[LivePicture]]:
     """Make pictures of a live stream, and iterate over them in a ``with`` block.
@@ -62,6 +64,8 @@ def pictures_live(
         Longest wait for encoder samples [ms]; after it the angle is extrapolated.
     policy : Policy or str, default "block"
         Treatment of events that arrive faster than they are counted: ``block``, ``drop-oldest`` or ``thin``.
+    device : str or warp.Device, default "cpu"
+        Device that makes the pictures, as for :class:`PhaseCamera`.
     say : callable, default print
         Function that gets messages, such as those about the clocks of controller and camera.
 
@@ -112,6 +116,7 @@ def pictures_live(
                 turns=turns,
                 rate_hz=rate_hz,
                 wait_us=wait_us,
+                device=device,
             )
             pictures: LiveItems[LivePicture] = LiveItems(opened)
             drawn = PictureStream(camera, pictures.put, newest=not fast)

@@ -15,9 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.imaging.bessel import BESSEL_STEP
-from amiwarp.imaging.phase import BINS
 from amiwarp.imaging.phase_costs import DAMPING, LONGEST_WAVES
-from amiwarp.imaging.phase_device import DeviceSums
 from amiwarp.kernels import long_waves, matrix_product, phase_lag, phase_lines
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.phase_grid import SIDE, TileGrid, join_tiles
@@ -26,24 +24,19 @@ from amiwarp.kernels.phase_slopes import write_divergence, write_slopes
 from amiwarp.optics.models.base import Model
 from amiwarp.reconstruction.phase_lag import FINEST, LAGS, LEAST_GAIN, TILES
 from amiwarp.reconstruction.phase_tiles import plan_of, tile_starts
-from amiwarp.reconstruction.picture_in_phase import LONG_WAVES, long_wave_filters, pixel_motion
-
-LEAST_SHARE = 2.0**-24
-"""Smallest share of a wave that comes from the gradient: the picture's float32 numbers would not show less."""
+from amiwarp.reconstruction.picture_in_phase import long_wave_filters, pixel_motion
 
 
 class DevicePictures:
-    """Pictures through one optic, each from the sums that :attr:`sums` holds at the time of :meth:`draw`.
+    """Pictures through one optic, each from the sums that an array holds at the time of :meth:`draw`.
 
-    Use one object from one thread only.
+    Use one object from one thread only. The sums have the shape (harmonics, height, width).
     """
 
-    def __init__(self, model: Model, harmonics: int, device: Any) -> None:
-        self.device = wp.get_device(device)
-        width = model.camera.width
-        height = model.camera.height
-        self.sums = DeviceSums(width, height, harmonics, BINS, self.device, extremes=True)
-        """Sums of which pictures are made."""
+    def __init__(self, model: Model, sums: wp.array) -> None:
+        self.device = sums.device
+        self._sums = sums
+        _, height, width = sums.shape
         self.picture = self._empty((height, width))
         """Log intensity of the last picture [ON thresholds], median 0."""
         self.detail = self._empty((height, width))
@@ -84,7 +77,7 @@ class DevicePictures:
 
     def _plan_tiles(self, model: Model) -> None:
         """Make the arrays of the tiles."""
-        harmonics = self.sums.harmonics
+        harmonics = len(self._sums)
         plan = plan_of(model, harmonics)
         rows, overlap_y = tile_starts(model.camera.height)
         columns, overlap_x = tile_starts(model.camera.width)
@@ -121,16 +114,12 @@ class DevicePictures:
         motion = pixel_motion(model)
         self._forward = self._pairs(motion.forward.ravel())
         self._backward = self._pairs(motion.backward.ravel())
-        self._slopes = self._empty((height, width), wp.vec2)
-
-        # Above this spatial frequency the gradient has no share [rad/px]
-        finest = math.sqrt(-2.0 * math.log(LEAST_SHARE)) * LONG_WAVES / motion.radius
-        lines = min(height, math.ceil(finest / math.pi * height) + 1)
-        columns = min(width, math.ceil(finest / math.pi * width) + 1)
+        self.slopes = self._empty((height, width), wp.vec2)
+        """Gradient of the last picture [thresholds/px]."""
         filters = long_wave_filters(height, width, motion.radius)
-        used = np.s_[:lines, :columns]
-        self._by_divergence = self._floats(filters.by_divergence[used])
-        self._share = self._floats(filters.share[used])
+        lines, columns = filters.share.shape
+        self._by_divergence = self._floats(filters.by_divergence)
+        self._share = self._floats(filters.share)
         along_y = cosines(height, lines)
         along_x = cosines(width, columns)
         self._to_lines = self._floats(along_y)
@@ -143,14 +132,14 @@ class DevicePictures:
         self._waves = [self._empty((lines, columns)) for _ in range(3)]
         self._back = self._empty((height, columns))
         self._long = self._empty((height, width))
-        # The sort needs twice the room.
-        self._keys = self._empty(2 * height * width)
+        self.keys = self._empty(2 * height * width)
+        """Numbers that are sorted for a median, with twice the room."""
         self._idle = self._empty(2 * height * width, int)
 
     def transform(self) -> None:
         """Cut out the tiles of all sums, and transform them."""
         planes = self._spectra.reshape((-1, SIDE, SIDE))
-        inputs = [self.sums.values, self._window, self._grid, self._turns, self._room]
+        inputs = [self._sums, self._window, self._grid, self._turns, self._room]
         self._transform(phase_lines.cut_lines, inputs, planes)
         inputs = [planes, self._turns, self._room, 1.0]
         self._transform(phase_lines.transform_columns, inputs)
@@ -183,12 +172,16 @@ class DevicePictures:
 
     def add_long_waves(self) -> None:
         """Replace the long waves of the detail by the waves of the gradient, and subtract the median."""
-        height = self.picture.shape[0]
-        first = self.sums.values[0].flatten()
+        first = self._sums[0].flatten()
         inputs = [first, self._forward, self._backward, self._turn]
-        self._launch(write_slopes, first.size, inputs, [self._slopes.flatten()])
-        self._launch(write_divergence, first.size, [self._slopes], [self._both[:height]])
-        wp.copy(self._both[height:], self.detail)
+        self._launch(write_slopes, first.size, inputs, [self.slopes.flatten()])
+        self.replace_long_waves(self.detail, self.slopes, self.picture)
+
+    def replace_long_waves(self, detail: wp.array, slopes: wp.array, out: wp.array) -> None:
+        """Write an image with its long waves replaced by the waves of a gradient, and with a median of 0."""
+        height = out.shape[0]
+        self._launch(write_divergence, out.size, [slopes], [self._both[:height]])
+        wp.copy(self._both[height:], detail)
 
         self._multiply(self._both, self._to_columns, self._half)
         of_divergence, of_detail, change = self._waves
@@ -198,11 +191,13 @@ class DevicePictures:
         self._launch(long_waves.weigh_waves, change.size, inputs, [change])
         self._multiply(self._from_lines, change, self._back)
         self._multiply(self._back, self._from_columns, self._long)
+        self._launch(long_waves.add_waves, out.size, [detail, self._long], [out, self.keys])
+        self.subtract_median(out)
 
-        outputs = [self.picture, self._keys]
-        self._launch(long_waves.add_waves, self.picture.size, [self.detail, self._long], outputs)
-        wp.utils.radix_sort_pairs(self._keys, self._idle, self.picture.size)
-        self._launch(long_waves.take_median, self.picture.size, [self._keys], [self.picture])
+    def subtract_median(self, image: wp.array) -> None:
+        """Subtract the median from an image, whose pixels are the first ones of :attr:`keys`, too."""
+        wp.utils.radix_sort_pairs(self.keys, self._idle, image.size)
+        self._launch(long_waves.take_median, image.size, [self.keys], [image])
 
     def _transform(self, kernel: Any, inputs: list[Any], *outputs: wp.array) -> None:
         """Run a kernel that transforms lines or columns of planes, the first of its inputs or its output."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from amiwarp.events.device_events import DeviceMemoryEvents, all_events, ranges_between
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import EventSource
-from amiwarp.imaging.phase import sum_turns
+from amiwarp.imaging.phase import BINS, sum_turns
 from amiwarp.imaging.phase_device import DeviceSums
 from amiwarp.optics.models.base import Model
 from amiwarp.reconstruction.device_picture import DevicePictures
@@ -36,19 +36,17 @@ class Drawn(NamedTuple):
 class Drawing:
     """Picture that is copied to the host when the device has made it."""
 
-    def __init__(self, pictures: DevicePictures) -> None:
+    def __init__(self, pictures: DevicePictures, sums: DeviceSums) -> None:
         pinned = pictures.device.is_cuda
         shape = pictures.picture.shape
-        sums = pictures.sums
         self._log = wp.empty(shape, dtype=float, device="cpu", pinned=pinned)
         self._known = wp.empty(shape, dtype=wp.uint8, device="cpu", pinned=pinned)
         self._marks = wp.empty(len(sums.marks), dtype=int, device="cpu", pinned=pinned)
         self._made = wp.Event(pictures.device) if pinned else None
         self._count = 0
 
-    def copy(self, pictures: DevicePictures) -> None:
-        """Queue the copies of a picture behind its work."""
-        sums = pictures.sums
+    def copy(self, pictures: DevicePictures, sums: DeviceSums) -> None:
+        """Queue the copies of a picture and what its sums note behind its work."""
         self._count = sums.count
         wp.copy(self._log, pictures.picture)
         wp.copy(self._known, sums.known)
@@ -73,7 +71,9 @@ class DeviceWindows:
     ) -> None:
         self._source: EventSource = source
         self._encoder = encoder
-        self._pictures = DevicePictures(model, harmonics, device)
+        width, height = source.size
+        self._sums = DeviceSums(width, height, harmonics, BINS, device, extremes=True)
+        self._pictures = DevicePictures(model, self._sums.values)
         self._idle: list[Drawing] = []
         # Events are looked up beside the pictures, not after them
         cuda = self._pictures.device.is_cuda
@@ -81,7 +81,7 @@ class DeviceWindows:
 
     def start(self, start_us: int, stop_us: int, turns: int) -> Drawing | None:
         """Begin with the picture of whole turns. None if there are no events."""
-        sums = self._pictures.sums
+        sums = self._sums
         if isinstance(self._source, DeviceMemoryEvents):
             with wp.ScopedStream(self._beside, sync_enter=False):
                 (part,) = ranges_between(self._source, [(start_us, stop_us)])
@@ -94,8 +94,8 @@ class DeviceWindows:
                 return None
             sum_turns(sums, events, self._encoder, float(turns))
         self._pictures.draw()
-        drawing = self._idle.pop() if self._idle else Drawing(self._pictures)
-        drawing.copy(self._pictures)
+        drawing = self._idle.pop() if self._idle else Drawing(self._pictures, sums)
+        drawing.copy(self._pictures, sums)
         return drawing
 
     def finish(self, drawing: Drawing) -> Drawn:

@@ -13,16 +13,15 @@ from scipy import ndimage
 from amiwarp.imaging.phase import PhaseSums
 from amiwarp.io.output_formats import check_ending
 from amiwarp.io.outputs import NewFile
+from amiwarp.kernels.phase_misfit import AROUND
 from amiwarp.optics.models.base import Model
 from amiwarp.reconstruction.phase_lag import lag_of
 from amiwarp.reconstruction.phase_tiles import scene_of_tiles
 from amiwarp.reconstruction.picture_in_phase import joined_picture, motion_of
 from amiwarp.schema.calls import guarded
 
-AROUND_PX = 7
-"""Side of the square over which the misfit of a pixel is taken [px]: single pixels have few events."""
 FEWEST_EVENTS = 20
-"""Fewest events in this square: with fewer the misfit is unknown."""
+"""Fewest events in the square around a pixel: with fewer its misfit is unknown."""
 
 
 @guarded
@@ -133,11 +132,11 @@ def _misfit(sums: PhaseSums, rest: NDArray[np.complex64]) -> NDArray[np.float32]
     whole = mean_around((np.abs(sums.values) ** 2).sum(axis=0))
     counts = mean_around((sums.on + sums.off).astype(np.float32))
     share = np.full(left.shape, np.nan, np.float32)
-    enough = (counts * AROUND_PX**2 >= FEWEST_EVENTS) & (whole > 0.0)
+    enough = (counts * AROUND**2 >= FEWEST_EVENTS) & (whole > 0.0)
     np.divide(left, whole, out=share, where=enough)
     return np.clip(share, 0.0, 1.0)
 
 
 def mean_around(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the mean of the values around each pixel."""
-    return np.asarray(ndimage.uniform_filter(values, AROUND_PX, mode="nearest"), np.float32)
+    return np.asarray(ndimage.uniform_filter(values, AROUND, mode="nearest"), np.float32)

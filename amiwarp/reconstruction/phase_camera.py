@@ -10,35 +10,33 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
 from amiwarp.events.encoder_stream import EncoderStream, check_prisms
 from amiwarp.events.recording import Events
-from amiwarp.imaging.phase import BINS, PhaseSums
-from amiwarp.imaging.phase_ring import PhaseRing, PhaseUpdate
+from amiwarp.imaging.phase import BINS
+from amiwarp.imaging.phase_ring import BIN
 from amiwarp.optics.models.base import Model
-from amiwarp.reconstruction.image_in_phase import AROUND_PX, mean_around
-from amiwarp.reconstruction.phase_lag import lag_of
 from amiwarp.reconstruction.phase_window import harmonics_for, picture_of
 from amiwarp.reconstruction.picture import Picture
-from amiwarp.reconstruction.picture_in_phase import joined_picture, motion_of, phase_picture
+from amiwarp.reconstruction.stream_pictures import pictures_on
 from amiwarp.schema.calls import guarded
 from amiwarp.validation import TIME_LIMIT, real, whole
 
+GATHERED = 1 << 15
+"""Number of events that are counted together, unless a picture is due: each count takes some time of its own."""
+GATHERED_US = 5_000
+"""Longest time of them [us]."""
 LAG_TURNS = 8
 """Number of turns after which the lag of events is found again: it changes with the speed of the optic."""
-MOVED = 0.5
-"""Misfit over which something has moved at a pixel."""
-LEAST_EVENTS = 60
-"""Number of events in the square around a pixel below which its misfit is weakened: some are few by chance."""
-RIM_PX = 25
-"""Side of the square around a moved pixel that counts as moved [px]: events show edges, not what lies between."""
 
 
 @guarded
@@ -98,6 +96,8 @@ class PhaseCamera:
         The same while fewer than two encoder samples have arrived [us].
     most_waiting : int, optional
         Largest number of events that wait.
+    device : str or warp.Device, default "cpu"
+        Device that counts the events and makes the pictures, such as ``"cuda"``.
 
     Raises
     ------
@@ -128,6 +128,7 @@ class PhaseCamera:
         wait_us: int = 10_000,
         start_us: int = 5_000_000,
         most_waiting: int = 1 << 24,
+        device: Any = "cpu",
     ) -> None:
         check_prisms(encoder, model.ANGLES)
         self.model = model
@@ -139,17 +140,15 @@ class PhaseCamera:
         self._step_us = None
         if rate_hz is not None:
             self._step_us = 1e6 / real(rate_hz, "rate_hz", 0.001, 1e5, " Hz")
-        camera = model.camera
         count = harmonics_for(model) if harmonics is None else harmonics
-        self._ring = PhaseRing(camera.width, camera.height, harmonics=count)
-        # Refuses the model, or loads kernels and tables before the stream needs them
-        phase_picture(_nothing(self._ring), model)
+        self._pictures = pictures_on(wp.get_device(device), model, count)
+        self._ring = self._pictures.ring
         self._queue: deque[tuple[Events, int]] = deque()
         self.waiting = 0
         """Number of events in the queue, which wait for encoder samples."""
+        self._gathered: list[Events] = []
         self._last_us = -(2**62)
-        self._before: tuple[PhaseSums, NDArray[np.float32]] | None = None
-        self._lag = 0.0
+        self._awaits_turn = True
         self._lag_bin = 0
         self._drawn_bin = 0
         self._next_bin = 0
@@ -208,24 +207,36 @@ class PhaseCamera:
         AmiwarpError
             If a packet is not sorted or has events outside the sensor.
         """
-        packets = self._ready(now_us)
-        until_us = int(packets[-1].t[-1]) if packets else 0
-        out: list[LivePicture] = []
-        for events in packets:
+        for events in self._ready(now_us):
             known = self._with_angle(events)
-            if not len(known):
+            if len(known):
+                self._gathered.append(known)
+        if not self._gathered:
+            return []
+        first_us = int(self._gathered[0].t[0])
+        until_us = int(self._gathered[-1].t[-1])
+        count = sum(len(events) for events in self._gathered)
+        enough = count >= GATHERED or until_us - first_us >= GATHERED_US
+        if not enough and not self._may_be_due(until_us):
+            return []
+        known = Events.concatenate(self._gathered)
+        self._gathered = []
+        out: list[LivePicture] = []
+        begun: deque[Callable[[], LivePicture]] = deque()
+        encoder = self.encoder.over(first_us, until_us)
+        for part in self._ring.split(known, encoder):
+            self._ring.add_part(part)
+            begins_us = int(part.events.t[0])
+            if not self._is_due(begins_us):
                 continue
-            encoder = self.encoder.over(int(known.t[0]), int(known.t[-1]))
-            for part in self._ring.split(known, encoder):
-                self._ring.add_part(part)
-                first_us = int(part.events.t[0])
-                if not self._is_due(first_us):
-                    continue
-                if newest and first_us + self._interval_us() <= until_us:
-                    self.skipped += 1
-                else:
-                    out.append(self._draw())
-        return out
+            if newest and begins_us + self._interval_us() <= until_us:
+                self.skipped += 1
+                continue
+            # On a GPU a picture is begun before the one before it is waited for
+            begun.append(self._begin())
+            if len(begun) > 1:
+                out.append(begun.popleft()())
+        return out + [finish() for finish in begun]
 
     def flush(self) -> list[LivePicture]:
         """Return the pictures of all events that still wait, with extrapolated angles if necessary.
@@ -260,11 +271,21 @@ class PhaseCamera:
         self.left_out += unknown
         return events[unknown:]
 
+    def _may_be_due(self, until_us: int) -> bool:
+        """Return whether a picture may be due in the events up to ``until_us``: if not, they can wait for more."""
+        ring = self._ring
+        if ring.bins < BINS:
+            return True
+        if self._step_us is not None:
+            return until_us >= self._due_us
+        angle = self.encoder.over(until_us, until_us).angle_at(np.array([until_us]))
+        return math.floor(ring.direction * float(angle[0]) / BIN) >= self._next_bin
+
     def _is_due(self, now_us: int) -> bool:
         """Return whether a picture is due after the last complete bin, and note when the next one is."""
         ring = self._ring
         if ring.bins < BINS:  # also after the optic turned back
-            self._before = None
+            self._awaits_turn = True
             self._next_bin = ring.newest
             self._due_us = now_us
             return False
@@ -286,77 +307,24 @@ class PhaseCamera:
         start_us, end_us = self._ring.span_us(self._bins)
         return float(end_us - start_us)
 
-    def _draw(self) -> LivePicture:
-        """Return the picture up to the last complete bin."""
+    def _begin(self) -> Callable[[], LivePicture]:
+        """Begin with the picture up to the last complete bin, and return what waits for it."""
         began = time.perf_counter()
-        bins = BINS
-        if self._before is None:
-            sums = self._ring.sums()
-            self._find_lag(sums)
-            log = phase_picture(sums, self.model, lag=self._lag)
-            misfit = np.zeros(log.shape, np.float32)
-            moved = np.zeros(log.shape, np.bool_)
-            ground = log
-        else:
-            bins = min(max(self._ring.newest - self._drawn_bin, self._bins), BINS)
-            prior, ground = self._before
-            update = self._ring.update(prior, bins / BINS)
-            sums = update.sums
-            misfit = _misfit(update)
-            moved = ndimage.maximum_filter(misfit > MOVED, RIM_PX)
-            if self._ring.newest - self._lag_bin >= LAG_TURNS * BINS:
-                self._find_lag(sums)
-            log = phase_picture(sums, self.model, lag=self._lag)
-            if moved.any():
-                ground = self._without_moved(log, sums, moved, ground)
-                log = np.where(moved, log, ground)
-                log -= np.median(log)
-            else:
-                ground = log
-        self._before = sums, ground
-        self._drawn_bin = self._ring.newest
-        start_us, end_us = self._ring.span_us(bins)
-        known = sums.values[0] != 0
-        length_us = end_us - start_us
-        picture = picture_of(log, known, sums.off_ratio, start_us, length_us, began)
-        return LivePicture(picture, misfit, moved, bins / BINS, sums.events)
+        ring = self._ring
+        first = self._awaits_turn
+        bins = BINS if first else min(max(ring.newest - self._drawn_bin, self._bins), BINS)
+        find_lag = first or ring.newest - self._lag_bin >= LAG_TURNS * BINS
+        if find_lag:
+            self._lag_bin = ring.newest
+        wait = self._pictures.begin(bins, first=first, find_lag=find_lag)
+        self._awaits_turn = False
+        self._drawn_bin = ring.newest
+        start_us, end_us = ring.span_us(bins)
 
-    def _find_lag(self, sums: PhaseSums) -> None:
-        """Find the lag of events anew."""
-        self._lag = lag_of(sums, self.model)
-        self._lag_bin = self._ring.newest
+        def finish() -> LivePicture:
+            made = wait()
+            length_us = end_us - start_us
+            picture = picture_of(made.log, made.known, made.off_ratio, start_us, length_us, began)
+            return LivePicture(picture, made.misfit, made.moved, bins / BINS, made.events)
 
-    def _without_moved(
-        self,
-        log: NDArray[np.float32],
-        sums: PhaseSums,
-        moved: NDArray[np.bool_],
-        before: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
-        """Return the picture with the gradient of the picture before in the long waves of what moved."""
-        rows, columns = np.gradient(before)
-        slopes = motion_of(sums, self.model).gradient(sums.values[0], self._lag)
-        wrong = np.where(moved, columns + 1j * rows - slopes, 0.0)
-        nothing = np.zeros_like(log)
-        return log + joined_picture(nothing, wrong.astype(np.complex64), self.model)
-
-
-def _nothing(ring: PhaseRing) -> PhaseSums:
-    """Return the sums of no events."""
-    shape = (ring.height, ring.width)
-    none = np.zeros(shape, np.int32)
-    return PhaseSums(np.zeros((ring.harmonics, *shape), np.complex64), none, none, 1.0, 1.0)
-
-
-def _misfit(update: PhaseUpdate) -> NDArray[np.float32]:
-    """Return the share of the newest brightness around each pixel that was not expected, 0 where nothing happens.
-
-    Events at random angles add the same to the squares of the change and of the newest part; the expected sums have as
-    much noise.
-    """
-    events = update.sums.on + update.sums.off_ratio**2 * update.sums.off
-    noise = update.noise * events.astype(np.float32)
-    change = mean_around(update.change - 2.0 * noise)
-    size = mean_around(update.size - noise)
-    least = update.noise * LEAST_EVENTS / AROUND_PX**2
-    return np.clip(0.5 * change / np.maximum(size, least), 0.0, 1.0)
+        return finish

@@ -23,12 +23,16 @@ from amiwarp.imaging.phase_costs import DAMPING
 from amiwarp.kernels import phase_spectra as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.phase_grid import SIDE
+from amiwarp.kernels.phase_lines import turns_of_places
+from amiwarp.kernels.phase_planes import PLANE, TileTables, tile_scenes
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.orbit import orbits_of
-from amiwarp.tasks import in_order
+from amiwarp.tasks import cpu_threads, in_order
 
 LEAST_OVERLAP = 24
 """Smallest overlap of tiles beside each other [px]."""
+HALF = SIDE // 2 + 1
+"""Number of columns of the spectrum of a real scene: the others are conjugates."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +53,20 @@ def scene_of_tiles(sums: PhaseSums, model: Model, lag: float, *, with_rest: bool
     harmonics, height, width = sums.values.shape
     plan = plan_of(model, harmonics)
     responses = plan.responses(lag)
+    parts = responses.parts(sums.values)
+    detail = _Mosaic((height, width), np.dtype(np.float32))
+    for place, part in zip(plan.places, parts, strict=True):
+        detail.add(place, part)
+    if not with_rest:
+        return TiledScene(detail.values, None)
     jobs = [
-        partial(_tile, sums.values, plan, responses, tile, with_rest)
+        partial(_rest_of_tile, sums.values, plan, responses, tile)
         for tile in range(len(plan.places))
     ]
-    detail = _Mosaic((height, width), np.dtype(np.float32))
-    rest = _Mosaic((harmonics, height, width), np.dtype(np.complex64)) if with_rest else None
-    for place, (part, left) in zip(plan.places, in_order(jobs, fill_cores=True), strict=True):
-        detail.add(place, part)
-        if rest is not None and left is not None:
-            rest.add(place, left)
-    return TiledScene(detail.values, None if rest is None else rest.values)
+    rest = _Mosaic((harmonics, height, width), np.dtype(np.complex64))
+    for place, left in zip(plan.places, in_order(jobs, fill_cores=True), strict=True):
+        rest.add(place, left)
+    return TiledScene(detail.values, rest.values)
 
 
 def tile_starts(length: int) -> tuple[list[int], int]:
@@ -92,19 +99,15 @@ class Plan:
     """Motion of each tile's middle, a exp(iθ) + b exp(-iθ), as (a, b) [px], shape (tiles, 2)."""
     bessel: wp.array
     """Bessel functions J_1, J_2, … in steps of :data:`BESSEL_STEP`, on the CPU."""
-    steps: wp.array
-    """Factors by which the responses of the harmonics differ, as ``response_tables`` writes them."""
-    strengths: wp.array
-    """Sizes of the responses over the sum of their squares, as ``response_tables`` writes them."""
+    tables: Any
+    """What the kernels take of all this, a ``TileTables``."""
 
     def responses(self, lag: float) -> Responses:
         """Return how a scene makes the sums of each tile, if events lag by an angle [rad]."""
         # The orbit's angle is behind.
         late = self.orbits * np.exp(np.array([-1j, 1j]) * lag).astype(np.complex64)
         behind = wp.vec2(math.cos(lag), -math.sin(lag))
-        return Responses(
-            wp.clone(shared_pairs(late)), self.bessel, self.steps, self.strengths, behind
-        )
+        return Responses(wp.clone(shared_pairs(late)), self.bessel, self.tables, behind)
 
 
 @lru_cache(maxsize=8)
@@ -131,18 +134,17 @@ def plan_of_orbits(
 ) -> Plan:
     """Return the plan of tiles with these places, weights and orbits, as :class:`Plan` has them."""
     bessel = bessel_of(orbits, harmonics)
-    steps, strengths = _response_tables(orbits, bessel)
-    return Plan(places, window, orbits, bessel, steps, strengths)
-
-
-def _response_tables(orbits: NDArray[np.complex64], bessel: wp.array) -> tuple[wp.array, wp.array]:
-    """Return the steps and strengths of the responses of tiles with these orbits, on the CPU."""
-    half = SIDE // 2 + 1
-    steps = wp.empty((len(orbits), SIDE, half), dtype=wp.vec2, device="cpu")
-    strengths = wp.empty((len(orbits), len(bessel), SIDE, half), dtype=float, device="cpu")
+    tables = TileTables()
+    tables.places = wp.array(places, dtype=wp.vec2i, device="cpu")
+    tables.window = wp.array(window, dtype=float, device="cpu")
+    tables.turns = wp.clone(shared_pairs(turns_of_places().astype(np.complex64)))
+    tables.steps = wp.empty((len(orbits), SIDE, HALF), dtype=wp.vec2, device="cpu")
+    shape = (len(orbits), len(bessel), SIDE, HALF)
+    tables.strengths = wp.empty(shape, dtype=float, device="cpu")
     inputs = [shared_pairs(orbits), bessel, 1.0 / BESSEL_STEP, DAMPING]
-    launch(kernels.response_tables, steps.size, inputs, [steps, strengths], device="cpu")
-    return steps, strengths
+    outputs = [tables.steps, tables.strengths]
+    launch(kernels.response_tables, tables.steps.size, inputs, outputs, device="cpu")
+    return Plan(places, window, orbits, bessel, tables)
 
 
 def bessel_of(orbits: NDArray[np.complex64], harmonics: int) -> wp.array:
@@ -160,22 +162,41 @@ class Responses:
     """Motion of each tile's middle, as (a, b)."""
     bessel: wp.array
     """Bessel functions J_1, J_2, … in steps of :data:`BESSEL_STEP`."""
-    steps: wp.array
-    """Factors by which the responses of the harmonics differ, without lag."""
-    strengths: wp.array
-    """Sizes of the responses over the sum of their squares."""
+    tables: Any
+    """The responses without lag, and what else the tiles have in common."""
     behind: wp.vec2
     """exp(-i lag), by which the steps turn."""
+
+    def parts(self, values: NDArray[np.complex64]) -> NDArray[np.float32]:
+        """Return the weighted scenes of all tiles by least squares, shape (tiles, side, side).
+
+        ``values`` are the sums in phase of the image, shape (harmonics, height, width).
+        """
+        tiles = len(self.tables.places)
+        shares = min(tiles, cpu_threads())
+        planes = np.empty((shares, 2 * PLANE), np.float32)
+        spectra = np.empty((shares, len(values), SIDE, SIDE), np.complex64)
+        scenes = np.empty((shares, SIDE, HALF), np.complex64)
+        parts = np.empty((tiles, SIDE, SIDE), np.float32)
+        outputs = [
+            wp.array(planes, device="cpu", copy=False),
+            shared_pairs(spectra),
+            shared_pairs(scenes),
+            wp.array(parts, device="cpu", copy=False),
+        ]
+        inputs = [shared_pairs(values), self.tables, self.behind]
+        launch(tile_scenes, shares, inputs, outputs, device="cpu", smallest=1)
+        return parts
 
     def scene(self, spectra: NDArray[np.complex64], tile: int) -> NDArray[np.complex64]:
         """Return the spectrum of the scene of a tile by least squares, shape (side, side // 2 + 1).
 
         ``spectra`` are the Fourier transforms of its sums, shape (harmonics, side, side).
         """
-        side = spectra.shape[1]
-        scene = np.empty((side, side // 2 + 1), np.complex64)
-        inputs = [shared_pairs(spectra), self.steps, self.strengths, tile, self.behind]
-        launch(kernels.scene_spectrum, side, inputs, [shared_pairs(scene)], device="cpu")
+        scene = np.empty((SIDE, HALF), np.complex64)
+        inputs = [shared_pairs(spectra), self.tables.steps, self.tables.strengths]
+        inputs += [tile, self.behind]
+        launch(kernels.scene_spectrum, SIDE, inputs, [shared_pairs(scene)], device="cpu")
         return scene
 
     def rest(
@@ -189,18 +210,14 @@ class Responses:
         return rest
 
 
-def _tile(
-    values: NDArray[np.complex64], plan: Plan, responses: Responses, tile: int, with_rest: bool
-) -> tuple[NDArray[np.float32], NDArray[np.complex64] | None]:
-    """Return the weighted scene of a tile, and the weighted rest of its sums."""
+def _rest_of_tile(
+    values: NDArray[np.complex64], plan: Plan, responses: Responses, tile: int
+) -> NDArray[np.complex64]:
+    """Return the weighted rest of the sums of a tile."""
     cut = cut_out(values, plan.places[tile], plan.window)
     spectra = scipy.fft.fft2(cut, workers=1, overwrite_x=True)
-    scene = responses.scene(spectra, tile)
-    part = plan.window * scipy.fft.irfft2(scene, s=(SIDE, SIDE), workers=1)
-    if not with_rest:
-        return part, None
-    rest = responses.rest(spectra, scene, tile)
-    return part, plan.window * scipy.fft.ifft2(rest, workers=1, overwrite_x=True)
+    rest = responses.rest(spectra, responses.scene(spectra, tile), tile)
+    return np.asarray(plan.window * scipy.fft.ifft2(rest, workers=1, overwrite_x=True))
 
 
 def cut_out(

@@ -20,7 +20,7 @@ from scipy.special import jv
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.phase import PhaseSums, shared_pairs
 from amiwarp.kernels.launch import launch
-from amiwarp.kernels.phase_slopes import write_divergence, write_slopes
+from amiwarp.kernels.phase_slopes import write_divergence_lines, write_slopes
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.orbit import Orbits, image_grid, orbits_of
 from amiwarp.reconstruction.phase_lag import lag_of
@@ -31,6 +31,10 @@ from amiwarp.validation import real
 
 LONG_WAVES = 1.2
 """Waves longer than 2π r / LONG_WAVES come from the gradient, with r the radius of the orbit [px]."""
+LEAST_SHARE = 2.0**-24
+"""Smallest share of a wave that comes from the gradient: the picture's float32 numbers would not show less."""
+LEAST_LINES = 64
+"""Fewest lines of an image for which a thread is worth its start."""
 LEAST_ATTENUATION = 0.2
 """Smallest attenuation of a wave in the first sum that is undone: shorter waves come from the tiles."""
 LEAST_WIDTH = 0.05
@@ -177,21 +181,23 @@ def _interpolated(rows: NDArray[Any], places: NDArray[np.float64]) -> NDArray[An
 
 @dataclass(frozen=True)
 class LongWaveFilters:
-    """Filters over the cosine waves of an image, shape (height, width)."""
+    """Filters over the cosine waves of an image that the gradient gives, shape (lines, columns): the longest ones."""
 
     by_divergence: NDArray[np.float32]
     """What the divergence of the gradient is multiplied with: Poisson's equation, and the share of a wave."""
     share: NDArray[np.float32]
     """Share of a wave that comes from the gradient."""
-    of_detail: NDArray[np.float32]
-    """What the detail is multiplied with: the rest of the share."""
 
 
 @lru_cache(maxsize=4)
 def long_wave_filters(height: int, width: int, radius: float) -> LongWaveFilters:
     """Return the filters that take waves which are long beside an orbit from the gradient."""
-    kx = math.pi * np.arange(width) / width
-    ky = math.pi * np.arange(height) / height
+    # Above this spatial frequency the gradient has no share [rad/px]
+    finest = math.sqrt(-2.0 * math.log(LEAST_SHARE)) * LONG_WAVES / radius
+    lines = min(height, math.ceil(finest / math.pi * height) + 1)
+    columns = min(width, math.ceil(finest / math.pi * width) + 1)
+    kx = math.pi * np.arange(columns) / width
+    ky = math.pi * np.arange(lines) / height
     square = kx[None, :] ** 2 + ky[:, None] ** 2
     share = np.exp(-0.5 * square * (radius / LONG_WAVES) ** 2)
 
@@ -203,9 +209,16 @@ def long_wave_filters(height: int, width: int, radius: float) -> LongWaveFilters
     reach = np.maximum(np.sqrt(square) * radius, 1e-6)
     attenuation = np.maximum(2.0 * jv(1, reach) / reach, LEAST_ATTENUATION)
     by_divergence = share / (laplace * attenuation)
-    of_detail = 1.0 - share
-    found = (by_divergence, share, of_detail)
-    return LongWaveFilters(*(values.astype(np.float32) for values in found))
+    return LongWaveFilters(by_divergence.astype(np.float32), share.astype(np.float32))
+
+
+def picture_of_slopes(slopes: NDArray[np.complex64], model: Model) -> NDArray[np.float32]:
+    """Return the long waves of a gradient alone, with a median of 0."""
+    height, width = slopes.shape
+    filters = long_wave_filters(height, width, pixel_motion(model).radius)
+    waves = filters.by_divergence * _long_waves(_flow(slopes), filters)
+    picture = _image_of(waves, height, width)
+    return picture - np.median(picture)
 
 
 def with_long_waves(
@@ -213,12 +226,29 @@ def with_long_waves(
 ) -> NDArray[np.float32]:
     """Return the picture with its waves that are long beside the orbit replaced by the waves of its gradient."""
     height, width = detail.shape
-    # The cosine waves of the picture have no flow over the border, either.
-    flow = np.empty((height, width), np.float32)
-    outputs = [wp.array(flow, device="cpu", copy=False)]
-    launch(write_divergence, flow.size, [shared_pairs(slopes)], outputs, device="cpu")
-
     filters = long_wave_filters(height, width, radius)
-    waves = scipy.fft.dctn(flow, workers=cpu_threads()) * filters.by_divergence
-    waves += scipy.fft.dctn(detail, workers=cpu_threads()) * filters.of_detail
-    return scipy.fft.idctn(waves, workers=cpu_threads(), overwrite_x=True)
+    waves = filters.by_divergence * _long_waves(_flow(slopes), filters)
+    waves -= filters.share * _long_waves(detail, filters)
+    return detail + _image_of(waves, height, width)
+
+
+def _flow(slopes: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Return the divergence of a gradient, with no flow over the border, as the cosine waves of the picture have."""
+    flow = np.empty(slopes.shape, np.float32)
+    inputs = [shared_pairs(slopes)]
+    outputs = [wp.array(flow, device="cpu", copy=False)]
+    launch(write_divergence_lines, len(flow), inputs, outputs, device="cpu", smallest=LEAST_LINES)
+    return flow
+
+
+def _long_waves(image: NDArray[np.float32], filters: LongWaveFilters) -> NDArray[np.float32]:
+    """Return the cosine waves of an image that the filters have."""
+    lines, columns = filters.share.shape
+    by_lines = scipy.fft.dct(image, axis=1, workers=cpu_threads())[:, :columns]
+    return np.asarray(scipy.fft.dct(by_lines, axis=0, workers=cpu_threads())[:lines])
+
+
+def _image_of(waves: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+    """Return the image of its longest cosine waves."""
+    by_lines = scipy.fft.idct(waves, n=height, axis=0, workers=cpu_threads())
+    return np.asarray(scipy.fft.idct(by_lines, n=width, axis=1, workers=cpu_threads()))

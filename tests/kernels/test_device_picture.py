@@ -68,6 +68,10 @@ class Case:
         width, height = self.camera.width, self.camera.height
         return phase_sums(events, self.encoder, width, height, turns=1.0, harmonics=self.harmonics)
 
+    def on_device(self, device: str) -> DeviceSums:
+        size = self.camera.width, self.camera.height
+        return DeviceSums(*size, self.harmonics, 64, device, extremes=True)
+
     def work(self, recording: Recording, device: str | None = None) -> PhaseReconstruction:
         values = {"apex": self.prism.apex, "phase": PHASE}
         calibration = exact_calibration(self.camera, self.prism, values)
@@ -93,12 +97,13 @@ def case(request: pytest.FixtureRequest, texture: NDArray[np.uint8]) -> Case:
 
 def test_pictures_are_those_of_the_cpu(case: Case, device: str) -> None:
     """Also after the sums of other events: the first ones are upside down, and fewer."""
-    pictures = DevicePictures(case.model, case.harmonics, device)
+    there = case.on_device(device)
+    pictures = DevicePictures(case.model, there.values)
     few = case.events[: len(case.events) // 2]
     other = Events(few.x, case.camera.height - 1 - few.y, few.t, few.p)
     for events in (other, case.events):
         sums = case.sums(events)
-        pictures.sums.sum(events, case.encoder, turns=1.0, direction=1)
+        there.sum(events, case.encoder, turns=1.0, direction=1)
         pictures.draw()
         lag = phase_lag.lag_of(sums, case.model)
         assert float(pictures.lag.numpy()[0]) == pytest.approx(lag, abs=1e-5)
@@ -113,9 +118,10 @@ def test_pictures_are_those_of_the_cpu(case: Case, device: str) -> None:
 def test_a_picture_is_the_same_each_time(case: Case, device: str) -> None:
     found = []
     for _ in range(2):
-        pictures = DevicePictures(case.model, case.harmonics, device)
+        there = case.on_device(device)
+        pictures = DevicePictures(case.model, there.values)
         for _ in range(2):
-            pictures.sums.sum(case.events, case.encoder, turns=1.0, direction=1)
+            there.sum(case.events, case.encoder, turns=1.0, direction=1)
             pictures.draw()
             found.append(pictures.log())
     for log in found[1:]:

@@ -178,6 +178,22 @@ def test_pictures_at_a_rate(recording: Recording) -> None:
     assert {one.turns for one in fast[1:]} <= {0.25}
 
 
+@pytest.mark.parametrize("rate_hz", [None, 40.0])
+def test_a_picture_does_not_wait_for_more_events(
+    recording: Recording, rate_hz: float | None
+) -> None:
+    """Packets are counted together, but for those that make a picture due."""
+    camera = PhaseCamera(MODEL, encoder_of(recording), rate_hz=rate_hz)
+    found = 0
+    for packet in packets(recording.events[: 1 << 18], 170):
+        camera.put(packet, 0)
+        for picture in camera.take(0):
+            found += 1
+            # Up to a bin until its last event is followed by a later bin, and the packet
+            assert 0 <= int(packet.t[-1]) - picture.end_us < TURN_US / 64 + 400
+    assert found > 3
+
+
 def test_of_pictures_that_are_ready_the_newest(recording: Recording) -> None:
     camera = PhaseCamera(MODEL, encoder_of(recording))
     events = recording.events[:]

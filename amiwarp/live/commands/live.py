@@ -312,6 +312,7 @@ def run_live(
             link,
             resources,
             fast=stream.fast,
+            device=device,
             say=line.say,
         )
         if picture_stream is not None:
@@ -357,6 +358,7 @@ def _picture_stream(
     resources: contextlib.ExitStack,
     *,
     fast: bool,
+    device: str,
     say: Callable[[str], None],
 ) -> PictureStream | None:
     """Return what makes the pictures that the options ask for, and open their outputs; None without any."""
@@ -373,6 +375,7 @@ def _picture_stream(
         event_encoder(source, calibration, link),
         rate_hz=options.picture_hz,
         wait_us=cli.microseconds(processing.wait_ms, "ms", "--wait-ms"),
+        device=device,
     )
     outputs: list[Callable[[LivePicture], None]] = []
     if options.picture is not None:
