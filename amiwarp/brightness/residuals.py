@@ -16,7 +16,13 @@ from amiwarp.kernels import conjugate_gradients as cg
 from amiwarp.kernels import equations as eqs
 from amiwarp.kernels.launch import BLOCK_DIM, RepeatedLaunches, launch
 from amiwarp.kernels.page_locked_memory import start_read
-from amiwarp.kernels.residual_sums import add_clusters, magnitudes, sum_costs, sum_products
+from amiwarp.kernels.residual_sums import (
+    CLUSTER_PX,
+    add_clusters,
+    magnitudes,
+    sum_costs,
+    sum_products,
+)
 from amiwarp.kernels.square_sums import (
     MOST_ROWS,
     find_squares,
@@ -30,7 +36,7 @@ Vector = NDArray[np.float64]
 CHUNKS = 8
 """Smallest number of chunks of a vector for which a second CPU thread is used."""
 SUM_COPIES = 64
-"""Number of copies of each tile's sum on a GPU."""
+"""Number of copies of each cluster's sum on a GPU, where many threads would wait for each other to add to few sums."""
 
 
 class Residuals:
@@ -93,19 +99,21 @@ class Residuals:
         sums = start_read(partial)
         return lambda: np.asarray(sums().sum(axis=1))
 
-    def start_clusters(self, slopes: list[Any]) -> Callable[[], Vector]:
+    def start_clusters(self, slopes: list[Any], width: int, height: int) -> Callable[[], Vector]:
         """Start to sum slope · weight · residual over clusters of neighbouring pairs.
 
-        Return a function that waits for the sums, shape (slopes, clusters).
+        ``width`` and ``height`` are the sensor's size [px]. Return a function that waits for the sums, shape (slopes,
+        clusters).
         """
         # The clusters are the tiles. On a map of one tile, they are squares of pixels.
-        several = self.tiles > 1
-        size = self.tiles if several else 1 << 20
-        # On a GPU, many threads would wait for each other to add to the few sums of the tiles.
-        copies = SUM_COPIES if self.device.is_cuda and several else 1
-        waiting = []
-        for slope in slopes:
-            sums = wp.zeros((2, size * copies), dtype=wp.int64, device=self.device)
+        columns = math.ceil(width / CLUSTER_PX)
+        size = self.tiles
+        if size == 1:
+            size = columns * math.ceil(height / CLUSTER_PX)
+        copies = SUM_COPIES if self.device.is_cuda else 1
+        shape = (len(slopes), 2, size * copies)
+        sums = wp.zeros(shape, dtype=wp.int64, device=self.device)
+        for k, slope in enumerate(slopes):
             # One CPU thread only: several would add to the same sums.
             wp.launch(
                 add_clusters,
@@ -113,26 +121,23 @@ class Residuals:
                 inputs=[
                     self.pairs.arrays,
                     self.tiles,
+                    columns,
                     copies,
                     slope,
                     self.weight,
                     self.values,
                     0,
-                    sums,
+                    sums[k],
                 ],
                 device=self.device,
             )
-            # The sums of one tile are too large for page-locked memory.
-            read = start_read(sums) if several else sums.numpy
-            waiting.append(read)
+        read = start_read(sums)
 
         def result() -> Vector:
-            rows = []
-            for read in waiting:
-                of_copies = read().reshape(2, size, -1)
-                total, number = of_copies.sum(axis=2)
-                rows.append(total[number > 0] / 2.0**32)
-            return np.array(rows)
+            of_copies = read().reshape(len(slopes), 2, size, copies)
+            total, number = np.moveaxis(of_copies.sum(axis=3), 1, 0)
+            # The pairs of a cluster are the same for every slope.
+            return np.asarray(total[:, number[0] > 0] / 2.0**32)
 
         return result
 

@@ -102,6 +102,7 @@ class RecordedLaunch:
         load(kernel, device)
         self._start = len(inputs) - 1
         self._first = inputs[-1]
+        self._n = n
         self._command = wp.launch(
             kernel,
             n,
@@ -120,7 +121,9 @@ class RecordedLaunch:
 
     def __call__(self, first: int, n: int) -> None:
         """Run a kernel whose last input is ``start: int`` over ``range(first, first + n)``, as :attr:`repeat` does."""
-        self._command.set_dim(n)
+        if n != self._n:
+            self._n = n
+            self._command.set_dim(n)
         if first != self._first:
             self._first = first
             self._command.set_param_at_index(self._start, first)

@@ -106,3 +106,34 @@ def angle_patterns(pairs: Pairs, cx: float, cy: float, start: int, out: wp.array
         out[3, at] = 2.0 * c * s
         out[4, at] = float(pairs.x[i]) - cx
         out[5, at] = float(pairs.y[i]) - cy
+
+
+@wp.kernel
+def by_sector(
+    pairs: Pairs,
+    angle: int,
+    first: wp.array(dtype=float),
+    second: wp.array(dtype=float),
+    start: int,
+    out: wp.array2d(dtype=float),
+):
+    """Compute derivatives by an offset of an angle in each of its sectors. ``out`` has a row for each sector.
+
+    ``first`` and ``second`` are the derivatives by the angle at either end of a pair; NaN counts as 0. ``angle`` is the
+    number of the angle of two; -1 for the only one, of which the pairs store cosine and sine.
+    """
+    i = start + wp.tid()
+    sectors = out.shape[0]
+    for k in range(sectors):
+        out[k, i] = 0.0
+    for end in range(2):
+        part = 2 * end * pairs.stride + i
+        if angle < 0:
+            turned = wp.atan2(pairs.azimuth[part + pairs.stride], pairs.azimuth[part])
+        else:
+            turned = pairs.azimuth[part + angle * pairs.stride]
+        turns = turned / (2.0 * wp.pi)
+        sector = wp.min(int((turns - wp.floor(turns)) * float(sectors)), sectors - 1)
+        slope = wp.where(end == 0, first[i], second[i])
+        if slope == slope:
+            out[sector, i] = out[sector, i] + slope

@@ -64,21 +64,26 @@ def sum_products(
     store_partial_sum(partial, thread, total)
 
 
+CLUSTER_PX = wp.constant(64)
+"""Length of the sides of the squares that are clusters of a map of one tile [px]."""
+
+
 @wp.func
-def cluster_of(pairs: Pairs, tiles: int, i: int) -> int:
+def cluster_of(pairs: Pairs, tiles: int, columns: int, i: int) -> int:
     """Return the cluster of a pair: its tile.
 
-    On a map of one tile, it is the square of 64 x 64 pixels that holds the pixel (1024 squares per row).
+    On a map of one tile, it is the square of pixels that holds the pixel; there are ``columns`` squares in a row.
     """
     if tiles > 1:
         return pairs.tile[i]
-    return int(pairs.x[i]) / 64 + int(pairs.y[i]) / 64 * 1024
+    return int(pairs.x[i]) / CLUSTER_PX + int(pairs.y[i]) / CLUSTER_PX * columns
 
 
 @wp.kernel
 def add_clusters(
     pairs: Pairs,
     tiles: int,
+    columns: int,
     copies: int,
     slope: wp.array(dtype=float),
     weight: wp.array(dtype=float),
@@ -91,7 +96,7 @@ def add_clusters(
     Each sum has ``copies`` that are added up later.
     """
     i = start + wp.tid()
-    cluster = cluster_of(pairs, tiles, i) * copies + i % copies
+    cluster = cluster_of(pairs, tiles, columns, i) * copies + i % copies
     add_fixed(sums[0], cluster, replace_nan(slope[i] * weight[i] * residual[i], 0.0))
     wp.atomic_add(sums[1], cluster, wp.int64(1))
 

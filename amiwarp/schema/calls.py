@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections.abc
 import functools
+import math
 import os
 import types
 import typing
@@ -16,7 +17,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.schema.annotations import annotated_type, leaves, parts_of
-from amiwarp.schema.kinds import TEXT, fits_array, no_device, unmet
+from amiwarp.schema.kinds import TEXT, expectation, fits_array, no_device
 from amiwarp.validation import INT64, TIME_HINT, as_words, real, shown, whole
 
 Target = TypeVar("Target", bound=Callable[..., Any])
@@ -150,6 +151,7 @@ class _Rule:
         of_record = numbers_too and function.__name__ == "__init__"
         something = inside - {types.NoneType}
         self.is_number = numbers_too and inside <= _NUMBERS
+        self.may_be_float = float in parts_of(self.kind)
         self.is_text = of_record and something == {str}
         self.has_words = any(part in _WORDS for part in parts_of(self.kind))
         """Whether it is a sequence of texts or paths."""
@@ -161,6 +163,11 @@ class _Rule:
         checked = self.is_number or self.is_text or self.has_words or self.is_device or some_numbers
         self.is_free = plain and not checked
         """Whether the function checks the values itself."""
+
+    @functools.cached_property
+    def expected(self) -> Callable[[Any], str]:
+        """Function of a value: what the type expects, in words, if the value does not fit; else an empty text."""
+        return expectation(TEXT if self.is_text else self.kind)
 
 
 class _Parameter:
@@ -197,27 +204,31 @@ class _Parameter:
         if (value is None and rule.may_be_none) or (rule.is_array and fits_array(value)):
             return value
         if rule.is_number:
-            return self._number(value, rule.kind)
+            return self._number(value, rule)
         if rule.is_device:
             here = "workers" not in self._function.__annotations__
             expected = no_device(value, rule.kind, here=here)
         else:
-            expected = unmet(TEXT if rule.is_text else rule.kind, value)
+            expected = rule.expected(value)
         if expected:
             raise AmiwarpError(
                 f"{self._label}: {self._name} is {shown(value)}; expected {expected}"
                 f"{_remedies(value, expected)}"
             )
-        if isinstance(value, bool | None) or type(value).__module__.startswith("amiwarp."):
+        is_own = type(value).__module__.startswith("amiwarp.")
+        is_device = rule.is_device and not isinstance(value, str)
+        if is_own or is_device or isinstance(value, bool | None):
             self.known.add(type(value))
         return value
 
-    def _number(self, value: Any, kind: Any) -> Any:
+    def _number(self, value: Any, rule: _Rule) -> Any:
         """Return a number, of Python if it is one of NumPy; raise :class:`AmiwarpError` for other values."""
         if type(value) is int and INT64[0] <= value <= INT64[1]:
             return value  # a shortcut
+        if type(value) is float and rule.may_be_float and math.isfinite(value):
+            return value  # another one
         what = f"{self._label}: {self._name}"
-        if float in parts_of(kind):
+        if rule.may_be_float:
             plain: float = real(value, what)
         else:
             is_time = self._name == "t" or self._name.startswith("t_")

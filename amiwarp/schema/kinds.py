@@ -3,6 +3,8 @@
 import collections.abc
 import contextlib
 import enum
+import functools
+import math
 import os
 import re
 import types
@@ -18,68 +20,101 @@ from amiwarp.schema.annotations import parts_of
 from amiwarp.validation import LONGEST_NAME, check_name_lengths, real
 
 
-def unmet(kind: Any, value: Any) -> str:
-    """Return what a type expects, in words, if a value does not fit; else an empty text.
+def expectation(kind: Any) -> Callable[[Any], str]:
+    """Return a function of a value: what a type expects, in words, if the value does not fit; else an empty text.
 
-    Single numbers, texts and members of enumerations always fit: functions check these themselves, because they know
-    ranges and choices. Inside a container they are checked.
+    The type is resolved here, once, because a search checks thousands of values. Single numbers, texts and members of
+    enumerations always fit: functions check these themselves, because they know ranges and choices. Inside a container
+    they are checked.
     """
     origin = typing.get_origin(kind) or kind
     arguments = typing.get_args(kind)
     if hasattr(origin, "__value__"):  # a named type, as NDArray and ArrayLike are from NumPy 2.5 on
-        return unmet(origin.__value__, value)
-    if len(parts_of(kind)) > 1:
-        return _unmet_union(parts_of(kind), value)
+        return expectation(origin.__value__)
+    parts = parts_of(kind)
+    if len(parts) > 1:
+        return _expectation_of_union(parts)
     if origin in _CHECKS:
-        fits, wording = _CHECKS[origin]
-        return "" if fits(value) else wording
+        return _expectation_of(*_CHECKS[origin])
     if not isinstance(origin, type) or issubclass(origin, enum.Enum | int | float | str):
-        return ""
+        return lambda _: ""
     if issubclass(origin, collections.abc.Mapping):
+        return _expectation_of_mapping(arguments[1:])
+    if issubclass(origin, tuple | list) or origin is collections.abc.Sequence:
+        return _expectation_of_entries("tuple or list", arguments[:1], _entries_of_sequence)
+    if getattr(origin, "_is_protocol", False):
+        return _expectation_of(functools.partial(has_members, origin), origin.__name__)
+    library = origin.__module__.partition(".")[0]
+    wording = origin.__name__ if library == "amiwarp" else f"{library}.{origin.__name__}"
+    return _expectation_of(lambda value: isinstance(value, origin), wording)
+
+
+def _expectation_of(fits: Callable[[Any], bool], wording: str) -> Callable[[Any], str]:
+    return lambda value: "" if fits(value) else wording
+
+
+def _expectation_of_union(parts: Sequence[Any]) -> Callable[[Any], str]:
+    """Return what the members of a union expect, in words, if a value fits none of them, as a function of the value."""
+    origins = {typing.get_origin(part) or part for part in parts}
+    is_path = not origins.isdisjoint((os.PathLike, Path))
+    # A path given as text is checked as a path.
+    expectations = [expectation(part) for part in parts if not (part is str and is_path)]
+
+    def expected(value: Any) -> str:
+        words: list[str] = []
+        for expected_by_part in expectations:
+            word = expected_by_part(value)
+            if not word:
+                return ""
+            if word not in words:
+                words.append(word)
+        if len(words) == 1:
+            return words[0]
+        return f"{', '.join(words[:-1])} or {words[-1]}"
+
+    return expected
+
+
+def _expectation_of_mapping(kinds: Sequence[Any]) -> Callable[[Any], str]:
+    """Return the expectation of a mapping by names, whose values are of a type."""
+
+    def entries_of(value: Any) -> Iterable[Any] | None:
         by_name = isinstance(value, collections.abc.Mapping) and all(
             isinstance(key, str) for key in value
         )
-        entries = value.values() if by_name else None
-        return _unmet_entries("mapping (dict) by names", arguments[1:], entries)
-    if issubclass(origin, tuple | list) or origin is collections.abc.Sequence:
-        entries = value if isinstance(value, list | tuple) else None
-        return _unmet_entries("tuple or list", arguments[:1], entries)
-    if getattr(origin, "_is_protocol", False):
-        return "" if has_members(origin, value) else origin.__name__
-    if isinstance(value, origin):
+        return value.values() if by_name else None
+
+    return _expectation_of_entries("mapping (dict) by names", kinds, entries_of)
+
+
+def _entries_of_sequence(value: Any) -> Iterable[Any] | None:
+    return value if isinstance(value, list | tuple) else None
+
+
+def _expectation_of_entries(
+    what: str, kinds: Sequence[Any], entries_of: Callable[[Any], Iterable[Any] | None]
+) -> Callable[[Any], str]:
+    """Return what a container expects, in words, if it or one of its entries does not fit, as a function of it.
+
+    ``entries_of`` returns the entries of a value, or None if it is no such container.
+    """
+    expectations = [expectation(_INSIDE.get(kind, kind)) for kind in kinds]
+    of_numbers = list(kinds) == [float]
+
+    def expected(value: Any) -> str:
+        entries = entries_of(value)
+        if entries is None:
+            return what
+        if of_numbers and set(map(type, entries)) <= {float} and all(map(math.isfinite, entries)):
+            return ""  # a shortcut: a search checks the values of thousands of models
+        for entry in entries:
+            for expected_of_entry in expectations:
+                words = expected_of_entry(entry)
+                if words:
+                    return f"{what}, each {words}"
         return ""
-    library = origin.__module__.partition(".")[0]
-    return origin.__name__ if library == "amiwarp" else f"{library}.{origin.__name__}"
 
-
-def _unmet_union(parts: Sequence[Any], value: Any) -> str:
-    """Return what the members of a union expect, in words, if a value fits none of them; else an empty text."""
-    origins = {typing.get_origin(part) or part for part in parts}
-    is_path = not origins.isdisjoint((os.PathLike, Path))
-    words: list[str] = []
-    for part in parts:
-        if part is str and is_path:
-            continue  # a path given as text is checked as a path
-        word = unmet(part, value)
-        if not word:
-            return ""
-        if word not in words:
-            words.append(word)
-    if len(words) == 1:
-        return words[0]
-    return f"{', '.join(words[:-1])} or {words[-1]}"
-
-
-def _unmet_entries(what: str, kinds: Sequence[Any], entries: Iterable[Any] | None) -> str:
-    """Return what a container expects, in words, if it or one of its entries does not fit; else an empty text."""
-    if entries is None:
-        return what
-    for entry in entries:
-        for kind in kinds:
-            words = unmet(_INSIDE.get(kind, kind), entry)
-            if words:
-                return f"{what}, each {words}"
-    return ""
+    return expected
 
 
 def has_members(protocol: Any, value: Any) -> bool:

@@ -569,6 +569,42 @@ def test_sums_of_products_by_square(recording: Recording, device: str) -> None:
         )
 
 
+@pytest.mark.parametrize("tiles", [1, 4])
+def test_sums_of_slopes_by_cluster(recording: Recording, device: str, tiles: int) -> None:
+    """Sums over the pairs of each square of 64 px, or of each tile, agree with NumPy; NaN counts as 0."""
+    width, height = recording.events.size
+    assert recording.encoder is not None
+    table = EventTable(
+        [recording.events.slice(0, 60_000)], np.zeros((height, width), np.int32), device
+    )
+    pairs = table.pairs(recording.encoder, longest_gap_us=20_000)
+    rng = np.random.default_rng(4)
+    if tiles > 1:
+        tile = np.zeros(pairs.arrays.stride, np.int32)
+        tile[: len(pairs)] = rng.choice([0, 1], len(pairs))
+        tile[5] = 3
+        pairs.arrays.tile.assign(tile)
+    slopes = rng.normal(size=(3, len(pairs))).astype(np.float32)
+    slopes[1, ::7] = np.nan
+    weight = rng.uniform(0.1, 1.0, len(pairs)).astype(np.float32)
+    residuals = Residuals(pairs, tiles)
+    residuals.weight = wp.array(weight, dtype=float, device=device)
+    residuals.values = wp.ones(len(pairs), dtype=float, device=device)
+    on_device = [wp.array(slope, dtype=float, device=device) for slope in slopes]
+
+    found = residuals.start_clusters(on_device, width, height)()
+
+    columns = -(-width // 64)
+    cluster = pairs.column("y").astype(int) // 64 * columns + pairs.column("x").astype(int) // 64
+    if tiles > 1:
+        cluster = pairs.column("tile").astype(int)
+    used = np.unique(cluster)
+    assert len(used) == 3 if tiles > 1 else len(used) > columns
+    summed = np.nan_to_num(slopes.astype(np.float64)) * weight
+    expected = np.array([[row[cluster == k].sum() for k in used] for row in summed])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
+
+
 def test_gauss_newton_halves_steps_that_are_too_long() -> None:
     """Slopes are started at each trial point before its score is known, and awaited only at points that are kept."""
     started: list[float] = []

@@ -774,13 +774,14 @@ def test_kernel_values_are_the_fields_of_the_struct(
 
 
 def test_several_models_in_one_call_equal_one_call_each() -> None:
-    """Successive places of one model share a launch."""
+    """Successive places of one model share a launch; models may have different lenses."""
     cam, wedge = camera(), prism()
     a, b = ExactModel(cam, wedge, phase=0.2), ExactModel(cam, wedge, phase=0.9)
     c = RadialCircleModel.from_prism(cam, wedge)
+    d = ExactModel(replace(cam, fx=1.5 * cam.fx), wedge, phase=0.2)
     rng = np.random.default_rng(0)
-    xy, theta = rng.uniform(0.0, 48.0, (50, 2)), rng.uniform(-3.0, 3.0, (6, 50))
-    models = [a, a, b, c, c, a]
+    xy, theta = rng.uniform(0.0, 48.0, (50, 2)), rng.uniform(-3.0, 3.0, (8, 50))
+    models = [a, a, b, d, c, c, d, a]
     expected = [
         compensate_by_each([model], xy, angle)[0]
         for model, angle in zip(models, theta, strict=True)

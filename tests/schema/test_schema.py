@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import enum
 import inspect
+import math
+import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -309,3 +311,27 @@ def test_a_record_may_have_a_field_of_its_own_type() -> None:
     assert found == Chain(1, Chain(2))
     with pytest.raises(AmiwarpError, match=r"field chain\.next\.length"):
         value_of(Chain, {"length": 1, "next": {"length": "2"}}, "chain")
+
+
+def test_annotations_are_resolved_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search makes thousands of calls with mappings and numbers: only the first one looks at the annotations."""
+
+    @guarded
+    def moved(values: Mapping[str, float], shift: float | None, camera: Camera | None) -> float:
+        return values["x"] + (shift or 0.0)
+
+    assert moved({"x": 1.0}, 0.5, None) == 1.5
+
+    def refuse(_: object) -> None:
+        raise AssertionError("an annotation was resolved again")
+
+    monkeypatch.setattr(typing, "get_origin", refuse)
+    monkeypatch.setattr(typing, "get_args", refuse)
+    assert moved({"x": 2.0, "y": 3}, 0.25, None) == 2.25
+    assert moved({"x": np.float32(2.0)}, np.float64(0.25), None) == 2.25
+    for values in ({"x": math.nan}, {"x": "1"}, {1: 1.0}, [1.0]):
+        with pytest.raises(AmiwarpError, match=r"moved: values is .*mapping"):
+            moved(values, 0.0, None)  # type: ignore[arg-type]
+    for shift in (math.inf, "1", True):
+        with pytest.raises(AmiwarpError, match="moved: shift"):
+            moved({"x": 1.0}, shift, None)  # type: ignore[arg-type]

@@ -334,7 +334,8 @@ class Cost:
         products = residuals.start_products(factors)
         clusters = None
         if with_parts:
-            clusters = residuals.start_clusters(left)
+            camera = self.space.camera
+            clusters = residuals.start_clusters(left, camera.width, camera.height)
 
         def result() -> Slopes:
             sums = products()

@@ -162,7 +162,7 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     left = []
     for name, column in columns.items():
         left.append(cost.unexplained_column(name, column, steps=MAP_STEPS))
-    sums, squares, width = _products_by_square(cost, left)
+    sums, squares, width = products_by_square(cost, left)
     xy = np.stack([squares % width, squares // width], axis=1).astype(np.float64)
     return LinearFit(
         names=tuple(columns),
@@ -173,7 +173,7 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     )
 
 
-def _products_by_square(
+def products_by_square(
     cost: Cost,
     columns: list[Any],
 ) -> tuple[Vector, NDArray[np.int64], int]:
@@ -213,7 +213,7 @@ def telling(
     if not columns:
         return []
     names = list(columns)
-    sums, _, _ = _products_by_square(cost, list(columns.values()))
+    sums, _, _ = products_by_square(cost, list(columns.values()))
     total = sums.sum(axis=0)
     squares_sum = max(float(total[-1, -1]), 1e-30)
 

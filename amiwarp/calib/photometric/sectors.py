@@ -11,20 +11,22 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.calib.photometric.angles import examined_errors, find_high_harmonics, harmonics_of
 from amiwarp.calib.photometric.cost import Cost
 from amiwarp.calib.photometric.distances import px_per_rad
 from amiwarp.calib.photometric.findings import SectorError
-from amiwarp.calib.photometric.linear_fit import SQUARE_PX, pseudo_inverse
+from amiwarp.calib.photometric.linear_fit import products_by_square, pseudo_inverse
 from amiwarp.calib.photometric.refinement import Refinement
 from amiwarp.calib.photometric.verdicts import angle_names
+from amiwarp.kernels.launch import launch
+from amiwarp.kernels.residual_slopes import by_sector
 from amiwarp.optics.models.registry import MODELS
 
 if TYPE_CHECKING:
     Vector = NDArray[np.float64]
-    Integers = NDArray[np.int64]
 
 ERROR_THAT_REPEATS = "an error that repeats with"
 """Words of what could hide in an angle of the model, before the name of the angle."""
@@ -107,62 +109,22 @@ def sector_offsets(cost: Cost, v: Vector) -> tuple[Vector, Vector]:
 def _normal_equations(cost: Cost, v: Vector) -> tuple[Vector, Vector]:
     """Return the Hessian by the offsets of all sectors, and the gradient of each square of pixels that has pairs."""
     angles = MODELS[cost.space.model].ANGLES
-    residuals = cost.brightness.residuals
-    pairs = len(cost.brightness.pairs)
-    residual = _on_host(residuals.values, pairs)
-    weight = _on_host(residuals.weight, pairs)
-
-    # The column of each angle's sector, and the slope by that angle, at both events of a pair.
-    column: list[Integers] = []
-    slope: list[Vector] = []
+    columns: list[Any] = []
     for angle in range(angles):
-        for sector in _sectors_of(cost, angle):
-            column.append(SECTORS * angle + sector)
-        for at_event in cost.by_angle(v, angle):
-            slope.append(_on_host(at_event, pairs))
-
-    columns = angles * SECTORS
-    squares, square = _squares_of(cost)
-    hessian = np.zeros((columns, columns))
-    gradients = np.zeros((squares, columns))
-    for at, by in zip(column, slope, strict=True):
-        place = square * columns + at
-        gradient = np.bincount(place, weight * by * residual, gradients.size)
-        gradients += gradient.reshape(gradients.shape)
-        for other_at, other_by in zip(column, slope, strict=True):
-            place = at * columns + other_at
-            products = np.bincount(place, weight * by * other_by, hessian.size)
-            hessian += products.reshape(hessian.shape)
+        columns += _by_sector(cost, v, angle)
+    products, _, _ = products_by_square(cost, columns)
+    hessian = products[:, :-1, :-1].sum(axis=0)
+    gradients = products[:, :-1, -1]
     return hessian, gradients
 
 
-def _squares_of(cost: Cost) -> tuple[int, Integers]:
-    """Return the number of the squares of pixels that have pairs, and the number of each pair's square among them."""
+def _by_sector(cost: Cost, v: Vector, angle: int) -> list[Any]:
+    """Return the derivatives of the residuals by an offset of an angle in each of its sectors, on the device."""
     pairs = cost.brightness.pairs
-    columns = math.ceil(cost.space.camera.width / SQUARE_PX)
-    row = pairs.column("y").astype(np.int64) // SQUARE_PX
-    column = pairs.column("x").astype(np.int64) // SQUARE_PX
-    used, square = np.unique(row * columns + column, return_inverse=True)
-    return len(used), square
-
-
-def _sectors_of(cost: Cost, angle: int) -> Integers:
-    """Return the number of the sector of an angle at both events of each pair, shape (2, pairs)."""
-    pairs = cost.brightness.pairs
-    padded = pairs.arrays.azimuth.numpy().reshape(2, 2, -1)
-    stored = padded[:, :, : len(pairs)]
-    if MODELS[cost.space.model].ANGLES > 1:
-        turned = stored[:, angle].astype(np.float64)
-    else:
-        cos = stored[:, 0]
-        sin = stored[:, 1]
-        turned = np.arctan2(sin, cos).astype(np.float64)
-    share_of_turn = turned % math.tau / math.tau
-    sector = np.floor(share_of_turn * SECTORS)
-    return sector.astype(np.int64) % SECTORS
-
-
-def _on_host(column: Any, count: int) -> Vector:
-    """Return a column of the pairs as numbers, with 0 for pairs off the map, shape (count,)."""
-    of_pairs = column.numpy()[:count]
-    return np.nan_to_num(of_pairs).astype(np.float64)
+    device = cost.brightness.device
+    first, second = cost.by_angle(v, angle)
+    number = angle if MODELS[cost.space.model].ANGLES > 1 else -1
+    rows = wp.empty((SECTORS, pairs.arrays.stride), dtype=float, device=device)
+    inputs = [pairs.arrays, number, first, second]
+    launch(by_sector, len(pairs), inputs, [rows], device=device)
+    return [rows[k] for k in range(SECTORS)]

@@ -33,20 +33,22 @@ def compensate_by_each(
     angles = wp.array(all_angles.ravel(), dtype=float, device="cpu", copy=False)
 
     out = wp.empty_like(pixels)
-    launches: dict[type, RecordedLaunch] = {}
+    launches: dict[type, tuple[RecordedLaunch, Any]] = {}  # each with the camera of its last model
     for _, group in groupby(range(len(models)), key=lambda k: id(models[k])):
         places = list(group)  # successive places of one model
         first = places[0]
         model = models[first]
         params = model.params("cpu")
         camera = model_camera(model, "cpu")
-        compensate = launches.get(type(model))
+        compensate, last_camera = launches.get(type(model), (None, None))
         if compensate is None:
             inputs = [params, camera, pixels, angles, 0]
             compensate = RecordedLaunch(compensate_points, inputs, [out], device="cpu")
-            launches[type(model)] = compensate
-        compensate.set(0, params)
-        compensate.set(1, camera)
+        else:
+            compensate.set(0, params)
+            if camera is not last_camera:
+                compensate.set(1, camera)
+        launches[type(model)] = compensate, camera
         compensate(first * count, len(places) * count)
     moved = out.numpy().reshape(len(models), count, 2)
     return moved.astype(np.float64)

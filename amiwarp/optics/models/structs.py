@@ -31,7 +31,7 @@ def struct_of(kind: Any, values: Sequence[Any]) -> Any:
     struct = kind()
     for name, value in zip(kind.vars, values, strict=True):
         # A new struct holds zeros, and setting a field takes longer than this check.
-        if isinstance(value, int | float) and not value:
+        if type(value) in (int, float) and not value:
             continue
         setattr(struct, name, value)
     return struct
