@@ -232,8 +232,9 @@ class BetweenPulses:
 def between_pulses(calibrator: Calibrator, tried: Attempt, search: Search) -> BetweenPulses:
     """Return what the events tell of the paths between the pulses of a recording.
 
-    ``search`` is the search of ``tried``, an attempt at the pulses' angles. If it found that something is wrong, the
-    paths of two angles are found even if few pairs of events do not show that they deviate: these tell less of each.
+    ``search`` is the search of ``tried``, an attempt at the pulses' angles. Few pairs of events tell first whether the
+    paths deviate; all pairs decide where these leave it open, or found that something is wrong with two angles, of each
+    of which they tell less.
     """
     source = calibrator.recording.events
     encoder = calibrator.recording.encoder
@@ -252,13 +253,18 @@ def between_pulses(calibrator: Calibrator, tried: Attempt, search: Search) -> Be
         for angle in angles
     ]
     must_be_found = tried.doubtful and len(angles) > 1
-    if math.hypot(*bent_px) < LEAST_BETWEEN_PX and not must_be_found:
+    evident = math.hypot(*bent_px) >= LEAST_BETWEEN_PX or must_be_found
+    if not evident:
         quick = PathFit(recording, start, GATE_PAIRS, GATE_TILES, angles, KNOTS_BETWEEN_PULSES)
-        if not quick.deviates(LEAST_BETWEEN_PX):
+        evident = quick.deviates(LEAST_BETWEEN_PX)
+        largest_px = quick.deviation_px() + BOUND * quick.std_px
+        if not evident and largest_px < LEAST_BETWEEN_PX:
             return BetweenPulses(None, quick.deviation_px(), quick.std_px)
     knots = KNOTS_BETWEEN_PULSES * len(angles)
     fit = PathFit(recording, start, angles=angles, knots_per_turn=knots)
     path = fit.run()
+    if not evident and not fit.shows(LEAST_BETWEEN_PX):
+        return BetweenPulses(None, fit.deviation_px(), fit.std_px)
 
     names = angle_names(MODELS[calibrator.settings.model])
     found = [*each_encoder(path)]

@@ -34,7 +34,7 @@ MOST_EVENTS = 8_000_000
 """Largest number of events that are used: more hardly lower the errors, which are those of the method."""
 LEAST_EVENTS = 1_000
 """Smallest number of events."""
-ROUNDS = 8
+ROUNDS = 12
 """Largest number of steps in which depths and phase are found in turn. Most plates need three. After five, the phase of
 few and strong events was still 0.01 rad off."""
 STEP_RAD = 0.05
@@ -47,7 +47,9 @@ GOOD_SHARE = 0.05
 """Largest relative deviation of the depths whose pixels determine the phase. Others have depths that fit a wrong phase.
 """
 LONGEST_RAD = 0.3
-"""Longest step of the phase [rad]."""
+BACK_SHARE = 0.5
+"""Longest step of the phase [rad], and longest step back as a share of the one before. Far from the answer the cost
+bends too little for Newton's method: from 15 deg off, there were steps of 17 deg to and fro without end."""
 FLOOR_PX = 0.02
 """Standard deviation of the phase by errors of the method, as the motion of a point at the mean depth [px]. Simulations
 of walls were off by at most 0.005 px, that of a desk by 0.012 px."""
@@ -179,9 +181,12 @@ def refine_phase(
             elif wedge:  # there is none after all: the phase without it
                 fit = _newton(slope - wedge * bend * by_wedge, bend, same)
                 wedge = 0.0
-        step, *of_wedge = fit.step.tolist()
-        shorter = min(1.0, LONGEST_RAD / max(abs(step), LONGEST_RAD))
-        step *= shorter
+        wanted, *of_wedge = fit.step.tolist()
+        longest = LONGEST_RAD
+        if k > 0 and wanted * step < 0.0:
+            longest = min(LONGEST_RAD, BACK_SHARE * abs(step))
+        shorter = min(1.0, longest / max(abs(wanted), longest))
+        step = shorter * wanted
         wedge += shorter * sum(of_wedge)
         model = replace(
             model,
@@ -189,9 +194,10 @@ def refine_phase(
             wedge=model.wedge if wedge_is_given else (model.wedge[0], wedge),
         )
         report((k + 1) / ROUNDS)
-        if abs(step) < SETTLED_RAD and half == FINE_STEP_RAD:
+        if abs(wanted) < SETTLED_RAD and half == FINE_STEP_RAD:
             break
     check_still(depths, recording.name)
+    check_settled(wanted, recording.name)
     weight = depths.count / np.maximum(depths.std, 1e-9) ** 2
     mean = float((weight * depths.inverse_depth).sum() / max(weight.sum(), 1e-30))
     std = math.hypot(fit.std(0), FLOOR_PX / max(mean * orbit_px(model), 1e-9))
@@ -245,6 +251,17 @@ def check_known_phase(std: float, name: str) -> None:
             f"{name}: the events determine the phase of the plate within {math.degrees(std):.0f} deg only (at most "
             f"{math.degrees(LARGEST_STD_RAD):.0f} deg are of use): record for longer, or nearer things with more "
             "texture, or use a thicker plate; faces that are not parallel, or a wrong thickness or tilt, do this too",
+            ErrorCode.CALIBRATION_REFUSED,
+        )
+
+
+def check_settled(step: float, name: str) -> None:
+    """Raise :class:`AmiwarpError` if the search for the phase would go on by a long step [rad]."""
+    if abs(step) >= FAR_RAD:
+        raise AmiwarpError(
+            f"{name}: the search for the phase of the plate does not settle (its next step would be "
+            f"{math.degrees(abs(step)):.1f} deg): check the encoder, or record for longer, or nearer things with more "
+            "texture",
             ErrorCode.CALIBRATION_REFUSED,
         )
 

@@ -228,10 +228,13 @@ class PathFit:
         for k in range(GATE_STEPS):
             self._improve(k)
             found_share = FIRST_SHARE if k == 0 else 1.0
-            least = max(found_share * least_px, SIGNIFICANT * self.std_px)
-            if self.deviation_px() < least:
+            if not self.shows(found_share * least_px):
                 return False
         return True
+
+    def shows(self, least_px: float) -> bool:
+        """Return whether the present paths deviate significantly, and by at least ``least_px``."""
+        return self.deviation_px() >= max(least_px, SIGNIFICANT * self.std_px)
 
     def run(self) -> Encoder:
         """Improve the paths and the sizes until the steps are short; return the path.

@@ -87,6 +87,31 @@ def test_samples_show_when_counts_were_lost(motion: PrismMotion, index: bool, co
     assert step.last_us - step.first_us < 1100
 
 
+@pytest.mark.parametrize(
+    ("degrees", "order"), [(0.3, 3), (1.0, 2), (3.0, 1)], ids=["thrice", "twice", "once"]
+)
+def test_samples_show_lost_counts_next_to_an_error_that_repeats(degrees: float, order: int) -> None:
+    given = samples(PrismMotion(760.0), 15, index=False)
+    wave = math.radians(degrees) * np.cos(order * given.angle + 0.4)
+    wrong = replace(given, angle=given.angle + wave)
+    [step] = lost_counts(wrong)
+    assert step.angle == pytest.approx(-15 * math.tau / 4096, abs=math.radians(0.12))
+    assert step.first_us <= LOST_AT <= step.last_us
+    assert (
+        lost_counts(replace(wrong, angle=samples(PrismMotion(760.0), 0, index=False).angle + wave))
+        == ()
+    )
+
+
+def test_a_pause_of_the_samples_hides_a_small_step_only() -> None:
+    """What the prism does in a pause is not known: between its sides, a path that bends looks like a small step."""
+    for counts, shown in ((-12, False), (-200, True)):
+        given = samples(hunting(0.05, 20.0), counts, index=False)
+        there = np.abs(given.t - LOST_AT) > 6_000
+        steps = lost_counts(Encoder(given.t[there], given.angle[there]))
+        assert bool(steps) == shown
+
+
 @pytest.mark.parametrize("index", [True, False])
 @pytest.mark.parametrize(
     "model",
@@ -258,6 +283,63 @@ def test_what_is_not_found_between_pulses_is_bounded() -> None:
     assert found.path is None
     assert found.photometric is not None
     assert error_px < found.photometric.hidden_px[BETWEEN_PULSES] < 3.0 * error_px
+
+
+@pytest.mark.parametrize(
+    ("few_px", "all_px", "found", "stated_px"),
+    [
+        ((0.001, 0.004), (0.02, 0.001), False, (0.001, 0.004)),
+        ((0.013, 0.004), (0.013, 0.001), True, (0.013, 0.001)),
+        ((0.013, 0.004), (0.004, 0.001), False, (0.004, 0.001)),
+        ((0.013, 0.004), (0.013, 0.003), False, (0.013, 0.003)),
+        ((0.030, 0.004), (0.009, 0.003), True, (0.009, 0.003)),
+    ],
+    ids=["few exclude it", "all show it", "all exclude it", "all leave it open", "few show it"],
+)
+def test_all_pairs_decide_what_few_leave_open(
+    monkeypatch: pytest.MonkeyPatch,
+    still: Trouble,
+    few_px: tuple[float, float],
+    all_px: tuple[float, float],
+    found: bool,
+    stated_px: tuple[float, float],
+) -> None:
+    """Each pair of numbers is a deviation from the smooth path through pulses, and its standard deviation [px]."""
+    pulses = encoder_troubles.pulses_only(still).recording
+    assert pulses.encoder is not None
+    path = smooth_path(pulses.encoder)
+
+    class Fit(PathFit):
+        def __init__(self, *given: Any, knots_per_turn: float = 16.0, **named: Any) -> None:
+            self.px = few_px if len(given) > 2 else all_px
+            self.std_px = self.px[1]
+
+        def _improve(self, k: int) -> float:
+            return 0.0
+
+        def deviation_px(self) -> float:
+            return self.px[0]
+
+        def run(self) -> Encoder:
+            return path
+
+    monkeypatch.setattr(encoder_attempts, "PathFit", Fit)
+    monkeypatch.setattr(encoder_attempts, "px_per_rad", lambda *_: 0.0)
+    start = SimpleNamespace(
+        calibration_events=SimpleNamespace(events=pulses.events[:]),
+        space=SimpleNamespace(to_vector=lambda _: None),
+        best={},
+    )
+    monkeypatch.setattr(encoder_attempts, "search_on", lambda *_: start)
+    calibrator = Calibrator(pulses, Settings(model="exact"), "cpu", None)
+    tried: Any = SimpleNamespace(doubtful=True, calibration=None)
+    between = encoder_attempts.between_pulses(
+        calibrator,
+        tried,
+        SimpleNamespace(full_space=None),  # type: ignore[arg-type]
+    )
+    assert (between.calibrator is not None) == found
+    assert (between.deviation_px, between.std_px) == stated_px
 
 
 @pytest.mark.parametrize(

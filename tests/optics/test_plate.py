@@ -554,6 +554,42 @@ def test_few_squares_of_pixels_do_not_show_an_angle_between_the_faces(
     assert found.warnings == ()
 
 
+class FlatFarAway(KnownPhases):
+    """Costs that rise ever less with the distance from their lowest point, so that Newton's steps are far too long."""
+
+    def gradient(self, model: amiwarp.PlateModel, *_: object) -> np.ndarray:
+        return self.count * np.tanh((self.phases(model) - self.truth) / 0.05)
+
+
+@pytest.mark.parametrize("truth", [0.16, -0.16, 0.4])
+def test_the_search_for_the_phase_does_not_go_to_and_fro(
+    calibration: amiwarp.Calibration, monkeypatch: pytest.MonkeyPatch, truth: float
+) -> None:
+    costs = FlatFarAway(np.full((72, 96), truth), np.ones((72, 96), np.int64))
+    found, models = refined(costs, calibration, monkeypatch)
+    assert found.parameters["phase"] == pytest.approx(truth, abs=1e-3)
+    assert len(models) < plate_phase.ROUNDS
+
+
+class NeverStill(KnownPhases):
+    """Costs whose lowest point is at the other side in each round, as with depths that follow the phase."""
+
+    def find_depths(self, at: int) -> SimpleNamespace:
+        self.truth[:] = 0.2 * (-1.0) ** at
+        return super().find_depths(at)
+
+
+def test_a_phase_that_does_not_settle_is_refused(
+    calibration: amiwarp.Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The steps become short, because they turn back, but the phase is not found."""
+    costs = NeverStill(np.zeros((72, 96)), np.ones((72, 96), np.int64))
+    with pytest.raises(
+        amiwarp.AmiwarpError, match="the search for the phase of the plate does not settle"
+    ):
+        refined(costs, calibration, monkeypatch)
+
+
 def test_an_angle_between_the_faces_that_later_rounds_do_not_show_is_dropped(
     calibration: amiwarp.Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
