@@ -98,10 +98,25 @@ def _with_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, A
     given = calibrator
     search = tried.search
     calibrator, tried = with_mended_encoder(calibrator, tried)
-    calibrator, tried = with_straight_angles(calibrator, tried)
-    if search is not None and calibrator.mended is None:
+    straight, straight_tried = with_straight_angles(calibrator, tried)
+    last, answer = _with_camera_examined(straight, straight_tried)
+    if straight.harmonics != calibrator.harmonics and tried.camera_turned:
+        # A camera that turns looks like errors of the angles, too: the lower cost decides.
+        uncorrected, rival = _with_camera_examined(calibrator, tried)
+        if rival.accepted and not (answer.accepted and answer.cost <= rival.cost):
+            last = uncorrected
+            answer = rival
+    if search is not None and last.mended is None:
         assert given.recording.encoder is not None
-        calibrator = with_rounding_named(calibrator, search, given.recording.encoder)
+        last = with_rounding_named(last, search, given.recording.encoder)
+    return last, answer
+
+
+def _with_camera_examined(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, Attempt]:
+    """Make the attempts for bad pixels, moving things and a camera that turns, with angles that are right.
+
+    Return the calibrator with what they found of bad pixels, and the attempt that holds.
+    """
     if MODELS[calibrator.settings.model].GLASS is Plate:
         return calibrator, tried  # its depths are found from a camera at rest
     if tried.unexplained:
