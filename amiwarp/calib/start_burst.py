@@ -87,6 +87,10 @@ def _size_within(source: EventSource, window_us: int) -> int:
     count = source.find(first + window_us)
     if count < FEWEST_IN_WINDOW:
         return 0
+    # Without a burst, the next window is nearly as full, and no other one needs to be looked at.
+    next_count = source.find(first + 2 * window_us) - count
+    if count < LEAST_WINDOW_RATIO * next_count:
+        return 0
     t = source.slice(count, count + MOST_COMPARED).t
     # the last window may not be whole, which makes it smaller
     later = _runs((t - first) // window_us)

@@ -511,6 +511,22 @@ def test_events_that_grow_fewer_slowly_are_no_burst(next_one: int, is_burst: boo
     assert burst_size(counted(numbers)) == (10_000 if is_burst else 0)
 
 
+def test_a_full_second_window_ends_the_search_for_a_burst(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only if the second window has fewer than half of the events of the first, the later ones are read."""
+    read: list[int] = []
+    read_slice = MemoryEvents.slice
+
+    def counting(self: MemoryEvents, start: int, stop: int) -> Events:
+        read.append(stop - start)
+        return read_slice(self, start, stop)
+
+    monkeypatch.setattr(MemoryEvents, "slice", counting)
+    assert burst_size(counted([2000] * 60)) == 0
+    assert read == []
+    assert burst_size(counted([4000, 2000, *[1900] * 60])) == 4000
+    assert len(read) == 1
+
+
 @pytest.mark.slow
 def test_a_focal_length_that_drifts_is_no_turning_camera() -> None:
     trouble = recorded(SIZE, steady(), seconds=0.6, growth=0.06)
