@@ -234,10 +234,13 @@ def test_a_part_of_a_turn_has_the_extremes_within_it() -> None:
         ([(40, 1), (66, 0), (75, 0)], {66: -1.0, 75: -1.0}),
         ([(60, 1), (66, 1), (66, 0), (72, 0)], {66: 0.0, 72: -1.0}),
         ([(66, 1), (66, 0), (72, 1)], {66: -0.4, 72: 1.4}),
+        ([(48, 1), (66, 0)], {66: -1.4}),
+        ([(47, 1), (66, 0)], {66: -1.0}),
+        ([(65, 0), (66, 1), (66, 0)], {65: -1.0, 66: 0.0}),
     ]
     first = [(x, 0, (0.5, 1)) for x in range(len(cases))]
     given = [(x, 0, event) for x, (own, _) in enumerate(cases) for event in own]
-    given += [(len(cases), 0, (80.0, 1)), (len(cases), 0, (20.0, 0))]
+    given += [(len(cases), 0, (place, 1)) for place in (20.0, 21.0, 22.0, 80.0)]
     order = sorted(first + given, key=lambda one: one[2][0])
     x, y = ([one[k] for one in order] for k in range(2))
     angles = (np.array([one[2][0] for one in order]) + 0.5) * (math.tau / BINS)
@@ -251,13 +254,14 @@ def test_a_part_of_a_turn_has_the_extremes_within_it() -> None:
     ratio = update.sums.off_ratio
     numbers = np.arange(ring.newest - 16, ring.newest)
     assert numbers[0] == 64
+    assert ratio > 1.2
     for k, (_, weights) in enumerate(cases):
         counts = np.zeros(16)
         for number, weight in weights.items():
             counts[number - 64] = weight if weight > 0.0 else ratio * weight
-        if k in (3, 4):
+        if 66 in weights and weights[66] in (0.0, -0.4):
             # Both polarities in one bin, and what its extremes add
-            counts[2] = (1.4 - 1.4 * ratio) + (0.0 if k == 3 else -0.4 * ratio)
+            counts[2] = (1.4 - 1.4 * ratio) + ratio * weights[66]
         expected = by_least_squares(counts, numbers, np.zeros(3, complex), 0.3)
         np.testing.assert_allclose(update.sums.values[:, 0, k], expected, rtol=0, atol=1e-4)
 
