@@ -29,7 +29,7 @@ from amiwarp.events import device_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
 from amiwarp.imaging.phase import BINS, HARMONICS, PhaseSums, shared_pairs
-from amiwarp.imaging.phase_tables import LEAST_RATIO, bin_attenuation
+from amiwarp.imaging.phase_tables import EXTREME, LEAST_RATIO, bin_attenuation
 from amiwarp.kernels import phase_ring as kernels
 from amiwarp.kernels.launch import RecordedLaunch, launch
 from amiwarp.schema.calls import guarded
@@ -39,6 +39,8 @@ MOST_TURNS = 16
 """Largest number of turns that a ring keeps."""
 LEAST_EVENTS = 60
 """Number of events in the square around a pixel below which its misfit is weakened: some are few by chance."""
+EARLIER = 16
+"""Number of bins before a part of a turn in which the polarity of the last event before it is looked up."""
 WEIGHT_OF_PRIOR = 0.3
 """Weight λ of expected sums, relative to the sums of a whole turn."""
 BACKWARDS = math.tau / 4.0
@@ -88,7 +90,7 @@ class PhaseUpdate:
 class PhaseRing:
     """The events of the last turns of a stream, as counts of each pixel in the 64 bins of a turn.
 
-    Its sums equal :func:`phase_sums` without extremes, for which the order of the events would be needed.
+    Its sums of whole turns equal :func:`phase_sums`.
 
     Parameters
     ----------
@@ -98,6 +100,9 @@ class PhaseRing:
         Number of harmonics, 1 to 31.
     turns : int, optional
         Number of turns that are kept, 1 to 16, each in 128 bytes per pixel.
+    extremes : bool, optional
+        Add the extremes of the brightness, as :func:`phase_sums` does. The order of events within a bin is not known:
+        where both polarities are in one bin, they are taken to change as seldom as they can.
 
     Raises
     ------
@@ -116,8 +121,16 @@ class PhaseRing:
     """
 
     def __init__(
-        self, width: int, height: int, *, harmonics: int = HARMONICS, turns: int = 1
+        self,
+        width: int,
+        height: int,
+        *,
+        harmonics: int = HARMONICS,
+        turns: int = 1,
+        extremes: bool = True,
     ) -> None:
+        self.extremes = extremes
+        """Whether the extremes of the brightness are added."""
         self.width = whole(width, "width", 1, 1 << 15, " px")
         self.height = whole(height, "height", 1, 1 << 15, " px")
         self.harmonics = whole(harmonics, "harmonics", 1, (BINS - 1) // 2)
@@ -355,6 +368,13 @@ class PhaseRing:
             )
         return np.arange(self.newest - bins, self.newest)
 
+    def _with_earlier(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers of bins after some that tell the polarity before them, unless they are whole turns."""
+        if not self.extremes or len(numbers) % BINS == 0:
+            return numbers
+        earlier = min(self.bins - len(numbers), EARLIER)
+        return np.arange(numbers[0] - earlier, numbers[-1] + 1)
+
     def _angles(self, numbers: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the angles at the middles of bins [rad]."""
         return np.asarray(self.direction * (numbers + 0.5) * BIN, np.float64)
@@ -376,27 +396,29 @@ class PhaseRing:
         ratio = self._off_ratio()
         # NumPy's memory, which has large pages
         values_out = np.empty((self.harmonics, pixels), np.complex64)
-        on = wp.empty(pixels, dtype=int, device="cpu")
-        off = wp.empty(pixels, dtype=int, device="cpu")
+        counts = wp.empty((3, pixels), dtype=int, device="cpu")
         changed = wp.empty((2, pixels), dtype=float, device="cpu")
         inputs = [
             wp.array(self._planes, dtype=wp.uint16, device="cpu", copy=False),
-            wp.array(numbers % self._slots, dtype=int, device="cpu"),
+            wp.array(self._with_earlier(numbers) % self._slots, dtype=int, device="cpu"),
             wp.array(np.concatenate(rows), dtype=float, device="cpu"),
             ratio,
+            EXTREME if self.extremes else 0.0,
             wp.array(expected, dtype=wp.vec2, device="cpu", copy=False),
         ]
-        outputs = [shared_pairs(values_out), on, off, changed]
+        outputs = [shared_pairs(values_out), counts, changed]
         blocks = -(-pixels // kernels.BLOCK)
         launch(kernels.sum_planes, blocks, inputs, outputs, device="cpu", smallest=1)
 
         shape = (self.height, self.width)
+        on, off, changes = counts.numpy().reshape(3, *shape)
         sums = PhaseSums(
             values_out.reshape(self.harmonics, *shape),
-            on.numpy().reshape(shape),
-            off.numpy().reshape(shape),
+            on,
+            off,
             len(numbers) / BINS,
             ratio,
+            changes if self.extremes else None,
         )
         change, size = changed.numpy().reshape(2, *shape)
         return PhaseUpdate(sums, change, size, square_of_event(factors))

@@ -12,7 +12,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.events.recording import Events
-from amiwarp.imaging.phase import BINS
+from amiwarp.imaging.phase import BINS, RANDOM_CHANGE
 from amiwarp.imaging.phase_ring import (
     LEAST_EVENTS,
     WEIGHT_OF_PRIOR,
@@ -20,6 +20,7 @@ from amiwarp.imaging.phase_ring import (
     square_of_event,
     unmixing,
 )
+from amiwarp.imaging.phase_tables import EXTREME
 from amiwarp.kernels import phase_ring_device as kernels
 from amiwarp.kernels.launch import RepeatedLaunches
 from amiwarp.kernels.phase_misfit import AROUND
@@ -44,7 +45,7 @@ class DeviceRing(PhaseRing):
         self.misfit = self._empty((height, width), float)
         """Share of the newest brightness around a pixel that the sums before did not lead to expect, 0 to 1."""
         self._expected = self._empty((harmonics, pixels), wp.vec2)
-        self._counts = self._empty((2, pixels), int)
+        self._counts = self._empty((3, pixels), int)
         self._squares = self._empty((2, groups * pixels), float)
         self._of_pixels = self._empty(pixels, wp.vec2)
         rows = BINS + 2 * harmonics
@@ -88,7 +89,11 @@ class DeviceRing(PhaseRing):
         given[kernels.NOISE] = noise
         # Nothing has moved before there is something to compare with
         given[kernels.LEAST] = np.inf if first else noise * LEAST_EVENTS
-        given[kernels.SLOTS : kernels.SLOTS + bins] = slots
+        given[kernels.EXTREME] = EXTREME
+        given[kernels.OF_CHANGE] = RANDOM_CHANGE
+        chosen = self._with_earlier(numbers)
+        given[kernels.EARLIER] = len(chosen) - bins
+        given[kernels.SLOTS : kernels.SLOTS + len(chosen)] = chosen % self._slots
         given[kernels.TABLE :] = table
         self._given.assign(given)
 

@@ -11,10 +11,14 @@ AROUND = 7
 # Sums over the lines around, and then over the pixels beside each other. Places outside of the image are those at its
 # border. 192 pixels at a time stay in the cache.
 @wp.func_native(f"""
-    const float* __restrict__ changes = (const float*)change.data;
+    const float* __restrict__ squares = (const float*)change.data;
     const float* __restrict__ sizes = (const float*)size.data;
     const int32_t* __restrict__ ones = (const int32_t*)on.data;
     const int32_t* __restrict__ others = (const int32_t*)off.data;
+    const int32_t* __restrict__ turns = (const int32_t*)changes.data;
+    const float of_one = noise[0];
+    const float of_other = noise[1];
+    const float of_turn = noise[2];
     float* __restrict__ to = (float*)misfit.data + (int64_t)row * width;
     const int reach = {AROUND // 2};
     float all[192 + {AROUND - 1}];
@@ -29,8 +33,9 @@ AROUND = 7
             const int line = row + k < 0 ? 0 : (row + k < height ? row + k : height - 1);
             const int64_t at = (int64_t)line * width;
             for (int x = first; x < stop; ++x) {{
-                const float random = noise * ((float)ones[at + x] + off_weight * (float)others[at + x]);
-                all[x + shift] += changes[at + x] - 2.0f * random;
+                const float of_events = of_one * (float)ones[at + x] + of_other * (float)others[at + x];
+                const float random = of_events + of_turn * (float)turns[at + x];
+                all[x + shift] += squares[at + x] - 2.0f * random;
                 whole[x + shift] += sizes[at + x] - random;
             }}
         }}
@@ -56,8 +61,8 @@ def misfit_of_row(
     size: wp.array(dtype=float),
     on: wp.array(dtype=int),
     off: wp.array(dtype=int),
-    noise: float,
-    off_weight: float,
+    changes: wp.array(dtype=int),
+    noise: wp.vec3,
     least: float,
     row: int,
     width: int,
@@ -73,16 +78,16 @@ def write_misfit(
     size: wp.array(dtype=float),
     on: wp.array(dtype=int),
     off: wp.array(dtype=int),
-    noise: float,
-    off_weight: float,
+    changes: wp.array(dtype=int),
+    noise: wp.vec3,
     least: float,
     start: int,
     misfit: wp.array2d(dtype=float),
 ):
     """Write the misfits of a row: half of the squared change over the squared size, over the square around each pixel.
 
-    An event at a random angle adds ``noise`` to the size and twice as much to
-    the change, an OFF event ``off_weight`` times that. A size below ``least`` counts as ``least``.
+    At random angles, an ON event, an OFF event and a change of polarity add ``noise`` to the size, and twice as much to
+    the change. A size below ``least`` counts as ``least``.
     """
     row = wp.tid() + start
     misfit_of_row(
@@ -90,8 +95,8 @@ def write_misfit(
         size,
         on,
         off,
+        changes,
         noise,
-        off_weight,
         least,
         row,
         misfit.shape[1],

@@ -22,9 +22,15 @@ NOISE = wp.constant(2)
 """Place of what an event at a random angle adds to the squares."""
 LEAST = wp.constant(3)
 """Place of the least size, of the square around a pixel."""
-SLOTS = wp.constant(4)
-"""First place of the numbers of the planes."""
-TABLE = wp.constant(4 + BINS)
+EXTREME = wp.constant(4)
+"""Place of what an extreme adds to the events before and after it."""
+OF_CHANGE = wp.constant(5)
+"""Place of what a change of polarity adds to the squares, relative to an event."""
+EARLIER = wp.constant(6)
+"""Place of the number of planes before these, which only tell the polarity of the event before."""
+SLOTS = wp.constant(7)
+"""First place of the numbers of the planes, in the order of time: at most 64 before, and 64."""
+TABLE = wp.constant(7 + 2 * BINS)
 """First place of the table, as :func:`amiwarp.kernels.phase_ring.sum_planes` has it: rows of 64 planes, then of the
 expected sums, each with a cosine and a sine for each harmonic."""
 
@@ -44,6 +50,41 @@ def factor(given: wp.array(dtype=float), row: int, k: int, harmonics: int) -> wp
     return wp.vec2(given[place], given[place + 1])
 
 
+@wp.func
+def begins_with(on: int, off: int, before: int) -> int:
+    """Return the polarity of the first event of a bin, 1 or -1, after an event of polarity ``before``; 0 without any.
+
+    A bin with both begins as the bin before ended: so the polarity changes as seldom as it can.
+    """
+    if on > 0 and off > 0:
+        return wp.where(before == 0, 1, before)
+    return wp.where(on > 0, 1, 0) - wp.where(off > 0, 1, 0)
+
+
+@wp.func
+def ends_with(on: int, off: int, begins: int) -> int:
+    """Return the polarity of the last event of a bin that begins with another one."""
+    return wp.where(on > 0 and off > 0, -begins, begins)
+
+
+@wp.func
+def on_of(word: int) -> int:
+    """Return the number of ON events of a word."""
+    return wp.min(word >> 16, MOST_COUNT)
+
+
+@wp.func
+def off_of(word: int) -> int:
+    """Return the number of OFF events of a word."""
+    return wp.min(word & 65535, MOST_COUNT)
+
+
+@wp.func
+def plane_of(given: wp.array(dtype=float), place: int) -> int:
+    """Return the number of a plane."""
+    return int(given[SLOTS + place])
+
+
 @wp.kernel
 def sum_bins(
     planes: wp.array2d(dtype=int),
@@ -57,7 +98,8 @@ def sum_bins(
 ):
     """Write ``AT_ONCE`` sums of one pixel over the planes, and with the first ones the numbers of its events.
 
-    ``counts`` are the numbers of OFF and ON events, shape (2, pixels), ``known`` is 1 for pixels with a sum.
+    ``counts`` are the numbers of OFF events, ON events and changes, shape (3, pixels), ``known`` is 1 for pixels with a
+    sum.
     ``squares`` are for these harmonics the squares of the change from the ``expected`` sums, and of what the planes
     alone add, shape (2, groups of harmonics times pixels).
     """
@@ -72,15 +114,51 @@ def sum_bins(
     sum_of_first = wp.vec2(0.0, 0.0)
     sum_of_second = wp.vec2(0.0, 0.0)
     sum_of_third = wp.vec2(0.0, 0.0)
+    used = int(given[USED])
+    earlier = int(given[EARLIER])
+    of_on = given[EXTREME]
+    of_off = -given[RATIO] * of_on
+    # Polarity of the last event, and its row if it is one of those that are summed
+    polarity = int(0)
+    last_row = int(-1)
+    for place in range(earlier):
+        word = planes[plane_of(given, place), pixel]
+        begins = begins_with(on_of(word), off_of(word), polarity)
+        if begins != 0:
+            polarity = ends_with(on_of(word), off_of(word), begins)
+    if used == BINS:
+        # A whole turn is closed: its first event follows its last one
+        for row in range(used):
+            word = planes[plane_of(given, earlier + row), pixel]
+            begins = begins_with(on_of(word), off_of(word), polarity)
+            if begins != 0:
+                polarity = ends_with(on_of(word), off_of(word), begins)
+                last_row = row
     on = int(0)
     off = int(0)
-    for row in range(int(given[USED])):
-        word = planes[int(given[SLOTS + row]), pixel]
-        ones = wp.min(word >> 16, MOST_COUNT)
-        others = wp.min(word & 65535, MOST_COUNT)
+    changes = int(0)
+    for row in range(used):
+        word = planes[plane_of(given, earlier + row), pixel]
+        ones = on_of(word)
+        others = off_of(word)
         on += ones
         off += others
         weight = float(ones) - given[RATIO] * float(others)
+        begins = begins_with(ones, others, polarity)
+        if begins * polarity < 0:
+            changes += 1
+            weight += wp.where(begins > 0, of_on, of_off)
+            if last_row >= 0:
+                further = wp.where(polarity > 0, of_on, of_off)
+                sum_of_first += further * factor(given, last_row, k, harmonics)
+                sum_of_second += further * factor(given, last_row, second, harmonics)
+                sum_of_third += further * factor(given, last_row, third, harmonics)
+        if ones > 0 and others > 0:
+            changes += 1
+            weight += of_on + of_off
+        if begins != 0:
+            polarity = ends_with(ones, others, begins)
+            last_row = row
         sum_of_first += weight * factor(given, row, k, harmonics)
         sum_of_second += weight * factor(given, row, second, harmonics)
         sum_of_third += weight * factor(given, row, third, harmonics)
@@ -112,6 +190,7 @@ def sum_bins(
     if k == 0:
         counts[0, pixel] = off
         counts[1, pixel] = on
+        counts[2, pixel] = changes
         known[pixel] = wp.uint8(wp.where(wp.length_sq(sum_of_first) > 0.0, 1, 0))
 
 
@@ -131,7 +210,8 @@ def without_noise(
         place = group * pixels + pixel
         total += wp.vec2(squares[0, place], squares[1, place])
     weight = given[RATIO] * given[RATIO]
-    random = given[NOISE] * (float(counts[1, pixel]) + weight * float(counts[0, pixel]))
+    events = float(counts[1, pixel]) + weight * float(counts[0, pixel])
+    random = given[NOISE] * (events + given[OF_CHANGE] * float(counts[2, pixel]))
     out[pixel] = total - wp.vec2(2.0 * random, random)
 
 

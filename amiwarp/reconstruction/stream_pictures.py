@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from amiwarp.imaging.phase import BINS, PhaseSums
+from amiwarp.imaging.phase import BINS, RANDOM_CHANGE, PhaseSums
 from amiwarp.imaging.phase_ring import LEAST_EVENTS, PhaseRing, PhaseUpdate
 from amiwarp.imaging.phase_ring_device import DeviceRing
 from amiwarp.kernels import phase_ring_device as kernels
@@ -269,9 +269,11 @@ def _misfit(update: PhaseUpdate) -> NDArray[np.float32]:
     much noise.
     """
     sums = update.sums
-    parts = (update.change, update.size, sums.on, sums.off)
+    changes = np.zeros_like(sums.on) if sums.changes is None else sums.changes
+    parts = (update.change, update.size, sums.on, sums.off, changes)
     inputs: list[Any] = [wp.array(part.ravel(), device="cpu", copy=False) for part in parts]
-    inputs += [update.noise, sums.off_ratio**2, update.noise * LEAST_EVENTS]
+    noise = update.noise * np.array([1.0, sums.off_ratio**2, RANDOM_CHANGE])
+    inputs += [wp.vec3(*noise), update.noise * LEAST_EVENTS]
     misfit = np.empty(sums.on.shape, np.float32)
     outputs = [wp.array(misfit, device="cpu", copy=False)]
     launch(write_misfit, len(misfit), inputs, outputs, device="cpu", smallest=LEAST_ROWS)

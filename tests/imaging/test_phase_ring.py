@@ -47,7 +47,7 @@ def events_of(
 @pytest.mark.parametrize("direction", [1, -1])
 def test_the_last_turn_has_the_sums_of_its_events(direction: int) -> None:
     events, angles = some_stream(2.6)
-    ring = PhaseRing(WIDTH, HEIGHT, harmonics=4)
+    ring = PhaseRing(WIDTH, HEIGHT, harmonics=4, extremes=False)
     ring.add(events, direction * angles)
     assert ring.direction == direction
     assert ring.turns == 1.0
@@ -161,7 +161,7 @@ def by_least_squares(
 @pytest.mark.parametrize("weight", [0.02, 0.7])
 def test_a_part_of_a_turn_is_solved_by_least_squares(turns: float, weight: float) -> None:
     events, angles = some_stream(1.9, seed=3)
-    ring = PhaseRing(WIDTH, HEIGHT, harmonics=4)
+    ring = PhaseRing(WIDTH, HEIGHT, harmonics=4, extremes=False)
     ring.add(events, angles)
     rng = np.random.default_rng(1)
     values = rng.normal(size=(2, 4, HEIGHT, WIDTH))
@@ -189,6 +189,84 @@ def test_a_part_of_a_turn_is_solved_by_least_squares(turns: float, weight: float
 
 
 @pytest.mark.parametrize("direction", [1, -1])
+def test_a_turn_has_the_extremes_of_its_events(direction: int) -> None:
+    """If no bin has both polarities, the sums are those of the events in their order, the last before the first."""
+    events, angles = some_stream(2.6, per_turn=600)
+    bins = np.floor(angles * (BINS / math.tau)).astype(int)
+    # one event of a pixel in a bin
+    places = (events.y.astype(int) * WIDTH + events.x) * 1000 + bins
+    kept = np.sort(np.unique(places, return_index=True)[1])
+    events = Events(events.x[kept], events.y[kept], events.t[kept], events.p[kept])
+    angles = angles[kept]
+    bins = bins[kept]
+    ring = PhaseRing(WIDTH, HEIGHT, harmonics=4)
+    ring.add(events, direction * angles)
+    last = (bins >= bins[-1] - BINS) & (bins < bins[-1])
+    chosen = Events(events.x[last], events.y[last], events.t[last], events.p[last])
+    expected = phase_sums(
+        chosen,
+        direction * angles[last],
+        WIDTH,
+        HEIGHT,
+        turns=1.0,
+        direction=direction,
+        harmonics=4,
+    )
+    found = ring.sums()
+    assert expected.changes is not None
+    assert found.changes is not None
+    assert expected.changes.sum() > 50
+    np.testing.assert_array_equal(found.changes, expected.changes)
+    assert np.abs(found.values - expected.values).mean() < 2e-3
+    # Two turns, each closed
+    long = PhaseRing(WIDTH, HEIGHT, harmonics=4, turns=2)
+    long.add(events, direction * angles)
+    newest = long.sums(2.0, weights=[1.0, 0.0])
+    np.testing.assert_allclose(newest.values, found.values, rtol=0, atol=1e-5)
+
+
+def test_a_part_of_a_turn_has_the_extremes_within_it() -> None:
+    """An event before the part tells whether its first event follows an extreme, unless it is long ago."""
+    # Bins of ON and OFF events of each pixel; the part are the bins 64 to 79
+    cases: list[tuple[list[tuple[int, int]], dict[int, float]]] = [
+        ([(60, 1), (66, 0), (70, 1), (70, 1)], {66: -1.8, 70: 2.4}),
+        ([(60, 0), (66, 0), (70, 1)], {66: -1.4, 70: 1.4}),
+        ([(40, 1), (66, 0), (75, 0)], {66: -1.0, 75: -1.0}),
+        ([(60, 1), (66, 1), (66, 0), (72, 0)], {66: 0.0, 72: -1.0}),
+        ([(66, 1), (66, 0), (72, 1)], {66: -0.4, 72: 1.4}),
+        ([(48, 1), (66, 0)], {66: -1.4}),
+        ([(47, 1), (66, 0)], {66: -1.0}),
+        ([(65, 0), (66, 1), (66, 0)], {65: -1.0, 66: 0.0}),
+    ]
+    first = [(x, 0, (0.5, 1)) for x in range(len(cases))]
+    given = [(x, 0, event) for x, (own, _) in enumerate(cases) for event in own]
+    given += [(len(cases), 0, (place, 1)) for place in (20.0, 21.0, 22.0, 80.0)]
+    order = sorted(first + given, key=lambda one: one[2][0])
+    x, y = ([one[k] for one in order] for k in range(2))
+    angles = (np.array([one[2][0] for one in order]) + 0.5) * (math.tau / BINS)
+    p = [one[2][1] for one in order]
+    ring = PhaseRing(len(cases) + 1, 1, harmonics=3)
+    ring.add(Events.from_arrays(x, y, np.arange(len(x)), p), angles)
+    nothing = np.zeros((3, 1, len(cases) + 1))
+    empty = np.zeros((1, len(cases) + 1), int)
+    prior = PhaseSums(nothing.astype(np.complex64), empty, empty, 1.0, 1.0)
+    update = ring.update(prior, 0.25)
+    ratio = update.sums.off_ratio
+    numbers = np.arange(ring.newest - 16, ring.newest)
+    assert numbers[0] == 64
+    assert ratio > 1.2
+    for k, (_, weights) in enumerate(cases):
+        counts = np.zeros(16)
+        for number, weight in weights.items():
+            counts[number - 64] = weight if weight > 0.0 else ratio * weight
+        if 66 in weights and weights[66] in (0.0, -0.4):
+            # Both polarities in one bin, and what its extremes add
+            counts[2] = (1.4 - 1.4 * ratio) + ratio * weights[66]
+        expected = by_least_squares(counts, numbers, np.zeros(3, complex), 0.3)
+        np.testing.assert_allclose(update.sums.values[:, 0, k], expected, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("turns", [0.25, 0.5, 0.75])
 def test_known_brightness_is_found_from_parts_of_a_turn(turns: float, direction: int) -> None:
     """The brightness 30 cos(2θ + 0.3) + 20 cos(θ) becomes 1.2 times as much; parts of a turn tell so, one by one."""
@@ -210,17 +288,25 @@ def test_known_brightness_is_found_from_parts_of_a_turn(turns: float, direction:
     assert still < 0.01 * (np.abs(expected) ** 2).sum()
 
 
-def test_noise_is_what_an_event_at_a_random_angle_adds() -> None:
+@pytest.mark.parametrize("extremes", [False, True])
+def test_noise_is_what_an_event_at_a_random_angle_adds(extremes: bool) -> None:
     rng = np.random.default_rng(4)
-    count = 20_000
+    count = 5000
     theta = np.sort(rng.uniform(0.0, 1.5 * math.tau, count))
     zeros = np.zeros(count, int)
     p = rng.integers(0, 2, count)
-    ring = PhaseRing(400, 1, harmonics=3)
+    ring = PhaseRing(400, 1, harmonics=3, extremes=extremes)
     ring.add(Events.from_arrays(rng.integers(0, 400, count), zeros, np.arange(count), p), theta)
     nothing = PhaseSums(np.zeros((3, 1, 400), np.complex64), zeros, zeros, 1.0, 1.0)
     update = ring.update(nothing, 0.5)
-    assert update.size.sum() / update.sums.events == pytest.approx(update.noise, rel=0.1)
+    # of the squares of single events, as random_square has them
+    expected = update.noise * (math.tau * update.sums.turns) ** 2 * update.sums.random_square
+    found = float(update.size.sum())
+    if extremes:
+        # Events beside an extreme are near each other, so that some of what they add cancels
+        assert update.noise * update.sums.events < found < expected.sum()
+    else:
+        assert found == pytest.approx(expected.sum(), rel=0.1)
     np.testing.assert_allclose(update.size, update.change, rtol=1e-5)
 
 

@@ -99,13 +99,13 @@ def test_sums_of_a_ring_on_a_device(device: str) -> None:
     rng = np.random.default_rng(2)
     count = 120_000
     angles = -np.sort(rng.uniform(0.0, 2.5 * math.tau, count))
-    x, y = rng.integers(0, (9, 5), (count, 2)).T
+    x, y = rng.integers(0, (60, 50), (count, 2)).T
     crowd = (angles < -1.4 * math.tau) & (angles > -1.45 * math.tau)
     x[crowd] = 3
     y[crowd] = 2
     events = Events.from_arrays(x, y, np.arange(count), rng.random(count) < 0.6)
-    host = PhaseRing(9, 5, harmonics=5)
-    there = DeviceRing(9, 5, 5, device)
+    host = PhaseRing(60, 50, harmonics=5)
+    there = DeviceRing(60, 50, 5, device)
     sums = None
     for start, bins in ((0, 64), (80_000, 12), (84_000, 20), (100_000, 64)):
         stop = start + 4000 if start else 80_000

@@ -39,16 +39,17 @@ def test_scenes_of_all_tiles_are_those_of_one_at_a_time(width: int, height: int)
 def test_misfits_are_means_of_squares_around(width: int, height: int) -> None:
     rng = np.random.default_rng(width)
     shape = (height, width)
-    change, size = rng.gamma(1.0, size=(2, *shape)).astype(np.float32)
-    on, off = rng.integers(0, 4, (2, *shape)).astype(np.int32)
-    noise, off_weight, least = 0.1, 1.3, 40.0
-    random = noise * (on + off_weight * off)
+    change, size = rng.gamma(1.0, 3.0, size=(2, *shape)).astype(np.float32)
+    on, off, changes = rng.integers(0, 4, (3, *shape)).astype(np.int32)
+    noise = np.array([0.1, 0.13, 0.2])
+    least = 40.0
+    random = noise[0] * on + noise[1] * off + noise[2] * changes
     parts = (change - 2.0 * random, size - random)
     mean = [ndimage.uniform_filter(part, AROUND, mode="nearest") for part in parts]
     expected = np.clip(0.5 * mean[0] / np.maximum(mean[1], least / AROUND**2), 0.0, 1.0)
-    inputs = [wp.array(part.ravel(), device="cpu") for part in (change, size, on, off)]
+    inputs = [wp.array(part.ravel(), device="cpu") for part in (change, size, on, off, changes)]
     misfit = wp.empty(shape, dtype=float, device="cpu")
-    launch(write_misfit, height, [*inputs, noise, off_weight, least], [misfit], device="cpu")
+    launch(write_misfit, height, [*inputs, wp.vec3(*noise), least], [misfit], device="cpu")
     np.testing.assert_allclose(misfit.numpy(), expected, rtol=0, atol=1e-5)
     assert width < 10 or expected.std() > 0.1
 
