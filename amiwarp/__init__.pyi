@@ -144,6 +144,7 @@ from .optics.models.parameter import Parameter as Parameter
 from .optics.models.plate import PlateModel as PlateModel
 from .optics.models.steerer import SteererModel as SteererModel
 from .optics.models.vibration import VibrationModel as VibrationModel
+from .optics.orbit import LockedAngles as LockedAngles
 from .optics.prism import FlatSide as FlatSide
 from .optics.prism import NominalPrism as NominalPrism
 from .optics.prism import Plate as Plate

@@ -23,6 +23,7 @@ NOT_CALLED = {
     "CameraPackets",
     "InspectorHandle",
     "LivePicture",
+    "LockedAngles",
     "Model",
     "Packet",
     "PhaseImage",

@@ -143,6 +143,7 @@ class PhaseCamera:
         count = harmonics_for(model) if harmonics is None else harmonics
         self._ring = PhaseRing(camera.width, camera.height, harmonics=count)
         # Refuses the model, or loads kernels and tables before the stream needs them
+        motion_of(_nothing(self._ring), model)
         phase_picture(_nothing(self._ring), model)
         self._queue: deque[tuple[Events, int]] = deque()
         self.waiting = 0
