@@ -78,6 +78,7 @@ from .imaging.phase import weighted_sums as weighted_sums
 from .imaging.phase_ring import PhaseRing as PhaseRing
 from .imaging.phase_ring import PhaseUpdate as PhaseUpdate
 from .imaging.phase_ring import RingPart as RingPart
+from .imaging.phase_tensor import phase_tensor as phase_tensor
 from .imaging.tensors import event_count as event_count
 from .imaging.tensors import latest_times as latest_times
 from .imaging.tensors import polarity_histogram as polarity_histogram

@@ -364,6 +364,7 @@ OWN: dict[str, dict[str, Any]] = {
     "pixel_thresholds": {"model": MODEL},
     "phase_sums": {"angles": np.zeros(3)},
     "PhaseSums.from_integers": {"integers": np.zeros((3, 4, 5), np.int32), "turns": 1.0, "off_ratio": 1.0},
+    "phase_tensor": {"harmonics": 2},
     "weighted_sums": {"parts": [SUMS, SUMS], "weights": [1.0, 2.0]},
     "phase_picture": {"sums": SUMS, "model": MODEL},
     "PhaseCamera": {"model": MODEL, "encoder": aw.EncoderStream()},

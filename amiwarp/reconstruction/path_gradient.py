@@ -98,7 +98,6 @@ def path_gradient_of(model: Model, locked: LockedAngles | None, harmonics: int) 
     """Return how the sums of each pixel tell the gradient. Motions are interpolated between some pixels."""
     columns, rows = grid_of_image(model.camera)
     paths = paths_of(model, image_grid(model.camera, columns, rows), ANGLES, locked)
-    # Both as one spectrum: that of the real part at m is the half with the conjugate at -m
     along = [scipy.fft.fft(part, axis=1) / ANGLES for part in (paths.real, paths.imag)]
     most = min(harmonics, ANGLES // 2 - 1)
     every = 1j * np.arange(1, most + 1) * np.stack(along)[:, :, 1 : most + 1]

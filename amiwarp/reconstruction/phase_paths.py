@@ -8,7 +8,7 @@ line, waves along it are seen, and waves across it are not: these stay 0.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 
 import numpy as np
@@ -38,6 +38,8 @@ LEAST_WIDTH = 0.05
 """Smallest difference of the two rotations of an orbit, relative to the larger one; less is a line."""
 LEAST_REACH_PX = 0.05
 """Smallest distance of a path from its middle that counts as motion [px]."""
+MOST_KEPT_BYTES = 1 << 28
+"""Largest size of the responses of all tiles that are kept."""
 LAG_TILES = 4
 """Number of tiles from which the lag is found: the strongest ones."""
 LAGS = np.radians(np.arange(-72.0, 75.0, 3.0))
@@ -58,6 +60,18 @@ class PathPlan:
     """Size of the motion [px]: the radius of circles, and the amplitude of motions along a line."""
     turns: int
     """Number of turns of the first angle in a period."""
+    harmonics: int
+    """Number of harmonics of the sums."""
+    _kept: dict[int, NDArray[np.complex64]] = field(default_factory=dict, repr=False)
+
+    def responses(self, tile: int) -> NDArray[np.complex64]:
+        """Return :func:`responses_of` the path of a tile, which takes most time: small ones are kept."""
+        found = self._kept.get(tile)
+        if found is None:
+            found = responses_of(self.paths[tile], self.harmonics)
+            if len(self.places) * found.nbytes <= MOST_KEPT_BYTES:
+                self._kept[tile] = found
+        return found
 
 
 def is_orbit(model: Model) -> bool:
@@ -100,7 +114,7 @@ def path_plan_of(model: Model, locked: LockedAngles | None, harmonics: int) -> P
     angles = 1 << math.ceil(math.log2(harmonics + 1.5 * math.pi * farthest + 8.0))
     paths = paths_of(model, middles, angles, locked)
     turns = 1 if locked is None else locked.turns
-    return PathPlan(places, window, paths.astype(np.complex64), _reach(coarse), turns)
+    return PathPlan(places, window, paths.astype(np.complex64), _reach(coarse), turns, harmonics)
 
 
 def _centred(paths: NDArray[np.complex128]) -> NDArray[np.complex128]:
@@ -118,7 +132,7 @@ def _reach(centred: NDArray[np.complex128]) -> float:
 def responses_of(path: NDArray[np.complex64], harmonics: int) -> NDArray[np.complex64]:
     """Return how the waves of a tile make its sums: H_1, H_2, …, shape (harmonics, side, side).
 
-    Those below 0 are the conjugates of the responses to the opposite waves.
+    Responses below 0 are the conjugates of the responses to the opposite waves.
     """
     at = (math.tau * scipy.fft.fftfreq(SIDE)).astype(np.float32)
     along_x = np.exp(1j * np.outer(path.real, at))
@@ -143,7 +157,7 @@ def detail_of_paths(sums: PhaseSums, plan: PathPlan, lag: float) -> NDArray[np.f
 
     def scene(tile: int) -> NDArray[np.float32]:
         spectra = _spectra(sums.values, plan, tile)
-        responses = responses_of(plan.paths[tile], harmonics) * _late(harmonics, lag)
+        responses = plan.responses(tile) * _late(harmonics, lag)
         found = scene_of_responses(spectra, responses)
         return np.asarray(plan.window * scipy.fft.ifft2(found, workers=1).real)
 
@@ -163,7 +177,7 @@ def rest_of_picture(
 
     def left(tile: int) -> NDArray[np.complex64]:
         spectra = _spectra(sums.values, plan, tile)
-        responses = responses_of(plan.paths[tile], harmonics) * _late(harmonics, lag)
+        responses = plan.responses(tile) * _late(harmonics, lag)
         rest = spectra - responses * _spectra(seen, plan, tile)
         return np.asarray(plan.window * scipy.fft.ifft2(rest, workers=1, overwrite_x=True))
 
@@ -223,12 +237,14 @@ def lag_of_paths(sums: PhaseSums, plan: PathPlan) -> float:
         spectra = _spectra(sums.values, plan, tile)
         path = plan.paths[tile][:, None]
         seen = np.exp(1j * (path.real * x + path.imag * y))
-        responses = factors @ seen
+        # Products this small take longer if they wait for threads.
+        responses = np.einsum("ma,aw->mw", factors, seen)
         # Harmonics below 0 are the conjugates at the opposite waves.
-        of_opposite = factors @ seen.conj()
+        of_opposite = np.einsum("ma,aw->mw", factors, seen.conj())
         weight = (np.abs(responses) ** 2 + np.abs(of_opposite) ** 2).sum(axis=0) + DAMPING
-        here = turned @ (responses.conj() * spectra[:, counts])
-        there = turned @ (of_opposite.conj() * opposite(spectra)[:, counts])
+        here = np.einsum("lm,mw->lw", turned, responses.conj() * spectra[:, counts])
+        behind = of_opposite.conj() * opposite(spectra)[:, counts]
+        there = np.einsum("lm,mw->lw", turned, behind)
         square = np.abs(here + there.conj()) ** 2
         # |A|² - (H* H + 2 d) |L|², over both halves of the waves
         left -= (square * (weight + DAMPING) / weight**2).sum(axis=1)

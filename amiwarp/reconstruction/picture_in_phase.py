@@ -257,7 +257,7 @@ def with_long_waves(
 def with_flow(
     detail: NDArray[np.float32], flow: NDArray[np.float32], radius: float
 ) -> NDArray[np.float32]:
-    """Return the picture with its waves that are long beside the motion replaced by those of its Laplacian ``flow``."""
+    """Return the detail with its waves that are long beside the motion replaced by waves of the Laplacian ``flow``."""
     filters = long_wave_filters(*detail.shape, radius)
     waves = scipy.fft.dctn(flow, workers=cpu_threads()) * filters.by_divergence
     waves += scipy.fft.dctn(detail, workers=cpu_threads()) * filters.of_detail
@@ -268,7 +268,7 @@ def with_long_picture(
     detail: NDArray[np.float32], picture: NDArray[np.float32], reach: float
 ) -> NDArray[np.float32]:
     """Return the detail with its waves that are long beside a motion of size ``reach`` [px] replaced by a picture's."""
-    # The Laplacian of the picture; with_long_waves has that of a gradient.
+    # The Laplacian of the picture, where with_long_waves has the divergence of a gradient
     x = np.diff(picture, axis=1, prepend=picture[:, :1], append=picture[:, -1:])
     y = np.diff(picture, axis=0, prepend=picture[:1], append=picture[-1:])
     return with_flow(detail, np.diff(x, axis=1) + np.diff(y, axis=0), reach)

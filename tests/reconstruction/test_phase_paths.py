@@ -177,6 +177,32 @@ def test_a_pair_of_prisms_whose_turns_are_locked() -> None:
     assert correlation(phase_picture(sums, model, lag=0.0), truth()) > 0.995
 
 
+def test_a_plate_moves_each_tile_by_its_depth() -> None:
+    """A wall at 0.6 m on the left, and at 0.3 m on the right."""
+    camera = Camera.from_fov(224, 72, math.radians(70.0))
+    plate = Plate(0.012, math.radians(45.0))
+    depths = np.full((72, 224), 1.0 / 0.6, np.float32)
+    depths[:, 112:] = 1.0 / 0.3
+
+    def path(pixels: Floats, angles: Floats) -> Floats:
+        inverse = depths[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+        return optics.at_depth(camera, plate, 0.5, pixels, angles, inverse.astype(np.float64))
+
+    places = phase.places_over_turn(path, 224, 72, 32)
+    values = phase.sums_of_scene(scene(places), 7).astype(np.complex64)
+    events = np.ones((72, 224), np.int32)
+    sums = PhaseSums(values, events, events, 1.0, 1.0)
+    model = PlateModel(camera, plate, 0.5).with_depths(depths)
+    y, x = np.mgrid[:72, :224]
+    seen = scene(np.stack([x, y], axis=2).astype(np.float64))
+    found = phase_picture(sums, model, lag=0.0)
+    for side in (np.s_[:, :88], np.s_[:, 136:]):
+        assert correlation(found[side], seen[side]) > 0.97
+    flat = PlateModel(camera, plate, 0.5, inverse_depth=1.0 / 0.6)
+    wrong = phase_picture(sums, flat, lag=0.0)
+    assert correlation(wrong[:, 136:], seen[:, 136:]) < 0.95
+
+
 @pytest.mark.parametrize("degrees", [-8.0, 0.0, 12.0, 40.0])
 def test_the_lag_of_events_is_found_and_undone(degrees: float) -> None:
     model = vibration(LOOP)
@@ -197,9 +223,10 @@ def test_the_lag_is_searched_in_the_angle_of_the_first_turn() -> None:
     plan = phase_paths.path_plan_of(model, locked, 12)
     sums = sums_of(mirrored(2, 3, 0.7), 12, locked)
     order = np.arange(1, 13)[:, None, None]
-    late = sums.values * np.exp(-1j * order * math.radians(9.0))
-    found = phase_paths.lag_of_paths(replace(sums, values=late.astype(np.complex64)), plan)
-    assert math.degrees(found) == pytest.approx(9.0, abs=0.7)
+    for degrees, expected in ((9.0, 9.0), (50.0, 36.0)):
+        late = sums.values * np.exp(-1j * order * math.radians(degrees))
+        found = phase_paths.lag_of_paths(replace(sums, values=late.astype(np.complex64)), plan)
+        assert math.degrees(found) == pytest.approx(expected, abs=0.7)
 
 
 def test_the_rest_is_what_the_scene_leaves() -> None:
