@@ -30,10 +30,14 @@ from amiwarp import (
     phase_image,
     phase_picture,
 )
-from amiwarp.reconstruction import phase_paths
-from amiwarp.reconstruction.locked_angles import MotionPeriod
-from amiwarp.reconstruction.phase_paths import is_orbit
-from amiwarp.reconstruction.phase_window import harmonics_for
+from amiwarp.reconstruction import (
+    MotionPeriod,
+    detail_of_paths,
+    harmonics_for,
+    is_orbit,
+    lag_of_paths,
+    path_plan_of,
+)
 from reference import optics, phase
 
 WIDTH = 96
@@ -220,12 +224,12 @@ def test_the_lag_is_searched_in_the_angle_of_the_first_turn() -> None:
     """Over two turns of the first angle, the angle of the sums goes half as fast."""
     locked = LockedAngles(2, 3, 0.7)
     model = MirrorModel.from_values(CAMERA, Prism(0.0), MIRROR)
-    plan = phase_paths.path_plan_of(model, locked, 12)
+    plan = path_plan_of(model, locked, 12)
     sums = sums_of(mirrored(2, 3, 0.7), 12, locked)
     order = np.arange(1, 13)[:, None, None]
     for degrees, expected in ((9.0, 9.0), (50.0, 36.0)):
         late = sums.values * np.exp(-1j * order * math.radians(degrees))
-        found = phase_paths.lag_of_paths(replace(sums, values=late.astype(np.complex64)), plan)
+        found = lag_of_paths(replace(sums, values=late.astype(np.complex64)), plan)
         assert math.degrees(found) == pytest.approx(expected, abs=0.7)
 
 
@@ -245,8 +249,8 @@ def test_further_harmonics_decide_which_form_is_taken() -> None:
     assert not is_orbit(vibration(LINE))
     sums = sums_of(vibrated({"amplitude": 3.0 * PX, "phase": 0.4}), 8)
     closed = phase_picture(sums, circle, lag=0.0)
-    plan = phase_paths.path_plan_of(circle, None, 8)
-    scene_found = phase_paths.detail_of_paths(sums, plan, 0.0)
+    plan = path_plan_of(circle, None, 8)
+    scene_found = detail_of_paths(sums, plan, 0.0)
     sharp = scene_found - gaussian_filter(scene_found, 4.0)
     assert correlation(sharp, closed - gaussian_filter(closed, 4.0)) > 0.999
 
