@@ -300,7 +300,9 @@ def kept_rows(path: Path, measured_axes: set[str]) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["rows"]
-    return [one for one in rows if one["axis"] not in measured_axes]
+    kept = [one for one in rows if one["axis"] not in measured_axes]
+    # Rows from before there were lamps
+    return [{"lamp_depth": 0.0, **one} for one in kept]
 
 
 def rounded(values: dict[str, Any]) -> dict[str, Any]:
@@ -354,10 +356,11 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         place.set_xticks(range(len(values)), [f"{value:g}" for value in values])
         place.set(xlabel=label, ylim=(0.5, 1.0))
         place.grid(alpha=0.3)
-    drawing.axes[0].legend(fontsize=8, loc="lower right")
     drawing.axes[0].set_ylabel("correlation with the truth")
     drawing.axes[4].set_ylabel("correlation with the truth")
-    drawing.axes[-1].set_axis_off()
+    *_, of_lamp, free = drawing.axes
+    free.set_axis_off()
+    free.legend(*of_lamp.get_legend_handles_labels(), fontsize=8, loc="center")
     drawing.savefig(path)
 
 

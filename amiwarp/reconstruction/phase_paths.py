@@ -21,6 +21,7 @@ from amiwarp.imaging.phase_costs import DAMPING, LONGEST_WAVES
 from amiwarp.kernels.phase_grid import SIDE
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.orbit import LockedAngles, image_grid, orbits_of, paths_of
+from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.phase_lag import FINEST, lag_of_costs
 from amiwarp.reconstruction.phase_tiles import (
     Mosaic,
@@ -33,7 +34,7 @@ from amiwarp.tasks import in_order
 COARSE_ANGLES = 128
 """Number of angles at which the extent of paths is found."""
 MOST_REST_PX = 0.1
-"""Largest rms of further harmonics of a motion that counts as an orbit [px]. Motions of prisms always do."""
+"""Largest rms of further harmonics of a motion that counts as an orbit [px]. Motions of a prism always do."""
 LEAST_WIDTH = 0.05
 """Smallest difference of the two rotations of an orbit, relative to the larger one; less is a line."""
 LEAST_REACH_PX = 0.05
@@ -82,7 +83,7 @@ def is_orbit(model: Model) -> bool:
 @lru_cache(maxsize=8)
 def _is_orbit(model: Model) -> bool:
     """Return the same for an optic with one angle."""
-    if model.PRISM:
+    if model.GLASS is Prism and model.PRISM:
         return True
     found = orbits_of(model, image_grid(model.camera, 5, 5))
     larger = np.maximum(np.abs(found.forward), np.abs(found.backward))

@@ -182,29 +182,29 @@ def test_a_pair_of_prisms_whose_turns_are_locked() -> None:
 
 
 def test_a_plate_moves_each_tile_by_its_depth() -> None:
-    """A wall at 0.6 m on the left, and at 0.3 m on the right."""
-    camera = Camera.from_fov(224, 72, math.radians(70.0))
+    """A wall at 0.6 m on the left, and at 0.3 m on the right, some tiles apart."""
+    camera = Camera.from_fov(320, 72, math.radians(70.0))
     plate = Plate(0.012, math.radians(45.0))
-    depths = np.full((72, 224), 1.0 / 0.6, np.float32)
-    depths[:, 112:] = 1.0 / 0.3
+    depths = np.full((72, 320), 1.0 / 0.6, np.float32)
+    depths[:, 160:] = 1.0 / 0.3
 
     def path(pixels: Floats, angles: Floats) -> Floats:
         inverse = depths[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
         return optics.at_depth(camera, plate, 0.5, pixels, angles, inverse.astype(np.float64))
 
-    places = phase.places_over_turn(path, 224, 72, 32)
+    places = phase.places_over_turn(path, 320, 72, 32)
     values = phase.sums_of_scene(scene(places), 7).astype(np.complex64)
-    events = np.ones((72, 224), np.int32)
+    events = np.ones((72, 320), np.int32)
     sums = PhaseSums(values, events, events, 1.0, 1.0)
     model = PlateModel(camera, plate, 0.5).with_depths(depths)
-    y, x = np.mgrid[:72, :224]
+    y, x = np.mgrid[:72, :320]
     seen = scene(np.stack([x, y], axis=2).astype(np.float64))
     found = phase_picture(sums, model, lag=0.0)
-    for side in (np.s_[:, :88], np.s_[:, 136:]):
-        assert correlation(found[side], seen[side]) > 0.97
+    assert correlation(found[:, :88], seen[:, :88]) > 0.985
+    assert correlation(found[:, 232:], seen[:, 232:]) > 0.93
     flat = PlateModel(camera, plate, 0.5, inverse_depth=1.0 / 0.6)
     wrong = phase_picture(sums, flat, lag=0.0)
-    assert correlation(wrong[:, 136:], seen[:, 136:]) < 0.95
+    assert correlation(wrong[:, 232:], seen[:, 232:]) < 0.9
 
 
 @pytest.mark.parametrize("degrees", [-8.0, 0.0, 12.0, 40.0])
@@ -260,7 +260,7 @@ def test_what_moves_nothing_is_refused() -> None:
     with pytest.raises(AmiwarpError, match=r"vibration model moves the image by 0 px only"):
         phase_picture(sums, vibration({"amplitude": 0.0, "phase": 0.0}))
     far = PlateModel(CAMERA, Plate(0.01, math.radians(45.0)))
-    with pytest.raises(AmiwarpError, match=r"not at all"):
+    with pytest.raises(AmiwarpError, match=r"plate model moves the image by 0 px"):
         phase_picture(sums, far)
 
 
