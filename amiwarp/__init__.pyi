@@ -78,6 +78,7 @@ from .imaging.phase import weighted_sums as weighted_sums
 from .imaging.phase_ring import PhaseRing as PhaseRing
 from .imaging.phase_ring import PhaseUpdate as PhaseUpdate
 from .imaging.phase_ring import RingPart as RingPart
+from .imaging.phase_tensor import phase_tensor as phase_tensor
 from .imaging.tensors import event_count as event_count
 from .imaging.tensors import latest_times as latest_times
 from .imaging.tensors import polarity_histogram as polarity_histogram
@@ -144,6 +145,7 @@ from .optics.models.parameter import Parameter as Parameter
 from .optics.models.plate import PlateModel as PlateModel
 from .optics.models.steerer import SteererModel as SteererModel
 from .optics.models.vibration import VibrationModel as VibrationModel
+from .optics.orbit import LockedAngles as LockedAngles
 from .optics.prism import FlatSide as FlatSide
 from .optics.prism import NominalPrism as NominalPrism
 from .optics.prism import Plate as Plate

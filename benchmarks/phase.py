@@ -4,10 +4,10 @@
 
 A 320 × 240 camera sees every picture of FOLDER through a prism (720 rpm) with apex angles of 0.5°, 1° and 2°, and noise
 of about 0, 20 and 50 % of all events; ``--axes`` changes one condition at a time instead, and ``--speed`` measures
-640 × 480 at 1°. Both methods use the true optic, and one turn. Each row states the correlation with the truth of the
-detail (high-passed at 8 px) and of the whole picture, what the picture's contrast is beside the truth, and the
-processor time of the same pictures. Rows of other axes that FILE.json already holds are kept. ``--figure`` draws the
-medians of all axes.
+640 × 480 at 1°. All methods use the true optic, sums in phase and the solver one turn, amiwarp's network the last
+quarter of it, if PyTorch is installed. Each row states the correlation with the truth of the detail (high-passed at
+8 px) and of the whole picture, what the picture's contrast is beside the truth, and the processor time of the same
+pictures. Rows of other axes that FILE.json already holds are kept. ``--figure`` draws the medians of all axes.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +30,23 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from amiwarp import (
+    Calibration,
     Camera,
     CameraMotion,
     CameraRotation,
+    Network,
     Prism,
     PrismMotion,
     Reconstruction,
+    Recording,
     Scene,
     SensorModel,
     Simulation,
+    Windows,
 )
 from amiwarp.reconstruction import PhaseReconstruction, phase_image
 from amiwarp.studies.machine import machine, versions
+from amiwarp.studies.stability.changing_scenes import Lamp
 from benchmarks.reconstruct import scene_fov
 from reference.calibration_sample import exact_calibration
 
@@ -70,6 +76,8 @@ class Condition:
     camera_deg_s: float = 0.0
     """Speed at which the camera turns about its vertical axis."""
     fov_deg: float = 60.0
+    lamp_depth: float = 0.0
+    """Relative decrease of the luminance of everything when a lamp is dark, 100 times a second."""
     width: int = 320
     height: int = 240
 
@@ -81,6 +89,7 @@ AXES: dict[str, tuple[Any, ...]] = {
     "refractory_us": (0.0, 100.0, 500.0, 2000.0, 5000.0),
     "camera_deg_s": (0.0, 1.0, 3.0, 10.0, 30.0),
     "fov_deg": (30.0, 60.0, 90.0),
+    "lamp_depth": (0.0, 0.05, 0.1, 0.2, 0.4),
 }
 TABLE = [Condition(apex_deg=a, noise=n) for a in (0.5, 1.0, 2.0) for n in (0.0, 0.2, 0.5)]
 LARGE = Condition(width=640, height=480)
@@ -103,10 +112,13 @@ def simulation(picture: Path, condition: Condition, seconds: float, noise_hz: fl
         PrismMotion(RPM, PHASE),
         sensor=sensor,
     )
-    if not condition.camera_deg_s:
-        return still
     # The same size of the scene, whose place would otherwise follow from the motion.
     scene = replace(Scene.from_picture(picture), fov=scene_fov(still))
+    if condition.lamp_depth:
+        lamp = Lamp(scene.frames.light, 1.0, math.ceil(1e6 * seconds), condition.lamp_depth)
+        return replace(still, scene=replace(scene, frames=lamp))
+    if not condition.camera_deg_s:
+        return still
     motion = CameraMotion((0.0, math.radians(condition.camera_deg_s), 0.0))
     return replace(still, scene=scene, camera_motion=motion)
 
@@ -171,10 +183,41 @@ def row(
     solver = Reconstruction(recording, calibration, camera_rotation=rate, device=device)
     found["phase"] = measured(phase, truth, condition, repeats)
     found["solver"] = measured(solver, truth, condition, repeats)
+    network = network_picture(recording, calibration, phase.span(START_US, None, 1.0), device)
+    if network is not None:
+        picture_of, processor_s, duration_s = network
+        found["network"] = {
+            **judged(picture_of, truth, condition.threshold),
+            "processor_s": processor_s,
+            "duration_s": duration_s,
+        }
     sums = phase.sums(*phase.span(START_US, None, 1.0))
     found["events_per_pixel"] = sums.events / (condition.width * condition.height)
     found["misfit"] = float(np.nanmedian(phase_image(sums, phase.model).misfit))
     return found
+
+
+def network_picture(
+    recording: Recording, calibration: Calibration, span: tuple[int, int], device: str | None
+) -> tuple[NDArray[np.float32], float, float] | None:
+    """Return the picture of amiwarp's network from the last quarter of a turn, and its times; None without PyTorch."""
+    if find_spec("torch") is None:
+        return None
+    network = Network.quarter_turn(device or "cpu")
+    encoder = recording.encoder
+    stop_us = sum(span)
+    start_us = stop_us - round(0.25 * span[1])
+    events = recording.events
+    cut = Windows(
+        *(np.array([at]) for at in (*map(events.find, (start_us, stop_us)), start_us, stop_us))
+    )
+    optic = {"model": calibration.model, "encoder": encoder}
+
+    def draw() -> NDArray[np.float32]:
+        return np.asarray(next(network.over(recording, cut, **optic)))[0]
+
+    draw()  # compiles
+    return timed(draw, 1)
 
 
 def view_at(through: Simulation, condition: Condition, time_us: float) -> NDArray[np.float32]:
@@ -239,7 +282,9 @@ def summary(rows: list[dict[str, Any]]) -> Iterator[str]:
     for key, group in groups.items():
         changed = [f"{n} {v:g}" for n, v in zip(names, key[1:], strict=True) if v != default[n]]
         parts = [f"{key[0]}: {', '.join(changed) or 'default'}"]
-        for method in ("phase", "solver"):
+        for method in METHODS:
+            if method not in group[0]:
+                continue
             detail = [one[method]["detail"] for one in group]
             whole = [one[method]["whole"] for one in group]
             spent = statistics.median(one[method]["processor_s"] for one in group)
@@ -255,7 +300,9 @@ def kept_rows(path: Path, measured_axes: set[str]) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["rows"]
-    return [one for one in rows if one["axis"] not in measured_axes]
+    kept = [one for one in rows if one["axis"] not in measured_axes]
+    # Rows from before there were lamps
+    return [{"lamp_depth": 0.0, **one} for one in kept]
 
 
 def rounded(values: dict[str, Any]) -> dict[str, Any]:
@@ -269,6 +316,8 @@ def rounded(values: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
+METHODS = {"phase": "tab:blue", "solver": "tab:orange", "network": "tab:green"}
+"""Methods with their colours. Rows from before the network have none."""
 LABELS = {
     "apex_deg": "apex angle [deg]",
     "noise": "share of noise",
@@ -276,6 +325,7 @@ LABELS = {
     "refractory_us": "refractory period [us]",
     "camera_deg_s": "speed of the camera [deg/s]",
     "fov_deg": "field of view [deg]",
+    "lamp_depth": "depth of a lamp's flicker",
 }
 
 
@@ -284,12 +334,14 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    drawing = Figure(figsize=(9.0, 5.2), dpi=110, layout="constrained")
+    drawing = Figure(figsize=(11.5, 5.2), dpi=110, layout="constrained")
     FigureCanvasAgg(drawing)
-    for place, (name, label) in zip(drawing.subplots(2, 3).flat, LABELS.items(), strict=True):
+    for place, (name, label) in zip(drawing.subplots(2, 4).flat, LABELS.items(), strict=False):
         of_axis = [one for one in rows if one["axis"] == name]
         values = sorted({one[name] for one in of_axis})
-        for method, colour in (("phase", "tab:blue"), ("solver", "tab:orange")):
+        for method, colour in METHODS.items():
+            if not of_axis or method not in of_axis[0]:
+                continue
             for quantity, line in (("detail", "-"), ("whole", "--")):
                 medians = [
                     statistics.median(
@@ -304,9 +356,11 @@ def figure(rows: list[dict[str, Any]], path: Path) -> None:
         place.set_xticks(range(len(values)), [f"{value:g}" for value in values])
         place.set(xlabel=label, ylim=(0.5, 1.0))
         place.grid(alpha=0.3)
-    drawing.axes[0].legend(fontsize=8, loc="lower right")
     drawing.axes[0].set_ylabel("correlation with the truth")
-    drawing.axes[3].set_ylabel("correlation with the truth")
+    drawing.axes[4].set_ylabel("correlation with the truth")
+    *_, of_lamp, free = drawing.axes
+    free.set_axis_off()
+    free.legend(*of_lamp.get_legend_handles_labels(), fontsize=8, loc="center")
     drawing.savefig(path)
 
 

@@ -37,6 +37,7 @@ from amiwarp.imaging.phase_tables import (
 from amiwarp.imaging.uploaded_events import upload_events
 from amiwarp.kernels import phase as kernels
 from amiwarp.kernels.launch import launch
+from amiwarp.optics.orbit import LockedAngles
 from amiwarp.schema.calls import guarded
 from amiwarp.tasks import cpu_threads
 from amiwarp.validation import array, real, whole
@@ -86,6 +87,9 @@ class PhaseSums:
     """Number of changes of polarity, shape (height, width), if the extremes between them were added to the sums."""
     weighted_noise: NDArray[np.float32] | None = None
     """Expected square of each sum of random events, shape (height, width), if the sums are a weighted mean."""
+    locked: LockedAngles | None = None
+    """How the second angle of an optic follows the first one: the angle of the sums is the first one, divided by
+    :attr:`LockedAngles.turns`. None for one angle."""
 
     @classmethod
     @guarded

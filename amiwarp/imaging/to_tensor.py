@@ -25,8 +25,8 @@ class ToTensor:
         Function such as :func:`voxel_grid`.
     **options : object
         Arguments of the function by name. ``width`` and ``height`` may be left out for recordings, which also have the
-        ``encoder`` that a ``model`` needs. ``windows`` may also be a function that is called with the events, such as
-        ``functools.partial(amiwarp.windows, count=10_000)``.
+        ``encoder`` that a ``model`` or the function needs. ``windows`` may also be a function that is called with the
+        events, such as ``functools.partial(amiwarp.windows, count=10_000)``.
 
     Raises
     ------
@@ -78,7 +78,7 @@ class ToTensor:
             source = events.events
             width, height = source.size
             options = {"width": width, "height": height} | options
-            if options.get("model") is not None:
+            if options.get("model") is not None or "encoder" in self._needed:
                 options.setdefault("encoder", events.encoder)
             events = source.slice(0, len(source))
         elif isinstance(events, np.ndarray) and events.dtype.names is not None:

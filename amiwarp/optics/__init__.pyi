@@ -18,6 +18,7 @@ from .models.parameter import Parameter as Parameter
 from .models.plate import PlateModel as PlateModel
 from .models.steerer import SteererModel as SteererModel
 from .models.vibration import VibrationModel as VibrationModel
+from .orbit import LockedAngles as LockedAngles
 from .prism import FlatSide as FlatSide
 from .prism import NominalPrism as NominalPrism
 from .prism import Plate as Plate

@@ -1,9 +1,10 @@
-"""Orbits of an optic: the motion of points over a turn, as a mean and a rotation in each direction."""
+"""Motion of points over a turn of an optic: as an orbit, which is a mean and two rotations, or as any closed path."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,27 @@ from amiwarp.optics.models.base import Model
 
 ANGLES = 32
 """Number of angles of a turn at which the motion is computed. Its harmonics up to the 16th do not disturb the first."""
+
+GRID_PX = 32
+"""Distance of the points of :func:`grid_of_image` [px]."""
+
+
+@dataclass(frozen=True)
+class LockedAngles:
+    """How the second angle of an optic follows the first one, so that the motion repeats.
+
+    Examples
+    --------
+    >>> amiwarp.LockedAngles(turns=2, second_turns=-3, second_at_zero=0.5)
+    LockedAngles(turns=2, second_turns=-3, second_at_zero=0.5)
+    """
+
+    turns: int
+    """Number of turns of the first angle after which both angles are as before, at least 1."""
+    second_turns: int
+    """Number of turns of the second angle meanwhile; negative if it turns the other way."""
+    second_at_zero: float
+    """Second angle where the first one is 0 [rad]."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +68,27 @@ def image_grid(camera: Camera, columns: int, rows: int) -> NDArray[np.float64]:
     return np.stack([columns_of_points.ravel(), rows_of_points.ravel()], axis=1)
 
 
+def grid_of_image(camera: Camera) -> tuple[int, int]:
+    """Return the numbers of columns and rows of a grid that shows how the motion varies over an image."""
+    columns = max(2, 1 + math.ceil((camera.width - 1) / GRID_PX))
+    rows = max(2, 1 + math.ceil((camera.height - 1) / GRID_PX))
+    return columns, rows
+
+
+def spread_over(camera: Camera, values: NDArray[Any], columns: int, rows: int) -> NDArray[Any]:
+    """Return values at the points of :func:`image_grid`, interpolated linearly at all pixels, shape (height, width)."""
+    grid = values.reshape(rows, columns)
+    lines = _interpolated(grid, np.linspace(0.0, rows - 1.0, camera.height))
+    return _interpolated(lines.T, np.linspace(0.0, columns - 1.0, camera.width)).T
+
+
+def _interpolated(rows: NDArray[Any], places: NDArray[np.float64]) -> NDArray[Any]:
+    """Return the rows of an array at places between them, interpolated linearly."""
+    below = np.minimum(places.astype(np.intp), len(rows) - 2)
+    share = (places - below)[:, None]
+    return rows[below] + share * (rows[below + 1] - rows[below])
+
+
 def orbits_of(model: Model, points: NDArray[np.float64]) -> Orbits:
     """Return the orbits of points, shape (n, 2) [px], about which the model moves the image.
 
@@ -71,3 +114,31 @@ def orbits_of(model: Model, points: NDArray[np.float64]) -> Orbits:
         backward=harmonics[:, -1],
         rest=np.sqrt(further.sum(axis=1)),
     )
+
+
+def paths_of(
+    model: Model, points: NDArray[np.float64], angles: int, locked: LockedAngles | None
+) -> NDArray[np.complex128]:
+    """Return the motion of points over a period of an optic [px], shape (n, angles), at even steps of the angle.
+
+    Real parts are along x, imaginary parts along y. The period is a turn; with two angles, which ``locked`` ties
+    together, it is some turns of the first one. Raises :class:`AmiwarpError` if a model with two angles has none that
+    ties them, or a point moves to no finite place.
+    """
+    if model.ANGLES == 2 and locked is None:
+        raise AmiwarpError(
+            f"the {model.NAME} model has two angles, and the sums do not say how the second one follows the first; "
+            "take the sums of a PhaseReconstruction, or use the method 'solver'"
+        )
+    first = np.arange(angles) * (math.tau / angles)
+    seen = first
+    if locked is not None and model.ANGLES == 2:
+        second = locked.second_turns * first + locked.second_at_zero
+        seen = np.stack([locked.turns * first, second], axis=1)
+    repeated = np.repeat(points, angles, axis=0)
+    moved = model.compensate_points(repeated, np.concatenate([seen] * len(points))) - repeated
+    if not np.isfinite(moved).all():
+        raise AmiwarpError(
+            "the model moves a pixel to no finite place; give the calibration of this recording"
+        )
+    return np.asarray(moved[:, 0] + 1j * moved[:, 1]).reshape(len(points), angles)

@@ -14,4 +14,10 @@ from .reconstruct import Reconstruction as Reconstruction
 # Names that are in this room only, kept by hand: what people who add to it need.
 
 from .film_files import save_film as save_film
+from .locked_angles import MotionPeriod as MotionPeriod
+from .phase_paths import detail_of_paths as detail_of_paths
+from .phase_paths import is_orbit as is_orbit
+from .phase_paths import lag_of_paths as lag_of_paths
+from .phase_paths import path_plan_of as path_plan_of
+from .phase_window import harmonics_for as harmonics_for
 from .picture_files import save_picture as save_picture

@@ -275,7 +275,7 @@ def _chosen(
         whole_turns(work.encoder, start, length)
     except AmiwarpError as error:
         return None, str(error)
-    return work, "whole turns, one angle, a camera at rest; the scene must be still"
+    return work, "whole turns, a camera at rest; the scene must be still"
 
 
 def _check_options(

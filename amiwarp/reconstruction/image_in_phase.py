@@ -15,9 +15,7 @@ from amiwarp.io.output_formats import check_ending
 from amiwarp.io.outputs import NewFile
 from amiwarp.kernels.phase_misfit import AROUND
 from amiwarp.optics.models.base import Model
-from amiwarp.reconstruction.phase_lag import lag_of
-from amiwarp.reconstruction.phase_tiles import scene_of_tiles
-from amiwarp.reconstruction.picture_in_phase import joined_picture, motion_of
+from amiwarp.reconstruction.picture_in_phase import scene_of_sums
 from amiwarp.schema.calls import guarded
 
 FEWEST_EVENTS = 20
@@ -33,7 +31,7 @@ class PhaseImage:
     """Log intensity of the scene [ON thresholds], median 0, shape (height, width)."""
     gradient: NDArray[np.float32]
     """Gradient of the log intensity along x and y [ON thresholds/px], smoothed by the orbit, shape (2, height, width).
-    An edge is perpendicular to it."""
+    Of motions that are no orbit, the gradient of the picture. An edge is perpendicular to it."""
     threshold_ratio: NDArray[np.float32]
     """OFF threshold divided by the ON threshold, shape (height, width); NaN without OFF events."""
     misfit: NDArray[np.float32]
@@ -44,7 +42,7 @@ class PhaseImage:
     turns: float
     """Number of turns."""
     lag: float = 0.0
-    """Angle by which the optic has turned on before an event is seen [rad]."""
+    """Angle of the sums by which the optic has moved on before an event is seen [rad]."""
     flicker: NDArray[np.float32] | None = None
     """Amplitude of the brightness at the frequency of a lamp [ON thresholds], shape (height, width), if it was asked
     for."""
@@ -89,7 +87,7 @@ def phase_image(sums: PhaseSums, model: Model) -> PhaseImage:
     sums : PhaseSums
         Sums of whole turns in phase with the angle of the optic.
     model : Model
-        Optical model of the same image size, with one angle.
+        Optical model of the same image size, as in :func:`phase_picture`.
 
     Returns
     -------
@@ -109,19 +107,16 @@ def phase_image(sums: PhaseSums, model: Model) -> PhaseImage:
     >>> amiwarp.phase_image(sums, amiwarp.ExactModel.from_prism(camera, prism, 0.0)).gradient.shape
     (2, 24, 32)
     """
-    motion = motion_of(sums, model)
-    lag = lag_of(sums, model)
-    slopes = motion.gradient(sums.values[0], lag)
-    scene = scene_of_tiles(sums, model, lag, with_rest=True)
+    scene = scene_of_sums(sums, model, None, with_rest=True)
     assert scene.rest is not None
     return PhaseImage(
-        log=joined_picture(scene.detail, slopes, model),
-        gradient=np.stack([slopes.real, slopes.imag]),
+        log=scene.log,
+        gradient=scene.gradient,
         threshold_ratio=sums.threshold_ratio,
         misfit=_misfit(sums, scene.rest),
         events=sums.on + sums.off,
         turns=sums.turns,
-        lag=lag,
+        lag=scene.lag,
     )
 
 

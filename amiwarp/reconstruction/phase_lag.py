@@ -37,17 +37,21 @@ def lag_of(sums: PhaseSums, model: Model) -> float:
     values = sums.values[:MOST_HARMONICS]
     cuts = np.stack([cut_out(values, plan.places[tile], plan.window) for tile in chosen])
     spectra = scipy.fft.fft2(cuts, axes=(2, 3), workers=1, overwrite_x=True)
-    costs = _costs(spectra, plan, chosen)
+    return lag_of_costs(LAGS, _costs(spectra, plan, chosen))
+
+
+def lag_of_costs(lags: NDArray[np.float64], costs: NDArray[np.float64]) -> float:
+    """Return the lag with the lowest cost, between those tried; 0 if it hardly explains more than no lag."""
     best = int(np.argmin(costs))
-    at_zero = costs[np.argmin(np.abs(LAGS))]
+    at_zero = costs[np.argmin(np.abs(lags))]
     if at_zero - costs[best] < LEAST_GAIN:
         return 0.0
-    if best in (0, len(LAGS) - 1):
-        return float(LAGS[best])
+    if best in (0, len(lags) - 1):
+        return float(lags[best])
     # Vertex of the parabola through the best lag and its neighbours.
     before, here, after = costs[best - 1 : best + 2]
     shift = 0.5 * (before - after) / (before - 2.0 * here + after)
-    return float(LAGS[best] + shift * (LAGS[1] - LAGS[0]))
+    return float(lags[best] + shift * (lags[1] - lags[0]))
 
 
 def _strongest(sums: PhaseSums, plan: Plan) -> list[int]:

@@ -25,6 +25,7 @@ from amiwarp.kernels.launch import launch
 from amiwarp.kernels.phase_grid import SIDE
 from amiwarp.kernels.phase_lines import turns_of_places
 from amiwarp.kernels.phase_planes import PLANE, TileTables, tile_scenes
+from amiwarp.optics.camera import Camera
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.orbit import orbits_of
 from amiwarp.tasks import cpu_threads, in_order
@@ -54,7 +55,7 @@ def scene_of_tiles(sums: PhaseSums, model: Model, lag: float, *, with_rest: bool
     plan = plan_of(model, harmonics)
     responses = plan.responses(lag)
     parts = responses.parts(sums.values)
-    detail = _Mosaic((height, width), np.dtype(np.float32))
+    detail = Mosaic((height, width), np.dtype(np.float32))
     for place, part in zip(plan.places, parts, strict=True):
         detail.add(place, part)
     if not with_rest:
@@ -63,7 +64,7 @@ def scene_of_tiles(sums: PhaseSums, model: Model, lag: float, *, with_rest: bool
         partial(_rest_of_tile, sums.values, plan, responses, tile)
         for tile in range(len(plan.places))
     ]
-    rest = _Mosaic((harmonics, height, width), np.dtype(np.complex64))
+    rest = Mosaic((harmonics, height, width), np.dtype(np.complex64))
     for place, left in zip(plan.places, in_order(jobs, fill_cores=True), strict=True):
         rest.add(place, left)
     return TiledScene(detail.values, rest.values)
@@ -113,17 +114,24 @@ class Plan:
 @lru_cache(maxsize=8)
 def plan_of(model: Model, harmonics: int) -> Plan:
     """Return the plan of pictures through an optic."""
-    width = model.camera.width
-    height = model.camera.height
-    rows, overlap_y = tile_starts(height)
-    columns, overlap_x = tile_starts(width)
-    places = [(row, column) for row in rows for column in columns]
-    window = np.outer(weights_of_line(overlap_y), weights_of_line(overlap_x))
-    middles = np.array([(column + SIDE / 2, row + SIDE / 2) for row, column in places])
-    inside = np.clip(middles, 0.0, (width - 1.0, height - 1.0))
-    found = orbits_of(model, inside)
+    places, window = places_and_window(model.camera)
+    found = orbits_of(model, tile_middles(model.camera, places))
     orbits = np.stack([found.forward, found.backward], axis=1).astype(np.complex64)
     return plan_of_orbits(places, window, orbits, harmonics)
+
+
+def places_and_window(camera: Camera) -> tuple[list[tuple[int, int]], NDArray[np.float32]]:
+    """Return the first row and column of each tile of an image [px], and the weights of a tile."""
+    rows, overlap_y = tile_starts(camera.height)
+    columns, overlap_x = tile_starts(camera.width)
+    places = [(row, column) for row in rows for column in columns]
+    return places, np.outer(weights_of_line(overlap_y), weights_of_line(overlap_x))
+
+
+def tile_middles(camera: Camera, places: list[tuple[int, int]]) -> NDArray[np.float64]:
+    """Return the middle of each tile, or the nearest point of the image [px], shape (tiles, 2)."""
+    middles = np.array([(column + SIDE / 2, row + SIDE / 2) for row, column in places])
+    return np.clip(middles, 0.0, (camera.width - 1.0, camera.height - 1.0))
 
 
 def plan_of_orbits(
@@ -233,7 +241,7 @@ def cut_out(
     return cut
 
 
-class _Mosaic:
+class Mosaic:
     """An image, or several, of weighted tiles that overlap."""
 
     def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:

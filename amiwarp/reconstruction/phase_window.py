@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,11 +17,13 @@ from amiwarp.events.device_events import device_of, read_between
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_speed import turn_between
 from amiwarp.events.recording import EventSource, Recording
-from amiwarp.imaging.phase import PhaseSums, phase_sums
+from amiwarp.imaging.phase import BINS, PhaseSums, phase_sums
 from amiwarp.imaging.windows import turn_edges, turn_end
 from amiwarp.optics.models.base import Model
-from amiwarp.optics.orbit import image_grid, orbits_of
+from amiwarp.optics.orbit import LockedAngles, image_grid, orbits_of
 from amiwarp.reconstruction.device_windows import DeviceWindows, Drawing
+from amiwarp.reconstruction.locked_angles import MotionPeriod
+from amiwarp.reconstruction.phase_paths import is_orbit, path_plan_of, radius_of_paths
 from amiwarp.reconstruction.picture import Picture
 from amiwarp.reconstruction.picture_in_phase import phase_picture, pixel_motion
 from amiwarp.reconstruction.windows import window_count, window_span
@@ -34,6 +37,10 @@ and 0.986."""
 FEWEST_HARMONICS = 6
 MOST_HARMONICS = 31
 """Limits of the number of harmonics: small orbits need some, and 64 bins hold no more."""
+MOST_HARMONICS_OF_PATHS = 63
+"""Limit of the number of harmonics of a motion over some turns."""
+MORE_BINS = 256
+"""Number of bins that hold these."""
 LEAST_TURN = 0.98
 """Shortest window that counts as a whole turn [turns]. It is lengthened to a turn."""
 
@@ -81,7 +88,8 @@ class PhaseReconstruction:
     recording : Recording
         Recording with events.
     calibration : Calibration
-        Calibration of the same sensor size. It provides model and encoder. An optic with one angle.
+        Calibration of the same sensor size. It provides model and encoder. Two angles of an optic must come back
+        together after at most 8 turns.
     device : str or warp.Device, optional
         Device on which events are summed and pictures are made, by default the events' device or the CPU. On CUDA a
         picture is copied to the host only when it is finished.
@@ -89,8 +97,8 @@ class PhaseReconstruction:
     Raises
     ------
     AmiwarpError
-        If the recording has no events, the sensor sizes differ, there is no encoder, the model has two angles or moves
-        pixels along a line, or the calibration says that the camera rotates.
+        If the recording has no events, the sensor sizes differ, there is no encoder, the motion of two angles does not
+        repeat, the model moves nothing, or the calibration says that the camera rotates.
 
     Examples
     --------
@@ -123,10 +131,19 @@ class PhaseReconstruction:
         encoder = calibration.encoder_for(recording.encoder, first_us, last_us)
         if encoder is None:
             raise AmiwarpError(f"{recording.name}: give a recording with an encoder")
-        self.encoder = encoder
-        self.turn_us = turn_between(encoder, first_us, last_us)
-        self.harmonics = harmonics_for(self.model)
-        pixel_motion(self.model)  # refuses an optic that moves the image along a line
+        self._period = MotionPeriod.of(self.model, encoder, first_us, last_us)
+        self.encoder = self._period.encoder
+        """Encoder of the sums' angle: of two angles, of the motion's period, which may take some turns."""
+        self.turn_us = turn_between(self.encoder, first_us, last_us)
+        half_us = round(0.5 * (self.turn_us or 0.0))
+        middle_us = (first_us + last_us) // 2
+        locked = self._period.locked(middle_us - half_us, middle_us + half_us)
+        self.harmonics = harmonics_for(self.model, locked)
+        # Refuses an optic that moves nothing
+        if is_orbit(self.model):
+            pixel_motion(self.model)
+        else:
+            path_plan_of(self.model, locked, self.harmonics)
         self.device = device_of(recording.events, device)
         self._on_device: DeviceWindows | None = None
 
@@ -186,7 +203,7 @@ class PhaseReconstruction:
         )
         if not sums.events:
             raise self._no_events(start_us, stop_us)
-        return sums
+        return replace(sums, locked=self._period.locked(start_us, stop_us))
 
     def _no_events(self, start_us: int, stop_us: int) -> AmiwarpError:
         """Return the error for a window without events."""
@@ -214,13 +231,18 @@ class PhaseReconstruction:
         AmiwarpError
             If the window is shorter than a turn, or has no events.
         """
-        if self.device.is_cuda:
+        if self._is_on_device:
             return self._finished(self._started(start_us, length_us))
         began = time.perf_counter()
         sums = self.sums(start_us, length_us)
         log = phase_picture(sums, self.model)
         known = (sums.on + sums.off) > 0
         return picture_of(log, known, sums.off_ratio, start_us, length_us, began)
+
+    @property
+    def _is_on_device(self) -> bool:
+        """Whether a GPU makes the whole picture; of motions that are no orbit it sums the events only."""
+        return bool(self.device.is_cuda) and is_orbit(self.model)
 
     def _started(self, start_us: int, length_us: int) -> _Started:
         """Begin with the picture of a window on the device."""
@@ -287,7 +309,7 @@ class PhaseReconstruction:
         count = self.count(start_us, length_us, step_us=step_us)
         # One at a time: a recording may have any number of windows
         starts = (start_us + round(k * step_us) for k in range(count))
-        if self.device.is_cuda:
+        if self._is_on_device:
             yield from self._streamed(starts, length_us)
             return
         for first_us in starts:
@@ -329,6 +351,7 @@ def sums_of_turns(
     stop_us, turns = whole_turns(encoder, start_us, length_us)
     events = read_between(source, start_us, stop_us)
     width, height = source.size
+    bins = BINS if harmonics <= MOST_HARMONICS else MORE_BINS
     sums = phase_sums(
         events,
         encoder,
@@ -336,15 +359,21 @@ def sums_of_turns(
         height,
         turns=float(turns),
         harmonics=harmonics,
+        bins=bins,
         device=device,
     )
     return sums, stop_us
 
 
-def harmonics_for(model: Model) -> int:
+def harmonics_for(model: Model, locked: LockedAngles | None = None) -> int:
     """Return the number of harmonics that a picture through an optic needs."""
-    radius = orbits_of(model, image_grid(model.camera, 5, 5)).radius
-    return int(np.clip(math.ceil(HARMONICS_PER_PX * radius), FEWEST_HARMONICS, MOST_HARMONICS))
+    if is_orbit(model):
+        radius = orbits_of(model, image_grid(model.camera, 5, 5)).radius
+        most = MOST_HARMONICS
+    else:
+        radius = radius_of_paths(model, locked)
+        most = MOST_HARMONICS_OF_PATHS
+    return int(np.clip(math.ceil(HARMONICS_PER_PX * radius), FEWEST_HARMONICS, most))
 
 
 @guarded

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -22,8 +21,17 @@ from amiwarp.imaging.phase import PhaseSums, shared_pairs
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.phase_slopes import write_divergence_lines, write_slopes
 from amiwarp.optics.models.base import Model
-from amiwarp.optics.orbit import Orbits, image_grid, orbits_of
+from amiwarp.optics.orbit import Orbits, grid_of_image, image_grid, orbits_of, spread_over
+from amiwarp.reconstruction.path_gradient import path_gradient_of
 from amiwarp.reconstruction.phase_lag import lag_of
+from amiwarp.reconstruction.phase_paths import (
+    LEAST_WIDTH,
+    detail_of_paths,
+    is_orbit,
+    lag_of_paths,
+    path_plan_of,
+    rest_of_picture,
+)
 from amiwarp.reconstruction.phase_tiles import scene_of_tiles
 from amiwarp.schema.calls import guarded
 from amiwarp.tasks import cpu_threads
@@ -37,11 +45,6 @@ LEAST_LINES = 64
 """Fewest lines of an image for which a thread is worth its start."""
 LEAST_ATTENUATION = 0.2
 """Smallest attenuation of a wave in the first sum that is undone: shorter waves come from the tiles."""
-LEAST_WIDTH = 0.05
-"""Smallest difference of the two rotations of an orbit, relative to the larger one: motion along a line shows no edge
-that lies along it."""
-GRID_PX = 32
-"""Distance of the points at which orbits are computed for the gradient [px]; between them they are interpolated."""
 
 
 @guarded
@@ -55,10 +58,11 @@ def phase_picture(
     sums : PhaseSums
         Sums of whole turns in phase with the angle of the optic, as the encoder gives it.
     model : Model
-        Optical model of the same image size, with one angle.
+        Optical model of the same image size. With two angles, the sums must say how one follows the other
+        (:attr:`PhaseSums.locked`).
     lag : float, optional
-        Angle by which the optic has turned on before an event is seen [rad], because of the sensor's latency and its
-        threshold; by default found from the sums.
+        Angle of the sums by which the optic has moved on before an event is seen [rad], because of the sensor's latency
+        and its threshold; by default found from the sums.
 
     Returns
     -------
@@ -68,7 +72,7 @@ def phase_picture(
     Raises
     ------
     AmiwarpError
-        If the sizes differ, the model has two angles, or it moves pixels along a line or not at all.
+        If the sizes differ, the model moves nothing, or it has two angles and the sums do not say how they are locked.
 
     Examples
     --------
@@ -78,11 +82,55 @@ def phase_picture(
     >>> amiwarp.phase_picture(sums, amiwarp.ExactModel.from_prism(camera, prism, 0.0)).shape
     (24, 32)
     """
-    motion = motion_of(sums, model)
-    lag = lag_of(sums, model) if lag is None else real(lag, "lag", -math.pi, math.pi, " rad")
-    slopes = motion.gradient(sums.values[0], lag)
-    detail = scene_of_tiles(sums, model, lag, with_rest=False).detail
-    return joined_picture(detail, slopes, model)
+    if lag is not None:
+        lag = real(lag, "lag", -math.pi, math.pi, " rad")
+    return scene_of_sums(sums, model, lag, with_rest=False).log
+
+
+@dataclass(frozen=True)
+class SceneInPhase:
+    """What sums in phase say of the scene."""
+
+    log: NDArray[np.float32]
+    """Log intensity [thresholds], median 0, shape (height, width)."""
+    gradient: NDArray[np.float32]
+    """Gradient along x and y, smoothed by an orbit [thresholds/px], shape (2, height, width)."""
+    rest: NDArray[np.complex64] | None
+    """What the scene leaves of the sums, shape (harmonics, height, width), if it was asked for."""
+    lag: float
+    """Angle by which the optic has moved on before an event is seen [rad]."""
+
+
+def scene_of_sums(
+    sums: PhaseSums, model: Model, lag: float | None, *, with_rest: bool
+) -> SceneInPhase:
+    """Return the scene that explains sums in phase best. The lag is found if it is None.
+
+    Motions that are no orbit have a rest always.
+
+    Raises :class:`AmiwarpError` as :func:`phase_picture`.
+    """
+    check_camera(sums, model)
+    if is_orbit(model):
+        motion = pixel_motion(model)
+        lag = lag_of(sums, model) if lag is None else lag
+        slopes = motion.gradient(sums.values[0], lag)
+        scene = scene_of_tiles(sums, model, lag, with_rest=with_rest)
+        log = joined_picture(scene.detail, slopes, model)
+        return SceneInPhase(log, np.stack([slopes.real, slopes.imag]), scene.rest, lag)
+
+    plan = path_plan_of(model, sums.locked, sums.harmonics)
+    lag = lag_of_paths(sums, plan) if lag is None else lag
+    slope = path_gradient_of(model, sums.locked, sums.harmonics)
+    long = slope.brightness(slope.told(sums.values, lag))
+    log = with_long_picture(detail_of_paths(sums, plan, lag), long, plan.reach)
+    # Harmonics of the motion mix with curved brightness, which the first picture tells.
+    rest = rest_of_picture(sums, plan, lag, log)
+    missing = slope.brightness(slope.told(rest, lag))
+    log += with_long_picture(np.zeros_like(log), missing, plan.reach)
+    log -= np.median(log)
+    rows, columns = np.gradient(log)
+    return SceneInPhase(log, np.stack([columns, rows]), rest, lag)
 
 
 def motion_of(sums: PhaseSums, model: Model) -> FirstSum:
@@ -90,6 +138,12 @@ def motion_of(sums: PhaseSums, model: Model) -> FirstSum:
 
     Raises :class:`AmiwarpError` if the model belongs to another camera, or moves the image along a line.
     """
+    check_camera(sums, model)
+    return pixel_motion(model)
+
+
+def check_camera(sums: PhaseSums, model: Model) -> None:
+    """Raise :class:`AmiwarpError` if the model belongs to another camera than the sums."""
     _, height, width = sums.values.shape
     camera = model.camera
     if (camera.width, camera.height) != (width, height):
@@ -97,7 +151,6 @@ def motion_of(sums: PhaseSums, model: Model) -> FirstSum:
             f"the model is for {camera.width}x{camera.height} px, the sums for {width}x{height}; give both of one "
             "camera"
         )
-    return pixel_motion(model)
 
 
 def joined_picture(
@@ -155,28 +208,10 @@ def pixel_motion(model: Model) -> FirstSum:
 
     Raises :class:`AmiwarpError` if the model has two angles, or moves pixels along a line or not at all.
     """
-    width = model.camera.width
-    height = model.camera.height
-    columns = max(2, 1 + math.ceil((width - 1) / GRID_PX))
-    rows = max(2, 1 + math.ceil((height - 1) / GRID_PX))
+    columns, rows = grid_of_image(model.camera)
     found = orbits_of(model, image_grid(model.camera, columns, rows))
-
-    def spread(values: NDArray[Any]) -> NDArray[Any]:
-        grid = values.reshape(rows, columns)
-        lines = _interpolated(grid, np.linspace(0.0, rows - 1.0, height))
-        return _interpolated(lines.T, np.linspace(0.0, columns - 1.0, width)).T
-
-    orbits = Orbits(
-        spread(found.mean), spread(found.forward), spread(found.backward), spread(found.rest)
-    )
-    return FirstSum.of(orbits)
-
-
-def _interpolated(rows: NDArray[Any], places: NDArray[np.float64]) -> NDArray[Any]:
-    """Return the rows of an array at places between them, interpolated linearly."""
-    below = np.minimum(places.astype(np.intp), len(rows) - 2)
-    share = (places - below)[:, None]
-    return rows[below] + share * (rows[below + 1] - rows[below])
+    parts = (found.mean, found.forward, found.backward, found.rest)
+    return FirstSum.of(Orbits(*(spread_over(model.camera, part, columns, rows) for part in parts)))
 
 
 @dataclass(frozen=True)
@@ -225,11 +260,28 @@ def with_long_waves(
     detail: NDArray[np.float32], slopes: NDArray[np.complex64], radius: float
 ) -> NDArray[np.float32]:
     """Return the picture with its waves that are long beside the orbit replaced by the waves of its gradient."""
+    return with_flow(detail, _flow(slopes), radius)
+
+
+def with_flow(
+    detail: NDArray[np.float32], flow: NDArray[np.float32], radius: float
+) -> NDArray[np.float32]:
+    """Return the detail with its waves that are long beside the motion replaced by waves of the Laplacian ``flow``."""
     height, width = detail.shape
     filters = long_wave_filters(height, width, radius)
-    waves = filters.by_divergence * _long_waves(_flow(slopes), filters)
+    waves = filters.by_divergence * _long_waves(flow, filters)
     waves -= filters.share * _long_waves(detail, filters)
     return detail + _image_of(waves, height, width)
+
+
+def with_long_picture(
+    detail: NDArray[np.float32], picture: NDArray[np.float32], reach: float
+) -> NDArray[np.float32]:
+    """Return the detail with its waves that are long beside a motion of size ``reach`` [px] replaced by a picture's."""
+    # The Laplacian of the picture, where with_long_waves has the divergence of a gradient
+    x = np.diff(picture, axis=1, prepend=picture[:, :1], append=picture[:, -1:])
+    y = np.diff(picture, axis=0, prepend=picture[:1], append=picture[-1:])
+    return with_flow(detail, np.diff(x, axis=1) + np.diff(y, axis=0), reach)
 
 
 def _flow(slopes: NDArray[np.complex64]) -> NDArray[np.float32]:
