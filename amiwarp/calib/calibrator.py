@@ -62,7 +62,7 @@ class Attempt:
     calibration: Calibration | None
     error: AmiwarpError | None = None
     search: Search | None = None
-    """The last sharpness search that was begun."""
+    """The last sharpness search that was begun; of a plate, with the depths that were found."""
 
     @property
     def photometric(self) -> PhotometricSummary | None:
@@ -192,8 +192,10 @@ class Calibrator:
                         if self.host_work is None
                         else partial(self.host_work, found),
                     )
-                    finish = _at_depths if through_plate else _by_brightness
-                    found = finish(problem, found)
+                    if through_plate:
+                        found, search = _at_depths(problem, found)
+                    else:
+                        found = _by_brightness(problem, found)
                 else:
                     found = with_warnings(found, *bound_warnings(search.space, found.parameters))
         except AmiwarpError as error:
@@ -248,15 +250,15 @@ def _sharpest(
     )
 
 
-def _at_depths(problem: Problem, sharpest: Calibration) -> Calibration:
-    """Return the calibration of a plate: its phase and depths, and what the photometric stage says of them.
+def _at_depths(problem: Problem, sharpest: Calibration) -> tuple[Calibration, Search]:
+    """Return the calibration of a plate with what the photometric stage says of it, and the search at its depths.
 
     If the lens is wrong, phase and depths are found again through the corrected one, and the answer with the lower cost
     counts. Raises :class:`AmiwarpError` as :func:`plate.refine_phase` does.
     """
     found, search = _at_each_depth(problem, sharpest)
     state = refine(replace(problem, sharp=search))
-    as_given = found, state
+    as_given = found, state, search
     given = given_lens(found.camera)["k1"]
     last: LensStep | None = None
     corrected: list[ParameterCorrected] = []
@@ -274,8 +276,9 @@ def _at_depths(problem: Problem, sharpest: Calibration) -> Calibration:
         state = refine(replace(through, sharp=search))
 
     if corrected and state.answer.cost >= as_given[1].answer.cost:
-        return _examined(as_given[1], as_given[0])
-    return _examined(state.noticing(*corrected), found)
+        found, state, search = as_given
+        return _examined(state, found), search
+    return _examined(state.noticing(*corrected), found), search
 
 
 def _at_each_depth(problem: Problem, sharpest: Calibration) -> tuple[Calibration, Search]:

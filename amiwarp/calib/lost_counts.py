@@ -36,8 +36,9 @@ RIDGE = 1e-9
 """Weight of the squares of the polynomial's coefficients, which samples on either side of a long pause do not tell."""
 AT_A_TIME = 65536
 """Number of intervals that are examined at a time, which bounds the memory."""
-AT_ONCE = 0.5
-"""Smallest share of a step that comes between two samples."""
+AT_ONCE = 0.8
+"""Smallest share of a step that comes between two samples. With 0.5, counts that were lost within 3 ms, and pauses of
+the samples, made steps of a part of them."""
 SAMPLES_PER_TURN = 16
 """Smallest number of samples per turn in which steps can be seen."""
 MOST_STEPS = 8

@@ -297,8 +297,8 @@ def wedge_floor(model: PlateModel) -> float:
 def hidden_by_faces(found: Calibration) -> dict[str, float]:
     """Return by how much faces that are not parallel may move points [px rms], by words; nothing if it is given.
 
-    It is the motion at depths that are known from elsewhere: found depths make up for an angle along the tilt. The
-    events do not limit that angle, so that it may be as large as in glass from stock.
+    It is the motion at depths that are known from elsewhere: found depths make up for most of an angle along the tilt.
+    That angle is not looked for, so that it may be as large as in glass from stock.
     """
     model = found.model
     assert isinstance(model, PlateModel)
@@ -319,7 +319,7 @@ def hidden_by_faces(found: Calibration) -> dict[str, float]:
 def with_wedge(found: Calibration, wedge: float, std: float) -> Calibration:
     """Return the calibration with an angle between the faces across the tilt [rad], and a warning of the one along it.
 
-    The events do not show the angle along the tilt, which looks like other depths. It is likely as large.
+    The angle along the tilt, which looks much like other depths, is not looked for. It is likely as large.
     """
     model = found.model
     assert isinstance(model, PlateModel)
@@ -338,9 +338,9 @@ def with_wedge(found: Calibration, wedge: float, std: float) -> Calibration:
     if not given:
         change = inverse_depth_by_wedge(model) * abs(wedge)
         said += (
-            "; the events do not show the angle along the tilt: if it is as large, all inverse depths are off by "
-            f"{change:.2g} 1/m, which is part of their standard deviations; measure it and give it by --start wedge_x, "
-            "or use a plate with parallel faces"
+            "; the angle along the tilt looks like other depths, and is not looked for: if it is as large, the inverse "
+            f"depths in the middle are off by {change:.2g} 1/m, which is part of their standard deviations; measure it "
+            "and give it by --start wedge_x, or use a plate with parallel faces"
         )
     return replace(
         found,

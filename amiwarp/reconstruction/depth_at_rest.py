@@ -99,7 +99,7 @@ def depth(
 
     found = find_depths(costs, model, 1.0 / nearest, report)
     check_still(found, name)
-    # Faces at an angle along the tilt change all inverse depths alike, which no event shows.
+    # Faces at an angle along the tilt look much like other depths, and are not looked for.
     wedge_std = calibration.uncertainty.get("wedge_x", 0.0)
     std = np.hypot(found.std, inverse_depth_by_wedge(model) * wedge_std)
     seen = found.count >= LEAST_PAIRS

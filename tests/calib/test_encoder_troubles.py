@@ -137,6 +137,11 @@ def test_an_index_shows_counts_that_were_lost_gradually() -> None:
     assert step.last_us - step.first_us < 84_000
 
 
+@pytest.mark.parametrize("within_us", [6_000, 10_000])
+def test_counts_that_are_lost_over_several_samples_are_no_step_of_them(within_us: int) -> None:
+    assert lost_counts(samples(steady(), 100, index=False, within_us=within_us)) == ()
+
+
 def test_two_losses_are_two_steps() -> None:
     once = samples(steady(), 100, index=True)
     twice = replace(once, angle=once.angle + 0.1 * (once.t > 700_000))

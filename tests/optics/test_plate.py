@@ -561,6 +561,42 @@ class FlatFarAway(KnownPhases):
         return self.count * np.tanh((self.phases(model) - self.truth) / 0.05)
 
 
+@pytest.mark.parametrize(
+    ("fov_deg", "moved", "left", "corner"),
+    [(30.0, 0.172, 0.014, 0.090), (60.0, 0.130, 0.036, 0.176)],
+)
+def test_an_angle_along_the_tilt_looks_much_like_other_depths(
+    fov_deg: float, moved: float, left: float, corner: float
+) -> None:
+    """The how-to states by how much 1 arcmin moves points [px rms], what other depths leave, and these depths [1/m]."""
+    camera = amiwarp.Camera.from_fov(320, 240, math.radians(fov_deg))
+    model = amiwarp.PlateModel(camera, amiwarp.Plate(0.01, math.radians(45.0)), 0.3, 2.0)
+    x, y = np.meshgrid(np.linspace(4.0, 315.0, 13), np.linspace(4.0, 235.0, 10))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    theta = np.arange(24) * (math.tau / 24)
+
+    def orbits(model: amiwarp.PlateModel, inverse_depth: float = 2.0) -> np.ndarray:
+        xy = np.repeat(pixels, len(theta), axis=0)
+        at = np.full(len(xy), inverse_depth)
+        places = model.compensate_at(xy, np.tile(theta, len(pixels)), at)
+        places = places.reshape(len(pixels), len(theta), 2)
+        return np.asarray(places - places.mean(axis=1, keepdims=True))
+
+    def rms(away: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.sum(away**2, axis=-1))))
+
+    change = orbits(replace(model, wedge=(ARCMIN, 0.0))) - orbits(model)
+    by_depth = (orbits(model, 2.01) - orbits(model)) / 0.01
+    depths = np.sum(change * by_depth, axis=(1, 2)) / np.sum(by_depth**2, axis=(1, 2))
+    rest = change - depths[:, None, None] * by_depth
+    assert rms(change) == pytest.approx(moved, abs=1e-3)
+    assert rms(rest) == pytest.approx(left, abs=1e-3)
+    assert float(np.abs(depths).min()) == pytest.approx(
+        inverse_depth_by_wedge(model) * ARCMIN, abs=1e-3
+    )
+    assert float(np.abs(depths).max()) == pytest.approx(corner, abs=1e-3)
+
+
 @pytest.mark.parametrize("truth", [0.16, -0.16, 0.4])
 def test_the_search_for_the_phase_does_not_go_to_and_fro(
     calibration: amiwarp.Calibration, monkeypatch: pytest.MonkeyPatch, truth: float
