@@ -36,8 +36,9 @@ def test_example_runs(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    if "import torch" in example.read_text():
-        pytest.importorskip("torch")
+    for module in ("torch", "newton", "mujoco_warp"):
+        if f"import {module}\n" in example.read_text():
+            pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
     if "__main__" in example.read_text():  # it starts processes, which import it
         command = [sys.executable, str(example)]
