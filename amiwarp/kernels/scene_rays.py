@@ -123,10 +123,20 @@ def find_flow(
 
 
 @wp.kernel
-def find_longest(flow: wp.array(dtype=wp.vec2), start: int, longest: wp.array(dtype=float)):
-    """Find the length of the longest vector; NaN does not count."""
-    length = wp.length(flow[start + wp.tid()])
-    if wp.isfinite(length):
+def find_longest(
+    flow: wp.array(dtype=wp.vec2),
+    counts: wp.array(dtype=wp.uint8),
+    size: int,
+    start: int,
+    longest: wp.array(dtype=float),
+):
+    """Find the length of the longest vector; NaN does not count.
+
+    ``counts``: 1 for each camera whose vectors count. ``size``: number of vectors of a camera.
+    """
+    i = start + wp.tid()
+    length = wp.length(flow[i])
+    if wp.isfinite(length) and counts[i // size] == wp.uint8(1):
         wp.atomic_max(longest, 0, length)
 
 

@@ -7,6 +7,8 @@ from .renderer import Surfaces as Surfaces
 
 # Names that are in this room only, kept by hand: what people who add to it need.
 
+from .gym_observation import EventObservation as EventObservation
+from .gym_observation import EventVectorObservation as EventVectorObservation
 from .mujoco_camera import MujocoWarpEventCamera as MujocoWarpEventCamera
 from .mujoco_camera import MujocoWarpRenderer as MujocoWarpRenderer
 from .newton_camera import NewtonEventCamera as NewtonEventCamera

@@ -141,6 +141,7 @@ class EventCamera:
         self._levels = ImageLevels(shape, device)
         self._before: Any = None
         self._before_us = -1
+        self._fresh = np.zeros(cameras, bool)
         self._warned = False
         self.images: Any = None
         """Last luminance that the renderer gave, None at first."""
@@ -232,12 +233,18 @@ class EventCamera:
                 at_us = begin_us + (t_us - begin_us) * k // count
             seen = scene if begin_us < 0 else self.renderer.between(before, scene, k / count)
             self.images = self.renderer.luminance(seen, self.rays(at_us))
+            if self._fresh.any():
+                # They start at the last picture, the state itself: those before show the way to it
+                self._sensor.reset(self._fresh)
             levels = self._levels.convert(self.images, ImageEncoding.LINEAR)
             parts.append(self._sensor.step(levels.reshape(shape), at_us))
         self._before = scene
         self._before_us = t_us
         self.pictures = count
-        return parts[0] if count == 1 else _joined(parts, self.renderer.device)
+        if count > 1:
+            parts = [_joined(parts, self._fresh, self.renderer.device)]
+        self._fresh[:] = False
+        return parts[0]
 
     def _number(self, before: Any, after: Any, t_us: int) -> int:
         """Return the number of pictures from the state before to the one at a time."""
@@ -273,7 +280,9 @@ class EventCamera:
         if flow is None:
             return 0.0
         longest = wp.zeros(1, dtype=float, device=self.renderer.device)
-        launch(scene_rays.find_longest, flow.size, [flow], [longest], device=flow.device)
+        counts = wp.array(~self._fresh, dtype=wp.uint8, device=flow.device)
+        inputs = [flow, counts, flow.size // len(self._fresh)]
+        launch(scene_rays.find_longest, flow.size, inputs, [longest], device=flow.device)
         return float(longest.numpy()[0])
 
     def _flow(self, before: Any, after: Any, writer: RayWriter) -> wp.array | None:
@@ -378,24 +387,23 @@ class EventCamera:
         poses[:, 3:] = np.stack([w, z, -y, -x], axis=1)
         return poses
 
-    def reset(self, which: Any = None, state: Any = None) -> None:
-        """Start cameras anew at their next pictures, as :meth:`amiwarp.EventSensor.reset` does.
+    def reset(self, which: Any = None) -> None:
+        """Start cameras anew at the next state, after the simulator has reset their worlds.
 
         Parameters
         ----------
         which : int or array_like, optional
-            Number of a camera, or numbers of several cameras, shape (k,), or truth values, shape (cameras,). By
-            default, all cameras: then the time starts anew, too.
-        state : object, optional
-            State of the simulator in which these worlds have been reset, at the time of the last state. Without it, the
-            next pictures are drawn on the way from where bodies were before.
+            Number of a camera, or numbers of several cameras, shape (k,), or truth values, shape (cameras,). These
+            cameras have no events in the next step, and what jumps before them does not count as movement. By default,
+            all cameras: then the time starts anew, too.
         """
         self._sensor.reset(which)
         if which is None:
             self._before = None
             self._before_us = -1
-        elif state is not None and self._before_us >= 0:
-            self._before = self.renderer.snapshot(state)
+            self._fresh[:] = False
+        else:
+            self._fresh[np.asarray(which)] = True
 
     def recording(
         self,
@@ -521,9 +529,12 @@ def _start_angles(start: ArrayLike, cameras: int, angles: int) -> NDArray[np.flo
 
 
 def _joined(
-    parts: Sequence[tuple[DeviceEvents, Windows]], device: Any
+    parts: Sequence[tuple[DeviceEvents, Windows]], fresh: NDArray[np.bool_], device: Any
 ) -> tuple[DeviceEvents, Windows]:
-    """Join the events of successive steps, each sorted by camera, into one that is."""
+    """Join the events of successive steps, each sorted by camera, into one that is.
+
+    ``fresh``: whether each camera starts in the last one.
+    """
     counts = np.array([windows.stop - windows.start for _, windows in parts])
     of_camera = counts.sum(axis=0)
     edges = np.concatenate([[0], np.cumsum(of_camera)])
@@ -548,7 +559,7 @@ def _joined(
     windows = Windows(
         start=edges[:-1].astype(np.int64),
         stop=edges[1:].astype(np.int64),
-        t_start=parts[0][1].t_start,
+        t_start=np.where(fresh, parts[-1][1].t_start, parts[0][1].t_start),
         t_end=parts[-1][1].t_end,
     )
     return DeviceEvents(*(getattr(columns, name) for name in NAMES)), windows

@@ -67,6 +67,8 @@ class NewtonRenderer(Renderer):
         """Newton's settings of the pictures. The number of rays of a pixel sets ``anti_aliasing``."""
         self._modes = camera.AntiAliasing
         self._drawn = model.state()
+        self._mounted = wp.empty_like(self._pose)
+        self._graphs: dict[tuple[int, ...], Any] = {}
         self._colours: wp.array | None = None
         self._no_shape = int(camera.ClearData().clear_shape_index)
 
@@ -217,19 +219,33 @@ class NewtonRenderer(Renderer):
         self._prepare(scene)
         several = rays.samples > 1
         self.config.anti_aliasing = self._modes.SSAA if several else self._modes.NONE
-        places = self.cameras_at(scene)
-        views = [slice(0, self.cameras)]
-        if rays.bundles > 1:
-            views = [slice(k, k + 1) for k in range(self.cameras)]
-        for view in views:
-            self.sensor.update(
-                self._drawn,
-                places[view],
-                rays.bundle(view.start),
-                world_indices=self._world[view],
-                render_config=self.config,
-                **{name: image[view] for name, image in images.items()},
-            )
+        wp.copy(self._mounted, self.cameras_at(scene))
+        if rays.bundles == 1:
+            self._draw(slice(0, self.cameras), rays, images)
+            return
+        # A launch for each camera, which CUDA records the first time and later repeats at once
+        key = (rays.values.ptr, *(image.ptr for image in images.values()))
+        if key in self._graphs and self.device.is_cuda:
+            wp.capture_launch(self._graphs[key])
+            return
+        for k in range(self.cameras):
+            self._draw(slice(k, k + 1), rays, images)
+        if self.device.is_cuda:
+            with wp.ScopedCapture(self.device, force_module_load=False) as capture:
+                for k in range(self.cameras):
+                    self._draw(slice(k, k + 1), rays, images)
+            self._graphs = {key: capture.graph}
+
+    def _draw(self, views: slice, rays: Rays, images: dict[str, Any]) -> None:
+        """Draw images of successive cameras by the rays of the first one."""
+        self.sensor.update(
+            self._drawn,
+            self._mounted[views],
+            rays.bundle(views.start),
+            world_indices=self._world[views],
+            render_config=self.config,
+            **{name: image[views] for name, image in images.items()},
+        )
 
     def _prepare(self, scene: NewtonScene) -> None:
         """Take the scene of a snapshot into the state that is drawn."""

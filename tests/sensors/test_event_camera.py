@@ -245,16 +245,25 @@ def test_too_many_pictures_are_not_drawn() -> None:
 
 
 def test_a_reset_world_starts_from_its_new_state() -> None:
-    renderer = Kept()
-    eyes = EventCamera(renderer, CAMERA, sensor=SENSOR, pictures=2)
-    eyes.step(0.0, 0)
-    eyes.step(1.0, 1000)
-    eyes.reset(0, state=3.0)
-    _, windows = eyes.step(3.0, 2000)
-    assert windows.start[0] == windows.stop[0]  # the first picture sets the reference
-    np.testing.assert_array_equal(renderer.drawn[-1], renderer.drawn[-2])
-    eyes.reset()
-    assert len(eyes.step(0.0, 0)[0]) == 0
+    """Its camera has no events in that step, and the other one the same as without the reset."""
+    both = [EventCamera(Kept(), CAMERA, sensor=SENSOR, pictures=3) for _ in range(2)]
+    for eyes in both:
+        eyes.step(0.0, 0)
+        eyes.step(1.0, 1000)
+    both[0].reset(0)
+    events, windows = both[0].step(3.0, 2000)
+    plain, others = both[1].step(3.0, 2000)
+    assert windows.start[0] == windows.stop[0]
+    assert windows.t_start.tolist() == [2000, 1000]
+    same(
+        events[int(windows.start[1]) : int(windows.stop[1])],
+        plain[int(others.start[1]) : int(others.stop[1])],
+    )
+    assert len(events) > 20
+    _, windows = both[0].step(3.5, 3000)
+    assert (windows.stop > windows.start).all()
+    both[0].reset()
+    assert len(both[0].step(0.0, 0)[0]) == 0
 
 
 def test_a_recording_has_the_true_encoder_and_can_be_compensated(tmp_path: Any) -> None:
@@ -386,3 +395,8 @@ def test_the_number_of_pictures_follows_the_scene() -> None:
     eyes.step(0.0, 0)
     eyes.step(0.1, 10_000)
     assert eyes.pictures == math.ceil(0.05 * CAMERA.fx / 0.25)
+    eyes.reset(0)
+    eyes.step(5.0, 20_000)  # a jump
+    assert eyes.pictures == 1
+    eyes.step(5.1, 30_000)
+    assert eyes.pictures > 1
