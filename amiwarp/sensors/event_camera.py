@@ -403,7 +403,8 @@ class EventCamera:
             self._before_us = -1
             self._fresh[:] = False
         else:
-            self._fresh[np.asarray(which)] = True
+            chosen = np.asarray(which).reshape(-1)
+            self._fresh[chosen if chosen.dtype == bool else chosen.astype(np.int64)] = True
 
     def recording(
         self,

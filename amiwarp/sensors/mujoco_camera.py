@@ -178,7 +178,8 @@ class MujocoWarpRenderer(Renderer):
             factor = 1.0 / (LARGEST_BYTE * SAMPLES**2)
             return look_up(sums.reshape(shape), self._wide, rays, self.AXES, factor)
         pictures = wp.empty(shape, dtype=wp.vec3, device=self.device)
-        self._library.get_rgb(self.context, 0, pictures)
+        with wp.ScopedDevice(self.device):
+            self._library.get_rgb(self.context, 0, pictures)
         return look_up(pictures, self._wide, rays, self.AXES)
 
     def surfaces(self, scene: MujocoScene, rays: Rays) -> Surfaces:
@@ -199,10 +200,11 @@ class MujocoWarpRenderer(Renderer):
         self._render(scene)
         size = (self.cameras, self._wide.height, self._wide.width)
         depth = wp.empty(size, dtype=float, device=self.device)
-        # Depth is cut off at the scale
-        self._library.get_depth(self.context, 0, FARTHEST, depth)
         hit = wp.empty(size, dtype=wp.vec2i, device=self.device)
-        self._library.get_segmentation(self.context, 0, hit)
+        with wp.ScopedDevice(self.device):
+            # Depth is cut off at the scale
+            self._library.get_depth(self.context, 0, FARTHEST, depth)
+            self._library.get_segmentation(self.context, 0, hit)
         shape = (self.cameras, rays.values.shape[0] // rays.bundles, rays.values.shape[1])
         distance = wp.empty(shape, dtype=float, device=self.device)
         number = wp.empty(shape, dtype=int, device=self.device)

@@ -13,7 +13,13 @@ from tests import ROOT
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
-SLOW_EXAMPLES = ("train_from_files", "save_for_paraview", "event_sensors")
+SLOW_EXAMPLES = (
+    "train_from_files",
+    "save_for_paraview",
+    "event_sensors",
+    "event_camera_in_newton",
+    "event_camera_in_mujoco",
+)
 """Examples that take many seconds."""
 
 
