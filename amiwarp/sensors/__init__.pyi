@@ -13,5 +13,9 @@ from .mujoco_camera import MujocoWarpEventCamera as MujocoWarpEventCamera
 from .mujoco_camera import MujocoWarpRenderer as MujocoWarpRenderer
 from .newton_camera import NewtonEventCamera as NewtonEventCamera
 from .newton_camera import NewtonRenderer as NewtonRenderer
+from .versions import DISTRIBUTIONS as DISTRIBUTIONS
+from .versions import EXTRAS as EXTRAS
+from .versions import TESTED as TESTED
+from .versions import simulator as simulator
 from .wide_view import look_up as look_up
 from .wide_view import wide_camera as wide_camera

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import amiwarp
-from amiwarp.sensors.versions import DISTRIBUTIONS, EXTRAS, TESTED, simulator
+from amiwarp.sensors import DISTRIBUTIONS, EXTRAS, TESTED, simulator
 from tests import ROOT
 
 
