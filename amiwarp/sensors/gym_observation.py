@@ -72,13 +72,18 @@ class _Observer:
         self._eyes.step(self._state(env), 0)
         return self.zeros
 
-    def advance(self, env: Any, fresh: NDArray[np.bool_] | None = None) -> wp.array:
-        """Return the tensors of the events since the state before. ``fresh``: cameras whose worlds were reset."""
+    def advance(
+        self, env: Any, fresh: NDArray[np.bool_] | None = None, step_us: int | None = None
+    ) -> wp.array:
+        """Return the tensors of the events since the state before. ``fresh``: cameras whose worlds were reset.
+
+        ``step_us``: time since then, by default a step of the environment.
+        """
         if self._t_us > TIME_LIMIT - 2 * self._step_us:
             raise AmiwarpError("the environment ran longer than the clock; reset it")
         if fresh is not None and fresh.any():
             self._eyes.reset(fresh)
-        self._t_us += self._step_us
+        self._t_us += self._step_us if step_us is None else step_us
         return self._tensor(*self._eyes.step(self._state(env), self._t_us))
 
     def _tensor(self, events: DeviceEvents, windows: Windows) -> wp.array:
@@ -273,13 +278,15 @@ class EventVectorObservation(gymnasium.vector.VectorWrapper):  # type: ignore[mi
         tuple
             The tensors, and the environments' information.
         """
-        own, info = self.env.reset(seed=seed, options=options)
+        # Gymnasium takes the mask out of the options
         mask = None if options is None else options.get("reset_mask")
+        own, info = self.env.reset(seed=seed, options=options)
         self._done[:] = False
         if mask is None:
             return self._observation(self._observer.start(self.unwrapped), own), info
         fresh = np.asarray(mask, bool)
-        return self._observation(self._observer.advance(self.unwrapped, fresh), own), info
+        # No time passes for the other environments; the sensors' clock needs a microsecond
+        return self._observation(self._observer.advance(self.unwrapped, fresh, 1), own), info
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step the environments, and observe their events.

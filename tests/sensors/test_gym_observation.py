@@ -132,6 +132,7 @@ def test_some_environments_are_reset_by_a_mask() -> None:
     found, _ = envs.reset(options={"reset_mask": np.array([True, False])})
     assert found.shape == (2, 8, 12)
     assert not found[0].any()
+    assert envs._observer._t_us == STEP_US + 1
     after = envs.step(np.array([1, 1]))[0]
     assert after[0].any()
     assert after[1].any()
