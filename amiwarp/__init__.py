@@ -28,6 +28,7 @@ GROUPS = (
     "plotting",
     "reconstruction",
     "results",
+    "sensors",
     "simulation",
     "studies",
     "viewer",

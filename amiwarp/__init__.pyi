@@ -13,6 +13,7 @@ from . import optics as optics
 from . import plotting as plotting
 from . import reconstruction as reconstruction
 from . import results as results
+from . import sensors as sensors
 from . import simulation as simulation
 from . import studies as studies
 from . import viewer as viewer
@@ -178,6 +179,10 @@ from .results.depth_map import DepthMap as DepthMap
 from .results.parameters import ParameterSpace as ParameterSpace
 from .results.pixel_map import PixelMap as PixelMap
 from .results.search_stage import SearchStage as SearchStage
+from .sensors.event_camera import EventCamera as EventCamera
+from .sensors.rays import Rays as Rays
+from .sensors.renderer import Renderer as Renderer
+from .sensors.renderer import Surfaces as Surfaces
 from .simulation.choices import Seeing as Seeing
 from .simulation.description import Frames as Frames
 from .simulation.description import Scene as Scene

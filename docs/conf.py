@@ -54,8 +54,8 @@ python_display_short_literal_types = True
 toc_object_entries_show_parents = "hide"
 
 api_rooms = [
-    "optics", "events", "io", "imaging", "simulation", "calib", "compensation", "reconstruction", "translation", "live",
-    "plotting", "studies", "viewer",
+    "optics", "events", "io", "imaging", "simulation", "sensors", "calib", "compensation", "reconstruction",
+    "translation", "live", "plotting", "studies", "viewer",
 ]  # fmt: skip
 
 repository_pages = {

@@ -29,7 +29,10 @@ NOT_CALLED = {
     "PhaseImage",
     "PhaseSums",
     "PhaseUpdate",
+    "Rays",
+    "Renderer",
     "RingPart",
+    "Surfaces",
     "Triggers",
 }
 """Public classes that users catch, receive, derive from or annotate with, and do not make."""
@@ -42,6 +45,17 @@ def _ring() -> aw.PhaseRing:
     ring = aw.PhaseRing(4, 3)
     ring.add(EVENTS, TURNED)
     return ring
+
+
+class Black(aw.Renderer):
+    """Renderer that sees nothing."""
+
+    def luminance(self, scene: Any, rays: aw.Rays) -> Any:
+        return np.zeros((2, 3, 4), np.float32)
+
+
+def _eyes() -> aw.EventCamera:
+    return aw.EventCamera(Black(2, "cpu"), CAMERA, pictures=1)
 
 
 def _new(suffix: str) -> Callable[[], str]:
@@ -456,6 +470,12 @@ OWN: dict[str, dict[str, Any]] = {
     "Scene": {"frames": SCENE.frames},
     "Scene.from_picture": {"picture": np.ones((4, 4), np.float32)},
     "SensorModel.preset": {"name": "gen4"},
+    "EventCamera": {"renderer": Black(2, "cpu")},
+    "EventCamera.angles": {"t_us": 0},
+    "EventCamera.flow_to": {"state": None},
+    "EventCamera.rays": {"t_us": 0},
+    "EventCamera.recording": {"steps": [_eyes().step(None, 0)]},
+    "EventCamera.step": {"state": None, "t_us": 0},
     "EventSensor": {"cameras": 2},
     "EventSensor.step": {"images": np.zeros((2, 3, 4), np.float32), "t_us": 0},
     "PictureFolder": _all(FOLDER),
@@ -576,6 +596,7 @@ MADE: dict[str, Callable[[], Any]] = {
     "PhaseCamera": lambda: aw.PhaseCamera(MODEL, _stream()),
     "PhaseRing": _ring,
     "EncoderStream": _stream,
+    "EventCamera": _eyes,
     "EventSensor": lambda: aw.EventSensor(2, 3, 4),
     "CornerDetector": lambda: aw.CornerDetector((4, 3)),
     "RecordingWriter": _writer,
@@ -606,6 +627,9 @@ REFUSED = {
     "plan_dataset": "no such file",
     "make_dataset": "no such file",
     "evaluate": "unknown evaluation",
+    "EventCamera.camera_poses": "call step first",
+    "EventCamera.flow_to": "call step first",
+    "EventCamera.surfaces": "call step first",
     "view": "in a notebook",
 }
 """Calls that would take minutes, or need a file or a browser: what they say to the arguments above."""

@@ -36,6 +36,7 @@ from .worlds.world_scene import WorldScene as WorldScene
 
 # Names that are in this room only, kept by hand: what people who add to it need.
 
+from .image_levels import ImageEncoding as ImageEncoding
 from .picture_light import DARK as DARK
 from .picture_light import linear_luminance as linear_luminance
 from .picture_opening import open_pictures as open_pictures

@@ -10,7 +10,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_columns import first_beyond, import_array
 from amiwarp.events.device_events import NAMES, DeviceEvents, wait
 from amiwarp.imaging.windows import Windows
 from amiwarp.kernels import (
@@ -28,10 +27,11 @@ from amiwarp.kernels.camera_pixels import Cameras
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.schema.calls import guarded
 from amiwarp.simulation.engine import LATEST_US, sensor_params
+from amiwarp.simulation.image_levels import ImageEncoding, ImageLevels
 from amiwarp.simulation.key_buffer import KeyBuffer, sort_keys
 from amiwarp.simulation.readout import bus_of, row_scan
 from amiwarp.simulation.sensor_model import SensorModel
-from amiwarp.validation import TIME_LIMIT, array, instance, on_gpu, packed, whole
+from amiwarp.validation import TIME_LIMIT, array, instance, whole
 
 MOST_CAMERAS = 1 << 16
 """Largest number of cameras of an :class:`EventSensor`."""
@@ -39,8 +39,6 @@ MOST_PIXELS = 1 << 24
 """Largest number of pixels of all cameras of an :class:`EventSensor`, whose steps then take up to 65 ms."""
 EVENTS_PER_PIXEL = 4
 """Initial capacity of the event buffer of a step [events per pixel]. The buffer grows if necessary."""
-LARGEST_LEVEL = 100.0
-"""Largest magnitude of a log intensity."""
 LARGEST_SEED = (1 << 31) - 1
 
 
@@ -113,6 +111,8 @@ class EventSensor:
                 "give fewer cameras at a time"
             )
         self._device = wp.get_device(device)
+        contrast = min(self._model.contrast_on, self._model.contrast_off)
+        self._images = ImageLevels(self._shape, self._device, contrast)
         self._cameras = Cameras()
         self._cameras.pixels = self._pixels
         self._cameras.seed = wp.array(_seeds(seed, n), dtype=int, device=self._device)
@@ -155,7 +155,9 @@ class EventSensor:
         layout.part = camera + bits_of_camera
         return layout
 
-    def step(self, images: Any, t_us: int) -> tuple[DeviceEvents, Windows]:
+    def step(
+        self, images: Any, t_us: int, encoding: str = ImageEncoding.LOG
+    ) -> tuple[DeviceEvents, Windows]:
         """Advance all cameras to their next images, and return the events since the images before.
 
         The first images, and those after :meth:`reset`, set the reference of each pixel and give no events. Events
@@ -165,13 +167,17 @@ class EventSensor:
         Parameters
         ----------
         images : array
-            Natural log intensity of each pixel, float32, shape (cameras, height, width), for one camera also (height,
-            width), of Warp, PyTorch, CuPy, JAX or any other library with DLPack. Arrays in host memory are copied to a
-            GPU. Arrays are not modified.
-            The simulator's scale is ``log(luminance + 0.02)`` with white at 1; the bandwidth and the noise of the model
-            depend on it, thresholds do not.
+            Log intensity, or luminance by ``encoding``, shape (cameras, height, width), for one camera also (height,
+            width). Luminance may have a last axis of red, green and blue, or of these and a fourth value, which does
+            not count. Of Warp, PyTorch, CuPy, JAX or any other library with DLPack, with any strides. Arrays in host
+            memory are copied to a GPU. Arrays are not modified.
         t_us : int
             Time of the images [us], after the time of the images before.
+        encoding : {"log", "linear", "srgb8"}
+            What the values are, see :class:`amiwarp.simulation.ImageEncoding`: the natural logarithm of the luminance
+            plus 0.02, white being ``log(1.02)``; linear luminance with white at 1; or 8-bit sRGB values. 0.02 is the
+            simulator's stray light and dark current: the bandwidth and the noise of the model depend on it,
+            thresholds do not.
 
         Returns
         -------
@@ -185,10 +191,16 @@ class EventSensor:
         AmiwarpError
             If the images have another shape, type or device, or a value that is not within -100 .. 100; if the time
             does not increase, or the step is too long for the number of pixels. The state then stays as it was.
+
+        Warns
+        -----
+        UserWarning
+            Once, for luminance: if 8-bit images are stairs of over a tenth of a threshold, or if over 1 % of the
+            pixels change by over 4 thresholds from one image to the next, whose events then come in bands.
         """
         t_us = whole(t_us, "t_us", 0, TIME_LIMIT - 1, " us")
         length = self._length(t_us)
-        levels = self._levels(images)
+        levels = self._images.convert(images, encoding)
         keys = self._generate(levels, t_us, length)
         keys, edges = self._arrange(keys, length)
         found, edges = self._read(keys, edges)
@@ -236,6 +248,7 @@ class EventSensor:
             )
         chosen = chosen.astype(np.int64)
         self._starts[chosen] = 1
+        self._images.restart()
         free = self._free.numpy()
         free[chosen] = 0
         self._free = wp.array(free, dtype=wp.int64, device=self._device)
@@ -256,41 +269,6 @@ class EventSensor:
                 f"1 .. {longest} us; give a later time, images in between, or fewer cameras"
             )
         return length
-
-    def _levels(self, images: Any) -> wp.array:
-        """Return the images as one row of levels on the device, checked."""
-        what = f"float32 of shape {self._shape}, log intensities of all cameras"
-        if on_gpu(images):
-            levels = import_array(images, "images")
-            kind = wp.dtype_to_numpy(levels.dtype)
-            where = levels.device
-        else:
-            levels = packed(array(images, "images"))
-            kind = levels.dtype
-            where = self._device
-        if self._shape[0] == 1 and levels.shape == self._shape[1:]:
-            levels = levels.reshape(self._shape)
-        if kind != np.float32 or levels.shape != self._shape:
-            raise AmiwarpError(
-                f"images are {np.dtype(kind)} of shape {levels.shape}; expected {what}"
-            )
-        if where != self._device:
-            raise AmiwarpError(
-                f"images are on {where}, the sensor is on {self._device}; move the images"
-            )
-        if isinstance(levels, np.ndarray):
-            # An axis of one camera, added by [None], has a stride that Warp cannot reshape
-            flat = levels.reshape(-1)
-            levels = wp.array(flat, dtype=float, device=self._device, copy=not self._device.is_cpu)
-        levels = levels.reshape((1, -1))
-        place = first_beyond(levels[0], LARGEST_LEVEL)
-        if place < levels.size:
-            camera, row, column = (int(k) for k in np.unravel_index(place, self._shape))
-            raise AmiwarpError(
-                f"the image of camera {camera} has log intensity {levels[0].numpy()[place]} at row {row}, column "
-                f"{column}; expected -{LARGEST_LEVEL:g} .. {LARGEST_LEVEL:g}; take the log of luminance + 0.02"
-            )
-        return levels
 
     def _generate(self, levels: wp.array, t_us: int, length: int) -> wp.array:
         """Simulate the pixels over a step. Return the keys of events, with those carried over, unsorted."""

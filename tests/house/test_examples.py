@@ -13,7 +13,13 @@ from tests import ROOT
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
-SLOW_EXAMPLES = ("train_from_files", "save_for_paraview", "event_sensors")
+SLOW_EXAMPLES = (
+    "train_from_files",
+    "save_for_paraview",
+    "event_sensors",
+    "event_camera_in_newton",
+    "event_camera_in_mujoco",
+)
 """Examples that take many seconds."""
 
 
@@ -36,8 +42,9 @@ def test_example_runs(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    if "import torch" in example.read_text():
-        pytest.importorskip("torch")
+    for module in ("torch", "newton", "mujoco_warp"):
+        if f"import {module}\n" in example.read_text():
+            pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
     if "__main__" in example.read_text():  # it starts processes, which import it
         command = [sys.executable, str(example)]

@@ -38,6 +38,7 @@ INNER = {
     "rig": 1,
     "rig_world": 1,
     "schema": 7,
+    "sensors": 2,
     "simulation": 67,
     "studies": 222,
     "viewer": 169,

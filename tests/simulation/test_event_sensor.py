@@ -307,8 +307,8 @@ def test_images_of_any_strides_are_taken(device: str) -> None:
 @pytest.mark.parametrize(
     ("images", "t_us", "message"),
     [
-        (np.zeros((3, 8, 10)), 10, "images are float64"),
-        (np.zeros((8, 10), np.float32), 10, r"shape \(8, 10\); expected float32 of shape \(3, 8, 10\)"),
+        (np.zeros((3, 8, 10), np.uint8), 10, "images are uint8.*give encoding='srgb8'"),
+        (np.zeros((8, 10), np.float32), 10, r"shape \(8, 10\); expected .* of shape \(3, 8, 10\)"),
         (np.full((3, 8, 10), np.nan, np.float32), 10, "camera 0 has log intensity nan at row 0, column 0"),
         (np.where(np.arange(240).reshape(3, 8, 10) == 95, -np.inf, 0).astype(np.float32), 10,
          "camera 1 has log intensity -inf at row 1, column 5.*take the log of luminance"),
