@@ -189,6 +189,7 @@ from .simulation.description import Scene as Scene
 from .simulation.description import SimulationValues as SimulationValues
 from .simulation.encoder_model import EncoderModel as EncoderModel
 from .simulation.event_sensor import EventSensor as EventSensor
+from .simulation.imu_model import ImuModel as ImuModel
 from .simulation.motion import CameraMotion as CameraMotion
 from .simulation.motion import Mirror as Mirror
 from .simulation.motion import PrismMotion as PrismMotion

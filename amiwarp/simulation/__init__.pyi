@@ -6,14 +6,15 @@ from .description import Scene as Scene
 from .description import SimulationValues as SimulationValues
 from .encoder_model import EncoderModel as EncoderModel
 from .event_sensor import EventSensor as EventSensor
+from .imu_model import ImuModel as ImuModel
 from .motion import CameraMotion as CameraMotion
 from .motion import Mirror as Mirror
 from .motion import PrismMotion as PrismMotion
 from .motion import Steerer as Steerer
 from .motion import Vibration as Vibration
 from .pictures import PictureFolder as PictureFolder
-from .pictures import Pictures as Pictures
 from .pictures import PictureStack as PictureStack
+from .pictures import Pictures as Pictures
 from .pictures import VideoFile as VideoFile
 from .sensor_model import SensorModel as SensorModel
 from .simulator import Simulation as Simulation

@@ -24,6 +24,7 @@ from amiwarp.schema.calls import guarded
 from amiwarp.schema.type_names import not_called
 from amiwarp.simulation.choices import Seeing
 from amiwarp.simulation.encoder_model import EncoderModel
+from amiwarp.simulation.imu_model import ImuModel
 from amiwarp.simulation.motion import (
     LONGEST_S,
     CameraMotion,
@@ -182,6 +183,8 @@ class SimulationValues:
     """Description of what the scene was made from; it becomes part of the recording's metadata."""
     pixels: PixelMap | None = None
     """Thresholds and hot and dead pixels; None to draw them by the sensor's model. Unknown thresholds are drawn."""
+    imu: ImuModel | None = None
+    """Gyroscope and accelerometer that move with the camera; None for a recording without."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.scene, WorldScene):
@@ -216,6 +219,8 @@ class SimulationValues:
             kinds["prism"] = Prism
         if self.encoder_model is not None:
             kinds["encoder_model"] = EncoderModel
+        if self.imu is not None:
+            kinds["imu"] = ImuModel
         for name, kind in kinds.items():
             instance(getattr(self, name), kind, f"simulation's {name}")
 

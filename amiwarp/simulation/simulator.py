@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.events.device_events import DeviceEvents
 from amiwarp.events.encoder import Encoder
+from amiwarp.events.other_sensors import ImuSamples
 from amiwarp.events.recording import Events, MetadataValue, Recording
 from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
@@ -23,6 +24,7 @@ from amiwarp.simulation.description import Scene, SimulationValues
 from amiwarp.simulation.device_block import CollectedEvents, DeviceBlock
 from amiwarp.simulation.encoder_model import EncoderModel
 from amiwarp.simulation.engine import Engine
+from amiwarp.simulation.imu_model import ImuModel
 from amiwarp.simulation.motion import (
     CameraMotion,
     Commanded,
@@ -81,6 +83,20 @@ class Simulation(SimulationValues):
         if self.encoder_model is None:
             return None
         return self.encoder_model.sample(self.prism_motion, self.duration_us, self.seed)
+
+    def imu_samples(self) -> ImuSamples | None:
+        """Simulate the IMU.
+
+        Returns
+        -------
+        ImuSamples or None
+            Samples of gyroscope and accelerometer, or None without an IMU. A vibration of the camera is not among them.
+        """
+        if self.imu is None:
+            return None
+        if isinstance(self.scene, WorldScene):
+            return self.imu.follow(self.scene.trajectory, self.duration_s, seed=self.seed)
+        return self.imu.turn(self.camera_motion, self.duration_s, seed=self.seed)
 
     def truth_parameters(self) -> dict[str, float]:
         """Return the true values of the parameters of prism, encoder, camera motion and sensor.
@@ -213,8 +229,16 @@ class Simulation(SimulationValues):
         known = recorded.kept(self.truth_parameters(), of_events)
         camera = self.camera
         encoder = self.encoder()
-        prism = self._stored_prism
-        return Recording(events, camera, encoder, prism, known, self.metadata(), "simulation")
+        return Recording(
+            events,
+            camera,
+            encoder,
+            self._stored_prism,
+            known,
+            self.metadata(),
+            "simulation",
+            imu=self.imu_samples(),
+        )
 
     @property
     def _stored_prism(self) -> Prism | Plate | None:
@@ -266,6 +290,9 @@ class Simulation(SimulationValues):
             metadata=self.metadata(),
             overwrite=overwrite,
         ) as writer:
+            imu = self.imu_samples()
+            if imu is not None:
+                writer.append_imu(imu)
             for block, now_us in self._run_engine(None, progress):
                 writer.append(block.events(), truth=block.truth())
                 for frame in recorded.frames_before(now_us):
@@ -291,6 +318,7 @@ def simulate(
     pixels: PixelMap | None = None,
     encoder: EncoderModel | None = None,
     nominal_prism: Prism | Plate | None = None,
+    imu: ImuModel | None = None,
     seed: int = 0,
     device: str = "cpu",
     on_device: bool = False,
@@ -325,6 +353,8 @@ def simulate(
         Errors of the encoder.
     nominal_prism : Prism or Plate, optional
         The prism or plate stored with the recording; by default the true one.
+    imu : ImuModel, optional
+        Gyroscope and accelerometer that move with the camera; by default none.
     seed : int, optional
         Seed of all random numbers.
     device : str, optional
@@ -367,6 +397,7 @@ def simulate(
         pixels=pixels,
         encoder_model=encoder or EncoderModel(),
         nominal_prism=nominal_prism,
+        imu=imu,
         seed=seed,
         device=device,
     ).run(truth_hz=truth_hz, on_device=on_device, progress=progress)

@@ -708,6 +708,20 @@ def test_simulate_a_named_world(named: Path) -> None:
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 1000
 
 
+def test_simulate_an_imu(named: Path) -> None:
+    ok("simulate", "i.h5", "--world", "room", "--imu", "mpu6500", "--imu-hz", "500", *SHORT)
+    imu = amiwarp.open_recording("i.h5").imu
+    assert imu is not None
+    assert (len(imu), imu.rate_hz) == (21, 500.0)
+    for options, words in (
+        (("--imu-hz", "500"), "give --imu"),
+        (("--imu", "mpu9"), "bmi160"),
+    ):
+        result = run("simulate", "j.h5", "--world", "room", *options, *SHORT)
+        assert result.exit_code != 0
+        assert words in result.stderr
+
+
 def test_info_of_a_recording_without_truth_of_a_world(named: Path) -> None:
     source = amiwarp.MemoryEvents(amiwarp.Events.from_arrays([0, 1], [0, 0], [0, 1], [1, 1]), 4, 4)
     amiwarp.save_recording("old.h5", amiwarp.Recording(source, truth=amiwarp.Truth({"apex": 0.01})))

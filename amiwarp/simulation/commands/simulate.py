@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -29,6 +29,7 @@ from amiwarp.simulation.commands.rig_options import (
 )
 from amiwarp.simulation.commands.world_options import WorldOptions
 from amiwarp.simulation.description import Scene
+from amiwarp.simulation.imu_model import ImuModel
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.worlds.world_scene import BLUR_PX, WorldScene
 
@@ -101,6 +102,16 @@ def run_simulate(
         ),
     ] = None,
     encoder: EncoderModelOptions,
+    imu: Annotated[
+        str | None,
+        typer.Option(
+            help="Gyroscope and accelerometer to simulate with the camera: bmi160, mpu6500 or ideal. Default: none."
+        ),
+    ] = None,
+    imu_hz: Annotated[
+        float | None,
+        typer.Option(help="Samples of the IMU per second (Hz). Default: 200."),
+    ] = None,
     common: cli.Common,
 ) -> None:
     """Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth.
@@ -128,6 +139,7 @@ def run_simulate(
         nominal_prism=rig.build_nominal() if optic.optic is Optic.WEDGE else None,
         seed=common.seed,
         device=device,
+        imu=_imu(imu, imu_hz),
     )
     world.draw_preview(simulation)
     write(
@@ -136,6 +148,18 @@ def run_simulate(
         common,
         truth_hz=world.truth_hz,
     )
+
+
+def _imu(name: str | None, rate_hz: float | None) -> ImuModel | None:
+    """Return the IMU that the options describe."""
+    if name is None:
+        if rate_hz is not None:
+            raise AmiwarpError(
+                "--imu-hz is the rate of an IMU; give --imu, or remove --imu-hz", ErrorCode.OPTIONS
+            )
+        return None
+    model = ImuModel.preset(name)
+    return model if rate_hz is None else replace(model, rate_hz=rate_hz)
 
 
 def _scene(
