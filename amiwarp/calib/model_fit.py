@@ -259,7 +259,8 @@ def fit(
     """Fit the parameters of several models to the compensated coordinates ``target`` [px], shape (n, 2).
 
     Return the parameters and the remaining distance [px rms] of each model. The phase is fitted too, which removes a
-    constant lag. The displacement is nearly linear: one Gauss-Newton step is accurate to 0.00001 px.
+    constant lag. The displacement is nearly linear: one Gauss-Newton step is accurate to 0.00001 px. No space has a
+    free drift (``clock_offset`` or ``rpm``), which would turn the angles of ``sample``.
     """
     best = []
     models = []

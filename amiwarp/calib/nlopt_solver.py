@@ -125,8 +125,8 @@ def maximise(
     """
     import nlopt
 
-    names = LOCAL_ALGORITHMS if algorithm.startswith("LN_") else GLOBAL_ALGORITHMS
-    one_of(algorithm, names, "algorithm")
+    one_of(algorithm, (*GLOBAL_ALGORITHMS, *LOCAL_ALGORITHMS), "algorithm")
+    one_of(inner, LOCAL_ALGORITHMS, "inner algorithm")
     began = time.perf_counter()
     nlopt.srand(seed + 1)  # 0 would seed NLopt from the clock
     optimiser = _optimiser(
@@ -257,7 +257,6 @@ def _optimiser(
         optimiser.set_xtol_abs(np.full(n, tolerance))
         optimiser.set_initial_step(np.minimum(step, 0.45 * (high - low)))
     if "MLSL" in algorithm:
-        one_of(inner, LOCAL_ALGORITHMS, "algorithm")
         local = _optimiser(
             inner,
             low=low,

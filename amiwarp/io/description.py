@@ -27,6 +27,7 @@ ANGLES = (
     "apex",
     "amplitude",
     "phase",
+    "deflection",
     "plate_tilt",
     "direction",
     "fold",
@@ -36,12 +37,13 @@ ANGLES = (
     "second_phase",
     "second_direction",
 )
-"""True parameters of the optic that are angles."""
+"""True parameters of the optic that are angles. The models know the units of theirs, but would load Warp here."""
 
 ANGLE_PAIRS = (
     "tilt",
     "cylinder",
     "wobble",
+    "wedge",
     "backward",
     "roll",
     "second",

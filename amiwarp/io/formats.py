@@ -186,7 +186,7 @@ def detect_format(path: Path) -> Format:
 
     why_not = name_kind(head) or why_no_rows(head)
     if why_not:
-        raise AmiwarpError(f"{path}: {why_not}")
+        raise AmiwarpError(f"{path}: {why_not}", ErrorCode.FORMAT_UNKNOWN)
     known = ", ".join(member.value for member in Format)
     raise AmiwarpError(
         f"{path}: content is of no known format; expected one of {known}", ErrorCode.FORMAT_UNKNOWN

@@ -431,9 +431,12 @@ def count_pixels(s: Sorted, start: int, count: wp.array(dtype=int)):
 
 @wp.func
 def mirrored(i: int, n: int) -> int:
-    """Return the index ``i`` reflected about the centres of the outermost pixels of ``n``."""
+    """Return the index ``i`` reflected about the centres of the outermost pixels of ``n``.
+
+    On a sensor of one or two pixels, what is reflected beyond the other border becomes the border.
+    """
     j = wp.abs(i)
-    return wp.where(j < n, j, 2 * n - 2 - j)
+    return wp.clamp(wp.where(j < n, j, 2 * n - 2 - j), 0, n - 1)
 
 
 @wp.kernel

@@ -168,7 +168,8 @@ def time_events(
 ):
     """Compute the time of each event from the middle of the window [s]."""
     i = start + wp.tid()
-    time[i] = float(int(t[i] - middle)) * 1.0e-6
+    # The difference may exceed 32 bits, which hold 36 minutes.
+    time[i] = float(wp.float64(t[i] - middle) * wp.float64(1.0e-6))
 
 
 @wp.kernel

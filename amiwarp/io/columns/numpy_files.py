@@ -206,7 +206,8 @@ def _array_table(opened: Opened, name: str, hints: Hints) -> Table:
             return _fields_table(array, opened, name)
     if len(shape) != 2 or dtype.kind not in "iuf" or min(shape) > MOST_COLUMNS:
         raise AmiwarpError(
-            f"{name} is {dtype} of shape {shape}; expected a table (n, 4) of t, x, y and p, or fields"
+            f"{name} is {dtype} of shape {shape}; expected a table (n, 4) of t, x, y and p, or fields",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     has_row_per_event = shape[1] <= MOST_COLUMNS
     count, width = shape if has_row_per_event else shape[::-1]

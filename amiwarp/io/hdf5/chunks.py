@@ -115,8 +115,8 @@ def decode(stored: Sequence[bytes], out: NDArray[Any]) -> bool:
 
 def _decompress(frame: memoryview, out: NDArray[Any]) -> bool:
     """Decompress a Blosc frame into ``out``. Return whether it has the right size and can be decoded."""
-    # After four bytes, the header of 16 bytes holds the sizes before and after compression. Blosc itself
-    # would trust them. A frame that is shorter than its header disagrees with them.
+    # The header of 16 bytes holds the size before compression at 4, the block size at 8 and the size after
+    # compression at 12. Blosc itself would trust them. A frame that is shorter than its header disagrees with them.
     decoded_size = int.from_bytes(frame[4:8], "little")
     encoded_size = int.from_bytes(frame[12:16], "little")
     if decoded_size != out.nbytes or encoded_size != len(frame):

@@ -115,7 +115,7 @@ def find_form(path: Path, head: bytes) -> TextForm:
     why = why_no_rows(head)
     if not why:
         why = f"line {number + 1} holds no numbers; expected 't x y p', or names of columns before them"
-    raise AmiwarpError(f"{path}: {why}")
+    raise AmiwarpError(f"{path}: {why}", ErrorCode.FORMAT_UNKNOWN)
 
 
 def _form_of_rows(path: Path, number: int, lines: Sequence[bytes]) -> TextRow:

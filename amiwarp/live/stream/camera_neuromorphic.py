@@ -122,6 +122,7 @@ class NeuromorphicSource(CameraSource):
         packet_us: int = 1000,
     ) -> None:
         super().__init__(request, say, packet_us=packet_us)
+        self.lost = 0
         found = _find_camera(request.which)
         drivers = import_module("neuromorphic_drivers")
         model = found.name.value
@@ -191,6 +192,7 @@ class NeuromorphicSource(CameraSource):
             )
 
     def _count_lost(self, ring: Any) -> None:
+        """Note how many USB packets are lost so far, and say when the first ones are."""
         lost = self.lost if ring is None else int(ring.dropped_packets)
         if lost and not self.lost:
             self._say(f"{self.name}: this computer is too slow: USB packets with events are lost")

@@ -76,8 +76,8 @@ class ReturningSource:
         self.prism = source.prism
         self.encoders = source.encoders
         self.metadata = getattr(source, "metadata", {})
-        self.lost = 0
-        """Number of USB packets that were lost, see :attr:`CameraSource.lost`."""
+        self.lost: int | None = getattr(source, "lost", 0)
+        """Number of USB packets that were lost, see :attr:`CameraSource.lost`; 0 for sockets."""
         self.problem: str | None = None
         """How the stream ended, in one line; None if it ended with its end message."""
         self.returns = 0
@@ -121,7 +121,9 @@ class ReturningSource:
         unchecked = fresh
         lost_before = self.lost
         for packet in self._source.packets():
-            self.lost = lost_before + getattr(self._source, "lost", 0)
+            if isinstance(self._source, CameraSource):
+                lost = self._source.lost
+                self.lost = None if lost is None or lost_before is None else lost_before + lost
             if self._restarts:
                 packet = self._shifted(packet, unchecked)
                 unchecked = unchecked and packet.empty

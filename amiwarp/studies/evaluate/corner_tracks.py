@@ -111,7 +111,7 @@ def _chains(t: NDArray[np.int64], xy: NDArray[np.float64], radius_px: float, gap
 
 
 MOST_CORNERS = 500
-"""Largest number of corners of a frame."""
+"""Largest number of corners that a frame adds to those that are tracked."""
 QUALITY = 0.01
 """Least quality of a corner, relative to the best."""
 APART_PX = 5.0
