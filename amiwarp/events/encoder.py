@@ -41,6 +41,8 @@ MOST_SAMPLES = 1 << 28
 Integers = NDArray[np.int64]
 Vector = NDArray[np.float64]
 
+GAP_INTERVALS = 5
+"""Number of median sample intervals above which the time between two samples is reported as a gap."""
 LONGEST_BENT_STEP = math.tau / 64.0
 """Longest step between samples of an encoder whose error within a turn is corrected [rad]."""
 LARGEST_ANGLE = 1e10

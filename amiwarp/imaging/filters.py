@@ -26,7 +26,7 @@ from amiwarp.events.truth import EventTruth
 from amiwarp.io import output_formats
 from amiwarp.io.conversion import convert
 from amiwarp.io.file_scan import RECORDS
-from amiwarp.io.native.copying import copy_records
+from amiwarp.io.native.copying import copy_sensors_and_truth
 from amiwarp.io.native.writer import RecordingWriter
 from amiwarp.io.output_formats import OutputFormat
 from amiwarp.io.outputs import check_output
@@ -499,7 +499,7 @@ def _write_kept(
         truth_labels=None if truth is None else truth.labels,
     ) as writer:
         kept_us = _write_kept_events(recording, running, writer, progress)
-        copy_records(replace(recording, imu=records.imu), writer)
+        copy_sensors_and_truth(replace(recording, imu=records.imu), writer)
         if records.frames is not None:
             for t, image in zip(records.frames.t.tolist(), records.frames, strict=True):
                 writer.append_image(t, image)

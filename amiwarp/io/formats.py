@@ -16,7 +16,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.io.bin_events import looks_like_bin
 from amiwarp.io.columns.options import GivenLayout
 from amiwarp.io.inputs import check_regular, errors_name, open_input
-from amiwarp.io.mistaken_files import name_kind
+from amiwarp.io.mistaken_files import what_it_is
 from amiwarp.io.opening import GivenSource, given_source
 from amiwarp.io.ros.bags import MCAP, ROS1, SQLITE
 from amiwarp.io.ros.packed import ZSTANDARD, packed_head
@@ -184,7 +184,7 @@ def detect_format(path: Path) -> Format:
     if head.startswith(ZSTANDARD) and packed_head(path).startswith((ROS1, SQLITE, MCAP)):
         return Format.ROSBAG
 
-    why_not = name_kind(head) or why_no_rows(head)
+    why_not = what_it_is(head) or why_no_rows(head)
     if why_not:
         raise AmiwarpError(f"{path}: {why_not}", ErrorCode.FORMAT_UNKNOWN)
     known = ", ".join(member.value for member in Format)

@@ -47,15 +47,14 @@ MISTAKEN_FILES: tuple[tuple[int, bytes, str, str], ...] = (
     (0, b"\x7fELF", "a program", "give a recording"),
     (0, b"<?xml", "an XML document", "give a recording"),
     (0, b"{", "a JSON document", JSON),
+    (0, b"RIFF", "a RIFF file of sound or pictures", "give a recording"),
 )
 """Files that are often mistaken for recordings."""
 
 
-def name_kind(head: bytes) -> str | None:
+def what_it_is(head: bytes) -> str | None:
     """Return what a file is and what to do with it, from its first bytes, or None if it is unknown."""
     for at, magic, what, remedy in MISTAKEN_FILES:
         if head[at : at + len(magic)] == magic:
             return f"is {what}; {remedy}"
-    if head.startswith(b"RIFF"):
-        return "is a RIFF file of sound or pictures; give a recording"
     return None

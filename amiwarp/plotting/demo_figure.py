@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.thinning import thin
 from amiwarp.choices import Tone
-from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.in_memory import compensate_events
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import PictureQuality
 from amiwarp.imaging.regions import best_box

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.choices import Axis, Vote
-from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.in_memory import compensate_events
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording

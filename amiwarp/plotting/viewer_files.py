@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from amiwarp.compensation.blocks import BlockCompensator
+from amiwarp.compensation.in_memory import BlockCompensator
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording

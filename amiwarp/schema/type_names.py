@@ -26,8 +26,9 @@ def not_called(instead: str) -> Callable[[Target], Target]:
                 )
             super(base, self).__init__(*args, **options)
 
-        init.__signature__ = inspect.signature(lambda self: None)  # type: ignore[attr-defined]  # as it was
-        type.__setattr__(base, "__init__", init)
+        # help() shows a call without arguments, as before.
+        init.__signature__ = inspect.signature(lambda self: None)  # type: ignore[attr-defined]
+        base.__init__ = init
         return target
 
     return decorate

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.plate import LARGEST_INVERSE
 from amiwarp.choices import Sharpness, Vote
-from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.in_memory import compensate_events
 from amiwarp.compensation.recordings import at_depths
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.calib.settings import Settings as CalibrationSettings
-from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.in_memory import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, Recording
 from amiwarp.events.truth import EventTruth, FrameTruth
