@@ -16,10 +16,12 @@ from amiwarp.events.recording import Events, EventSource
 from amiwarp.schema.calls import guarded
 
 MOST_TURNS = 8
+"""Largest number of the prism's turns that are searched for bad pixels. A longer part reveals slower hot pixels, but
+costs time."""
 LEAST_TURNS = 2
+"""Smallest number of turns that are searched, however many events they have."""
 MOST_EVENTS = 2_500_000
-"""Limits of the part of a recording that is searched for bad pixels: most turns of the prism, fewest turns, most
-events. A longer part reveals slower hot pixels, but costs time."""
+"""Number of events above which fewer than :data:`MOST_TURNS` turns are searched."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +43,12 @@ class BadPixelSummary:
         if self.hot:
             kinds.append(f"{self.hot} hot pixel{'s' if self.hot > 1 else ''}")
         if self.flickering:
-            at = " and ".join(f"{hz:.0f}" for hz in self.lamps_hz)
-            kinds.append(f"{self.flickering} that flicker at {at} Hz")
+            frequencies = ", ".join(f"{hz:.0f}" for hz in self.lamps_hz)
+            is_one = self.flickering == 1
+            noun = "pixel" if is_one else "pixels"
+            verb = "flickers" if is_one else "flicker"
+            subject = f"{self.flickering} that" if self.hot else f"{self.flickering} {noun} that"
+            kinds.append(f"{subject} {verb} at {frequencies} Hz")
         if not kinds:
             return ""
         return f"{' and '.join(kinds)} left out, {100.0 * self.share:.0f} % of the events"

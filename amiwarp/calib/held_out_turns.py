@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.calib.calibration_events import CalibrationEvents
 from amiwarp.calib.sharpness_objective import STEP_PX, finite_differences, padding
 from amiwarp.choices import Sharpness
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events
 from amiwarp.imaging.canvas import CanvasShape
 from amiwarp.imaging.sharpness import SharpnessMeter
@@ -40,14 +41,19 @@ PARTS = 8
 
 
 def split_turns(calibration_events: CalibrationEvents) -> tuple[Events, Events]:
-    """Return the events of the even and of the odd turns, or of alternate spans if there are less than two turns."""
+    """Return the events of the even and of the odd turns, or of alternate spans if there are fewer than two turns."""
     events = calibration_events.events
     turned = calibration_events.encoder.angle_at(events.t)
     turned -= turned[0]  # in place: with ten million events, each array has 80 MB
     np.abs(turned, out=turned)
-    whole = float(turned.max())
-    span = math.tau if whole >= FEWEST_TURNS * math.tau else whole / SPANS
-    turned /= span
+    total_rad = float(turned.max())
+    if total_rad == 0.0:
+        raise AmiwarpError(
+            "the encoder stands still during the events; turn the prism",
+            ErrorCode.CALIBRATION_REFUSED,
+        )
+    span_rad = math.tau if total_rad >= FEWEST_TURNS * math.tau else total_rad / SPANS
+    turned /= span_rad
     odd = (turned.astype(np.int32) & 1).astype(np.bool_)
     del turned
     return events[np.flatnonzero(~odd)], events[np.flatnonzero(odd)]

@@ -20,6 +20,7 @@ from amiwarp.events.device_columns import cast, import_array
 from amiwarp.imaging.canvas import CanvasShape, Image
 from amiwarp.kernels.edge_directions import SEGMENT, find_largest, sum_directions
 from amiwarp.kernels.launch import BLOCK_DIM, launch
+from amiwarp.kernels.lowest import lowest_value
 from amiwarp.kernels.page_locked_memory import page_locked
 from amiwarp.kernels.program import Program
 from amiwarp.kernels.smoothing import (
@@ -269,8 +270,8 @@ def sharpness(
     Parameters
     ----------
     image : array
-        Image [events per pixel], shape ``(height, width)`` or ``(2, height, width)``: an array of NumPy, Warp, PyTorch,
-        CuPy, JAX or any other library with DLPack.
+        Image [events per pixel], 0 or above, shape ``(height, width)``, or ``(n, height, width)`` with one or two
+        layers: an array of NumPy, Warp, PyTorch, CuPy, JAX or any other library with DLPack.
     kind : Sharpness, optional
         Sharpness measure.
     smoothing : float, optional
@@ -286,7 +287,7 @@ def sharpness(
     Raises
     ------
     AmiwarpError
-        If the image has another shape or holds values that are not finite.
+        If the image has another shape, or holds a value that is negative or not finite.
 
     Examples
     --------
@@ -317,6 +318,12 @@ def sharpness(
     if not meter.finite:
         raise AmiwarpError(
             f"image of shape {image.shape} holds a value that is not finite; replace it"
+        )
+    lowest = lowest_value(stack) if on_device else float(stack.min())
+    if lowest < 0.0:
+        raise AmiwarpError(
+            f"image of shape {image.shape} holds the negative value {lowest:g}; give numbers of events, for example "
+            "one image for each polarity, shape (2, height, width)"
         )
     return value
 

@@ -48,7 +48,7 @@ def even(model: Any):
 def even(model: ExactParams) -> ExactParams:
     """Return the exact model of a prism without cylinder power and wobble.
 
-    Every field is copied but those of cylinder power and wobble.
+    Every field is copied but the fields of cylinder power and wobble.
     """
     m = ExactParams()
     m.sin_apex = model.sin_apex

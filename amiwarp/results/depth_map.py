@@ -66,7 +66,8 @@ class DepthMap(ArrayMap):
     std: NDArray[np.float32]
     """Standard deviation of :attr:`inverse_depth` [1/m], shape (height, width); NaN where it is unknown."""
     points: NDArray[np.float32]
-    """Point in the camera's frame that each pixel sees [m], shape (height, width, 3); NaN where it is unknown."""
+    """Point in the camera's frame that each pixel sees [m], shape (height, width, 3); NaN where it is unknown
+    or infinitely far."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.inverse_depth)
@@ -87,6 +88,11 @@ class DepthMap(ArrayMap):
         if np.isnan(self.std[self.known]).any():
             raise AmiwarpError(
                 "depth map's std is NaN at a pixel whose depth is known; make both NaN, or none"
+            )
+        # A point at infinity, whose inverse depth is 0, has no finite coordinates.
+        if np.isnan(self.points[self.inverse_depth > 0.0]).any():
+            raise AmiwarpError(
+                "depth map's points are NaN at a pixel whose depth is known; make both NaN, or none"
             )
 
     def __repr__(self) -> str:

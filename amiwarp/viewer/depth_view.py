@@ -44,15 +44,16 @@ def draw_depth(
         bar.add_actor(actor, render=False, pickable=False, reset_camera=False)
     for k, mesh, title in ((1, image, "depth map"), (2, cloud, "its points")):
         plotter.subplot(0, first + k)
-        plotter.add_mesh(
-            mesh,
-            scalars="colour",
-            rgb=True,
-            lighting=False,
-            render=False,
-            pickable=False,
-            point_size=3.0,
-        )
+        if mesh.n_points:  # all known points may be at infinity
+            plotter.add_mesh(
+                mesh,
+                scalars="colour",
+                rgb=True,
+                lighting=False,
+                render=False,
+                pickable=False,
+                point_size=3.0,
+            )
         text = text_actor(title, ink, (0.4, CORNER[1]), font_px)
         plotter.renderers[first + k].add_actor(
             text, render=False, pickable=False, reset_camera=False

@@ -71,6 +71,8 @@ QUICK = {
 """Updates that are made at once, with the parts of the page that wait for them."""
 SLOW = ("curve", "picture", "statistics")
 """Updates that take longer; each is named as the part of the page that waits for it."""
+SLOW_ORDER = (*SLOW, "preparation")
+"""Slow updates in the order in which they are made: what is on the page first."""
 PLAY_S = 0.05
 """Shortest interval between two pictures while a recording is played [s]."""
 FOLLOW_S = 0.1
@@ -151,6 +153,7 @@ class Panel(Actions):
         self._picked = -1
         self.history = None
         self.history_steps = ()
+        self._rates = []  # the next count has not begun
         self._made_for.clear()
         self.use_card(self._has_card)
         inspector.renew()  # a live stream may have gone on since the inspector was made
@@ -270,7 +273,7 @@ class Panel(Actions):
             self._quick_task = self.start_job(self._run_quick_updates())
 
     def request_slow(self, *what: str) -> None:
-        """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
+        """Request updates of :data:`SLOW_ORDER`, which run in a thread after all quick updates."""
         self._slow_requests.update(what)
         self._show_pending()
         if self._slow_task is None or self._slow_task.done():
@@ -322,6 +325,9 @@ class Panel(Actions):
         self._jobs.discard(task)
         error = None if task.cancelled() else task.exception()
         if error is not None:
+            if isinstance(error, (AmiwarpError, OSError)):
+                self.say(str(error), "error")
+                return
             logging.getLogger(__name__).error("the page's work failed", exc_info=error)
             text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
             self.say(text, "error")
@@ -346,8 +352,7 @@ class Panel(Actions):
         """Make the requested slow updates one after the other, each when no quick update is pending."""
         while self._slow_requests:
             await self.until_drawn()
-            # In alphabetical order: the curve first, the preparation last
-            name = min(self._slow_requests)
+            name = min(self._slow_requests, key=SLOW_ORDER.index)
             self._slow_requests.discard(name)
             async with self._marked_on_page({name}), self.device_lock:
                 with self.errors_shown(name):
@@ -554,12 +559,16 @@ class Panel(Actions):
 
     def draw(self, left: float, top: float, right: float, bottom: float) -> None:
         """Show a region of the image [px] that was drawn or typed."""
+        # Typed sides may come in any order.
+        left, right = sorted((left, right))
+        top, bottom = sorted((top, bottom))
+        width, height = self.state.size
         sides = (left, top, right, bottom)
-        limits = 2 * self.state.size
+        limits = (width, height, width, height)
         region = [
-            min(max(round(each), 0), limit) for each, limit in zip(sides, limits, strict=True)
+            min(max(round(side), 0), limit) for side, limit in zip(sides, limits, strict=True)
         ]
-        whole = region == [0, 0, *self.state.size]
+        whole = region == [0, 0, width, height]
         self.state.update({"region_wanted": region, "region_kind": "whole" if whole else "drawn"})
         self.request("window")
         self.released()
@@ -591,7 +600,7 @@ class Panel(Actions):
         end = min(float(end_ms), float(self.state.whole_ms))
         if end - start > 1e-2:
             self.state.rate_span = [start, end]
-            self._show_rates()
+            self.start_job(self._show_zoomed_rates())
 
     def play(self) -> None:
         """Play the recording from the current window, or follow a live stream; stop if already playing."""
@@ -670,28 +679,50 @@ class Panel(Actions):
         rates = [EventRates(each.recording.events) for each in inspectors]
         self._rates = rates
         self._rates_first_us = self.inspector.recording.events.t_first
-        for each in rates:
-            finished = False
-            while not finished and rates is self._rates:
-                finished = await self.in_thread(each.fill, STEP_S)
-                with self.state:
-                    self._show_rates()
+        with self.errors_shown("timeline"):
+            for each in rates:
+                finished = False
+                while not finished and rates is self._rates:
+                    finished = await self.in_thread(each.fill, STEP_S)
+                    await self._show_rates()
+        self.state.flush()
 
-    def _show_rates(self) -> None:
+    async def _show_zoomed_rates(self) -> None:
+        with self.errors_shown("timeline"):
+            await self._show_rates()
+        self.state.flush()
+
+    async def _show_rates(self) -> None:
+        """Show what is counted of the shown part of the time, unless the page shows another part before it is ready."""
+        rates = self._rates
+        span = self.state.rate_span
+        if not rates:
+            return
+        values = await self.in_thread(self._rate_state, self.inspector, rates, span)
+        if rates is self._rates and span == self.state.rate_span:
+            with self.state:
+                self.state.update(values)
+
+    def _rate_state(
+        self, inspector: Inspector, rates: list[EventRates], span: list[float]
+    ) -> dict[str, Any]:
+        """Return the state variables of the timeline between two times [ms]. It may read events from a file."""
         # Of a live stream, the counted events may be a second older than the shown ones.
         first_us = self._rates_first_us
-        start_us, end_us = (round(1e3 * each) for each in self.state.rate_span)
-        own, *others = self._rates
-        _, rates = own.curve(first_us + start_us, first_us + end_us, layout.RATE_BINS)
-        off, on = map(page_state.float_bytes, rates)
+        start_us, end_us = (round(1e3 * each) for each in span)
+        own, *others = rates
+        _, own_rates = own.curve(first_us + start_us, first_us + end_us, layout.RATE_BINS)
+        off, on = map(page_state.float_bytes, own_rates)
         rows = []
-        for each, counted in zip(self.inspector.besides, others, strict=True):
-            _, rates = counted.curve(each.time_of(start_us), each.time_of(end_us), layout.RATE_BINS)
-            off_beside, on_beside = map(page_state.float_bytes, rates)
+        for each, counted in zip(inspector.besides, others, strict=True):
+            _, rates_beside = counted.curve(
+                each.time_of(start_us), each.time_of(end_us), layout.RATE_BINS
+            )
+            off_beside, on_beside = map(page_state.float_bytes, rates_beside)
             name = captions.beside_text(each)
             rows.append({"name": name, "on": on_beside, "off": off_beside})
         note = "" if own.share >= 1.0 else f"counting events: {100.0 * own.share:.0f} %"
-        self.state.update({"rate_on": on, "rate_off": off, "rate_note": note, "rate_rows": rows})
+        return {"rate_on": on, "rate_off": off, "rate_note": note, "rate_rows": rows}
 
     # Parameters of the prism, and those to compare with
 
@@ -795,6 +826,8 @@ class Panel(Actions):
                 answer = await self.in_thread(
                     _result_or_error, find, weakref.ref(inspector), progress
                 )
+            if self.inspector is not inspector:  # another recording was opened meanwhile
+                return
             if isinstance(answer, str):
                 if progress.cancelled:
                     self.say("calibration cancelled", "info")
@@ -814,8 +847,10 @@ class Panel(Actions):
                 with state:
                     state.surface = surface
         finally:
-            with state:
-                state.update({"busy": "", "calibrating": False})
+            # In another recording, the next calibration may run already.
+            if self._progress is progress:
+                with state:
+                    state.update({"busy": "", "calibrating": False})
 
     def _show_progress(self, what: str, share: float) -> None:
         """Show the current step of a calibration or a film, and the finished share, 0 to 1."""

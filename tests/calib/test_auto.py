@@ -17,6 +17,7 @@ from amiwarp import (
     CircleModel,
     Encoder,
     EncoderModel,
+    ErrorCode,
     Events,
     ExactModel,
     FlatSide,
@@ -359,6 +360,14 @@ def test_halves_are_alternate_turns() -> None:
     # an event at the border of two turns may belong to either
     whole = [half.t[half.t % 200_000 > 1000] // 200_000 for half in (first, second)]
     assert [set(turns.tolist()) for turns in whole] == [{0, 2, 4}, {1, 3}]
+
+
+def test_turns_of_an_encoder_that_stands_still_cannot_be_held_out() -> None:
+    still = Encoder(np.array([0, 10_000]), np.zeros(2))
+    events = Events.from_arrays([1, 2], [1, 2], [0, 5000], [0, 1])
+    with pytest.raises(AmiwarpError, match="the encoder stands still") as caught:
+        split_turns(CalibrationEvents(events, still, None))
+    assert caught.value.code is ErrorCode.CALIBRATION_REFUSED
 
 
 def test_an_encoder_s_noise_is_told_from_its_speeding_up() -> None:

@@ -221,6 +221,29 @@ def test_a_flickering_lamp_is_found(
     assert f"that flicker at {summary.lamps_hz[0]:.0f} Hz left out" in str(summary)
 
 
+@pytest.mark.parametrize(
+    ("first_hz", "second_hz", "depth"), [(100.4, 101.2, 0.8), (100.45, 101.2, 0.7)]
+)
+def test_two_estimates_for_a_lamp_are_one_lamp(
+    first_hz: float, second_hz: float, depth: float
+) -> None:
+    """The second patch is found by a second search. Within a second, less than 1 Hz cannot be told apart."""
+    rng = np.random.default_rng(3)
+    count = 60_000
+
+    def lit(left: int, hz: float, depth: float) -> list[NDArray[np.int64]]:
+        t = rng.integers(0, 1_000_000, count)
+        chance = 0.5 + 0.5 * depth * np.cos(math.tau * hz * 1e-6 * t)
+        x, y = rng.integers(0, 32, (2, count))
+        return [left + x, 16 + y, t, rng.random(count) < chance]
+
+    columns = np.concatenate([lit(16, first_hz, 1.0), lit(96, second_hz, depth)], axis=1)
+    events = Events.from_arrays(*columns[:, np.argsort(columns[2], kind="stable")])
+    _, summary = strange_pixels(events, Encoder.constant_speed(720.0, 0, 1_000_000), (144, 64))
+    assert summary.flickering > 2000, "both patches"
+    assert summary.lamps_hz == (pytest.approx(first_hz, abs=0.1),)
+
+
 def test_an_image_of_hot_pixels_is_not_called_flickering() -> None:
     mask = np.ones((4, 4), np.bool_)
     with pytest.raises(AmiwarpError, match="100 % of the pixels are hot"):
@@ -284,3 +307,9 @@ def test_the_summary_says_what_was_left_out() -> None:
     assert str(BadPixelSummary(1, 0, (), 0.031)) == "1 hot pixel left out, 3 % of the events"
     text = str(BadPixelSummary(12, 3400, (100.2,), 0.41))
     assert text == "12 hot pixels and 3400 that flicker at 100 Hz left out, 41 % of the events"
+    text = str(BadPixelSummary(0, 3400, (100.2, 120.0, 50.0), 0.41))
+    assert text == "3400 pixels that flicker at 100, 120, 50 Hz left out, 41 % of the events"
+    text = str(BadPixelSummary(0, 1, (100.2,), 0.0))
+    assert text == "1 pixel that flickers at 100 Hz left out, 0 % of the events"
+    text = str(BadPixelSummary(2, 1, (100.2,), 0.0))
+    assert text == "2 hot pixels and 1 that flickers at 100 Hz left out, 0 % of the events"

@@ -258,8 +258,8 @@ def test_a_window_starts_with_a_bookmark(inspector: Inspector, path: Path) -> No
 
 def test_the_page_lists_saves_opens_and_deletes_bookmarks(path: Path, browser: Any) -> None:
     pytest.importorskip("trame_client")
+    from amiwarp.viewer import Panel
     from amiwarp.viewer.layout import SETTABLE
-    from amiwarp.viewer.panel import Panel
     from tests.viewer.test_serve import served
 
     wrong = replace(another(Inspector(open_recording(path))), against=None)

@@ -125,7 +125,7 @@ class Tabs:
             self.failures.append(message.text)
 
     def __call__(self, server: Any) -> Callable[[], None]:
-        from amiwarp.viewer.panel import Panel
+        from amiwarp.viewer import Panel
 
         panel = Panel(server, self.make(), self.library)
         self.panels.append(panel)

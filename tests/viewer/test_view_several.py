@@ -130,7 +130,7 @@ def test_the_command_takes_several_recordings_with_offsets(
 
 def test_the_page_has_a_row_of_rates_for_each_recording(inspector: Inspector, browser: Any) -> None:
     pytest.importorskip("trame_client")
-    from amiwarp.viewer.panel import Panel
+    from amiwarp.viewer import Panel
     from tests.viewer.test_serve import served, until
 
     panels: list[Panel] = []

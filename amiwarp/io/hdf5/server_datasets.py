@@ -28,6 +28,7 @@ COLUMNS = {
     "encoder/index_t": "iu",
     "encoder/second_t": "iu",
     "encoder/second_angle": "f",
+    "encoder/second_index_t": "iu",
     "truth/x": "f",
     "truth/y": "f",
     **{
@@ -88,6 +89,7 @@ READ_AT_ONCE = (
     "encoder/index_t",
     "encoder/second_t",
     "encoder/second_angle",
+    "encoder/second_index_t",
     "truth/frames/t",
     "truth/known/t",
     "truth/world/instances",

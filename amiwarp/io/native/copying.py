@@ -26,7 +26,7 @@ def write_recording(
 ) -> None:
     """Write a recording to a native file.
 
-    ``size`` is the size of the output's image [px], which a scale may make another than that of the recording.
+    ``size`` is the size of the output's image [px], which a scale may have changed.
     """
     truth = recording.truth
     with RecordingWriter(

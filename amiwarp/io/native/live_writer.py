@@ -129,7 +129,8 @@ class LiveWriter:
         self._names = ENCODERS[:encoders]
         self._spans: dict[str, tuple[int, int]] = {}
         """Times of the first and the last sample of each encoder [us], by the beginning of its datasets' names."""
-        self._pulses = np.zeros(0, np.int64)  # index pulses later than the last encoder sample
+        self._early_pulses = dict.fromkeys(self._names, np.zeros(0, np.int64))
+        """Index pulses later than the last sample of each encoder [us], by the beginning of its datasets' names."""
         self._encoder: Encoder | None = None
 
     def __len__(self) -> int:
@@ -183,9 +184,13 @@ class LiveWriter:
             for name, dtype in dtypes.items()
         }
         file["t_offset"] = np.int64(0)
-        small: dict[str, Any] = {"ms_to_idx": np.int64, "encoder/index_t": np.int64}
+        small: dict[str, Any] = {"ms_to_idx": np.int64}
         for name in self._names:
-            small |= {f"{name}t": np.int64, f"{name}angle": np.float64}
+            small |= {
+                f"{name}t": np.int64,
+                f"{name}angle": np.float64,
+                f"{name}index_t": np.int64,
+            }
         for name, kind in small.items():
             dataset = file.create_dataset(
                 name, shape=(0,), maxshape=(None,), chunks=(SMALL_CHUNK,), dtype=kind
@@ -259,9 +264,8 @@ class LiveWriter:
     ) -> None:
         """Append encoder samples: times on the events' clock [us], unwrapped angles [rad], and index pulses [us].
 
-        ``second``: whether they are samples of the second encoder, whose index pulses are not stored. Pulses before the
-        first sample are dropped. Raises :class:`AmiwarpError` for samples that are not later than the samples before,
-        or not finite.
+        ``second``: whether they are samples of the second encoder. Pulses before the first sample are dropped. Raises
+        :class:`AmiwarpError` for samples that are not later than the samples before, or not finite.
         """
         self._check_open("append_encoder")
         name = self._names[1 if second else 0]
@@ -275,8 +279,8 @@ class LiveWriter:
             )
         if t.size:
             self._accept_samples(name, t, angles)
-        if not second and name in self._spans:
-            self._accept_pulses(as_times(index_t_us) + offset, self._spans[name])
+        if name in self._spans:
+            self._accept_pulses(name, as_times(index_t_us) + offset)
         if self._waiting_bytes() > MOST_WAITING:
             with errors_name(self.path, lambda: f"after {len(self)} events"):
                 self._flush()
@@ -295,12 +299,12 @@ class LiveWriter:
         self._small[f"{name}angle"].add(angles)
         self._spans[name] = first, int(t[-1])
 
-    def _accept_pulses(self, pulses: NDArray[np.int64], span: tuple[int, int]) -> None:
-        """Add index pulses within the ``span`` of the samples. Later pulses wait for their samples."""
-        first, last = span
-        pulses = np.append(self._pulses, pulses)
-        self._small["encoder/index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
-        self._pulses = pulses[pulses > last][-MOST_PULSES:]
+    def _accept_pulses(self, name: str, pulses: NDArray[np.int64]) -> None:
+        """Add index pulses [us] of an encoder within the time of its samples. Later pulses wait for their samples."""
+        first, last = self._spans[name]
+        pulses = np.append(self._early_pulses[name], pulses)
+        self._small[f"{name}index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
+        self._early_pulses[name] = pulses[pulses > last][-MOST_PULSES:]
 
     def set_encoder(self, encoder: Encoder) -> None:
         """Set the encoder data that the finished file holds instead of the appended encoder samples.
@@ -441,7 +445,8 @@ class LiveWriter:
         return of_events + sum(small.stored_bytes for small in self._small.values())
 
     def _replace_encoder(self, encoder: Encoder) -> None:
-        columns = {"encoder/index_t": np.zeros(0, np.int64), **encoder_columns(encoder)}
+        no_pulses = {f"{name}index_t": np.zeros(0, np.int64) for name in self._names}
+        columns = no_pulses | encoder_columns(encoder)
         self._reserve(2 * sum(values.nbytes for values in columns.values()))
         self._file["encoder"].attrs["clock_offset_us"] = float(encoder.clock_offset_us)
         for name, values in columns.items():

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.events.each_encoder import each_encoder
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MetadataValue
 from amiwarp.events.truth import EVENT_COLUMNS, EventTruth, check_truth
 from amiwarp.io.hdf5.chunks import CHUNK
 from amiwarp.io.native.attributes import camera_attributes, prism_attributes
-from amiwarp.io.native.layout import ENCODERS, FORMAT, FORMAT_VERSION, Columns
+from amiwarp.io.native.layout import ATTRIBUTE_BYTES, ENCODERS, FORMAT, FORMAT_VERSION, Columns
 from amiwarp.io.output_formats import MAX_MS
 from amiwarp.optics.camera import Camera, check_size
 from amiwarp.optics.prism import NominalPrism
@@ -80,18 +81,21 @@ def write_header(
         file.create_group("prism").attrs.update(prism_attributes(prism))
     group = file.create_group("metadata")
     for name, item in metadata.items():
+        if isinstance(item, str) and len(item.encode()) > ATTRIBUTE_BYTES:
+            raise AmiwarpError(
+                f"metadata '{name}' has {len(item.encode()):,} bytes; give at most {ATTRIBUTE_BYTES:,}"
+            )
         group.attrs[name] = item
 
 
 def encoder_columns(encoder: Encoder) -> Columns:
     """Return times [us], angles [rad] and index pulses [us] of an encoder and of its second one as datasets."""
-    first_name, second_name = ENCODERS
-    columns: Columns = {f"{first_name}t": encoder.t, f"{first_name}angle": encoder.angle}
-    if encoder.index_t is not None:
-        columns[f"{first_name}index_t"] = encoder.index_t
-    if encoder.second is not None:
-        columns[f"{second_name}t"] = encoder.second.t
-        columns[f"{second_name}angle"] = encoder.second.angle
+    columns: Columns = {}
+    for name, each in zip(ENCODERS, each_encoder(encoder), strict=False):
+        columns[f"{name}t"] = each.t
+        columns[f"{name}angle"] = each.angle
+        if each.index_t is not None:
+            columns[f"{name}index_t"] = each.index_t
     return columns
 
 

@@ -145,18 +145,15 @@ def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
         return None
     t, angle = samples
 
-    index_t = None
-    if "encoder/index_t" in file.columns:
-        pulses = file.columns["encoder/index_t"]
-        index_t = rounded_times(pulses.read(0, len(pulses)))
-        if file.unfinished:
-            index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])]
+    index_t = _read_pulses(file, ENCODERS[0], t)
 
     second = None
     if "encoder/second_t" in file.columns:
         samples_of_second = _read_samples(file, ENCODERS[1])
         if samples_of_second is not None:
-            second = Encoder(*samples_of_second)
+            second_t, second_angle = samples_of_second
+            second_index_t = _read_pulses(file, ENCODERS[1], second_t)
+            second = Encoder(second_t, second_angle, index_t=second_index_t)
 
     offset_us = attribute(
         file.attributes["encoder"], f"{path}: /encoder", "clock_offset_us", float, 0.0
@@ -181,6 +178,19 @@ def _read_samples(
     if t.size < 2 and (file.unfinished or t.size == angle.size == 0):
         return None
     return t, angle
+
+
+def _read_pulses(file: Hdf5File, name: str, t: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Return times of the index pulses [us] of the encoder with samples at ``t`` [us]; None without pulses."""
+    if f"{name}index_t" not in file.columns:
+        return None
+    pulses = file.columns[f"{name}index_t"]
+    index_t = rounded_times(pulses.read(0, len(pulses)))
+    if file.unfinished:
+        # The last samples may not be written yet.
+        index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])]
+    # A live recording has the dataset before it is known whether there are pulses.
+    return index_t if index_t.size else None
 
 
 def _read_imu(path: Path, file: Hdf5File) -> ImuSamples | None:

@@ -20,7 +20,7 @@ GROUP_EVENTS = 2_000_000
 GROUP_ROWS = 1000
 """Largest number of recordings in a row group."""
 MOST_EVENTS = 2**31 - 1
-"""Largest number of events of a recording in Parquet, whose lists have 32-bit offsets."""
+"""Largest number of events of a recording, and of a row group, in Parquet, whose lists have 32-bit offsets."""
 
 
 def _hub_name(split: str) -> str:
@@ -112,6 +112,8 @@ def _parquet_parts(
                     path, table.schema, compression="zstd", use_dictionary=["split"]
                 )
                 yield path
+            if events + item.events > MOST_EVENTS:
+                flush()
             waiting.append(table)
             events += item.events
             written += table.nbytes

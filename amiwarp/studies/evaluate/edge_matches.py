@@ -105,8 +105,8 @@ def match_rows(
 ) -> list[dict[str, Any]]:
     """Return the number of matches over the thresholds for each kind of true edges and tolerance.
 
-    ``tolerances``: those of the comparison [px]; the other kinds have the strict one. ``chance`` belongs to the true
-    edges turned by 180 deg, which have the same matches as a turned image.
+    ``tolerances``: tolerances of the comparison [px]; the other kinds have the strict one. ``chance`` belongs to the
+    true edges turned by 180 deg, which have the same matches as a turned image.
     """
     rows = []
     for truth, edges in image.true.items():
