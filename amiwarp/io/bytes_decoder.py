@@ -151,7 +151,7 @@ class BytesDecoder:
     def _decode_aedat4(self, data: Any) -> DeviceEvents:
         """Return the events of packets of AEDAT 4."""
         from amiwarp.kernels import aedat4 as kernels
-        from amiwarp.kernels.records import Span
+        from amiwarp.kernels.raw_numbers import Span
 
         packets = self._listed(data, kernels.list_packets, Span)
         decoded = aedat4_events.decode_packets(packets, self._device)

@@ -26,7 +26,7 @@ from amiwarp.kernels.prism_view import see_without_prism
 from amiwarp.kernels.refraction import compensate_points
 from amiwarp.kernels.residual_slopes import slope_between
 from amiwarp.kernels.residual_sums import sum_costs
-from amiwarp.kernels.slow_pixels import find_time_constants
+from amiwarp.kernels.slow_pixels import write_brightness, write_time_constants
 from amiwarp.kernels.smoothing import smooth, smooth_and_sum
 from amiwarp.kernels.square_sums import find_squares
 from amiwarp.optics.models.registry import MODELS
@@ -47,7 +47,8 @@ EXACT_KERNELS = (
     (descend,),
     (sum_costs,),
     (slope_between,),
-    (find_time_constants, ExactParams),
+    (write_brightness, ExactParams),
+    (write_time_constants, ExactParams),
     (find_squares,),
     (compensate_blocks, ExactParams, PinholeParams),
     (compute_checksums,),

@@ -381,7 +381,7 @@ class InspectorHandle:
         if self._window is not None and not self._drawing:
             self._drawing = True
             try:
-                self._window.turn()
+                self._window.run_once()
             finally:
                 self._drawing = False
 
