@@ -407,7 +407,9 @@ def cut(recording: Recording, window: str) -> Recording:
     events = recording.events.between(low, high)
     if not len(events):
         raise AmiwarpError(
-            f"{recording.name}: no events in the window {window} s; the recording is {(last - first) * 1e-6:.6g} s long"
+            f"{recording.name}: no events in the window {window} s; "
+            f"the recording is {(last - first) * 1e-6:.6g} s long",
+            ErrorCode.CONTENT_MISSING,
         )
     return replace(recording, events=MemoryEvents(events, *recording.events.size))
 

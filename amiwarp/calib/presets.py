@@ -75,7 +75,9 @@ class Preset:
             )
         if data.get("kind") != kind:
             given = shown(data.get("kind"))
-            raise AmiwarpError(f"{path}: kind is {given}; give a preset for {kind}")
+            raise AmiwarpError(
+                f"{path}: kind is {given}; give a preset for {kind}", ErrorCode.FIELD
+            )
         with errors_name(path, lambda: "damaged preset, create it again with 'amiwarp chart'"):
             fields_of(data, "", "format", "version", "kind", "settings", optional=("measured",))
             settings = data["settings"]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from amiwarp.compensation.gpu_pieces import PIECE
 from amiwarp.compensation.in_memory import BlockCompensator
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events, EventSource, Recording
 from amiwarp.io import RecordingWriter
 from amiwarp.io.conversion import bag_of, left_out, subtracted_us
@@ -169,7 +169,8 @@ def compensate(
     if len(events):
         if not events[:1].whole_pixels:
             raise AmiwarpError(
-                f"{recording.name}: its events are already compensated; give the sensor's events"
+                f"{recording.name}: its events are already compensated; give the sensor's events",
+                ErrorCode.CONTENT_MISSING,
             )
         encoder = calibration.encoder_for(encoder, events.t_first, events.t_last)
         if encoder is not None:

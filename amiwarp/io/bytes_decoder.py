@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.aedat import aedat3, aedat4_events
 from amiwarp.io.aedat.aedat2_decoder import Aedat2Decoder
 from amiwarp.io.aedat.aedat2_header import CHIPS
@@ -69,9 +69,13 @@ class BytesDecoder:
         self._format = one_of(format, FORMATS, "format of the bytes")
         self._device = wp.get_device("cpu" if device is None else device)
         if self._format == "aedat2" and chip is None:
-            raise AmiwarpError(f"format aedat2 needs a chip; give one of {', '.join(CHIPS)}")
+            raise AmiwarpError(
+                f"format aedat2 needs a chip; give one of {', '.join(CHIPS)}", ErrorCode.OPTIONS
+            )
         if self._format != "aedat2" and chip is not None:
-            raise AmiwarpError(f"format {self._format} needs no chip; leave it out")
+            raise AmiwarpError(
+                f"format {self._format} needs no chip; leave it out", ErrorCode.OPTIONS
+            )
         self._dat: DatDecoder | None = None
         self._aedat2: Aedat2Decoder | None = None
         if self._format in ("dat1", "dat2"):

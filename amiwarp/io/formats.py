@@ -150,7 +150,8 @@ def detect_format(path: Path) -> Format:
     if path.is_dir() and any(inner.name.endswith(BAG_ENDS) for inner in path.iterdir()):
         raise AmiwarpError(
             f"{path}: is the folder of a ROS 2 bag without its metadata.yaml; "
-            "run ros2 bag reindex, or give one of its files"
+            "run ros2 bag reindex, or give one of its files",
+            ErrorCode.CONTENT_MISSING,
         )
     with errors_name(path, lambda: "opening"), open_input(path) as file:
         head = file.read(HEAD_BYTES)

@@ -149,7 +149,8 @@ def run_lens(
     if live:
         if len(recordings) != 1:
             raise AmiwarpError(
-                f"--live takes one source, and {len(recordings)} are given; see 'amiwarp live --help'"
+                f"--live takes one source, and {len(recordings)} are given; see 'amiwarp live --help'",
+                ErrorCode.OPTIONS,
             )
         poses, said = _watch(
             str(recordings[0]), made, stream, prism, fov=fov, fisheye=fisheye, device=device

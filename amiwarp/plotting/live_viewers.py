@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.compensation.streams import Compensated
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events
 from amiwarp.plotting.foxglove_messages import foxglove_messages, foxglove_module, foxglove_topics
 from amiwarp.plotting.frames import (
@@ -169,7 +169,8 @@ def foxglove_server(address: str, size: tuple[int, int]) -> LiveViewer:
         )
     except Exception as error:
         raise AmiwarpError(
-            f"--foxglove {address}: cannot listen there: {error}; choose another address"
+            f"--foxglove {address}: cannot listen there: {error}; choose another address",
+            ErrorCode.UNREACHABLE,
         ) from error
     channels = {
         topic: foxglove.Channel(topic, schema=schema, message_encoding=kind, context=context)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError, optional_module
+from amiwarp.errors import AmiwarpError, ErrorCode, optional_module
 from amiwarp.io.output_formats import Outline
 from amiwarp.plotting.frames import Window, degrees_in_turn, points
 
@@ -64,4 +64,6 @@ def write_rerun(part: Path, content: Iterable[Window], about: Outline) -> None:
     except RuntimeError as error:
         if failed:
             raise failed[0] from error
-        raise AmiwarpError(f"Rerun cannot write it: {error}; choose another place") from error
+        raise AmiwarpError(
+            f"Rerun cannot write it: {error}; choose another place", ErrorCode.OUTPUT_FAILED
+        ) from error

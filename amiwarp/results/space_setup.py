@@ -241,7 +241,8 @@ def _check_given(
     for name in bounds:
         if name not in names:
             raise AmiwarpError(
-                f"bounds are given for {name}, which is not free; add {name} to the free parameters"
+                f"bounds are given for {name}, which is not free; add {name} to the free parameters",
+                ErrorCode.OPTIONS,
             )
 
 

@@ -271,8 +271,8 @@ class Window(WindowContents):
         if now >= self._progress_due_s:
             self.message = f"{what}: {100.0 * min(share, 1.0):.0f} % ({self._job_keys})"
             self.request("look")
-            # A job runs inside a key's callback, so inside run_once(): this draws and handles keys meanwhile. The keys of
-            # a running job stop it, so that no other job begins in it.
+            # A job runs inside a key's callback, so inside run_once(): this draws and handles keys meanwhile. The keys
+            # of a running job stop it, so that no other job begins in it.
             self.run_once()
             after = time.perf_counter()
             self._progress_due_s = after + max(PROGRESS_S, (after - now) / DRAWING_SHARE)

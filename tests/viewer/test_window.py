@@ -1713,15 +1713,15 @@ def test_a_plain_recording_has_no_keys_of_a_prism(plain: Window) -> None:
     knobs, look = plain.inspector.knobs, plain.look
     for key in ("t", "m", "c", "b", "v"):
         plain.key(key)
-        plain.turn()
+        plain.run_once()
         assert "with a prism; x: set a prism" in said(plain)
     assert (plain.inspector.knobs, plain.look) == (knobs, look)
     assert plain.b is None
     plain.key("x")
-    plain.turn()
+    plain.run_once()
     assert {key for key, _ in plain.sheets.help_rows} >= OF_OPTICS
     plain.key("t")  # there is still no motion, and so no angle
-    plain.turn()
+    plain.run_once()
     assert plain.look.axis is Axis.TIME
 
 
@@ -1729,7 +1729,7 @@ def test_steps_and_playing_keep_the_number_of_events(
     plain: Window, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plain.key("comma")
-    plain.turn()
+    plain.run_once()
     count = plain.inspector.fixed_count
     assert count is not None
     assert f"({count:,} events)" in plain.sliders["length_ms"].title
@@ -1738,7 +1738,7 @@ def test_steps_and_playing_keep_the_number_of_events(
     assert before is not None
     for key in ("Right", "Right", "Left"):
         plain.key(key)
-        plain.turn()
+        plain.run_once()
         assert plain.inspector.window is not None
         assert plain.shown.span.count == pytest.approx(count, abs=5)
         lengths.add(plain.inspector.window[1])
@@ -1747,7 +1747,7 @@ def test_steps_and_playing_keep_the_number_of_events(
     assert plain.inspector.window[0] == pytest.approx(sum(before), abs=3)
     plain.key("space")
     plain._played_s -= 0.1
-    plain.turn()
+    plain.run_once()
     assert plain.shown.span.count == pytest.approx(count, abs=5)
     plain.key("space")
     line = plain.sheets.timeline
@@ -1756,14 +1756,14 @@ def test_steps_and_playing_keep_the_number_of_events(
     assert plain.inspector.fixed_count is None
     length = plain.time_window[1]
     plain.key("Left")
-    plain.turn()
+    plain.run_once()
     assert plain.time_window[1] == length
 
 
 def test_filters_say_the_rates_before_and_after_them(plain: Window) -> None:
     everything = plain.shown.selected
     plain.key("8")
-    plain.turn()
+    plain.run_once()
     assert plain.inspector.selection.noise_us == 2_000
     assert plain.shown.selected < everything
     rows = step_rows(plain.shown.steps, plain.shown.read_us)
@@ -1773,16 +1773,16 @@ def test_filters_say_the_rates_before_and_after_them(plain: Window) -> None:
     assert rows
     plain.key("8")
     plain.key("7")
-    plain.turn()
+    plain.run_once()
     assert plain.inspector.selection.noise_us is None
     assert plain.inspector.selection.hide_hot
     assert "1 hot pixel hidden; x 73, y 28: 84 events/s" in said(plain)
     plain.key("bracketleft")
-    plain.turn()
+    plain.run_once()
     assert plain.image is ImageKind.DECAY
     assert plain.decay_us == DECAY_US // 2
     plain.key("bracketright")
-    plain.turn()
+    plain.run_once()
     assert plain.decay_us == DECAY_US
 
 
@@ -1830,7 +1830,7 @@ def test_a_plain_recording_has_the_whole_image_beside_a_region(
     assert plain.statistics_shown  # where a recording with a prism has its charts
     assert len(plain.sheets.images.panels) == 1
     plain.draw_region((20, 10, 80, 70))
-    plain.turn()
+    plain.run_once()
     whole, part = plain.sheets.images.panels
     events = plain.shown.span.events
     expected = np.zeros((90, 120))

@@ -103,7 +103,8 @@ def _read_aedat3_header(path: Path) -> tuple[tuple[int, int] | None, int]:
             format = re.match(r"#Format:\s*(\S+)", text)
             if format is not None and format[1] != "RAW":
                 raise AmiwarpError(
-                    f"the packets have the format '{format[1][:40]}'; export the file again as RAW"
+                    f"the packets have the format '{format[1][:40]}'; export the file again as RAW",
+                    ErrorCode.FORMAT_UNKNOWN,
                 )
             source = re.match(r"#Source \d+:\s*(\S+)", text)
             if size is None and source is not None:
@@ -175,7 +176,8 @@ def _contents(
                 file.seek(length, 1)
             elif width != expected:
                 raise AmiwarpError(
-                    f"{path}: byte {at}: events of {width} bytes in a packet of type {kind}; expected {expected}"
+                    f"{path}: byte {at}: events of {width} bytes in a packet of type {kind}; expected {expected}",
+                    ErrorCode.FILE_DAMAGED,
                 )
             else:
                 yield kind, source, file.read(length), overflow << 31

@@ -87,7 +87,9 @@ def _number(archive: zipfile.ZipFile, name: str) -> int:
     """Return the single number in an array of the archive."""
     with open_array(archive, name) as (stream, shape, dtype):
         if math.prod(shape) != 1:
-            raise AmiwarpError(f"{name} has shape {shape}; expected one number")
+            raise AmiwarpError(
+                f"{name} has shape {shape}; expected one number", ErrorCode.FORMAT_UNKNOWN
+            )
         return int(np.frombuffer(stream.read(dtype.itemsize), dtype)[0])
 
 
@@ -158,7 +160,8 @@ def _own_table(opened: OpenedByName, has_size: bool) -> Table:
     if x_is_float != y_is_float:
         given = f"array x is {types['x']}, y is {types['y']}"
         raise AmiwarpError(
-            f"{given}; expected integers, or floating numbers for compensated events"
+            f"{given}; expected integers, or floating numbers for compensated events",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     unit = "us" if types["t"].kind in "iub" else None
     hints = Hints(unit=unit, compensated=True, is_own=has_size)
@@ -180,7 +183,10 @@ def _arrays_table(names: Sequence[str], opened: OpenedByName) -> Table:
                 columns.append(Column(name, head))
                 counts[name] = count
             elif role is not None:
-                raise AmiwarpError(f"array {name} has shape {shape}; expected one length (n,)")
+                raise AmiwarpError(
+                    f"array {name} has shape {shape}; expected one length (n,)",
+                    ErrorCode.FILE_DAMAGED,
+                )
 
     def pieces(chosen: tuple[int, ...], notes: dict[str, int]) -> Rows:
         first, *others = [str(columns[at].name) for at in chosen]
@@ -188,7 +194,7 @@ def _arrays_table(names: Sequence[str], opened: OpenedByName) -> Table:
         for name in others:
             if counts[name] != count:
                 shapes = f"array {name} has shape ({counts[name]},), {first} ({count},)"
-                raise AmiwarpError(f"{shapes}; expected one length (n,)")
+                raise AmiwarpError(f"{shapes}; expected one length (n,)", ErrorCode.FILE_DAMAGED)
         with contextlib.ExitStack() as stack:
             arrays = [opened(name, stack)[0] for name in (first, *others)]
             for length in lengths(count, notes):
@@ -250,7 +256,8 @@ def _fields_table(array: Array, opened: Opened, name: str) -> Table:
     _, shape, dtype = array
     if len(shape) != 1:
         raise AmiwarpError(
-            f"{name} is {dtype} of shape {shape}; expected fields t, x, y, p of shape (n,)"
+            f"{name} is {dtype} of shape {shape}; expected fields t, x, y, p of shape (n,)",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     (count,) = shape
     head = next_rows(array, min(count, SAMPLE))

@@ -37,7 +37,8 @@ def find_layout(columns: Sequence[Column], given: GivenLayout, hints: Hints) -> 
     for role, column in chosen.items():
         if column.values.dtype.kind not in "iufb" or column.values.ndim != 1:
             raise AmiwarpError(
-                f"column {_shown(columns, roles[role])} for {role} is {column.values.dtype}; give numbers"
+                f"column {_shown(columns, roles[role])} for {role} is {column.values.dtype}; give numbers",
+                ErrorCode.FORMAT_UNKNOWN,
             )
 
     unit, why = find_unit(chosen["t"], given, hints)
@@ -125,7 +126,8 @@ def _given_columns(columns: Sequence[Column], text: str) -> dict[str, int]:
             if not known:
                 known = f"the numbers 1 to {len(columns)}"
             raise AmiwarpError(
-                f"has no column {wanted!r}, which --columns gives for {role}; it has {known}"
+                f"has no column {wanted!r}, which --columns gives for {role}; it has {known}",
+                ErrorCode.CONTENT_MISSING,
             )
         (roles[role],) = matches
     return roles

@@ -195,7 +195,8 @@ def read_columns(
         counts = {source.count for source in used}
         if len(counts) != 1:
             raise AmiwarpError(
-                f"the columns have the lengths {sorted(counts)}; expected one length"
+                f"the columns have the lengths {sorted(counts)}; expected one length",
+                ErrorCode.FILE_DAMAGED,
             )
         count = counts.pop()
         notes["total"] = max(count, 1)

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.file_access import read_at, write_at
 from amiwarp.io.hdf5.chunks import CHUNK
 from amiwarp.tasks import interrupts_later
@@ -86,7 +86,7 @@ class ChunkFile:
         with self._turns:
             self._turns.wait_for(lambda: self._turn == number or self._failed < number)
             if self._failed < number:
-                raise AmiwarpError("an earlier part could not be written")
+                raise AmiwarpError("an earlier part could not be written", ErrorCode.OUTPUT_FAILED)
             yield
             self._turn += 1
             self._turns.notify_all()

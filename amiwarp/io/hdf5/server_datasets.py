@@ -161,7 +161,8 @@ def describe(stored: Any, name: str, kinds: str, about: FileFacts) -> dict[str, 
     if row_bytes(dataset) > CHUNK_BYTES or not has_whole_rows:
         raise AmiwarpError(
             f"dataset '{name}' has rows of over {CHUNK_BYTES >> 20} MiB, or chunks of partial rows; "
-            "rewrite the file with chunks of whole rows"
+            "rewrite the file with chunks of whole rows",
+            ErrorCode.FORMAT_UNKNOWN,
         )
 
     places: list[tuple[int, int]] | None = None
@@ -287,7 +288,8 @@ def bytes_of_chunk(dataset: Any, name: str) -> int:
     size = math.prod(dataset.chunks) * int(dataset.dtype.itemsize)
     if size > CHUNK_BYTES:
         raise AmiwarpError(
-            f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store it in smaller chunks"
+            f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store it in smaller chunks",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     return size
 

@@ -90,7 +90,8 @@ def _open_ros1(bag: Any, path: str) -> None:
             ) from error
         if str(error).startswith("Bag is not indexed"):
             raise AmiwarpError(
-                "has no index, because its recording was not ended; run rosbag reindex"
+                "has no index, because its recording was not ended; run rosbag reindex",
+                ErrorCode.FILE_DAMAGED,
             ) from error
         if not str(error).startswith("Bag index looks damaged"):
             raise
@@ -170,7 +171,8 @@ def choose(bag: Any, topic: str | None, version: int) -> Any:
     )
     shown = ", ".join(others[:20]) or "none"
     raise AmiwarpError(
-        f"is a ROS {version} bag without event topics; its topics are {shown}; give a bag with events"
+        f"is a ROS {version} bag without event topics; its topics are {shown}; give a bag with events",
+        ErrorCode.CONTENT_MISSING,
     )
 
 
@@ -214,5 +216,6 @@ def _check_order(types: Any, name: str) -> None:
         if given != expected:
             shown = ", ".join(given) or "nothing"
             raise AmiwarpError(
-                f"defines {name} with the fields {shown}; expected {', '.join(expected)}"
+                f"defines {name} with the fields {shown}; expected {', '.join(expected)}",
+                ErrorCode.FORMAT_UNKNOWN,
             )

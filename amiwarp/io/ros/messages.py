@@ -142,7 +142,8 @@ def decode_array(raw: bytes | memoryview, *, ros1: bool) -> tuple[int, int, Colu
         encapsulation = bytes(raw[:2])
         if encapsulation != b"\0\1":
             raise AmiwarpError(
-                f"has messages of the encapsulation {encapsulation.hex()}; expected little-endian CDR"
+                f"has messages of the encapsulation {encapsulation.hex()}; expected little-endian CDR",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         raw = raw[4:]
     # The header: in ROS 1 a sequence number, then in both the time and a string. In ROS 2, numbers are aligned.

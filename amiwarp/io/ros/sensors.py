@@ -48,7 +48,8 @@ def read_heads(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[N
         if depth is None:
             known = ", ".join(DEPTHS)
             raise AmiwarpError(
-                f"the images have the encoding '{message.encoding[:40]}', not one of {known}"
+                f"the images have the encoding '{message.encoding[:40]}', not one of {known}",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         is_row_short = message.step < message.width * depth
         if is_row_short or message.data.size < message.height * message.step:

@@ -76,7 +76,8 @@ def find_form(path: Path, head: bytes) -> TextForm:
         if b"\r" in line.rstrip(b"\r\n"):
             raise AmiwarpError(
                 f"{path}: line {number + 1} holds a carriage return; lines must end with a newline; replace the "
-                "carriage returns by newlines"
+                "carriage returns by newlines",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         words = TextRow.of(line).words(line) if holds_values(line) else []
         may_be_size = len(words) == 2 and size is None and names is None
@@ -89,7 +90,9 @@ def find_form(path: Path, head: bytes) -> TextForm:
             if len(words) == 2:
                 shown = b" ".join(words)[:80].decode("ascii", "replace")
                 raise AmiwarpError(
-                    f"{path}: line {number + 1} '{shown}' is not a size in pixels; expected 'width height' or 't x y p'"
+                    f"{path}: line {number + 1} '{shown}' is not a size in pixels; "
+                    "expected 'width height' or 't x y p'",
+                    ErrorCode.FORMAT_UNKNOWN,
                 )
             rows = head[position:].split(b"\n", ROWS_OF_FORM)[:ROWS_OF_FORM]
             row = _form_of_rows(path, number + 1, rows)

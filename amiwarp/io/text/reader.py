@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events, Recording
 from amiwarp.io.camera_files import read_calib
 from amiwarp.io.columns.layout import Layout
@@ -113,7 +113,8 @@ def _text_packets(
         whole, newline, rest = (rest + data).rpartition(b"\n")
         if len(rest) > LONGEST_LINE:
             raise AmiwarpError(
-                f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters"
+                f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters",
+                ErrorCode.FILE_DAMAGED,
             )
         if newline:
             yield parse(whole, line_number)
@@ -176,7 +177,9 @@ def _parse(path: Path, form: TextForm, layout: Layout, text: bytes, line_number:
         table = np.zeros((0, 0))
     if not _are_events(table, (len(kept), form.width), layout):
         bad = _first_bad_line(text.split(b"\n"), line_number, form, layout)
-        raise AmiwarpError(f"{path}: {bad}; expected {_expected(form, layout)}")
+        raise AmiwarpError(
+            f"{path}: {bad}; expected {_expected(form, layout)}", ErrorCode.FILE_DAMAGED
+        )
     if layout.unit == "ns":
         return _events(table, layout, _whole_times(kept, layout))
     return _events(table, layout)

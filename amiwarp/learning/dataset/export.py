@@ -199,7 +199,8 @@ def _exportable(
     head, items = recorded_dataset.read_manifest(folder / recorded_dataset.MANIFEST)
     if not items:
         raise AmiwarpError(
-            f"{folder}: has no recordings to export; make some with 'amiwarp dataset'"
+            f"{folder}: has no recordings to export; make some with 'amiwarp dataset'",
+            ErrorCode.CONTENT_MISSING,
         )
     tensors = [item for item in items if item.representation is not None]
     if tensors and chosen is ExportFormat.PARQUET:

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.camera_source import CameraSource
@@ -59,7 +59,8 @@ class ReturningSource:
             what = "give camera:, dv, prophesee, tcp:, unix:, tcp-listen: or unix-listen:, or omit the option"
             raise AmiwarpError(
                 f"{spec}: --wait-for-source applies to sockets and cameras only, because other sources cannot be "
-                f"reopened; {what}"
+                f"reopened; {what}",
+                ErrorCode.OPTIONS,
             )
         self._wait_s = wait_s
         self._say = say

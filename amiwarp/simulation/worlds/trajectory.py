@@ -224,7 +224,9 @@ class Trajectory:
             If both ``look_at`` and ``rotation`` are given, or one of the arguments is not usable.
         """
         if look_at is not None and rotation is not None:
-            raise AmiwarpError("look_at and rotation are both given; give one of them")
+            raise AmiwarpError(
+                "look_at and rotation are both given; give one of them", ErrorCode.OPTIONS
+            )
         quaternion: ArrayLike = (0, 0, 0, 1) if rotation is None else rotation
         if look_at is not None:
             quaternion = looking_at(position, look_at).as_quat()
@@ -307,11 +309,13 @@ class Trajectory:
                 row = [float(word) for word in words]
             except ValueError as error:
                 raise AmiwarpError(
-                    f"{path}: line {number} is {line[:60]!r}; expected 8 numbers t x y z qx qy qz qw"
+                    f"{path}: line {number} is {line[:60]!r}; expected 8 numbers t x y z qx qy qz qw",
+                    ErrorCode.FILE_DAMAGED,
                 ) from error
             if len(row) != COLUMNS:
                 raise AmiwarpError(
-                    f"{path}: line {number} has {len(row)} numbers; expected 8: t x y z qx qy qz qw"
+                    f"{path}: line {number} has {len(row)} numbers; expected 8: t x y z qx qy qz qw",
+                    ErrorCode.FILE_DAMAGED,
                 )
             if len(values) == COLUMNS * MOST_POSES:
                 raise AmiwarpError(

@@ -38,7 +38,8 @@ def open_world(
     world, stored = load_world(Path(name))
     if trajectory is not None and poses is None:
         raise AmiwarpError(
-            f"trajectory {trajectory} applies only to named worlds; give a file of poses for {name}"
+            f"trajectory {trajectory} applies only to named worlds; give a file of poses for {name}",
+            ErrorCode.OPTIONS,
         )
     chosen = poses or stored
     if chosen is None:

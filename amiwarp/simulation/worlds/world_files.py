@@ -130,7 +130,8 @@ def _read(path: Path) -> dict[str, Any]:
         data = read_toml(path, "a world")
     else:
         raise AmiwarpError(
-            f"{path}: has the suffix {path.suffix!r}; a world file ends in .toml or .json"
+            f"{path}: has the suffix {path.suffix!r}; a world file ends in .toml or .json",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     return data
 
