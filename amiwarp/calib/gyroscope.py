@@ -135,16 +135,16 @@ def find_gyroscope(recording: Recording, encoder: Encoder, camera: Camera) -> Gy
     known = imu.to_camera
     others = orientations()
     if known is not None:
-        others = [each for each in others if angle_between(each, known) > OTHER_RAD]
-    first = [coarse.agreement(each, np.zeros(7)) for each in others]
+        others = [rotation for rotation in others if angle_between(rotation, known) > OTHER_RAD]
+    first = [coarse.agreement(rotation, np.zeros(7)) for rotation in others]
     best_first = np.argsort(first, kind="stable")[::-1]
     tried = [others[k] for k in best_first[:BEST]]
     if known is not None:
         tried = [known, *tried[:1]]
     runs = []
-    for each in tried:
-        rough = coarse.search(each, BIAS_ALONE)
-        runs.append(fine.search(each, BIAS_ALONE, rough.v))
+    for rotation in tried:
+        rough = coarse.search(rotation, BIAS_ALONE)
+        runs.append(fine.search(rotation, BIAS_ALONE, rough.v))
     best = runs[0]
     if known is None:
         best = max(runs, key=lambda run: run.agreement)

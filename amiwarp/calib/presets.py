@@ -163,6 +163,8 @@ def _gain(model: Model, other: Model) -> float:
         indexing="ij",
     )
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
-    ours, theirs = (each.compensate_points(xy, theta.ravel()) - xy for each in (model, other))
+    ours, theirs = (
+        moving_model.compensate_points(xy, theta.ravel()) - xy for moving_model in (model, other)
+    )
     finite = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
     return float(np.sum(ours[finite] * theirs[finite]) / np.sum(ours[finite] ** 2))

@@ -60,9 +60,9 @@ def without_start_burst(recording: Recording) -> tuple[Recording, tuple[str, ...
     stamps = f"carry the first time stamp ({source.t_first} us), far more than any later one"
     if last > source.t_first:
         stamps = f"came in the first {last - source.t_first} us (from {source.t_first} us on), far more than later"
-    said = f"{count:,} events {stamps}, as cameras emit when they start: they were left out of the calibration"
+    warning = f"{count:,} events {stamps}, as cameras emit when they start: they were left out of the calibration"
     # The ground truth has a value for each event of the whole recording. Calibration does not use it.
-    return replace(recording, events=later, truth=None), (said,)
+    return replace(recording, events=later, truth=None), (warning,)
 
 
 def burst_size(source: EventSource) -> int:

@@ -164,12 +164,12 @@ class BatchPipeline:
         count = len(start)
         params = self._encoder
         if count > len(getattr(params, f"{prefix}start") or ()):
-            room = max(2 * count, 64)
+            capacity = max(2 * count, 64)
             larger = {
                 "first": wp.zeros(2, dtype=int, device=self._device),
-                "start": wp.zeros(room, dtype=wp.int64, device=self._device),
-                "angle": wp.zeros(room, dtype=wp.uint64, device=self._device),
-                "slope": wp.zeros(room, dtype=wp.uint64, device=self._device),
+                "start": wp.zeros(capacity, dtype=wp.int64, device=self._device),
+                "angle": wp.zeros(capacity, dtype=wp.uint64, device=self._device),
+                "slope": wp.zeros(capacity, dtype=wp.uint64, device=self._device),
             }
             for name, values in larger.items():
                 setattr(params, prefix + name, values)

@@ -387,10 +387,10 @@ def host_numbers(n: int, dtype: Any, device: Any) -> wp.array:
 
     A caller that has waited for the device puts it back to ``idle_numbers``.
     """
-    idle = idle_numbers[device.is_cpu, dtype]
-    while idle:
+    free_numbers = idle_numbers[device.is_cpu, dtype]
+    while free_numbers:
         with contextlib.suppress(IndexError):  # another thread took it
-            numbers = idle.pop()
+            numbers = free_numbers.pop()
             if len(numbers) >= n:
                 return numbers
     return wp.zeros(max(n, 64), dtype=dtype, device="cpu", pinned=device.is_cuda)

@@ -405,9 +405,9 @@ class Events:
         >>> events.to_structured([("t", "i8"), ("x", "i2"), ("y", "i2"), ("p", "?")])[0].item()
         (0, 10, 5, True)
         """
-        own = [(name, getattr(self, name).dtype) for name in COLUMNS]
+        own_types = [(name, getattr(self, name).dtype) for name in COLUMNS]
         try:
-            wanted = np.dtype(own if dtype is None else dtype)
+            wanted = np.dtype(own_types if dtype is None else dtype)
         except Exception as error:  # any that converting an unknown object raises
             raise AmiwarpError(
                 f"dtype is {shown(dtype)}; give a NumPy data type with the fields x, y, t, p"

@@ -241,7 +241,7 @@ class RunningFilter:
             never = wp.int64(NEVER)
             self._latest[name] = wp.full(pixels, never, dtype=wp.int64, device="cpu")
         columns = [
-            wp.array(each, device="cpu", copy=False) for each in (events.x, events.y, events.t)
+            wp.array(column, device="cpu", copy=False) for column in (events.x, events.y, events.t)
         ]
         marks = wp.empty(len(events), dtype=wp.bool, device="cpu")
         load(kernel, wp.get_device("cpu"))
@@ -322,7 +322,7 @@ def is_given(chosen: EventFilter, name: str) -> bool:
     return True
 
 
-NOTHING = {each.name: each.default for each in fields(EventFilter)}
+NOTHING = {option.name: option.default for option in fields(EventFilter)}
 """Values with which the parts of a filter keep all events."""
 
 

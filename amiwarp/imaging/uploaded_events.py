@@ -140,8 +140,8 @@ class UploadedEvents:
         """Return the same events with other columns."""
         arrays = angle_kernels.EventsWithAngles()
         for name in ("x", "y", "turn", "second", "azimuths", "time", "weight", "layer"):
-            own = getattr(self.arrays, name)
-            setattr(arrays, name, columns.get(name, own))
+            own_values = getattr(self.arrays, name)
+            setattr(arrays, name, columns.get(name, own_values))
         return replace(self, arrays=arrays)
 
 
@@ -283,15 +283,17 @@ def _fold_keys(arrays: Any, n: int, bins: int) -> Keys:
         raise AmiwarpError(
             f"fold = {bins} angles a turn; give 1 .. {LARGEST_FOLD}, or 0 to disable folding"
         )
-    room = n if device.is_cpu else 2 * n  # sorting on CUDA needs scratch memory behind the keys
-    keys = wp.empty(room, dtype=wp.int64, device=device)
+    key_count = (
+        n if device.is_cpu else 2 * n
+    )  # sorting on CUDA needs scratch memory behind the keys
+    keys = wp.empty(key_count, dtype=wp.int64, device=device)
     inputs = [arrays.x, arrays.y, arrays.layer, arrays.turn, bins]
     launch(event_folding.fold_keys, n, inputs, [keys], device=device)
     if device.is_cpu:
         values = keys.numpy()  # shares the memory of keys
         values.sort()
         return values
-    order = wp.zeros(room, dtype=int, device=device)
+    order = wp.zeros(key_count, dtype=int, device=device)
     wp.utils.radix_sort_pairs(keys, order, n)
     return np.asarray(keys[:n].numpy())
 

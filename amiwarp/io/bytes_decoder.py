@@ -172,17 +172,17 @@ class BytesDecoder:
         from amiwarp.kernels.loading import load
 
         load(kernel, self._device)
-        room = MOST_PACKETS
+        capacity = MOST_PACKETS
         while True:
-            packets = wp.empty(room, dtype=kind, device=self._device)
+            packets = wp.empty(capacity, dtype=kind, device=self._device)
             result = wp.empty(2, dtype=int, device=self._device)
-            wp.launch(kernel, 1, [data, room], [packets, result], device=self._device)
+            wp.launch(kernel, 1, [data, capacity], [packets, result], device=self._device)
             count, wrong = result.numpy().tolist()
             if wrong >= 0:
                 raise self._damaged(wrong)
-            if count <= room:
+            if count <= capacity:
                 return np.asarray(packets.numpy()[:count])
-            room = count
+            capacity = count
 
     def _damaged(self, at: int) -> AmiwarpError:
         """Return the error to raise for a packet at a position."""

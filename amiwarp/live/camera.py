@@ -109,7 +109,7 @@ def open_camera(
     kind, colon, _ = name.partition(":")
     if kind not in CAMERAS:
         raise AmiwarpError(
-            f"name is {name!r}; give a camera: {', '.join(f'{each}:' for each in CAMERAS)}"
+            f"name is {name!r}; give a camera: {', '.join(f'{prefix}:' for prefix in CAMERAS)}"
         )
     wait_s = real(wait_for_source_s, "wait_for_source_s", 0.0, 1e9, " s")
     text = "" if settings is None else str(settings)

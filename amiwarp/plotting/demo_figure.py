@@ -176,11 +176,11 @@ class Grid:
 
 def enlarge(figure: Any, cost: Any) -> None:
     """Enlarge the text so that it stays legible when the figure is shown at half its size."""
-    for each in figure.axes:
-        each.title.set_fontsize(TITLE)
-        each.tick_params(labelsize=TITLE - 2.0)
-        each.xaxis.label.set_fontsize(TITLE - 2.0)
-        each.yaxis.label.set_fontsize(TITLE - 2.0)
+    for ax in figure.axes:
+        ax.title.set_fontsize(TITLE)
+        ax.tick_params(labelsize=TITLE - 2.0)
+        ax.xaxis.label.set_fontsize(TITLE - 2.0)
+        ax.yaxis.label.set_fontsize(TITLE - 2.0)
     for text in cost.get_legend().get_texts():
         text.set_fontsize(TITLE - 3.0)
 

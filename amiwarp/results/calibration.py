@@ -83,7 +83,7 @@ class StageSummary:
         """
         scores = stage.scores.tolist()
         values = list(values)
-        complete = all(isinstance(each, Mapping) and each.keys() >= {*names} for each in values)
+        complete = all(isinstance(row, Mapping) and row.keys() >= {*names} for row in values)
         if len(values) != len(scores) or not complete:
             raise AmiwarpError(
                 f"values are {shown(values)}; give {', '.join(names)} at each of {len(scores)} points"
@@ -595,11 +595,11 @@ def replaces(path: Encoder, encoder: Encoder) -> bool:
 def _replaces_one(path: Encoder, encoder: Encoder) -> bool:
     """Return whether the path of one angle was found for the samples of its encoder, or for a part of them."""
     first, last = np.searchsorted(encoder.t, [path.t[0], path.t[-1] + 1])
-    own = slice(int(first), int(last))
-    if last - first < 2 or not np.isin(encoder.t[own], path.t).all():
+    own_turns = slice(int(first), int(last))
+    if last - first < 2 or not np.isin(encoder.t[own_turns], path.t).all():
         return False
-    at = np.searchsorted(path.t, encoder.t[own])
-    return bool((np.abs(path.angle[at] - encoder.angle[own]) < math.pi).all())
+    at = np.searchsorted(path.t, encoder.t[own_turns])
+    return bool((np.abs(path.angle[at] - encoder.angle[own_turns]) < math.pi).all())
 
 
 def prism_to_json(prism: Prism | Plate) -> dict[str, Any]:

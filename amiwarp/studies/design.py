@@ -189,11 +189,11 @@ class Design:
         smallest_apex = orbit.apex * LEAST_SWING / orbit.swing
 
         # Square of the blur that clock and encoder may add to the rounding to pixels
-        room = self.limits.tolerance_px**2 - QUANTISATION_PX**2
+        blur_left = self.limits.tolerance_px**2 - QUANTISATION_PX**2
         added = math.hypot(*self.timing.blur(orbit.radius, rpm))
         if added == 0.0:
             return smallest_apex, math.inf
-        return smallest_apex, orbit.apex * (math.sqrt(max(room, 0.0)) / added)
+        return smallest_apex, orbit.apex * (math.sqrt(max(blur_left, 0.0)) / added)
 
 
 def design(

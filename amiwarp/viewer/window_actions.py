@@ -406,7 +406,7 @@ def _hot_text(hot: Sequence[HotPixel]) -> str:
     if not hot:
         return "no hot pixels found"
     busiest = "; ".join(
-        f"x {each.x}, y {each.y}: {each.rate:,.0f} events/s" for each in hot[:NAMED_HOT]
+        f"x {pixel.x}, y {pixel.y}: {pixel.rate:,.0f} events/s" for pixel in hot[:NAMED_HOT]
     )
     most = "with the highest rates: " if len(hot) > NAMED_HOT else ""
     return f"{len(hot):,} hot pixel{'s' if len(hot) > 1 else ''} hidden; {most}{busiest}"

@@ -58,7 +58,7 @@ class Chart:
     def __init__(self, title: str, curves: tuple[tuple[str, float, str], ...]) -> None:
         """``title``: what the chart shows over what, with units; ``curves``: colours, widths and names."""
         self.title = title
-        self.curves = [Curve(*each) for each in curves]
+        self.curves = [Curve(*curve) for curve in curves]
         self.x_range = (0.0, 1.0)
         self.y_range = (0.0, 1.0)
 
@@ -71,9 +71,9 @@ class Chart:
         if len(values):
             low = float(values.min())
             high = float(values.max())
-        room = ROOM * max(high - low, least)
+        margin = ROOM * max(high - low, least)
         self.x_range = x_range
-        self.y_range = (low - room, max(high, low + least) + room)
+        self.y_range = (low - margin, max(high, low + least) + margin)
 
     def plot_area(self, rect: Rect, font_px: int) -> Rect:
         """Return the part of the chart's place in which the curves are."""

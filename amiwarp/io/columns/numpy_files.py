@@ -112,7 +112,7 @@ def _npz_table(path: Path, names: Sequence[str], given: GivenLayout) -> Table:
     are_chosen = False
     if given.columns is not None:
         wanted = tuple(given_roles(given.columns).values())
-        all_exist = all(_is_among(names, each) for each in wanted)
+        all_exist = all(_is_among(names, wanted_name) for wanted_name in wanted)
         are_chosen = len(names) >= len(ROLES) and (all_exist or not whole)
     if names_roles(names) or are_chosen:
         return _arrays_table(_readable(path, names, wanted), opened)

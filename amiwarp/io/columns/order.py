@@ -96,7 +96,7 @@ def common_values(values: NDArray[Any]) -> list[Any]:
 
 def order_by_values(values: Sequence[NDArray[Any]], hints: Hints) -> tuple[str, ...]:
     """Return the order of four columns without names; x is taken to come before y."""
-    facts = [_Facts.of(each) for each in values]
+    facts = [_Facts.of(column_values) for column_values in values]
     if hints.order is not None and _fits_promise(facts, hints.order):
         return hints.order
     fitting = []

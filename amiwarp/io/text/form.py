@@ -55,7 +55,7 @@ class TextForm:
     """Indices of the columns that are dates with times of day."""
     units: tuple[str | None, ...] = ()
     """Unit of time of each column in a line below the names; empty without such a line."""
-    own: TextSize | None = None
+    written_size: TextSize | None = None
     """What amiwarp wrote beside the text, or None."""
 
 
@@ -176,8 +176,8 @@ def find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLayo
     rows, numbers = _rows_of_numbers(head, is_cut, form)
     names = _fitting_names(form, numbers, given)
     hints = Hints(is_text=True)
-    if form.own is not None:
-        hints = replace(hints, unit=form.own.unit, is_own=True)
+    if form.written_size is not None:
+        hints = replace(hints, unit=form.written_size.unit, is_own=True)
     if names is None:
         hints = replace(hints, order=ROLES, fractions="s")
     layout = find_layout(_columns_of(form, names, numbers), given, hints)
@@ -193,8 +193,8 @@ def find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLayo
     if given.time_unit is None and names is None and are_seconds:
         layout = _in_seconds(layout, given)
 
-    if form.own is not None and form.own.compensated is not None:
-        return replace(layout, compensated=form.own.compensated)
+    if form.written_size is not None and form.written_size.compensated is not None:
+        return replace(layout, compensated=form.written_size.compensated)
     x_and_y = [layout.columns["x"], layout.columns["y"]]
     places = numbers[:, x_and_y]
     has_fraction = (places != np.floor(places)).any(axis=1)

@@ -62,10 +62,10 @@ def open_text(path: Path, given: GivenLayout) -> Recording:
     with errors_name(path, lambda: "line 1"):
         head, is_cut = text_head(path, max(HEAD_BYTES, 2 * LONGEST_LINE))
         form = find_form(path, head)
-    own = read_size(path)
-    if own is not None:
+    written_size = read_size(path)
+    if written_size is not None:
         names = form.names or ROLES
-        form = replace(form, names=names, size=own.size, own=own)
+        form = replace(form, names=names, size=written_size.size, written_size=written_size)
     with errors_name(path, lambda: "finding the columns"):
         layout = find_text_layout(head, is_cut, form, given)
     events = FileEvents(

@@ -175,7 +175,9 @@ def doubtful_comma(lines: Iterable[bytes]) -> bytes | None:
 def _decimals_between_spaces(line: bytes) -> bool:
     """Return whether the commas of a line are decimal ones in columns between spaces or tabs."""
     fields = line.split()
-    return len(fields) >= 4 and all(b"," not in each or DECIMAL.fullmatch(each) for each in fields)
+    return len(fields) >= 4 and all(
+        b"," not in field or DECIMAL.fullmatch(field) for field in fields
+    )
 
 
 def number_of(word: bytes) -> float:

@@ -234,7 +234,7 @@ def check_lost_host(talk: Conversation) -> Check:
     talk.run(LOST_HOST_S + STOP_S, until=lambda: talk.status.target_rpm == 0, pings=False)
     after = (talk.wire.now_us() - silent) * 1e-6
     stopped = talk.run(STOP_S, until=lambda: talk.status.state == 0, pings=False)
-    said = bool(talk.status.faults & LOST_HOST_STOP)
+    stops = bool(talk.status.faults & LOST_HOST_STOP)
     end = talk.ask(protocol.Condition)
 
     # A new command clears the fault. The setting cannot change while the prism turns.
@@ -254,11 +254,13 @@ def check_lost_host(talk: Conversation) -> Check:
         and end.host_timeout_s == LOST_HOST_S
     )
     on_time = LOST_HOST_S - PING_S <= after <= LOST_HOST_S + CHANGE_S
-    good = taken == restored == again == 0 and not kept and stopped and said and counted and cleared
+    good = (
+        taken == restored == again == 0 and not kept and stopped and stops and counted and cleared
+    )
     what = (
         f"told {LOST_HOST_S} s, {'' if stopped else 'not '}stopped after {after:.1f} s of silence"
     )
-    what += f"{'' if counted else ', not counted'}{'' if said else ', not said'}"
+    what += f"{'' if counted else ', not counted'}{'' if stops else ', not stops'}"
     remedy = "brake when no frame came for the setting host-timeout; count it; set fault bit 10 until a new command"
     return Check(name, good and on_time and while_turning == 3, what, remedy)
 

@@ -182,7 +182,7 @@ def _parse_settings(parts: Sequence[str]) -> CameraSettings:
         name, _, value = part.partition("=")
         if name == "settings":
             saved = saved_settings(value)
-            values |= {each.name: getattr(saved, each.name) for each in fields(saved)}
+            values |= {field.name: getattr(saved, field.name) for field in fields(saved)}
             biases |= saved.biases
             continue
         field_name, read, form = FORMS.get(

@@ -86,7 +86,7 @@ def run_translate(
 
     device = cli.choose_device(common.device)
     name = None if dataset is None else choice(DataSet, dataset, "--dataset")
-    way = choice(Interpolation, interpolation, "--interpolation")
+    interpolation_kind = choice(Interpolation, interpolation, "--interpolation")
     plain: Path | Recording = source
     between: Path | Recording | None = events
     if layout.given():
@@ -97,7 +97,7 @@ def run_translate(
             plain,
             events=between,
             dataset=name,
-            interpolation=way,
+            interpolation=interpolation_kind,
             fps=fps,
             device=device,
             progress=advance,

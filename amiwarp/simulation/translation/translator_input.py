@@ -185,7 +185,7 @@ def _from_events(
 def _saccade_windows(start_us: int, camera: Camera) -> list[Window]:
     """Return one window for each saccade."""
     rates = saccade_rates(camera)
-    return [Window(start_us + k * SACCADE_US, SACCADE_US, each) for k, each in enumerate(rates)]
+    return [Window(start_us + k * SACCADE_US, SACCADE_US, rate) for k, rate in enumerate(rates)]
 
 
 def _from_picture(path: Path) -> TranslatorInput:

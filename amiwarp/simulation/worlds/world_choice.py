@@ -33,8 +33,8 @@ def open_world(
         if trajectory is not None and poses is None:
             _check_is_name("trajectory", trajectory, TRAJECTORIES, POSE_FILES)
         kind = "still" if poses is not None else trajectory or "handheld"
-        world, own = named_world(name, kind, seed=seed, duration_s=duration_s)
-        return world, poses or own
+        world, named_trajectory = named_world(name, kind, seed=seed, duration_s=duration_s)
+        return world, poses or named_trajectory
     world, stored = load_world(Path(name))
     if trajectory is not None and poses is None:
         raise AmiwarpError(

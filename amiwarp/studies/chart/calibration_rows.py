@@ -106,8 +106,8 @@ def _stages(known: KnownRecording) -> Iterator[CalibrationSetting]:
     for model in rungs():
         yield from _both(model, "model", Settings(model=model))
     guess = Settings(global_algorithm=None, start={"phase": known.model.phase + GUESS})
-    for way in _both("local search from a guess", "algorithms", guess):
-        yield replace(way, comparable=False)
+    for setting in _both("local search from a guess", "algorithms", guess):
+        yield replace(setting, comparable=False)
 
 
 def _events() -> Iterator[CalibrationSetting]:

@@ -425,7 +425,7 @@ def _claims_of_paper(moving: Sequence[dict[str, Any]]) -> list[Claim]:
 def _error_checks(rows: Sequence[dict[str, Any]], moving: Sequence[dict[str, Any]]) -> list[Claim]:
     """Check the error at the usual limit: against the S-EV's, and over the camera's motions."""
     efast = where(moving, detector=CornerMethod.EFAST)
-    room = where(rows, detector=CornerMethod.EFAST, scene="room")
+    rows_of_room = where(rows, detector=CornerMethod.EFAST, scene="room")
     return [
         judge(
             None,
@@ -439,7 +439,7 @@ def _error_checks(rows: Sequence[dict[str, Any]], moving: Sequence[dict[str, Any
         judge(
             None,
             f"The error does not depend on the camera's motion, within {SAME_PX:g} px (room, {TRACKS_END}).",
-            differences(ranges(room, "error_px"), "error_px", AMI, by=("scene",)),
+            differences(ranges(rows_of_room, "error_px"), "error_px", AMI, by=("scene",)),
             f"the range of the error of '{Stream.CALIBRATED}' over the camera's motions, with rest,",
             below=SAME_PX,
             unit="px",
