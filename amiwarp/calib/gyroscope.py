@@ -211,11 +211,13 @@ class Alignment:
 def _range_edges(encoder: Encoder, first: int, last: int) -> NDArray[np.int64]:
     """Return the times [us] between ranges of angles of the optic, for whole ranges from ``first`` on."""
     samples = max(2, (last - first) // 500)
-    at = np.linspace(first, last, samples)
-    turned = np.abs(encoder.angle_at(at.astype(np.int64)) - float(encoder.angle_at(first)))
+    sample_times = np.linspace(first, last, samples)
+    turned = np.abs(
+        encoder.angle_at(sample_times.astype(np.int64)) - float(encoder.angle_at(first))
+    )
     ranges = np.maximum.accumulate(turned) * (ANGLE_RANGES / math.tau)
     count = int(ranges[-1])
-    return np.interp(np.arange(count + 1), ranges, at).astype(np.int64)
+    return np.interp(np.arange(count + 1), ranges, sample_times).astype(np.int64)
 
 
 class ImagePairs:

@@ -200,8 +200,8 @@ def search_in_phase(space: ParameterSpace, tiles: PhaseTiles) -> FoundInPhase:
     costs = tiles.costs(both, BANDS[0])
     forward, backward = costs.reshape(2, PHASES, SIZES)
 
-    at = np.unravel_index(int(np.argmin(forward)), forward.shape)
-    apart = np.abs(np.angle(np.exp(1j * (phases - phases[at[0]]))))
+    best = np.unravel_index(int(np.argmin(forward)), forward.shape)
+    apart = np.abs(np.angle(np.exp(1j * (phases - phases[best[0]]))))
     rival = float(forward[apart >= RIVAL_PHASE].min())
     points = [
         space.to_vector({**space.start, size: float(grid_size), "phase": float(phase)})

@@ -185,9 +185,9 @@ def reach(space: ParameterSpace, values: Mapping[str, float]) -> float:
 @lru_cache(maxsize=16)
 def _border_points(camera: Camera) -> tuple[NDArray[np.float64], wp.array, wp.array]:
     """Return pixels of the image's border at 16 prism angles [px], shape (n, 2); and both as Warp arrays on the CPU."""
-    at = border(camera)
-    xy = np.tile(at, (16, 1))
-    return xy, *points_on_host(xy, np.repeat(np.arange(16) * (np.pi / 8), len(at)))
+    border_pixels = border(camera)
+    xy = np.tile(border_pixels, (16, 1))
+    return xy, *points_on_host(xy, np.repeat(np.arange(16) * (np.pi / 8), len(border_pixels)))
 
 
 STEP_PX = 0.25

@@ -104,8 +104,8 @@ class Encoder:
             )
         good = np.abs(self.angle) <= LARGEST_ANGLE  # NaN fails
         if not good.all():
-            at = int(np.argmin(good))
-            given = f"encoder sample {at} has angle {self.angle[at]}"
+            first_bad = int(np.argmin(good))
+            given = f"encoder sample {first_bad} has angle {self.angle[first_bad]}"
             raise AmiwarpError(
                 f"{given}; expected a finite number within {LARGEST_ANGLE:g} rad of 0"
             )

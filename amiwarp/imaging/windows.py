@@ -368,16 +368,16 @@ def _one_way(turned: NDArray[np.float64]) -> Iterator[tuple[int, int, int, int, 
     steps = np.diff(np.floor(turned) + np.ceil(turned))
     passes = np.flatnonzero(steps) + 1
     for k in passes.tolist():
-        at = float(turned[k])
-        if abs(at - level) < 1.0:
+        start_turns = float(turned[k])
+        if abs(start_turns - level) < 1.0:
             continue
-        ahead = 1 if at > level else -1
+        ahead = 1 if start_turns > level else -1
         if direction == -ahead:
             yield start, k, before, direction, abs(level - before)
             start = k - 1
             before = level
         direction = ahead
-        level = ahead * math.floor(ahead * at)
+        level = ahead * math.floor(ahead * start_turns)
     if direction:
         yield start, len(turned), before, direction, abs(level - before)
 

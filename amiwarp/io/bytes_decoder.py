@@ -184,9 +184,10 @@ class BytesDecoder:
                 return np.asarray(packets.numpy()[:count])
             capacity = count
 
-    def _damaged(self, at: int) -> AmiwarpError:
+    def _damaged(self, offset: int) -> AmiwarpError:
         """Return the error to raise for a packet at a position."""
         return AmiwarpError(
-            f"byte {at} of the data does not begin a whole packet of {self._format}; give whole packets, and leave out "
+            f"byte {offset} of the data does not begin a whole packet of {self._format}; give whole packets, "
+            "and leave out "
             "damaged ones"
         )

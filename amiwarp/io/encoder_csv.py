@@ -36,7 +36,7 @@ def read_encoder_csv(
     path = Path(path)
     with errors_name(path, lambda: "reading the encoder"):
         names, table, lines = _read_table(path)
-        columns = {name: table[:, at] for at, name in enumerate(names)}
+        columns = {name: table[:, column] for column, name in enumerate(names)}
         t = np.rint(columns["t_us"]).astype(np.int64)
         late = np.flatnonzero(t[1:] <= t[:-1])
         if late.size:

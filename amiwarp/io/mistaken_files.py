@@ -54,7 +54,7 @@ MISTAKEN_FILES: tuple[tuple[int, bytes, str, str], ...] = (
 
 def what_it_is(head: bytes) -> str | None:
     """Return what a file is and what to do with it, from its first bytes, or None if it is unknown."""
-    for at, magic, what, remedy in MISTAKEN_FILES:
-        if head[at : at + len(magic)] == magic:
+    for offset, magic, what, remedy in MISTAKEN_FILES:
+        if head[offset : offset + len(magic)] == magic:
             return f"is {what}; {remedy}"
     return None

@@ -211,8 +211,8 @@ class JointPrism:
             cost.replace_map(unknowns)
 
         # The parabola through the three costs of each pose.
-        low, at, high = np.array(rows)
-        bend = low - 2.0 * at + high
+        low, at_vector, high = np.array(rows)
+        bend = low - 2.0 * at_vector + high
         slope = high - low
         if not bend.sum() > 0.0:
             return middle, math.inf
@@ -266,13 +266,13 @@ class JointPrism:
         poses = list(self.equations)[::PROBED]
         some = self._costs(space, poses).values()
         vector = space.to_vector(self.values)
-        at = _total(self._slopes(some, vector))
+        total = _total(self._slopes(some, vector))
         changes = []
         for unit in np.eye(2):
             moved = _total(self._slopes(some, vector + PROBE_PX * unit))
-            changes.append((moved.gradient - at.gradient) / PROBE_PX)
+            changes.append((moved.gradient - total.gradient) / PROBE_PX)
         hessian = np.stack(changes, axis=1)
-        by_hessian, *_ = np.linalg.lstsq(at.hessian, hessian, rcond=None)
+        by_hessian, *_ = np.linalg.lstsq(total.hessian, hessian, rcond=None)
         shares = np.linalg.eigvals(by_hessian).real
         share = np.clip(shares.mean(), 1.0 / LARGEST_GAIN, 1.0)
         return 1.0 / float(share)
@@ -369,10 +369,10 @@ class JointPrism:
             camera = _with_other_lens(fit, step)
             models.append(replace(space, camera=camera).build(values))
 
-        at, *ends = displacements(models, xy)
+        at_point, *ends = displacements(models, xy)
         with_other_prism = np.stack(ends[:count], axis=1)
         with_other_lens = np.stack(ends[count:], axis=1)
-        by_prism = (with_other_prism - at[:, None]) / FOLLOW_PX
+        by_prism = (with_other_prism - at_point[:, None]) / FOLLOW_PX
         there, back = np.split(with_other_lens, 2, axis=1)
         by_lens = (there - back) / (2.0 * shares)
         seen = np.isfinite(by_prism).all(axis=1) & np.isfinite(by_lens).all(axis=1)

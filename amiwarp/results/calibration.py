@@ -548,7 +548,7 @@ class Calibration:
         prism = prism_from_json(data["prism"], "prism") if MODELS[model].PRISM else Prism(0.0)
         sharpness = build(_Sharpness, data["sharpness"], "sharpness")
         path = None if data.get("path") is None else build(_Path, data["path"], "path")
-        names = [f.name for f in fields(_PlainFields)]
+        names = [field.name for field in fields(_PlainFields)]
         rest = build(_PlainFields, {name: data[name] for name in names if name in data}, "")
         result = cls(
             model_name=model,
@@ -598,8 +598,8 @@ def _replaces_one(path: Encoder, encoder: Encoder) -> bool:
     own_turns = slice(int(first), int(last))
     if last - first < 2 or not np.isin(encoder.t[own_turns], path.t).all():
         return False
-    at = np.searchsorted(path.t, encoder.t[own_turns])
-    return bool((np.abs(path.angle[at] - encoder.angle[own_turns]) < math.pi).all())
+    sample = np.searchsorted(path.t, encoder.t[own_turns])
+    return bool((np.abs(path.angle[sample] - encoder.angle[own_turns]) < math.pi).all())
 
 
 def prism_to_json(prism: Prism | Plate) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def _open_folder(folder: Path, fps: float | None) -> PictureFolder:
     if table.exists() and fps is None:
         files, times = _read_times(table)
     else:
-        pictures = [f for f in folder.iterdir() if f.suffix.lower() in PICTURE_SUFFIXES]
+        pictures = [file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES]
         files = sorted(pictures, key=_natural)
         if fps is None:
             raise AmiwarpError(

@@ -668,7 +668,7 @@ def test_a_film_of_the_window_is_ended_or_cancelled(
         shares.append(share)
         if len(shares) == 3:
             window.key(key)
-        window._progress_due_s = 0.0
+        window._job_keys_due_s = 0.0
         show(what, share)
         assert "(f ends it, c cancels it)" in " ".join(said(window).split())
 
@@ -678,7 +678,7 @@ def test_a_film_of_the_window_is_ended_or_cancelled(
     assert [len(film_of(path)) for path in tmp_path.iterdir()] == [3] * films
     assert ("saved" if films else "film cancelled") in said(window)
     assert len(shares) == 3
-    assert not window._progress
+    assert not window._job_keys
 
 
 FILM_OF_A_WINDOW = """
@@ -698,7 +698,7 @@ while window.run_once():
 before, show, pictures = seen(), window._show_progress, []
 
 def progress(what, share):
-    window._progress_due_s = 0.0
+    window._job_keys_due_s = 0.0
     show(what, share)
     pictures.append(seen())
     if len(pictures) == 4:

@@ -189,7 +189,7 @@ def _arrays_table(names: Sequence[str], opened: OpenedByName) -> Table:
                 )
 
     def pieces(chosen: tuple[int, ...], notes: dict[str, int]) -> Rows:
-        first, *others = [str(columns[at].name) for at in chosen]
+        first, *others = [str(columns[column].name) for column in chosen]
         count = counts[first]
         for name in others:
             if counts[name] != count:
@@ -227,11 +227,11 @@ def _array_table(opened: Opened, name: str, hints: Hints) -> Table:
             by_event = (stream, (count, width), dtype)
             for length in lengths(count, notes):
                 rows = next_rows(by_event, length)
-                yield tuple(np.ascontiguousarray(rows[:, at]) for at in chosen)
+                yield tuple(np.ascontiguousarray(rows[:, number]) for number in chosen)
 
     def rows_of_properties(chosen: tuple[int, ...], notes: dict[str, int]) -> Rows:
         with contextlib.ExitStack() as stack:
-            columns = [_column_of(opened(stack)[0], at, count) for at in chosen]
+            columns = [_column_of(opened(stack)[0], number, count) for number in chosen]
             for length in lengths(count, notes):
                 yield tuple(next_rows(column, length) for column in columns)
 
@@ -243,10 +243,10 @@ def _array_table(opened: Opened, name: str, hints: Hints) -> Table:
     return Table(columns, pieces, hints)
 
 
-def _column_of(array: Array, at: int, count: int) -> Array:
+def _column_of(array: Array, column: int, count: int) -> Array:
     """Return a column of an array that is stored by columns. It needs a stream of its own."""
     stream, _, dtype = array
-    bytes_before = at * count * dtype.itemsize
+    bytes_before = column * count * dtype.itemsize
     stream.seek(bytes_before, 1)
     return stream, (count,), dtype
 
@@ -278,6 +278,6 @@ def _fields_table(array: Array, opened: Opened, name: str) -> Table:
             array, _ = opened(stack)
             for length in lengths(count, notes):
                 rows = next_rows(array, length)
-                yield tuple(rows[names[at]] for at in chosen)
+                yield tuple(rows[names[column]] for column in chosen)
 
     return Table(columns, pieces, Hints(unit=unit))

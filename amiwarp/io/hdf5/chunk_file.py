@@ -124,9 +124,9 @@ class ChunkFile:
                 if chunk.name not in self._datasets:
                     self._datasets[chunk.name] = dataset_of(chunk)
                 placed.append((self._place(chunk, rows[chunk.name]), chunk.parts))
-        for at, parts in placed:
-            if at is not None:
-                self.output.write_at(parts, at)
+        for offset, parts in placed:
+            if offset is not None:
+                self.output.write_at(parts, offset)
         self.check()
 
     def _place(self, chunk: EncodedChunk, rows: int) -> int | None:
@@ -139,10 +139,10 @@ class ChunkFile:
         if held < rows:
             dataset.id.set_extent((rows, *row))
         write = partial(dataset.id.write_direct_chunk, (chunk.start, *(0 for _ in row)))
-        at = self.output.place_of(sum(map(len, chunk.parts)), write)
-        if at is None:
+        offset = self.output.place_of(sum(map(len, chunk.parts)), write)
+        if offset is None:
             write(b"".join(chunk.parts))
-        return at
+        return offset
 
     def check(self) -> None:
         """Raise the error of the first write of HDF5 that failed, such as OSError for a full disk."""

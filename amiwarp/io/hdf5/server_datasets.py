@@ -215,7 +215,7 @@ def _opened(stored: Any, name: str) -> _Dataset:
         shape=shape,
         dtype=stored.dtype,
         chunks=creation.get_chunk() if is_chunked else None,
-        filters=[creation.get_filter(at) for at in range(creation.get_nfilters())],
+        filters=[creation.get_filter(number) for number in range(creation.get_nfilters())],
     )
 
 

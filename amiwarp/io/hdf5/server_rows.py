@@ -85,7 +85,7 @@ def read_rows(notes: dict[str, int], path: str, name: str) -> Iterator[Columns]:
 def _filters(dataset: Any) -> list[int]:
     """Return the numbers of the filters of a dataset."""
     creation = dataset.id.get_create_plist()
-    return [creation.get_filter(at)[0] for at in range(creation.get_nfilters())]
+    return [creation.get_filter(number)[0] for number in range(creation.get_nfilters())]
 
 
 CODED_BYTES = 1 << 20

@@ -242,5 +242,5 @@ def _read_frames(path: Path, file: Hdf5File) -> StoredImages | None:
             raise AmiwarpError("frames/t decreases; the file is damaged", ErrorCode.FILE_DAMAGED)
         height, width = image.row
         return StoredImages(
-            path, "frames", t, (width, height), lambda at: image.read(at, at + 1)[0], file
+            path, "frames", t, (width, height), lambda index: image.read(index, index + 1)[0], file
         )

@@ -101,15 +101,15 @@ class MessageClock:
     def times(self, t: int) -> tuple[int, int]:
         """Return the time of the recording and the stamp of a message whose first event is at ``t`` [us], in ns."""
         following = int(np.searchsorted(self._t, t, "right"))
-        at = max(following - 1, 0)
+        message = max(following - 1, 0)
         # Negative for events before the first message.
-        later_us = t - int(self._t[at])
+        later_us = t - int(self._t[message])
         later_ns = later_us * 1000
-        recorded = int(self._recorded[at]) + later_ns
-        if at + 1 < len(self._t):
+        recorded = int(self._recorded[message]) + later_ns
+        if message + 1 < len(self._t):
             # Packets stay in order.
-            recorded = min(recorded, int(self._recorded[at + 1]))
-        return recorded, int(self._stamps[at]) + later_ns
+            recorded = min(recorded, int(self._recorded[message + 1]))
+        return recorded, int(self._stamps[message]) + later_ns
 
 
 def _others(writer: Any, bag: Bag, add_topic: AddTopic) -> Messages:

@@ -187,7 +187,7 @@ def _parse(path: Path, form: TextForm, layout: Layout, text: bytes, line_number:
 
 def _whole_times(kept: list[bytes], layout: Layout) -> NDArray[np.int64] | None:
     """Return the times in some lines, which have more digits than float64; None if they are not whole numbers."""
-    at = layout.columns["t"]
+    time_column = layout.columns["t"]
     try:
         return np.loadtxt(
             kept,
@@ -195,7 +195,7 @@ def _whole_times(kept: list[bytes], layout: Layout) -> NDArray[np.int64] | None:
             ndmin=1,
             comments=None,
             encoding="ascii",
-            usecols=at,
+            usecols=time_column,
         )
     except ValueError:
         return None
@@ -283,7 +283,7 @@ def _expected(form: TextForm, layout: Layout) -> str:
 
 def _chosen(table: Vector, layout: Layout) -> list[Vector]:
     """Return the columns t, x, y, p."""
-    return [table[:, at] for at in layout.chosen]
+    return [table[:, column] for column in layout.chosen]
 
 
 def _plausible(columns: Sequence[Vector], layout: Layout) -> NDArray[np.bool_]:

@@ -137,8 +137,8 @@ def write_manifest(
         "splits": dict(Counter(row["split"] for row in rows)),
         "licences": _licences(licences),
         "failed": [
-            {"file": by_key[f.key].file, "source": by_key[f.key].source, "error": f.error}
-            for f in failed
+            {"file": by_key[file.key].file, "source": by_key[file.key].source, "error": file.error}
+            for file in failed
         ],
         "not_in_specification": journal.others(items),
     }

@@ -83,7 +83,7 @@ def _sensors(value: Any, name: str) -> dict[str, SensorModel]:
         raise AmiwarpError(
             f"{name} is {shown(value)}; expected a list of at least one entry", ErrorCode.FIELD
         )
-    known = tuple(f.name for f in fields(SensorModel))
+    known = tuple(field.name for field in fields(SensorModel))
     sensors: dict[str, SensorModel] = {}
     for k, entry in enumerate(value):
         where = f"sensors[{k}]"

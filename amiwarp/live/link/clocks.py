@@ -127,10 +127,10 @@ def _fit_line(
     for rounds in range(MOST_ROUNDS):
         # A weighted least-squares line about the mean time; about a median, so that float64 keeps microseconds.
         weight = sigma[kept] ** -2.0
-        at = int(np.rint(np.average(own_pulses[kept] - own_pulses[0], weights=weight))) + int(
+        shift = int(np.rint(np.average(own_pulses[kept] - own_pulses[0], weights=weight))) + int(
             own_pulses[0]
         )
-        x = (own_pulses - at).astype(np.float64)
+        x = (own_pulses - shift).astype(np.float64)
         base = float(np.median(difference[kept]))
         offset = float(np.average(difference[kept] - base, weights=weight))
         rest = difference[kept] - base - offset
@@ -149,7 +149,7 @@ def _fit_line(
     std = scale / math.sqrt(float(np.sum(weight)))
     drift_std = scale / math.sqrt(max(slope_weight, 1e-300))
     return ClockMap(
-        at_us=at,
+        at_us=shift,
         offset_us=base + offset,
         drift=drift,
         offset_std_us=std,

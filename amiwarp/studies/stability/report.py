@@ -35,8 +35,8 @@ def atlas_json(atlas: Atlas) -> str:
         **atlas.about,
         "cells": atlas.cells,
         "aims": atlas.aims.to_json(),
-        "stated_deviations": [d.to_json() for d in atlas.stated],
-        "failures": [asdict(f) for f in atlas.failures],
+        "stated_deviations": [deviation.to_json() for deviation in atlas.stated],
+        "failures": [asdict(failure) for failure in atlas.failures],
     }
     head = json.dumps(data, indent=1, allow_nan=False).removesuffix("\n}")
     lines = []
