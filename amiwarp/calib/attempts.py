@@ -115,11 +115,11 @@ def _with_turning_named(tried: Attempt) -> Attempt:
     """Return an attempt whose camera turned, with a warning that its rotation was not found."""
     if tried.photometric is None or not tried.accepted:
         return tried
-    said = (
+    warning = (
         f"the camera turned: a slow rotation explains {100 * tried.photometric.rotation_gain:.0f} % of the residual, "
         "but none was found that explains the events; hold the camera still"
     )
-    return replace(tried, calibration=with_warnings(tried.found(), said))
+    return replace(tried, calibration=with_warnings(tried.found(), warning))
 
 
 def _with_assumptions(calibrator: Calibrator, found: Calibration) -> Calibration:
@@ -228,12 +228,12 @@ def of_turning_vibration(calibrator: Calibrator, tried: Attempt) -> Attempt:
     if not tried.accepted:
         return tried
     if unexamined:
-        said = (
+        warning = (
             f"{100 * tried.cost:.0f} % of the residual remains, too much for the answer to be examined: much noise, or "
             "the camera turned while it vibrated; it may be off by tenths of a pixel: hold the camera where it only "
             "vibrates, and lower the sensor's sensitivity"
         )
-        return replace(tried, calibration=with_warnings(tried.found(), said))
+        return replace(tried, calibration=with_warnings(tried.found(), warning))
     return _with_turning_named(tried)
 
 
@@ -270,13 +270,13 @@ def without_moving_parts(calibrator: Calibrator, tried: Attempt) -> Attempt:
     mask = tried.moving[part_row][:, part_column]
     recording = replace(calibrator.recording, events=MaskedEventSource(source, mask))
     again = replace(calibrator, recording=recording).attempt()
-    said = f"something moves: {100 * mask.mean():.0f} % of the view are left out"
+    warning = f"something moves: {100 * mask.mean():.0f} % of the view are left out"
     if again.accepted and not again.unexplained:
-        return Attempt(with_warnings(again.found(), said))
+        return Attempt(with_warnings(again.found(), warning))
     return Attempt(
         None,
         AmiwarpError(
-            f"{calibrator.recording.name}: {said}, but the rest does not determine the prism; "
+            f"{calibrator.recording.name}: {warning}, but the rest does not determine the prism; "
             "record a scene that stays still",
             ErrorCode.CALIBRATION_REFUSED,
         ),

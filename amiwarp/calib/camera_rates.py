@@ -186,8 +186,8 @@ def _correlations(
     patches = len(windows)
 
     spectra = np.zeros((patches, padded_rows, padded_columns // 2 + 1), np.complex128)
-    for each in range(ANGLE_RANGES):
-        in_range = range_of_event == each
+    for range_index in range(ANGLE_RANGES):
+        in_range = range_of_event == range_index
         first_turn = np.flatnonzero(in_range & (turn_of_event == 0))
         second_turn = np.flatnonzero(in_range & (turn_of_event == 1))
         before = _signed_counts_in_cells(events[first_turn], rows, columns)

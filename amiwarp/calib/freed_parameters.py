@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from amiwarp.calib.groundwork import TILT
-from amiwarp.calib.model_fit import motion_per_angle
 from amiwarp.calib.photometric.descent import LEAST_CURVATURE, UNDETERMINED_PX
+from amiwarp.calib.timing_blur import motion_per_angle
 from amiwarp.calib.trial import LARGEST_MOTION_PX, SIGNIFICANT_STD, Trial, in_pixels, largest_tilt
 from amiwarp.events.recording import Recording
 from amiwarp.results.calibration import Calibration, FreedParameter

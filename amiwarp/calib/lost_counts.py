@@ -146,24 +146,24 @@ def steps_in_samples(encoder: Encoder) -> list[Step]:
         return []
 
     # The speed about each interval between two samples, without what happens in it.
-    at = np.arange(spread, len(t) - spread - 1)
-    before = at - spread
-    after = at + 1 + spread
-    turned = (angle[at] - angle[before]) + (angle[after] - angle[at + 1])
-    elapsed = (t[at] - t[before]) + (t[after] - t[at + 1])
+    sample = np.arange(spread, len(t) - spread - 1)
+    before = sample - spread
+    after = sample + 1 + spread
+    turned = (angle[sample] - angle[before]) + (angle[after] - angle[sample + 1])
+    elapsed = (t[sample] - t[before]) + (t[after] - t[sample + 1])
     speed = turned / elapsed
 
     # The size of a step in each interval: what the speed does not explain of the samples beside it.
-    around = at[:, None] + np.arange(1 - BESIDE, BESIDE + 1)
-    by_speed = speed[:, None] * (t[around] - t[at][:, None])
-    left = angle[around] - angle[at][:, None] - by_speed
+    around = sample[:, None] + np.arange(1 - BESIDE, BESIDE + 1)
+    by_speed = speed[:, None] * (t[around] - t[sample][:, None])
+    left = angle[around] - angle[sample][:, None] - by_speed
     left_before = np.median(left[:, :BESIDE], axis=1)
     left_after = np.median(left[:, BESIDE:], axis=1)
     size = left_after - left_before
     scatter = _scatter(size - np.median(size))
 
     # A step comes at once. A prism that changes its speed takes many samples.
-    at_once = np.diff(angle)[at] - speed * interval[at]
+    at_once = np.diff(angle)[sample] - speed * interval[sample]
     strong = np.abs(size) > max(LEAST_STEP, SIGNIFICANT * scatter)
     strong &= at_once * size > AT_ONCE * size**2
     steps: list[Step] = []
@@ -172,7 +172,7 @@ def steps_in_samples(encoder: Encoder) -> list[Step]:
         near = slice(max(0, k - BESIDE), k + BESIDE + 1)
         rivals = np.abs(at_once[near][strong[near]])
         if abs(at_once[k]) == rivals.max():
-            first = at[k]
+            first = sample[k]
             steps.append(Step(int(t[first]), int(t[first + 1]), float(size[k])))
     return steps
 

@@ -155,8 +155,8 @@ class ModelChooser:
                 exact = calibrate(recording, free)
             except AmiwarpError as error:
                 why = f"the calibration fails with it free: {error}"
-                return trial, tuple(held_instead(each, why) for each in parameters)
-            confirmed = tuple(confirmed_freedom(trial, each, exact) for each in parameters)
+                return trial, tuple(held_instead(named, why) for named in parameters)
+            confirmed = tuple(confirmed_freedom(trial, named, exact) for named in parameters)
             if confirmed == parameters:
                 warnings = tuple(dict.fromkeys((*first.warnings, *exact.warnings)))
                 exact = replace(exact, stages=(*first.stages, *exact.stages), warnings=warnings)

@@ -184,16 +184,16 @@ class Search:
             fine = PhaseObjective(space, self._tiles(space), FINEST)
         starts = self._global_starts(summaries) if start is None else [space.to_vector(start)]
         if space.moving:
-            starts = [self._track_rotation(each, summaries) for each in starts]
+            starts = [self._track_rotation(start_vector, summaries) for start_vector in starts]
 
         runs: list[SearchStage] = []
-        for each in starts:
+        for start_vector in starts:
             # Near an optimum that is known a search ends early.
             known = [run.x for run in runs]
             run = self._maximise(
                 fine,
                 settings.local_algorithm,
-                each,
+                start_vector,
                 settings.local_evaluations,
                 step=FIRST_STEP_PX,
                 known=known,

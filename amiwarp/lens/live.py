@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.first_guess import ANGLE_RANGES
 from amiwarp.calib.repeated_turns import counts_of, repetition
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_stream import starts_of_runs
 from amiwarp.events.recording import Events, MemoryEvents, Recording, held_bytes
@@ -97,7 +97,8 @@ class StillSpans:
         """Use the span that the end of the stream ends. Raises :class:`AmiwarpError` if the prism did not turn."""
         if not self.samples:
             raise AmiwarpError(
-                f"{self._name}: no encoder samples have come; connect the encoder, or give the controller's --port"
+                f"{self._name}: no encoder samples have come; connect the encoder, or give the controller's --port",
+                ErrorCode.CONTENT_MISSING,
             )
         if not self.turns:
             raise AmiwarpError(

@@ -107,7 +107,8 @@ def depth(
     if known.sum() < max(1.0, LEAST_KNOWN * seen.sum()):
         raise AmiwarpError(
             f"{name}: the events determine no depth: too little texture, or everything is beyond "
-            f"{orbit_limit_m(model):.2g} m; record a nearer scene with more texture, or a longer time"
+            f"{orbit_limit_m(model):.2g} m; record a nearer scene with more texture, or a longer time",
+            ErrorCode.CONTENT_MISSING,
         )
     inverse = np.where(known, found.inverse_depth, np.float32(np.nan))
     points = _points(model, inverse)

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.array_maps import ArrayMap
 from amiwarp.io.output_formats import check_ending
 from amiwarp.io.outputs import NewFile
@@ -124,7 +124,10 @@ class DepthMap(ArrayMap):
 
         known = self.known
         if not known.any():
-            raise AmiwarpError("the depth map knows no depth; record a scene with more texture")
+            raise AmiwarpError(
+                "the depth map knows no depth; record a scene with more texture",
+                ErrorCode.CONTENT_MISSING,
+            )
         # Where no known depth is near enough for the mean, the nearest one stays.
         nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
         of_nearest = self.inverse_depth[tuple(nearest)]
@@ -159,7 +162,8 @@ class DepthMap(ArrayMap):
         check_ending(path, "points are written", [".ply"])
         if not self.known.any():
             raise AmiwarpError(
-                "the depth map knows no depth, so there are no points; record a scene with more texture"
+                "the depth map knows no depth, so there are no points; record a scene with more texture",
+                ErrorCode.CONTENT_MISSING,
             )
         values = self.inverse_depth[self.known]
         low, high = np.percentile(values, [2, 98])

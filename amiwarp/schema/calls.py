@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.schema.annotations import annotated_type, leaves, parts_of
 from amiwarp.schema.kinds import TEXT, fits_array, no_device, unmet
 from amiwarp.validation import INT64, TIME_HINT, as_words, real, shown, whole
@@ -204,9 +204,11 @@ class _Parameter:
         else:
             expected = unmet(TEXT if rule.is_text else rule.kind, value)
         if expected:
+            is_absent = rule.is_device and isinstance(value, str)
             raise AmiwarpError(
                 f"{self._label}: {self._name} is {shown(value)}; expected {expected}"
-                f"{_remedies(value, expected)}"
+                f"{_remedies(value, expected)}",
+                ErrorCode.DEVICE_MISSING if is_absent else None,
             )
         if isinstance(value, bool | None) or type(value).__module__.startswith("amiwarp."):
             self.known.add(type(value))

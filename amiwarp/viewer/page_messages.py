@@ -32,7 +32,7 @@ def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
 
 def one_of(*known: Any) -> Check:
     """Return a check that accepts the ``known`` values, types included."""
-    return lambda value: any(type(value) is type(each) and value == each for each in known)
+    return lambda value: any(type(value) is type(choice) and value == choice for choice in known)
 
 
 flag = one_of(True, False)

@@ -39,7 +39,7 @@ from amiwarp.viewer import (
     sliders,
     view_state,
 )
-from amiwarp.viewer.actions import Actions
+from amiwarp.viewer.actions import Actions, Request
 from amiwarp.viewer.address import MOST_COUNT, decode_state, encode_state
 from amiwarp.viewer.bookmarks import Bookmarks
 from amiwarp.viewer.filters import Selection, step_rows
@@ -264,8 +264,8 @@ class Panel(Actions):
             {"start_ms": round(start_us * 1e-3, 3), "length_ms": round(length_us * 1e-3, 3)}
         )
 
-    def request(self, *what: str, change: str = "") -> None:
-        """Request quick updates of :data:`QUICK`; "newest" is for a live stream.
+    def request(self, *what: Request, change: str = "") -> None:
+        """Request quick updates; "newest" is for a live stream.
 
         ``change``: name of a change that lasts, such as a drag; it is undone in one step.
         """

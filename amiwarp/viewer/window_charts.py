@@ -70,7 +70,7 @@ class Chart:
     def __init__(self, title: str, curves: tuple[tuple[str, float, str], ...]) -> None:
         """``title``: what the chart shows over what, with units; ``curves``: colours, widths and names."""
         self.title = title
-        self.curves = [Curve(*each) for each in curves]
+        self.curves = [Curve(*curve) for curve in curves]
         self.x_range = (0.0, 1.0)
         self.y_range = (0.0, 1.0)
 

@@ -39,7 +39,7 @@ INNER = {
     "rig_world": 1,
     "schema": 7,
     "simulation": 67,
-    "studies": 222,
+    "studies": 221,
     "viewer": 167,
 }
 """Number of inner names that the tests of each room import. It may only fall; then write the new number here."""

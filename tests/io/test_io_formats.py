@@ -24,6 +24,7 @@ from amiwarp import (
     AmiwarpError,
     Camera,
     DeviceEvents,
+    ErrorCode,
     Events,
     EvtDecoder,
     MemoryEvents,
@@ -742,6 +743,13 @@ def test_messages_of_ros_that_are_refused(tmp_path):
     other[0].encoding = "zip"
     path = write_ros2(tmp_path / "b", {"/events": other})
     assert "encoding 'zip'; expected one of evt3" in str(refusal(open_recording, path))
+    changed = [*packets("mono", EVENTS), *packets("evt3", EVENTS)]
+    path = write_ros2(tmp_path / "d", {"/events": changed})
+    several = (
+        "has packets of several encodings, now 'evt3'; record the topic again with one encoding"
+    )
+    with pytest.raises(AmiwarpError, match=several):
+        open_recording(path)
     store = typestore(True)
     empty = array_message(store, EVENTS[:0], ros1=True)
     write_ros1(tmp_path / "c.bag", {"/events": [empty]})
@@ -901,6 +909,11 @@ FOREIGN = {
     "finding events in the Parquet table: Parquet magic bytes not found": b"PAR1" + bytes(99),
     "is an Arrow table": b"ARROW1\0\0" + bytes(99),
     "is a Python pickle; .* never loaded": pickle.dumps({"x": list(range(999))}, protocol=4),
+    "is a Python pickle; save": pickle.dumps({"x": list(range(999))}, protocol=5),
+    "is a HEIC picture; .*simulate": struct.pack(">I", 24) + b"ftypheic" + bytes(99),
+    "is a HEIF picture; .*simulate": struct.pack(">I", 24) + b"ftypmif1" + bytes(99),
+    "is an AVIF picture; .*simulate": struct.pack(">I", 24) + b"ftypavif" + bytes(99),
+    "is a pcap capture of network": b"\xa1\xb2\x3c\x4d" + bytes(99),
     "is a program": b"\x7fELF\x02\x01\x01" + bytes(99),
     "is an XML document": b'<?xml version="1.0"?><a/>',
 }
@@ -957,8 +970,9 @@ def test_a_bag_tells_how_many_of_its_messages_are_read(tmp_path):
 @pytest.mark.parametrize("message", FOREIGN)
 def test_other_files_are_named(tmp_path, message):
     (tmp_path / "file.raw").write_bytes(FOREIGN[message])
-    with pytest.raises(AmiwarpError, match=rf"file\.raw: {message}"):
+    with pytest.raises(AmiwarpError, match=rf"file\.raw: {message}") as caught:
         open_recording(tmp_path / "file.raw")
+    assert caught.value.code is not ErrorCode.INVALID
     assert os.listdir(tmp_path) == ["file.raw"]
 
 

@@ -84,7 +84,7 @@ def test_the_window_goes_through_the_recordings(inspector: Inspector) -> None:
         names.append(window.inspector.beside.recording.name)
         assert window.shown.first.span.first_us == window.inspector.beside.recording.events.t_first
         window.key("g")
-        window.turn()
+        window.run_once()
     assert names == ["early", "late", "early"]
     window.scene.close()
     alone = Window(Inspector(recorded("own", 0, 1)), size=(500, 350), off_screen=True)

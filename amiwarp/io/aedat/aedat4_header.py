@@ -100,11 +100,11 @@ def read_header(path: Path) -> Aedat4File:
     return Aedat4File(path, compression, streams, start, end)
 
 
-def _is_table(file: BinaryIO, at: int, size: int, compression: Compression) -> bool:
+def _is_table(file: BinaryIO, offset: int, size: int, compression: Compression) -> bool:
     """Return whether the table of the packets is at a position, and no packet."""
     if size > LARGEST_PACKET:
         return False
-    file.seek(at)
+    file.seek(offset)
     content = Decompressor(compression)(file.read(size)) or b""
     return content[8:12] == b"FTAB"
 

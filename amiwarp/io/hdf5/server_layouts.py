@@ -57,15 +57,15 @@ def _own_or_columns(objects: Finder) -> str:
     if not isinstance(events, h5py.h5g.GroupID):
         return "columns"
     names = list(h5py.Group(events))
-    own = set(ROLES) & set(names)
-    if not own:
+    role_names = set(ROLES) & set(names)
+    if not role_names:
         return "columns"
     if h5py.h5a.exists(objects.find(""), b"format"):
         return "native"
     # Others give the same names to times in seconds, or have only some of the names by chance.
     times = objects.find("events/t")
     has_seconds = isinstance(times, h5py.h5d.DatasetID) and times.dtype.kind == "f"
-    has_other_names = len(own) < len(ROLES) and names_roles(names)
+    has_other_names = len(role_names) < len(ROLES) and names_roles(names)
     return "columns" if has_seconds or has_other_names else "native"
 
 

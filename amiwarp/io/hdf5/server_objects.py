@@ -46,14 +46,16 @@ class Finder:
             return None
         if parent.links.get_info(key).type != h5py.h5l.TYPE_HARD:
             raise AmiwarpError(
-                f"'{name}' is a soft or external link; replace the link by a copy of the data"
+                f"'{name}' is a soft or external link; replace the link by a copy of the data",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         found = h5py.h5o.open(parent, key)
         if isinstance(found, h5py.h5d.DatasetID):
             creation = found.get_create_plist()
             if creation.get_layout() == h5py.h5d.VIRTUAL or creation.get_external_count():
                 raise AmiwarpError(
-                    f"dataset '{name}' takes its values from other files; copy the values into this file"
+                    f"dataset '{name}' takes its values from other files; copy the values into this file",
+                    ErrorCode.FORMAT_UNKNOWN,
                 )
         return found
 
@@ -99,7 +101,8 @@ def _value(group: Any, name: str, attribute: str) -> Any:
     classes = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
     if stored.get_type().get_class() not in classes or stored.shape is None:
         raise AmiwarpError(
-            f"{name} attribute '{attribute}' is neither a number nor a string; remove it"
+            f"{name} attribute '{attribute}' is neither a number nor a string; remove it",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     # A text of variable length counts as 16 bytes here; its own length is checked once it is read.
     stored_bytes = stored.get_storage_size()

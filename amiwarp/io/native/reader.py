@@ -96,7 +96,8 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
         if (camera.width, camera.height) != events.size:
             raise AmiwarpError(
                 f"{path}: camera is {camera.width}x{camera.height}, events are {events.size}; both must have the same "
-                "size"
+                "size",
+                ErrorCode.FILE_DAMAGED,
             )
     if "encoder" in file.attributes:
         encoder = _read_encoder(path, file)
@@ -218,7 +219,8 @@ def _rotation_of_imu(file: Hdf5File) -> NDArray[np.float64] | None:
     rotation = as_numbers(rotation, "attribute 'to_camera'").astype(np.float64)
     if rotation.shape != (9,):
         raise AmiwarpError(
-            f"attribute 'to_camera' has shape {rotation.shape}; expected 9 numbers, row by row"
+            f"attribute 'to_camera' has shape {rotation.shape}; expected 9 numbers, row by row",
+            ErrorCode.FILE_DAMAGED,
         )
     return np.asarray(rotation.reshape(3, 3))
 
@@ -232,12 +234,13 @@ def _read_frames(path: Path, file: Hdf5File) -> StoredImages | None:
         image = dataset_of(file, "frames/image", len(times))
         if image.dtype not in (np.uint8, np.uint16) or not all(image.row):
             raise AmiwarpError(
-                f"frames are {image.dtype} of shape {image.row}; expected uint8 or uint16"
+                f"frames are {image.dtype} of shape {image.row}; expected uint8 or uint16",
+                ErrorCode.FILE_DAMAGED,
             )
         t = rounded_times(times.read(0, len(times)))
         if (t[1:] < t[:-1]).any():
             raise AmiwarpError("frames/t decreases; the file is damaged", ErrorCode.FILE_DAMAGED)
         height, width = image.row
         return StoredImages(
-            path, "frames", t, (width, height), lambda at: image.read(at, at + 1)[0], file
+            path, "frames", t, (width, height), lambda index: image.read(index, index + 1)[0], file
         )

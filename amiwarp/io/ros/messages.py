@@ -70,9 +70,14 @@ def decode_packet(message: Any) -> tuple[Columns, Columns]:
         return _libcaer(base, data), NOTHING
     if message.encoding == "libcaer_cmp":
         return _libcaer_cmp(base, data), NOTHING
+    if message.encoding in EVT:
+        raise AmiwarpError(
+            f"has packets of several encodings, now '{message.encoding}'; record the topic again with one encoding",
+            ErrorCode.FORMAT_UNKNOWN,
+        )
     known = ", ".join((*EVT, *WORD_BYTES))
     raise AmiwarpError(
-        f"has packets with the encoding '{message.encoding[:40]}'; expected one of {known}, in the whole topic",
+        f"has packets with the encoding '{message.encoding[:40]}'; expected one of {known}",
         ErrorCode.FORMAT_UNKNOWN,
     )
 

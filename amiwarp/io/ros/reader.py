@@ -165,7 +165,7 @@ def read_head(path: str, topic: str | None) -> Reply:
                 width, height, _ = decode_array(first_array.raw, ros1=ros1)
                 about["size"] = width, height
             return about, []
-        messages = (deserialised(connection, each.raw, ros1=ros1) for each in stored)
+        messages = (deserialised(connection, message.raw, ros1=ros1) for message in stored)
         first = next(messages, None)
         if first is not None:
             about["size"] = int(first.width), int(first.height)
@@ -296,11 +296,11 @@ def read_others(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[
         if not others:
             return
         index_of = {connection.id: index for index, connection in enumerate(others)}
-        for each in messages_of(bag, others, ros1=False):
-            index = index_of[each.connection.id]
+        for message in messages_of(bag, others, ros1=False):
+            index = index_of[message.connection.id]
             yield (
-                np.frombuffer(each.raw, np.uint8),
-                np.array([len(each.raw)], np.int64),
-                np.array([each.recorded], np.int64),
+                np.frombuffer(message.raw, np.uint8),
+                np.array([len(message.raw)], np.int64),
+                np.array([message.recorded], np.int64),
                 np.array([index], np.int64),
             )

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.live.stream.sockets import IDLE_S, close_listener, listen, ready
 from amiwarp.live.stream.stream_format import encode_end, packet_count
 
@@ -251,7 +251,8 @@ class PipeSink:
                 self._file.flush()
         except OSError as error:
             raise AmiwarpError(
-                f"{self._name}: {error.strerror}; start the program that reads it again"
+                f"{self._name}: {error.strerror}; start the program that reads it again",
+                ErrorCode.OUTPUT_FAILED,
             ) from error
         except ValueError as error:  # Python's error for a closed file
             raise AmiwarpError(f"{self._name}: the file is closed; open it again") from error
@@ -265,7 +266,8 @@ class PipeSink:
             if time.monotonic() > until:
                 raise AmiwarpError(
                     f"{self._name}: its reader accepts no more data, so the end of the stream is lost; check the "
-                    "program that reads it"
+                    "program that reads it",
+                    ErrorCode.OUTPUT_FAILED,
                 )
 
     def tick(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.compensation.streams import Compensated
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events
 from amiwarp.io.native.attributes import (
     camera_attributes,
@@ -282,5 +282,6 @@ class PacketDecoder:
 
     def _error(self, what: str) -> AmiwarpError:
         return AmiwarpError(
-            f"{self._where}: packet at byte {self._offset}: {what}; see docs/reference/stream-format.md"
+            f"{self._where}: packet at byte {self._offset}: {what}; see docs/reference/stream-format.md",
+            ErrorCode.FILE_DAMAGED,
         )

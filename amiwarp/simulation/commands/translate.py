@@ -86,7 +86,7 @@ def run_translate(
 
     device = cli.choose_device(common.device)
     name = None if dataset is None else choice(DataSet, dataset, "--dataset")
-    kind = choice(Interpolation, interpolation, "--interpolation")
+    interpolation_kind = choice(Interpolation, interpolation, "--interpolation")
     pictures: Path | Recording = source
     events_between: Path | Recording | None = events
     if layout.given():
@@ -97,7 +97,7 @@ def run_translate(
             pictures,
             events=events_between,
             dataset=name,
-            interpolation=kind,
+            interpolation=interpolation_kind,
             fps=fps,
             device=device,
             progress=advance,

@@ -121,9 +121,10 @@ class Trajectory:
         """Raise :class:`AmiwarpError` if any speed between two poses is above a limit."""
         if speeds.max() > limit:
             t, _ = self._table()
-            at = float(t[int(np.argmax(speeds))])
+            fastest_s = float(t[int(np.argmax(speeds))])
             raise AmiwarpError(
-                f"trajectory {what} at {speeds.max():.3g} {unit} after {at:.6g} s, faster than {limit:g} {unit}; "
+                f"trajectory {what} at {speeds.max():.3g} {unit} after {fastest_s:.6g} s, "
+                f"faster than {limit:g} {unit}; "
                 "check the units of the times (s) and positions (m), or split the trajectory at the jump"
             )
 
@@ -151,8 +152,8 @@ class Trajectory:
         from scipy.interpolate import CubicSpline
         from scipy.spatial.transform import RotationSpline
 
-        at, position = self._table()
-        return RotationSpline(at, self._orientation), CubicSpline(at, position)
+        times, position = self._table()
+        return RotationSpline(times, self._orientation), CubicSpline(times, position)
 
     def poses(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the orientations and positions at given times.
@@ -176,20 +177,20 @@ class Trajectory:
         """
         from scipy.spatial.transform import Slerp
 
-        at, position = self._table()
+        times, position = self._table()
         given = np.atleast_1d(np.asarray(array(t, "t"), np.float64))
         if given.ndim != 1 or np.isnan(given).any():
             what = "holds NaN" if given.ndim == 1 else f"has shape {given.shape}"
             raise AmiwarpError(f"t {what}; give times in seconds, shape (k,)")
-        inside = np.clip(given, at[0], at[-1])
-        if at.size == 1:
+        inside = np.clip(given, times[0], times[-1])
+        if times.size == 1:
             turns = np.repeat(self._orientation.as_matrix(), inside.size, axis=0)
             places = np.repeat(position, inside.size, axis=0)
             return turns, places
-        if at.size == 2:
-            share = (inside - at[0]) / (at[1] - at[0])
+        if times.size == 2:
+            share = (inside - times[0]) / (times[1] - times[0])
             between = position[0] + share[:, None] * (position[1] - position[0])
-            return Slerp(at, self._orientation)(inside).as_matrix(), between
+            return Slerp(times, self._orientation)(inside).as_matrix(), between
         turn, place = self._splines
         return turn(inside).as_matrix(), np.asarray(place(inside))
 
@@ -224,7 +225,9 @@ class Trajectory:
             If both ``look_at`` and ``rotation`` are given, or one of the arguments is not usable.
         """
         if look_at is not None and rotation is not None:
-            raise AmiwarpError("look_at and rotation are both given; give one of them")
+            raise AmiwarpError(
+                "look_at and rotation are both given; give one of them", ErrorCode.OPTIONS
+            )
         quaternion: ArrayLike = (0, 0, 0, 1) if rotation is None else rotation
         if look_at is not None:
             quaternion = looking_at(position, look_at).as_quat()
@@ -307,11 +310,13 @@ class Trajectory:
                 row = [float(word) for word in words]
             except ValueError as error:
                 raise AmiwarpError(
-                    f"{path}: line {number} is {line[:60]!r}; expected 8 numbers t x y z qx qy qz qw"
+                    f"{path}: line {number} is {line[:60]!r}; expected 8 numbers t x y z qx qy qz qw",
+                    ErrorCode.FILE_DAMAGED,
                 ) from error
             if len(row) != COLUMNS:
                 raise AmiwarpError(
-                    f"{path}: line {number} has {len(row)} numbers; expected 8: t x y z qx qy qz qw"
+                    f"{path}: line {number} has {len(row)} numbers; expected 8: t x y z qx qy qz qw",
+                    ErrorCode.FILE_DAMAGED,
                 )
             if len(values) == COLUMNS * MOST_POSES:
                 raise AmiwarpError(
