@@ -30,7 +30,7 @@ from .choices import Layers as Layers
 from .choices import SearchCost as SearchCost
 from .choices import Sharpness as Sharpness
 from .choices import Vote as Vote
-from .compensation.blocks import compensate_events as compensate_events
+from .compensation.in_memory import compensate_events as compensate_events
 from .compensation.recordings import CompensationSummary as CompensationSummary
 from .compensation.recordings import compensate as compensate
 from .compensation.streams import Compensated as Compensated

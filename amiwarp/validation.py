@@ -181,8 +181,8 @@ def packed(values: NDArray[Any]) -> NDArray[Any]:
 def finite(values: NDArray[Any], what: str, hint: str = "give finite numbers") -> NDArray[Any]:
     """Return an array without NaN and infinite values; raise :class:`AmiwarpError` that names the first one."""
     if values.dtype.kind == "f" and not np.isfinite(values).all():
-        at = int(np.argmax(~np.isfinite(values)))
-        raise AmiwarpError(f"{what} hold {values.flat[at]} (number {at}); {hint}")
+        first_bad = int(np.argmax(~np.isfinite(values)))
+        raise AmiwarpError(f"{what} hold {values.flat[first_bad]} (number {first_bad}); {hint}")
     return values
 
 
@@ -221,8 +221,10 @@ def as_times(values: ArrayLike, what: str = "times", unit: str = "us") -> NDArra
         scaled = given.astype(np.float64) * scale
     times = rounded_times(scaled, what)
     if scale == 1.0 and not np.array_equal(times, scaled):
-        at = int(np.argmax(times != scaled))
-        raise AmiwarpError(f"{what} hold {scaled.flat[at]:.9g} (number {at}): {FRACTION_OF_US}")
+        first_bad = int(np.argmax(times != scaled))
+        raise AmiwarpError(
+            f"{what} hold {scaled.flat[first_bad]:.9g} (number {first_bad}): {FRACTION_OF_US}"
+        )
     if times.size and max(-int(times.min()), int(times.max())) > limit:
         raise AmiwarpError(
             f"{what} reach {np.abs(times).max()} us, and {given.dtype} {COARSE_TIMES}"
@@ -251,9 +253,9 @@ def check_ascending(t: NDArray[np.int64], what: str) -> None:
     """Raise :class:`AmiwarpError` if a time is not later than the one before. ``what`` is at each time."""
     later = t[1:] > t[:-1]
     if not later.all():
-        at = int(np.argmin(later)) + 1
+        first_bad = int(np.argmin(later)) + 1
         raise AmiwarpError(
-            f"{what} {at} ({t[at]} us) is not later than the one before; sort by time"
+            f"{what} {first_bad} ({t[first_bad]} us) is not later than the one before; sort by time"
         )
 
 

@@ -39,7 +39,8 @@ from amiwarp import (
     simulate,
     truth_model,
 )
-from amiwarp.calib.model_fit import Places, candidate_space, fit, linear_motions
+from amiwarp.calib.event_sample import EventSample
+from amiwarp.calib.model_fit import candidate_space, fit_models, linear_motions
 from amiwarp.optics.models.registry import rungs
 from amiwarp.studies.machine import machine
 
@@ -83,14 +84,14 @@ def true_errors(recording: Recording, c: Calibration) -> dict[str, float]:
     assert recording.encoder is not None
     truth = truth_model(recording.camera, recording.truth, FlatSide.SCENE)
     source = recording.events
-    places = Places.of(source.slice(0, len(source)), recording.encoder, JUDGED)
+    places = EventSample.of(source.slice(0, len(source)), recording.encoder, JUDGED)
     values = {"apex": truth.prism.apex, "index": truth.prism.index, "phase": truth.phase}
     values |= dict(zip(("tilt_x", "tilt_y"), truth.tilt, strict=True))
     exact = replace(c, model_name="exact", parameters=values)
     found = {"ellipse": places.distance(EllipseModel.from_model(truth), truth), "exact": 0.0}
     for name in ("circle", "radial"):
         space = candidate_space(name, exact, (), rad_per_us=1e-4, duration_us=1e6)
-        ((_, found[name]),) = fit(
+        ((_, found[name]),) = fit_models(
             linear_motions([space], places), places.compensated(truth), places
         )
     return {name: found[name] for name in rungs()}

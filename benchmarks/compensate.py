@@ -46,8 +46,8 @@ from amiwarp import (
     compensate,
     open_recording,
 )
-from amiwarp.compensation.blocks import BlockCompensator
 from amiwarp.compensation.gpu_pieces import PIECE
+from amiwarp.compensation.in_memory import BlockCompensator
 from amiwarp.events.recording import inside_image
 from amiwarp.optics.models.registry import MODELS
 from amiwarp.tasks import cpu_threads, in_order

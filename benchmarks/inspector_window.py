@@ -59,7 +59,7 @@ def mouse(window: Window, event: str, place: tuple[float, float]) -> None:
 
 def drawn(window: Window) -> None:
     """Let the window draw what has changed, and wait until the renderer has finished."""
-    if not window.turn():
+    if not window.run_once():
         raise RuntimeError("the window had nothing to draw")
     window.plotter.render_window.WaitForCompletion()
 

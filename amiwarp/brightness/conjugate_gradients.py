@@ -11,7 +11,7 @@ from amiwarp.brightness.multigrid import GridHierarchy
 from amiwarp.kernels import conjugate_gradients as kernels
 from amiwarp.kernels.program import Program
 
-FEW_CHUNKS = 16
+LEAST_CHUNKS_OF_TWO_THREADS = 16
 """Smallest number of chunks of the unknowns for which a second CPU thread is used. Fewer take less time than the
 hand-over to a thread."""
 
@@ -30,7 +30,7 @@ class NormalEquations:
     """Coarser grids for the preconditioner; None for the diagonal."""
     sums: wp.array
     """Sums over the equations for each unknown, in fixed point, a row for each thread."""
-    slices: list[wp.array]
+    rows_of_sums: list[wp.array]
     """Rows of ``sums``."""
     vectors: Any
     """Warp struct :class:`amiwarp.kernels.conjugate_gradients.Unknowns`."""
@@ -38,7 +38,7 @@ class NormalEquations:
     """Preconditioned residual, one element for each unknown; empty without grids."""
     dots: Any
     """Warp struct :class:`amiwarp.kernels.conjugate_gradients.Dots`."""
-    width: int
+    unknowns_per_thread: int
     """Number of unknowns of a thread."""
     threads: int
     """Number of threads for all unknowns."""
@@ -62,7 +62,7 @@ class ConjugateGradients:
         dots = system.dots
 
         self._start = Program(system.device)
-        equations.add_transpose(self._start, system.weight, residual, system.slices)
+        equations.add_transpose(self._start, system.weight, residual, system.rows_of_sums)
         inputs = [system.sums, system.prior, image]
         self._add(self._start, kernels.start_descent, inputs, [vectors, dots])
         self._add_preconditioner(self._start)
@@ -74,7 +74,7 @@ class ConjugateGradients:
             inputs = [system.preconditioned]
             kernel = kernels.update_search_direction_with
             self._add(self._step, kernel, inputs, [vectors, dots])
-        equations.add_product(self._step, system.weight, vectors.direction, system.slices)
+        equations.add_product(self._step, system.weight, vectors.direction, system.rows_of_sums)
         inputs = [system.sums, system.prior]
         self._add(self._step, kernels.finish_product, inputs, [vectors, dots])
         self._add(self._step, kernels.descend, [], [image, vectors, dots])
@@ -102,5 +102,7 @@ class ConjugateGradients:
 
     def _add(self, program: Program, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
         """Add to ``program`` a kernel over the unknowns."""
-        inputs = [*inputs, self._system.width]
-        program.add(kernel, self._system.threads, inputs, outputs, smallest=FEW_CHUNKS)
+        inputs = [*inputs, self._system.unknowns_per_thread]
+        program.add(
+            kernel, self._system.threads, inputs, outputs, smallest=LEAST_CHUNKS_OF_TWO_THREADS
+        )

@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 
 from amiwarp.brightness.pairs import PairSet, empty_pairs, running_count
 from amiwarp.brightness.sensor_timing import SensorTiming
+from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_sensor, join, time_span
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
 from amiwarp.kernels import pairs as pair_kernels
 from amiwarp.kernels.encoder_pieces import encoder_params
 from amiwarp.kernels.launch import launch
+
+LARGEST_KEY = 2**31 - 1
+"""Largest sort key of an event: its time span times the number of pixels, plus its pixel."""
 
 
 class EventTable:
@@ -76,6 +80,12 @@ class EventTable:
         launch(pair_kernels.mark_inside, events, pixels, [is_inside], device=device)
         place, count = running_count(is_inside)
         table.count = count
+        most_spans = LARGEST_KEY // table.places
+        if len(self.spans) > most_spans:
+            raise AmiwarpError(
+                f"there are {len(self.spans)} time spans of {table.places} pixels; "
+                f"their sort keys allow {most_spans}: calibrate from fewer spans"
+            )
 
         # The sort needs twice the room.
         table.key = wp.empty(2 * count, dtype=int, device=device)

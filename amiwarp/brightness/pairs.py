@@ -184,7 +184,7 @@ class PairSet:
         place = 0
         for part in parts:
             inputs = [part.arrays, place]
-            launch(pair_kernels.append, len(part), inputs, [joined], device=first.device)
+            launch(pair_kernels.copy_all, len(part), inputs, [joined], device=first.device)
             place += len(part)
         return cls(joined, first.device)
 
@@ -248,7 +248,7 @@ class PairSet:
         drifts = self.arrays.slope.shape[0] > 0
         selected = empty_pairs(count, device, drifts=drifts)
         launch(
-            pair_kernels.select,
+            pair_kernels.copy_marked,
             len(self),
             [self.arrays, flag, place],
             [selected],

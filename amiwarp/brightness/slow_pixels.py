@@ -53,23 +53,21 @@ def darkness(
     """
     pairs = brightness.pairs
     device = brightness.device
+    path = brightness.path_arguments(model)
+
+    every = max(1, len(pairs) // SAMPLED)
+    count = math.ceil(len(pairs) / every)
+    sampled = wp.empty((2, count), dtype=float, device=device)
+    launch(slow_kernels.write_brightness, count, [*path, ahead, every], [sampled], device=device)
+
     pixels = slow_kernels.Photoreceptor()
     pixels.ahead = ahead
-
-    def compute(every: int, columns: int) -> Any:
-        """Compute a value for each of both events of every ``every``-th pair, as ``pixels`` says."""
-        values_of_pairs = wp.empty((2, columns), dtype=float, device=device)
-        count = math.ceil(len(pairs) / every)
-        inputs = [*brightness.path_arguments(model), pixels, every]
-        launch(slow_kernels.find_time_constants, count, inputs, [values_of_pairs], device=device)
-        return values_of_pairs
-
-    # Without a threshold, the kernel returns the brightness itself.
-    every = max(1, len(pairs) // SAMPLED)
-    sampled = compute(every, math.ceil(len(pairs) / every))
     pixels.middle = float(np.nanmedian(sampled.numpy()))
     pixels.threshold = THRESHOLD
-    return compute(1, pairs.arrays.stride), pixels.middle
+    relative = wp.empty((2, pairs.arrays.stride), dtype=float, device=device)
+    kernel = slow_kernels.write_time_constants
+    launch(kernel, len(pairs), [*path, pixels], [relative], device=device)
+    return relative, pixels.middle
 
 
 def set_lags(
@@ -120,4 +118,4 @@ def set_lags(
     pixels.ahead = ahead
     pixels.turn = wp.array(turns, dtype=float, device=device)
     inputs = [*brightness.path_arguments(model), pixels]
-    launch(slow_kernels.find_offsets, count, inputs, [pairs.arrays.offset], device=device)
+    launch(slow_kernels.write_offsets, count, inputs, [pairs.arrays.offset], device=device)

@@ -17,7 +17,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.brightness.conjugate_gradients import (
-    FEW_CHUNKS,
+    LEAST_CHUNKS_OF_TWO_THREADS,
     ConjugateGradients,
     NormalEquations,
 )
@@ -106,7 +106,7 @@ class BrightnessMap:
         # Sums over the equations in fixed point, a slice for each thread.
         shape = (slice_count(self.device), unknowns)
         self._sums = wp.zeros(shape, dtype=wp.int64, device=self.device)
-        self._slices = [self._sums[row] for row in range(len(self._sums))]
+        self._rows_of_sums = [self._sums[row] for row in range(len(self._sums))]
         self._make_vectors(unknowns)
         self._make_prior(damping, unknowns)
         if off_excess is not None:
@@ -125,8 +125,8 @@ class BrightnessMap:
 
     def _make_vectors(self, unknowns: int) -> None:
         """Allocate the vectors of the conjugate-gradient method."""
-        self._width = cg.CPU_WIDTH if self.device.is_cpu else 1
-        self._threads = math.ceil(unknowns / self._width)
+        self._unknowns_per_thread = cg.CPU_WIDTH if self.device.is_cpu else 1
+        self._threads = math.ceil(unknowns / self._unknowns_per_thread)
         self._vectors = cg.Unknowns()
         self._vectors.diagonal = self._zeros(unknowns)
         self._vectors.residual = self._zeros(unknowns)
@@ -239,9 +239,9 @@ class BrightnessMap:
         self._launch(
             cg.sum_seen,
             threads,
-            [self._image[: self.tiles.nodes], self._width],
+            [self._image[: self.tiles.nodes], self._unknowns_per_thread],
             [partial],
-            smallest=FEW_CHUNKS,
+            smallest=LEAST_CHUNKS_OF_TWO_THREADS,
         )
         squares, number = partial.numpy().sum(axis=1).tolist()
         if squares <= CONTRAST * number:
@@ -323,7 +323,7 @@ class BrightnessMap:
                 [self._image, self.tiles.rows, self.smoothness.edge, self._prior],
                 [self._prior.right, self._prior.down],
             )
-        self._equations.add_diagonal(program, self.residuals.weight, self._slices)
+        self._equations.add_diagonal(program, self.residuals.weight, self._rows_of_sums)
         program.add(
             cg.gather_diagonal,
             len(self._image),
@@ -338,7 +338,7 @@ class BrightnessMap:
         program = Program(self.device)
         if self._grids is not None:
             equations = [self._atlas, self._positions.geometry, self.residuals.weight]
-            self._grids.prepare(program, equations, self.count, self._sums, self._slices)
+            self._grids.prepare(program, equations, self.count, self._sums, self._rows_of_sums)
         return program
 
     @cached_property
@@ -360,11 +360,11 @@ class BrightnessMap:
             prior=self._prior,
             grids=self._grids,
             sums=self._sums,
-            slices=self._slices,
+            rows_of_sums=self._rows_of_sums,
             vectors=self._vectors,
             preconditioned=self._preconditioned,
             dots=self._dots,
-            width=self._width,
+            unknowns_per_thread=self._unknowns_per_thread,
             threads=self._threads,
             device=self.device,
         )
@@ -415,7 +415,7 @@ class BrightnessMap:
         program = Program(self.device)
         # Equations from silence and from the window's ends do not count.
         self._add_weigh(program, self.pairs.with_columns(weak=0.0))
-        self._equations.add_diagonal(program, self.residuals.weight, self._slices)
+        self._equations.add_diagonal(program, self.residuals.weight, self._rows_of_sums)
         out = self._zeros(len(self._image))
         program.add(cg.gather, len(out), [self._sums], [out])
         program.launch()

@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from amiwarp.calib import checks
-from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
+from amiwarp.calib.bad_pixels import MaskedEventSource, find_bad_pixels, searched_part
 from amiwarp.calib.calibrator import Attempt, Calibrator, hiding, with_warnings
 from amiwarp.calib.camera_attempts import with_gyroscope, with_rotation, without_rotation
 from amiwarp.calib.coarse_encoder import hidden_by_rounding, rounding_in_words
@@ -148,11 +148,11 @@ def _with_turning_named(tried: Attempt) -> Attempt:
     """Return an attempt whose camera turned, with a warning that its rotation was not found."""
     if tried.photometric is None or not tried.accepted:
         return tried
-    said = (
+    warning = (
         f"the camera turned: a slow rotation explains {100 * tried.photometric.rotation_gain:.0f} % of the residual, "
         "but none was found that explains the events; hold the camera still"
     )
-    return replace(tried, calibration=with_warnings(tried.found(), said))
+    return replace(tried, calibration=with_warnings(tried.found(), warning))
 
 
 def _with_assumptions(calibrator: Calibrator, found: Calibration) -> Calibration:
@@ -263,12 +263,12 @@ def of_turning_vibration(calibrator: Calibrator, tried: Attempt) -> Attempt:
     if not tried.accepted:
         return tried
     if unexamined:
-        said = (
+        warning = (
             f"{100 * tried.cost:.0f} % of the residual remains, too much for the answer to be examined: much noise, or "
             "the camera turned while it vibrated; it may be off by tenths of a pixel: hold the camera where it only "
             "vibrates, and lower the sensor's sensitivity"
         )
-        return replace(tried, calibration=with_warnings(tried.found(), said))
+        return replace(tried, calibration=with_warnings(tried.found(), warning))
     return _with_turning_named(tried)
 
 
@@ -281,7 +281,7 @@ def without_bad_pixels(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrat
     source = calibrator.recording.events
     encoder = calibrator.recording.encoder
     assert encoder is not None
-    mask, summary = strange_pixels(stretch(source, encoder), encoder, source.size)
+    mask, summary = find_bad_pixels(searched_part(source, encoder), encoder, source.size)
     if summary.share < LEAST_BAD_SHARE:
         return calibrator, tried
     checks.check_light(mask, summary, calibrator.recording.name)
@@ -305,13 +305,13 @@ def without_moving_parts(calibrator: Calibrator, tried: Attempt) -> Attempt:
     mask = tried.moving[part_row][:, part_column]
     recording = replace(calibrator.recording, events=MaskedEventSource(source, mask))
     again = replace(calibrator, recording=recording).attempt()
-    said = f"something moves: {100 * mask.mean():.0f} % of the view are left out"
+    warning = f"something moves: {100 * mask.mean():.0f} % of the view are left out"
     if again.accepted and not again.unexplained:
-        return Attempt(with_warnings(again.found(), said))
+        return Attempt(with_warnings(again.found(), warning))
     return Attempt(
         None,
         AmiwarpError(
-            f"{calibrator.recording.name}: {said}, but the rest does not determine the prism; "
+            f"{calibrator.recording.name}: {warning}, but the rest does not determine the prism; "
             "record a scene that stays still",
             ErrorCode.CALIBRATION_REFUSED,
         ),

@@ -106,7 +106,8 @@ def _for_optic(recording: Recording, settings: Settings) -> Settings:
             if kind.ANGLES == 2
         )
         raise AmiwarpError(
-            f"{recording.name}: has the angles of two motors, and names no optic; give one: {choices}"
+            f"{recording.name}: has the angles of two motors, and names no optic; give one: {choices}",
+            ErrorCode.AMBIGUOUS,
         )
     if best != ExactModel.NAME:
         return replace(settings, model=best)

@@ -167,7 +167,7 @@ class Calibrator:
                 found_in_senses = []
                 for search in searches:
                     found_in_senses.append(search.run())
-                search = max(found_in_senses, key=lambda each: each.score)
+                search = max(found_in_senses, key=lambda search: search.score)
                 search = in_larger_sense(recording, search)
                 if recording.encoder is None and self.path is None and path_is_examined(search):
                     search, hidden_px = with_path(recording, search)
@@ -390,6 +390,6 @@ def hiding(found: Calibration, hidden_px: Mapping[str, float]) -> Calibration:
     return replace(found, photometric=replace(stage, hidden_px={**stage.hidden_px, **hidden_px}))
 
 
-def with_warnings(found: Calibration, *said: str) -> Calibration:
+def with_warnings(found: Calibration, *warnings: str) -> Calibration:
     """Return the calibration with more warnings."""
-    return replace(found, warnings=(*found.warnings, *said))
+    return replace(found, warnings=(*found.warnings, *warnings))

@@ -143,11 +143,11 @@ def _growing(calibrator: Calibrator, tried: Attempt, turning: Attempt) -> Attemp
     if abs(growth) < LEAST_GROWTH_DEVIATIONS * std:
         return None
     how = "grew" if growth > 0.0 else "shrank"
-    said = (
+    warning = (
         f"the image {how} by {100.0 * abs(growth):.2g} % a second, which was calibrated together with the prism: "
         "the focal length drifts, or the camera moves along its axis"
     )
-    return Attempt(with_warnings(_without_motion(found), said))
+    return Attempt(with_warnings(_without_motion(found), warning))
 
 
 def _is_confirmed(calibrator: Calibrator, turning: Attempt, apart_px: float) -> bool:
@@ -180,8 +180,8 @@ def without_rotation(found: Calibration, calmest: str = "") -> Calibration:
     """
     speed = math.degrees(math.hypot(*(found.parameters[name] for name in RATES)))
     mover = MODELS[found.model_name].MOVER
-    said = f"the camera turned at {speed:.1f} deg/s; its rotation was calibrated together with the {mover}{calmest}"
-    return with_warnings(_without_motion(found), said)
+    warning = f"the camera turned at {speed:.1f} deg/s; its rotation was calibrated together with the {mover}{calmest}"
+    return with_warnings(_without_motion(found), warning)
 
 
 def _without_motion(found: Calibration) -> Calibration:

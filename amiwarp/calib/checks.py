@@ -11,7 +11,7 @@ from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.canvas import Image
-from amiwarp.imaging.sharpness import edge_coherence
+from amiwarp.imaging.edge_coherence import edge_coherence
 from amiwarp.io.assumptions import ASSUMED_SIZE
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.models.registry import MODELS
@@ -85,15 +85,15 @@ def check_pulses(encoder: Encoder, name: str) -> None:
     """
     if encoder.index_t is None or len(encoder.index_t) < FEWEST_PULSES:
         return
-    at = encoder.pulse_angles() / math.tau
-    steps = np.diff(at)
+    pulse_turns = encoder.pulse_angles() / math.tau
+    steps = np.diff(pulse_turns)
     turns = float(np.median(np.abs(steps)))
     if not turns > 0.0:
         return
     number = np.concatenate([[0.0], np.cumsum(np.rint(steps / turns))])
-    slope, start = np.polyfit(number, at, 1)
+    slope, start = np.polyfit(number, pulse_turns, 1)
     drift = abs(abs(slope) - 1.0) * float(np.ptp(number))
-    off = float(np.abs(at - (start + slope * number)).max())
+    off = float(np.abs(pulse_turns - (start + slope * number)).max())
     # if every other pulse is missing, the pulses are a whole number of turns apart
     whole = abs(turns - max(1.0, round(turns))) * float(np.ptp(number)) <= LARGEST_DRIFT
     if drift > LARGEST_DRIFT and off <= STEADY * drift and not whole:
@@ -202,9 +202,9 @@ def check_light(mask: NDArray[np.bool_], summary: BadPixelSummary, name: str) ->
                 f"{name}: {100 * mask.mean():.0f} % of the pixels are hot; record with other biases, or cooler",
                 ErrorCode.CALIBRATION_REFUSED,
             )
-        at = " and ".join(f"{hz:.0f}" for hz in summary.lamps_hz)
+        lamps = " and ".join(f"{hz:.0f}" for hz in summary.lamps_hz)
         raise AmiwarpError(
-            f"{name}: {100 * mask.mean():.0f} % of the pixels flicker at {at} Hz; "
+            f"{name}: {100 * mask.mean():.0f} % of the pixels flicker at {lamps} Hz; "
             "use daylight or flicker-free lighting",
             ErrorCode.CALIBRATION_REFUSED,
         )

@@ -407,7 +407,9 @@ def cut(recording: Recording, window: str) -> Recording:
     events = recording.events.between(low, high)
     if not len(events):
         raise AmiwarpError(
-            f"{recording.name}: no events in the window {window} s; the recording is {(last - first) * 1e-6:.6g} s long"
+            f"{recording.name}: no events in the window {window} s; "
+            f"the recording is {(last - first) * 1e-6:.6g} s long",
+            ErrorCode.CONTENT_MISSING,
         )
     return replace(recording, events=MemoryEvents(events, *recording.events.size))
 
@@ -514,18 +516,18 @@ def _photometric(c: Calibration) -> list[str]:
     if c.photometric is None or not c.photometric.accepted:
         return []
     p = c.photometric
-    said = [
+    lines = [
         f"photometric: {p.verdict}; {p.pairs:,} pairs, {p.moved_px:.3f} px from the result of the sharpness stage"
     ]
     if p.deviation_px is not None:
-        said.append(
+        lines.append(
             f"the events determine their motion within ± {p.deviation_px:.2g} px rms, a constant lag apart"
         )
     if p.hidden_px:
-        bounds = sorted(p.hidden_px.items(), key=lambda each: -each[1])
+        bounds = sorted(p.hidden_px.items(), key=lambda bound: -bound[1])
         could = ", ".join(f"{words} {px:.2g} px" for words, px in bounds)
-        said.append(f"what was looked for and could still hide in it, at most: {could}")
-    return said
+        lines.append(f"what was looked for and could still hide in it, at most: {could}")
+    return lines
 
 
 def _shown(entry: dict[str, Any]) -> tuple[str, str, str]:

@@ -27,7 +27,7 @@ LONGEST_US = 1_000_000
 SLOWEST_HZ = 40.0
 """Lowest detected flicker frequency [Hz]. Slower changes of the light cannot be distinguished from motion of the scene.
 """
-LAMP_CYCLES = 6
+FEWEST_CYCLES = 6
 """Smallest number of cycles of a lamp during the events from which its frequency can be determined."""
 LEAST_SHARE = 0.3
 """Smallest share of a cell's or a pixel's events that must oscillate with the lamp for it to count as flickering.
@@ -40,8 +40,13 @@ NEAR_TURNS = 2.6
 range then contains harmonics of the prism's rotation."""
 FEWEST_NEAR = 5
 """Smallest number of frequencies on either side to which a lamp's power is compared."""
-FINER = 8
+SPECTRUM_REFINEMENT = 8
 """How much finer the spectrum is in which the lamp's frequency is found."""
+SAME_LAMP_HZ = 1.0
+"""Smallest difference of two lamps' frequencies [Hz]; below it, they are two estimates for one lamp."""
+LOWEST_SHARE = 0.5
+"""Smallest summed amplitude of a lamp's lowest frequency, as a share of the largest at any frequency. Overtones may be
+nearly as strong."""
 FEWEST_EVENTS = 100
 """Smallest number of events of a cell whose spectrum is analysed."""
 LEAST_SIGMA = 4.0
@@ -79,12 +84,12 @@ def flickering_pixels(
         if lamp is None:
             break
         hz, cells = lamp
-        patch = _patch(events, pixel, hz, cells, hot) & ~found
+        patch = _region_of_lamp(events, pixel, hz, cells, hot) & ~found
         if not patch.any():
             break
         found |= patch
         # A second search may find more pixels of the same lamp.
-        known = any(round(hz) == round(other) for other in lamps)
+        known = any(abs(hz - other) < SAME_LAMP_HZ for other in lamps)
         if not known:
             lamps.append(hz)
     return found, tuple(lamps)
@@ -94,31 +99,30 @@ def _find_lamp(
     events: Events,
     pixel: NDArray[np.int32],
     turns_hz: float,
-    without: Mask,
+    ignored: Mask,
 ) -> tuple[float, Mask] | None:
     """Return the frequency [Hz] of the strongest lamp and the cells that see it, shape (rows, columns)."""
-    signed, count, rows = _signals(events, pixel, without)
+    signed, count, rows = _signals(events, pixel, ignored)
     bins = signed.shape[1]
     amplitude = np.abs(np.fft.rfft(signed, axis=1))
     hz = np.fft.rfftfreq(bins, BIN_US * 1e-6)
-    reach = FEWEST_NEAR
+    reach_bins = FEWEST_NEAR
     if bins > 1:
-        reach = max(FEWEST_NEAR, round(NEAR_TURNS * turns_hz / hz[1]))
+        reach_bins = max(FEWEST_NEAR, round(NEAR_TURNS * turns_hz / hz[1]))
 
     # At which frequencies each cell sees a lamp.
     count_of_cell = count[:, None]
     duration_us = bins * BIN_US
-    slowest_hz = max(SLOWEST_HZ, LAMP_CYCLES * 1e6 / duration_us)
-    sees = amplitude**2 >= LEAST_RATIO * _largest_near(amplitude, reach) ** 2
+    slowest_hz = max(SLOWEST_HZ, FEWEST_CYCLES * 1e6 / duration_us)
+    sees = amplitude**2 >= LEAST_RATIO * _largest_near(amplitude, reach_bins) ** 2
     sees &= amplitude >= LEAST_SHARE * count_of_cell
     sees &= count_of_cell >= FEWEST_EVENTS
     sees[:, hz < slowest_hz] = False
     if not sees.any():
         return None
 
-    # The lowest frequency: overtones may be nearly as strong
     seen = np.where(sees, amplitude, 0.0).sum(axis=0)
-    strong = seen >= 0.5 * seen.max()
+    strong = seen >= LOWEST_SHARE * seen.max()
     lowest = int(np.argmax(strong))
     cells = sees[:, lowest - 1 : lowest + 2].any(axis=1)
     lamp_hz = _finer_hz(signed[cells], lowest)
@@ -127,11 +131,11 @@ def _find_lamp(
 
 def _finer_hz(signed: Vector, nearest: int) -> float:
     """Return the frequency of a lamp between the bins next to the bin ``nearest`` of the spectrum [Hz]."""
-    fine_bins = FINER * signed.shape[1]
+    fine_bins = SPECTRUM_REFINEMENT * signed.shape[1]
     spectrum = np.fft.rfft(signed, fine_bins, axis=1)
     power = (np.abs(spectrum) ** 2).sum(axis=0)
-    first = FINER * (nearest - 1)
-    last = FINER * (nearest + 1)
+    first = SPECTRUM_REFINEMENT * (nearest - 1)
+    last = SPECTRUM_REFINEMENT * (nearest + 1)
     peak = first + int(np.argmax(power[first : last + 1]))
     return peak * 1e6 / (fine_bins * BIN_US)
 
@@ -139,10 +143,10 @@ def _finer_hz(signed: Vector, nearest: int) -> float:
 def _signals(
     events: Events,
     pixel: NDArray[np.int32],
-    without: Mask,
+    ignored: Mask,
 ) -> tuple[Vector, Vector, int]:
     """Return ON minus OFF events, shape (cells, bins), the events per cell, shape (cells,), and the rows of cells."""
-    height, width = without.shape
+    height, width = ignored.shape
     rows = math.ceil(height / CELL)
     columns = math.ceil(width / CELL)
     cells = rows * columns
@@ -150,8 +154,8 @@ def _signals(
     bins = int(events.t[-1] - events.t[0]) // BIN_US + 1
 
     # masked pixels are counted in an extra cell at the end
-    y, x = np.indices(without.shape, np.int32)
-    cell = np.where(without, cells, y // CELL * columns + x // CELL)
+    y, x = np.indices(ignored.shape, np.int32)
+    cell = np.where(ignored, cells, y // CELL * columns + x // CELL)
     first_slot = cell.astype(np.int32) * np.int32(bins)
 
     edges = begin + np.arange(bins + 1) * BIN_US
@@ -170,11 +174,11 @@ def _signals(
     return 2.0 * on - count, count_of_cell, rows
 
 
-def _largest_near(amplitude: Vector, reach: int) -> Vector:
-    """Return the largest amplitude at 2 to ``reach`` frequency bins away: a spectral line is up to two bins wide."""
+def _largest_near(amplitude: Vector, reach_bins: int) -> Vector:
+    """Return the largest amplitude at 2 to ``reach_bins`` bins away: a spectral line is up to two bins wide."""
     from scipy.ndimage import maximum_filter1d
 
-    window = (reach - 1) | 1  # odd, so that it has a middle
+    window = (reach_bins - 1) | 1  # odd, so that it has a middle
     off = 2 + window // 2
     largest = maximum_filter1d(amplitude, window, axis=1, mode="constant")
     padded = np.pad(largest, ((0, 0), (off, off)))
@@ -184,22 +188,22 @@ def _largest_near(amplitude: Vector, reach: int) -> Vector:
     return np.maximum(below, above)
 
 
-def _patch(
+def _region_of_lamp(
     events: Events,
     pixel: NDArray[np.int32],
     hz: float,
     cells: Mask,
-    without: Mask,
+    ignored: Mask,
 ) -> Mask:
     """Return the connected region of pixels that oscillate at ``hz`` [Hz], grown from the cells that see the lamp."""
     from scipy import ndimage
 
-    height, width = without.shape
+    height, width = ignored.shape
 
     def around(weights: Vector | None) -> Vector:
         """Return the sums of the events' weights, or their numbers, in the square about each pixel."""
         of_pixel = np.bincount(pixel, weights, minlength=height * width)
-        image = np.where(without, 0.0, of_pixel.reshape(height, width))
+        image = np.where(ignored, 0.0, of_pixel.reshape(height, width))
         mean = ndimage.uniform_filter(image, SMOOTHING, mode="mirror")
         sums = mean * SMOOTHING**2
         if weights is None:

@@ -12,19 +12,19 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.calib.event_sample import EventSample
 from amiwarp.calib.model_fit import (
     LinearMotion,
-    Places,
     candidate_space,
-    encoder_noise,
-    fit,
+    fit_models,
     independent_directions,
     linear_motions,
-    scales,
+    px_per_unit,
 )
 from amiwarp.calib.settings import Settings
 from amiwarp.calib.sharpness_objective import STEP_PX
 from amiwarp.calib.thinning import rotation_window, thin
+from amiwarp.calib.timing_blur import encoder_noise
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.optics.models.exact import ExactModel
@@ -65,7 +65,7 @@ class Groundwork:
     """Events of the recording: all that are in memory, or a part of those in a file."""
     most_events: int
     """Largest number of events on which sharpness is measured."""
-    sample: Places
+    sample: EventSample
     """Evenly thinned events at which the displacements of models are compared."""
     rad_per_us: float
     """Mean speed of the prism [rad/us]."""
@@ -110,7 +110,7 @@ class Groundwork:
         """Return the space of a smaller model about ``exact``, and its parameters that fit ``exact`` best."""
         space = self.space_of(model, exact)
         target = self.sample.compensated(exact.model)
-        ((values, _),) = fit(linear_motions([space], self.sample), target, self.sample)
+        ((values, _),) = fit_models(linear_motions([space], self.sample), target, self.sample)
         return space, values
 
     def motion_range(self, name: str) -> float:
@@ -143,13 +143,13 @@ def lay_groundwork(
         last = int(events.t[-1])
     duration_us = float(max(last - first, 1))
     rad_per_us = float(np.ptp(encoder.angle_at(events.t[[0, -1]]))) / duration_us
-    sample = Places.of(events, encoder)
+    sample = EventSample.of(events, encoder)
 
     # The spaces of the exact model and of the smaller ones. How far a tilt moves events must be measured.
     answer = sharpness_answer(exact)
     pixels = None
     if not set(TILT) & set(names):
-        pixels = scales(sample.path(answer.model), sample, answer, rad_per_us)
+        pixels = px_per_unit(sample.path(answer.model), sample, answer, rad_per_us)
     about = partial(candidate_space, rad_per_us=rad_per_us, duration_us=duration_us)
     space = _with_search_range(about("exact", answer, names, pixels=pixels))
     circles = [about(name, answer, (), pixels=space.pixels) for name in CIRCLES]
@@ -167,7 +167,7 @@ def lay_groundwork(
         duration_us=duration_us,
         space=space,
         circles=tuple(smaller),
-        start=motion.v,
+        start=motion.point,
         directions=rows,
         tested=tuple(n for n in space.names if _motion_range(space, rows, n) >= STEP_PX),
     )

@@ -135,16 +135,16 @@ def find_gyroscope(recording: Recording, encoder: Encoder, camera: Camera) -> Gy
     known = imu.to_camera
     others = orientations()
     if known is not None:
-        others = [each for each in others if angle_between(each, known) > OTHER_RAD]
-    first = [coarse.agreement(each, np.zeros(7)) for each in others]
+        others = [rotation for rotation in others if angle_between(rotation, known) > OTHER_RAD]
+    first = [coarse.agreement(rotation, np.zeros(7)) for rotation in others]
     best_first = np.argsort(first, kind="stable")[::-1]
     tried = [others[k] for k in best_first[:BEST]]
     if known is not None:
         tried = [known, *tried[:1]]
     runs = []
-    for each in tried:
-        rough = coarse.search(each, BIAS_ALONE)
-        runs.append(fine.search(each, BIAS_ALONE, rough.v))
+    for rotation in tried:
+        rough = coarse.search(rotation, BIAS_ALONE)
+        runs.append(fine.search(rotation, BIAS_ALONE, rough.v))
     best = runs[0]
     if known is None:
         best = max(runs, key=lambda run: run.agreement)
@@ -211,11 +211,13 @@ class Alignment:
 def _range_edges(encoder: Encoder, first: int, last: int) -> NDArray[np.int64]:
     """Return the times [us] between ranges of angles of the optic, for whole ranges from ``first`` on."""
     samples = max(2, (last - first) // 500)
-    at = np.linspace(first, last, samples)
-    turned = np.abs(encoder.angle_at(at.astype(np.int64)) - float(encoder.angle_at(first)))
+    sample_times = np.linspace(first, last, samples)
+    turned = np.abs(
+        encoder.angle_at(sample_times.astype(np.int64)) - float(encoder.angle_at(first))
+    )
     ranges = np.maximum.accumulate(turned) * (ANGLE_RANGES / math.tau)
     count = int(ranges[-1])
-    return np.interp(np.arange(count + 1), ranges, at).astype(np.int64)
+    return np.interp(np.arange(count + 1), ranges, sample_times).astype(np.int64)
 
 
 class ImagePairs:

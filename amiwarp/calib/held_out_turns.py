@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.calib.calibration_events import CalibrationEvents
 from amiwarp.calib.sharpness_objective import STEP_PX, finite_differences, padding
 from amiwarp.choices import Sharpness
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events
 from amiwarp.imaging.canvas import CanvasShape
 from amiwarp.imaging.sharpness import SharpnessMeter
@@ -40,14 +41,19 @@ PARTS = 8
 
 
 def split_turns(calibration_events: CalibrationEvents) -> tuple[Events, Events]:
-    """Return the events of the even and of the odd turns, or of alternate spans if there are less than two turns."""
+    """Return the events of the even and of the odd turns, or of alternate spans if there are fewer than two turns."""
     events = calibration_events.events
     turned = calibration_events.encoder.angle_at(events.t)
     turned -= turned[0]  # in place: with ten million events, each array has 80 MB
     np.abs(turned, out=turned)
-    whole = float(turned.max())
-    span = math.tau if whole >= FEWEST_TURNS * math.tau else whole / SPANS
-    turned /= span
+    total_rad = float(turned.max())
+    if total_rad == 0.0:
+        raise AmiwarpError(
+            "the encoder stands still during the events; turn the prism",
+            ErrorCode.CALIBRATION_REFUSED,
+        )
+    span_rad = math.tau if total_rad >= FEWEST_TURNS * math.tau else total_rad / SPANS
+    turned /= span_rad
     odd = (turned.astype(np.int32) & 1).astype(np.bool_)
     del turned
     return events[np.flatnonzero(~odd)], events[np.flatnonzero(odd)]
@@ -77,11 +83,11 @@ class HalfSharpness:
         self._meter = SharpnessMeter(
             canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=device
         )
-        self.fastest: dict[str, float] = {}
+        self.fastest_s: dict[str, float] = {}
         """Shortest measured time for one event's angle, displacement and vote [s], by name of the model."""
 
-    def each(self, space: ParameterSpace, values: Mapping[str, float]) -> Vector:
-        """Return the sharpness of each part, shape (PARTS,)."""
+    def of_parts(self, space: ParameterSpace, values: Mapping[str, float]) -> Vector:
+        """Return the sharpness of each part, shape (PARTS,), and note the time in :attr:`fastest_s`."""
         model = space.build(values)
         device = self._meter.device
         self._votes.clear()
@@ -94,8 +100,9 @@ class HalfSharpness:
             camera_rotation=space.camera_rotation(values),
         )
         wp.synchronize_device(device)
-        took = (time.perf_counter() - began) / max(self._events.count, 1)
-        self.fastest[space.model] = min(took, self.fastest.get(space.model, math.inf))
+        seconds_per_event = (time.perf_counter() - began) / max(self._events.count, 1)
+        fastest_s = self.fastest_s.get(space.model, math.inf)
+        self.fastest_s[space.model] = min(seconds_per_event, fastest_s)
         self._votes.read(self._meter.image)
         self._meter.launch()
         return np.array(self._meter.results())
@@ -105,15 +112,15 @@ def gradient(half: HalfSharpness, space: ParameterSpace, v: Vector) -> Vector:
     """Return the gradient of the mean sharpness at a search vector [1/px]."""
     rise = []
     for step in STEP_PX * np.eye(len(v)):
-        ahead = half.each(space, space.to_values(v + step))
-        behind = half.each(space, space.to_values(v - step))
+        ahead = half.of_parts(space, space.to_values(v + step))
+        behind = half.of_parts(space, space.to_values(v - step))
         rise.append(ahead - behind)
     return np.asarray(np.mean(rise, axis=1) / (2.0 * STEP_PX))
 
 
 @dataclass(frozen=True)
-class Quadratic:
-    """Quadratic approximation of sharpness about a point along n directions."""
+class QuadraticSharpness:
+    """QuadraticSharpness approximation of sharpness about a point along n directions."""
 
     slopes: Vector
     """Gradient of the sharpness of each part of the events [1/px], shape ``(n, parts)``."""
@@ -123,29 +130,34 @@ class Quadratic:
     @classmethod
     def about(
         cls, half: HalfSharpness, space: ParameterSpace, v: Vector, directions: Vector
-    ) -> Quadratic:
+    ) -> QuadraticSharpness:
         """Return the approximation about a search vector.
 
         Each row of ``directions`` is a vector that moves events by one pixel, shape (n, entries of the vector).
         """
-        each = partial(half.each, space)
-        slopes, hessian = finite_differences(each, space, v, directions)
+        of_parts = partial(half.of_parts, space)
+        slopes, hessian = finite_differences(of_parts, space, v, directions)
         return cls(slopes, hessian)
 
-    def restricted_to(self, which: list[int]) -> Quadratic:
+    def restricted_to(self, which: list[int]) -> QuadraticSharpness:
         """Return the approximation along the directions whose numbers are in ``which``."""
-        return Quadratic(self.slopes[which], self.hessian[np.ix_(which, which)])
+        return QuadraticSharpness(self.slopes[which], self.hessian[np.ix_(which, which)])
 
-    def step_to_maximum(self, gradient: Vector | None = None) -> Vector:
+    def _curvatures(self) -> tuple[Vector, Vector, float]:
+        """Return the curvatures [1/px²], the directions in which they are, and the smallest one that counts."""
+        values, vectors = np.linalg.eigh(-self.hessian)
+        floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
+        return values, vectors, floor
+
+    def step_to_maximum(self, other_gradient: Vector | None = None) -> Vector:
         """Return the step to the sharpest point [px]: 0 along flat directions, at most :data:`LONGEST_STEP_PX` long.
 
-        ``gradient`` [1/px] replaces the approximation's own gradient, for another model with about the same Hessian.
+        ``other_gradient`` [1/px] replaces the approximation's own gradient, for another model with about the same
+        Hessian.
         """
-        values, vectors = np.linalg.eigh(-self.hessian)
-        if gradient is None:
-            gradient = self.slopes.mean(axis=1)
-        along = vectors.T @ gradient
-        floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
+        values, vectors, floor = self._curvatures()
+        own_gradient = self.slopes.mean(axis=1)
+        along = vectors.T @ (own_gradient if other_gradient is None else other_gradient)
         to_maximum = along / np.maximum(values, floor)
         step = vectors @ np.where(values > floor, to_maximum, 0.0)
         length = max(float(np.linalg.norm(step)), 1e-12)
@@ -158,8 +170,8 @@ class Quadratic:
 
     def deviations(self) -> Vector:
         """Return the standard deviation of the maximum along each direction [px], by the sandwich estimate."""
-        values, vectors = np.linalg.eigh(-self.hessian)
-        floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
+        values, vectors, floor = self._curvatures()
+        # Flat directions count with the smallest curvature, so that their deviation is large but finite.
         inverse_values = np.diag(1.0 / np.maximum(values, floor))
         inverse = vectors @ inverse_values @ vectors.T
         parts = self.slopes.shape[1]

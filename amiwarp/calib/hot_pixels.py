@@ -41,14 +41,14 @@ def outliers(count: Counts) -> NDArray[np.bool_]:
     padded = np.pad(count, NEIGHBOURS, mode="symmetric")
     far_more = 3.0 * padded + 5.0 * np.sqrt(padded) + 8.0
     enough = far_more.astype(np.float32)
-    own = count.astype(np.float32)
+    counts = count.astype(np.float32)
     low_neighbours = np.zeros(count.shape, np.int8)
     for i in range(2 * NEIGHBOURS + 1):
         for j in range(2 * NEIGHBOURS + 1):
             if i == NEIGHBOURS and j == NEIGHBOURS:
                 continue  # the pixel itself
             neighbour = enough[i : i + height, j : j + width]
-            low_neighbours += own > neighbour
+            low_neighbours += counts > neighbour
     return low_neighbours >= LEAST_LOW
 
 

@@ -150,8 +150,8 @@ def steps_in_samples(encoder: Encoder) -> list[Step]:
     usual_interval = float(np.median(np.diff(t)))
     if abs(encoder.rpm) * usual_interval * SAMPLES_PER_TURN > 60e6:
         return []
-    at = np.arange(AROUND - 1, len(t) - AROUND)
-    parts = np.array_split(at, math.ceil(len(at) / AT_A_TIME))
+    sample = np.arange(AROUND - 1, len(t) - AROUND)
+    parts = np.array_split(sample, math.ceil(len(sample) / AT_A_TIME))
     fits = [_fit_steps(encoder, part) for part in parts]
     size, at_once, share = np.concatenate(fits, axis=1)
 
@@ -168,20 +168,20 @@ def steps_in_samples(encoder: Encoder) -> list[Step]:
         near = slice(max(0, k - BESIDE), k + BESIDE + 1)
         rivals = np.abs(at_once[near][strong[near]])
         if abs(at_once[k]) == rivals.max():
-            first = at[k]
+            first = sample[k]
             steps.append(Step(int(t[first]), int(t[first + 1]), float(size[k])))
     return steps
 
 
-def _fit_steps(encoder: Encoder, at: NDArray[np.int64]) -> Vector:
+def _fit_steps(encoder: Encoder, sample: NDArray[np.int64]) -> Vector:
     """Return what the samples around some intervals tell of a step in each, shape (3, n).
 
-    ``at``: indices of the samples before the intervals, shape (n,). The rows are the size of the step [rad], the part
+    ``sample``: indices of the samples before the intervals, shape (n,). The rows are the size of the step [rad], the part
     of it that comes in the interval [rad], and the sum of the squares that a smooth path leaves of a step of 1.
     """
-    around = at[:, None] + np.arange(1 - AROUND, AROUND + 1)
-    angle = encoder.angle[around] - encoder.angle[at][:, None]
-    elapsed = encoder.t[around] - 0.5 * (encoder.t[at] + encoder.t[at + 1])[:, None]
+    around = sample[:, None] + np.arange(1 - AROUND, AROUND + 1)
+    angle = encoder.angle[around] - encoder.angle[sample][:, None]
+    elapsed = encoder.t[around] - 0.5 * (encoder.t[sample] + encoder.t[sample + 1])[:, None]
     reach = np.abs(elapsed).max(axis=1, keepdims=True)
     smooth = (elapsed / reach)[:, :, None] ** np.arange(DEGREE + 1)
     by_smooth = np.swapaxes(smooth, 1, 2)

@@ -45,6 +45,23 @@ LOCAL_ALGORITHMS = (
 """NLopt's derivative-free local algorithms."""
 _NEEDS_TWO = ("LN_BOBYQA", "LN_NEWUOA", "LN_NEWUOA_BOUND")
 """Powell's algorithms with quadratic models, which need at least two dimensions."""
+_ENDS = {
+    1: "converged",
+    2: "score reached",
+    3: "tolerance of the score",
+    4: "tolerance",
+    5: "budget",
+    6: "time",
+}
+"""Why NLopt ended, by its result codes."""
+LARGEST_STEP_SHARE = 0.45
+"""Largest first step, as a share of the box: NLopt refuses a step that leaves the box from its middle."""
+LEAST_INNER_EVALUATIONS = 20
+"""Smallest number of evaluations of a search inside MLSL."""
+INNER_SEARCHES = 8
+"""Number of searches inside MLSL that fit into the budget."""
+LEAST_INNER_TOLERANCE_PX = 0.05
+"""Smallest tolerance of a search inside MLSL [px]: the best optimum is refined by the local search that follows."""
 SAME_OPTIMUM_PX = 1.0
 """Distance from a known optimum below which a search would end there [px]."""
 
@@ -125,8 +142,8 @@ def maximise(
     """
     import nlopt
 
-    names = LOCAL_ALGORITHMS if algorithm.startswith("LN_") else GLOBAL_ALGORITHMS
-    one_of(algorithm, names, "algorithm")
+    one_of(algorithm, (*GLOBAL_ALGORITHMS, *LOCAL_ALGORITHMS), "algorithm")
+    one_of(inner, LOCAL_ALGORITHMS, "inner algorithm")
     began = time.perf_counter()
     nlopt.srand(seed + 1)  # 0 would seed NLopt from the clock
     optimiser = _optimiser(
@@ -149,7 +166,7 @@ def maximise(
         ended = "known optimum" if samples.near_known else "budget"
     except (RuntimeError, ValueError) as error:
         raise AmiwarpError(
-            f"{algorithm} failed in {len(low)} dimensions: {error}; choose another algorithm"
+            f"{algorithm} failed in {len(low)} dimensions: {error}; choose another algorithm or other bounds"
         ) from error
     finally:
         samples.release()
@@ -184,10 +201,8 @@ class _EvaluationLog:
     @property
     def near_known(self) -> bool:
         """Whether the last point is near a known optimum."""
-        return (
-            any(math.dist(self.points[-1], k) < SAME_OPTIMUM_PX for k in self._known)
-            if self.points
-            else False
+        return bool(self.points) and any(
+            math.dist(self.points[-1], optimum) < SAME_OPTIMUM_PX for optimum in self._known
         )
 
     def release(self) -> None:
@@ -195,19 +210,19 @@ class _EvaluationLog:
         self._score = self._stop = None
 
     def cost(self, x: NDArray[np.float64], _gradient: Any) -> float:
+        """Return the negative score of a point, for NLopt, which minimises."""
         assert self._score is not None
         assert self._stop is not None
         # NLopt's C code may continue after an exception. So the exception is stored here and raised after NLopt stops.
-        if (
-            self.failure is not None or len(self.scores) >= self._most
-        ):  # some algorithms exceed their budget
+        # Some algorithms exceed their budget.
+        if self.failure is not None or len(self.scores) >= self._most:
             self._stop()
             return -min(self.scores, default=0.0)
         try:
             value = self._score(x)
             if not math.isfinite(value):
                 raise AmiwarpError(
-                    f"sharpness or cost is {value} at the point {x} px; check camera and prism"
+                    f"sharpness or cost is {value} at the search vector {x} px; check camera and prism"
                 )
         except BaseException as error:
             self.failure = error
@@ -218,16 +233,6 @@ class _EvaluationLog:
         if self.near_known:
             self._stop()
         return -value
-
-
-_ENDS = {
-    1: "converged",
-    2: "score reached",
-    3: "tolerance of the score",
-    4: "tolerance",
-    5: "budget",
-    6: "time",
-}
 
 
 def _optimiser(
@@ -255,15 +260,14 @@ def _optimiser(
     optimiser.set_maxeval(evaluations)
     if algorithm.startswith("LN_"):
         optimiser.set_xtol_abs(np.full(n, tolerance))
-        optimiser.set_initial_step(np.minimum(step, 0.45 * (high - low)))
+        optimiser.set_initial_step(np.minimum(step, LARGEST_STEP_SHARE * (high - low)))
     if "MLSL" in algorithm:
-        one_of(inner, LOCAL_ALGORITHMS, "algorithm")
         local = _optimiser(
             inner,
             low=low,
             high=high,
-            evaluations=max(20, evaluations // 8),
-            tolerance=max(tolerance, 0.05),
+            evaluations=max(LEAST_INNER_EVALUATIONS, evaluations // INNER_SEARCHES),
+            tolerance=max(tolerance, LEAST_INNER_TOLERANCE_PX),
             step=step,
             inner=inner,
         )

@@ -117,13 +117,13 @@ def _whole_turns(events: CalibrationEvents) -> Events:
     used = events.events
     times = np.linspace(int(used.t[0]), int(used.t[-1]), CHECKED_ANGLES)
     angles = events.encoder.angle_at(times.astype(np.int64))
-    way = np.abs(np.diff(angles)).sum()
+    path_length = np.abs(np.diff(angles)).sum()
     swept = angles[-1] - angles[0]
     turns = math.floor(abs(swept) / math.tau + 1.0 - LEAST_TURNS)
-    if turns < 1 or abs(swept) < LEAST_FORWARD * way:
+    if turns < 1 or abs(swept) < LEAST_FORWARD * path_length:
         raise AmiwarpError(
-            f"the angle goes {abs(swept) / math.tau:.2f} turns on, and {way / math.tau:.2f} turns in all; sums in "
-            "phase need a whole turn in one direction: record for longer, or search with the cost 'sharpness'"
+            f"the angle goes {abs(swept) / math.tau:.2f} turns on, and {path_length / math.tau:.2f} turns in all; "
+            "sums in phase need a whole turn in one direction: record for longer, or search with the cost 'sharpness'"
         )
 
     # Cut at equal angles before and after the middle.
@@ -200,13 +200,13 @@ def search_in_phase(space: ParameterSpace, tiles: PhaseTiles) -> FoundInPhase:
     costs = tiles.costs(both, BANDS[0])
     forward, backward = costs.reshape(2, PHASES, SIZES)
 
-    at = np.unravel_index(int(np.argmin(forward)), forward.shape)
-    apart = np.abs(np.angle(np.exp(1j * (phases - phases[at[0]]))))
+    best = np.unravel_index(int(np.argmin(forward)), forward.shape)
+    apart = np.abs(np.angle(np.exp(1j * (phases - phases[best[0]]))))
     rival = float(forward[apart >= RIVAL_PHASE].min())
     points = [
-        space.to_vector({**space.start, size: float(each), "phase": float(phase)})
+        space.to_vector({**space.start, size: float(grid_size), "phase": float(phase)})
         for phase in phases
-        for each in grid.sizes
+        for grid_size in grid.sizes
     ]
     scores = (-forward).ravel().tolist()
 
@@ -257,7 +257,7 @@ class OrbitGrid:
         high = space.high[size]
         sizes = low + (high - low) * (np.arange(SIZES) + 1.0) / SIZES
         still = {**space.start, "phase": 0.0}
-        models = [_model(space, {**still, size: float(each)}) for each in sizes]
+        models = [_model(space, {**still, size: float(size_value)}) for size_value in sizes]
         return cls(sizes, np.stack([_orbits(model, tiles) for model in models]))
 
     def turned(self, phase: float) -> NDArray[np.complex128]:

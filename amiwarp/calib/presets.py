@@ -75,7 +75,9 @@ class Preset:
             )
         if data.get("kind") != kind:
             given = shown(data.get("kind"))
-            raise AmiwarpError(f"{path}: kind is {given}; give a preset for {kind}")
+            raise AmiwarpError(
+                f"{path}: kind is {given}; give a preset for {kind}", ErrorCode.FIELD
+            )
         with errors_name(path, lambda: "damaged preset, create it again with 'amiwarp chart'"):
             fields_of(data, "", "format", "version", "kind", "settings", optional=("measured",))
             settings = data["settings"]
@@ -161,6 +163,8 @@ def _gain(model: Model, other: Model) -> float:
         indexing="ij",
     )
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
-    ours, theirs = (each.compensate_points(xy, theta.ravel()) - xy for each in (model, other))
+    ours, theirs = (
+        moving_model.compensate_points(xy, theta.ravel()) - xy for moving_model in (model, other)
+    )
     finite = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
     return float(np.sum(ours[finite] * theirs[finite]) / np.sum(ours[finite] ** 2))

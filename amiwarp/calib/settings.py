@@ -150,8 +150,8 @@ class Settings:
         """
         one_of(self.model, (AUTO, *MODELS), "model")
         if self.global_algorithm is not None:
-            one_of(self.global_algorithm, (AUTO, PHASE, *GLOBAL_ALGORITHMS), "algorithm")
-        one_of(self.local_algorithm, LOCAL_ALGORITHMS, "algorithm")
+            one_of(self.global_algorithm, (AUTO, PHASE, *GLOBAL_ALGORITHMS), "global_algorithm")
+        one_of(self.local_algorithm, LOCAL_ALGORITHMS, "local_algorithm")
         words = isinstance(self.stages, tuple) and all(
             isinstance(stage, str) for stage in self.stages
         )

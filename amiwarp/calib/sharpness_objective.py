@@ -139,7 +139,7 @@ class Objective:
         """Return the sharpness at a search vector [px]."""
         return self.values(self.space.to_values(v))
 
-    def each(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+    def of_parts(self, values: Mapping[str, float]) -> NDArray[np.float64]:
         """Return the sharpness of each part at parameter values, shape (parts,)."""
         return np.array(self.measure(values))
 
@@ -174,8 +174,8 @@ def reach(space: ParameterSpace, values: Mapping[str, float]) -> float:
     xy, *points = _border_points(camera)
     model = replace(space, model=kind.NAME).build(values)
     radius = 0.0
-    for each in model.singles():
-        moved = each.compensate_points(*points).numpy() - xy
+    for single in model.singles():
+        moved = single.compensate_points(*points).numpy() - xy
         seen = np.isfinite(moved).all(axis=1)
         radius += float(np.linalg.norm(moved[seen], axis=1).max(initial=0.0))
     turned = space.camera_rotation(values).reach(camera, space.duration_us * 0.5e-6)
@@ -185,9 +185,9 @@ def reach(space: ParameterSpace, values: Mapping[str, float]) -> float:
 @lru_cache(maxsize=16)
 def _border_points(camera: Camera) -> tuple[NDArray[np.float64], wp.array, wp.array]:
     """Return pixels of the image's border at 16 prism angles [px], shape (n, 2); and both as Warp arrays on the CPU."""
-    at = border(camera)
-    xy = np.tile(at, (16, 1))
-    return xy, *points_on_host(xy, np.repeat(np.arange(16) * (np.pi / 8), len(at)))
+    border_pixels = border(camera)
+    xy = np.tile(border_pixels, (16, 1))
+    return xy, *points_on_host(xy, np.repeat(np.arange(16) * (np.pi / 8), len(border_pixels)))
 
 
 STEP_PX = 0.25
@@ -195,7 +195,10 @@ STEP_PX = 0.25
 
 
 def finite_differences(
-    each: Callable[[dict[str, float]], Vector], space: ParameterSpace, v: Vector, directions: Vector
+    sharpness_of_parts: Callable[[dict[str, float]], Vector],
+    space: ParameterSpace,
+    v: Vector,
+    directions: Vector,
 ) -> tuple[Vector, Vector]:
     """Return the parts' gradients of sharpness [1/px], shape (n, parts), and the mean Hessian [1/px²], shape (n, n).
 
@@ -206,7 +209,7 @@ def finite_differences(
     steps = STEP_PX * directions
     both = [steps[i] + steps[j] for i in range(count) for j in range(i)]
     shifts = [np.zeros(directions.shape[1]), *steps, *-steps, *both, *(-step for step in both)]
-    found = np.array([each(space.to_values(v + shift)) for shift in shifts])
+    found = np.array([sharpness_of_parts(space.to_values(v + shift)) for shift in shifts])
     centre = found[0]
     up = found[1 : 1 + count]
     down = found[1 + count : 1 + 2 * count]

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.calibration_events import CalibrationEvents
 from amiwarp.calib.groundwork import CIRCLES, TILT, Groundwork, accepted_photometric, lay_groundwork
-from amiwarp.calib.held_out_turns import HalfSharpness, Quadratic, split_turns
-from amiwarp.calib.model_fit import QUANTISATION_PX, SHARE, ellipse_error, fit, timing_blur
+from amiwarp.calib.held_out_turns import HalfSharpness, QuadraticSharpness, split_turns
+from amiwarp.calib.model_fit import BUDGET_SHARE, ellipse_error, fit_models
 from amiwarp.calib.settings import Settings
 from amiwarp.calib.thinning import thin_events
+from amiwarp.calib.timing_blur import QUANTISATION_PX, timing_blur
 from amiwarp.events.recording import Recording
 from amiwarp.results.calibration import Calibration
 
@@ -83,15 +84,15 @@ class Trial(Groundwork):
         return self._halves[1]
 
     @cached_property
-    def quadratic(self) -> Quadratic:
+    def quadratic(self) -> QuadraticSharpness:
         """Quadratic approximation of the exact model's sharpness on the training turns, along all tested directions."""
         rows = [self.space.names.index(n) for n in self.tested]
-        return Quadratic.about(self.train, self.space, self.start, self.directions[rows])
+        return QuadraticSharpness.about(self.train, self.space, self.start, self.directions[rows])
 
     @cached_property
     def reference(self) -> Vector:
         """Sharpness of the exact model on the held-out turns, with the parameters sharpest on the training turns."""
-        return self.test.each(self.space, self.sharpest([0, 1]))
+        return self.test.of_parts(self.space, self.sharpest([0, 1]))
 
     @property
     def rejection_px(self) -> float:
@@ -168,19 +169,19 @@ def make_trial(
 ) -> Trial:
     """Compare the models with the calibrated exact model, on the groundwork for it.
 
-    ``budget_px`` is the largest tolerated model error [px rms]; None: :data:`SHARE` of the blur by quantisation and
-    timing.
+    ``budget_px`` is the largest tolerated model error [px rms]; None: :data:`BUDGET_SHARE` of the blur by quantisation
+    and timing.
     """
     path = ground.sample.path(exact.model)
     timing = timing_blur(path, ground.encoder_noise, ground.rad_per_us)
-    fits = fit(ground.circles, path[0], ground.sample)
+    fits = fit_models(ground.circles, path[0], ground.sample)
     predicted = {name: px for name, (_, px) in zip(CIRCLES, fits, strict=True)}
     return Trial(
         **vars(ground),
         exact=exact,
         path=path,
         predicted={**predicted, "ellipse": ellipse_error(path), "exact": 0.0},
-        budget_px=budget_px or SHARE * math.hypot(QUANTISATION_PX, timing),
+        budget_px=budget_px or BUDGET_SHARE * math.hypot(QUANTISATION_PX, timing),
         timing_px=timing,
         device=device,
     )

@@ -120,20 +120,20 @@ def turn_by_turn(
     if error_px > LARGEST_MEAN_PX:
         name = calibrator.recording.name
         return Attempt(None, checks.scatters(name, len(answers), error_px, LARGEST_MEAN_PX))
-    said = f"the camera never rests: the answer is the mean of those of {len(answers)} turns, ± {error_px:.2f} px"
+    warning = f"the camera never rests: the answer is the mean of those of {len(answers)} turns, ± {error_px:.2f} px"
     if how:
         rates = [[found[name] for name in RATES] for found in answers.values()]
         bias = -np.degrees(np.mean(rates, axis=0))
         shown = ", ".join(f"{rate:.1f}" for rate in bias)
-        said += (
+        warning += (
             f". The gyroscope's rotation was used: {how}. Its bias was free in each turn, in the mean {shown} "
             "deg/s about the camera's x, y, z, to which the camera's translation adds"
         )
-    return Attempt(with_warnings(mean, said))
+    return Attempt(with_warnings(mean, warning))
 
 
 def mean_of_turns(
-    each: NDArray[np.float64], share: NDArray[np.float64]
+    of_turns: NDArray[np.float64], share: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the weighted mean of the answers of turns, shape (n,), and its covariance, shape (n, n).
 
@@ -145,20 +145,22 @@ def mean_of_turns(
     """
     weight = np.sin(math.pi * share) ** 2
     weight /= weight.sum()
-    mean = weight @ each
+    mean = weight @ of_turns
     oscillations = np.exp(2j * math.pi * np.outer(NEAR_OSCILLATIONS, share))
-    amplitudes = oscillations @ (weight[:, None] * (each - mean))
+    amplitudes = oscillations @ (weight[:, None] * (of_turns - mean))
     return mean, np.real(amplitudes.T @ amplitudes.conj()) / len(NEAR_OSCILLATIONS)
 
 
-def mean_of_few_turns(each: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def mean_of_few_turns(
+    of_turns: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the mean of the answers of a few turns, shape (n,), and its covariance, shape (n, n).
 
     ``each`` holds their search vectors, shape (turns, n). Parts overlap by half a turn, so that they count for
     :data:`WINDOW_TURNS` times fewer.
     """
-    independent = max(len(each) / WINDOW_TURNS, 1.0)
-    return each.mean(axis=0), np.atleast_2d(np.cov(each.T)) / independent
+    independent = max(len(of_turns) / WINDOW_TURNS, 1.0)
+    return of_turns.mean(axis=0), np.atleast_2d(np.cov(of_turns.T)) / independent
 
 
 def _mean(
@@ -172,13 +174,13 @@ def _mean(
     assert best.search is not None
     assert best.photometric is not None
     space = best.search.full_space.without(MOTION)
-    each = np.array([space.to_vector(parameters) for parameters in answers.values()])
+    of_turns = np.array([space.to_vector(parameters) for parameters in answers.values()])
     if count < LEAST_TURNS:
-        v, scatter = mean_of_few_turns(each)
+        v, scatter = mean_of_few_turns(of_turns)
     else:
-        v, scatter = mean_of_turns(each, (np.array([*answers]) + 0.5) / count)
+        v, scatter = mean_of_turns(of_turns, (np.array([*answers]) + 0.5) / count)
     parallax_px = PARALLAX_PX * max(0.0, cost - ROTATION_COST)
-    covariance = scatter + parallax_px**2 * np.eye(each.shape[1])
+    covariance = scatter + parallax_px**2 * np.eye(of_turns.shape[1])
     # The values of the rotation would be the start's.
     values = {name: value for name, value in space.to_values(v).items() if name not in MOTION}
     stds = space.deviations(v, covariance)
@@ -188,7 +190,7 @@ def _mean(
         uncertainty=stds,
         cost=cost,
         warnings=(),
-        verdict=f"mean of the answers of {len(each)} turns",
+        verdict=f"mean of the answers of {len(of_turns)} turns",
     )
     found = replace(
         best.found(),

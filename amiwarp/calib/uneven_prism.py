@@ -107,9 +107,9 @@ def other_shape(model: ExactModel, shape: str) -> Rival:
     target = _displaced([model])[0]
     values = np.array([model.prism.apex, model.phase, 0.0, 0.0])
 
-    def made(at: Vector) -> ExactModel:
+    def made(at_point: Vector) -> ExactModel:
         """Return the model with other values of apex, phase and the other shape."""
-        apex, phase, x, y = at.tolist()
+        apex, phase, x, y = at_point.tolist()
         prism = replace(model.prism, apex=apex)
         shapes = {shape: (0.0, 0.0), other: (x, y)}
         return replace(model, prism=prism, phase=phase, **shapes)  # type: ignore[arg-type]
@@ -120,9 +120,9 @@ def other_shape(model: ExactModel, shape: str) -> Rival:
         models = [made(values)]
         for step in steps:
             models.append(made(values + step))
-        at, *ends = _displaced(models)
-        columns = np.stack([_moving(end - at).ravel() for end in ends], axis=1)
-        left = _moving(target - at).ravel()
+        at_point, *ends = _displaced(models)
+        columns = np.stack([_moving(end - at_point).ravel() for end in ends], axis=1)
+        left = _moving(target - at_point).ravel()
         change, *_ = np.linalg.lstsq(columns, left, rcond=None)
         values = values + change @ steps
 

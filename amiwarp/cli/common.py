@@ -100,7 +100,7 @@ class LayoutOptions:
 
     def given(self) -> dict[str, Any]:
         """Return the arguments of :func:`amiwarp.open_recording` that the options give."""
-        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value not in (None, False)}
 
 

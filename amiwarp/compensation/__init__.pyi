@@ -1,6 +1,6 @@
 # Public names of this room. Written by .ci/public_names.py from the front door's.
 
-from .blocks import compensate_events as compensate_events
+from .in_memory import compensate_events as compensate_events
 from .recordings import CompensationSummary as CompensationSummary
 from .recordings import compensate as compensate
 from .streams import Compensated as Compensated

@@ -164,12 +164,12 @@ class BatchPipeline:
         count = len(start)
         params = self._encoder
         if count > len(getattr(params, f"{prefix}start") or ()):
-            room = max(2 * count, 64)
+            capacity = max(2 * count, 64)
             larger = {
                 "first": wp.zeros(2, dtype=int, device=self._device),
-                "start": wp.zeros(room, dtype=wp.int64, device=self._device),
-                "angle": wp.zeros(room, dtype=wp.uint64, device=self._device),
-                "slope": wp.zeros(room, dtype=wp.uint64, device=self._device),
+                "start": wp.zeros(capacity, dtype=wp.int64, device=self._device),
+                "angle": wp.zeros(capacity, dtype=wp.uint64, device=self._device),
+                "slope": wp.zeros(capacity, dtype=wp.uint64, device=self._device),
             }
             for name, values in larger.items():
                 setattr(params, prefix + name, values)
@@ -190,14 +190,14 @@ class BatchPipeline:
     def stage(self, parts: list[Events], arrived_us: int) -> StagedBatch:
         """Start to copy packets into the buffers; long packets are copied by several threads."""
         n = sum(part.t.size for part in parts)
-        at, end = self._reserve(n)
+        start, end = self._reserve(n)
         direct = self._device.is_cuda and n > LEAST_DIRECT
         if direct:
             locked_t, t = self._pool.result(self._batch, n, wp.int64)
         else:
             locked_t = None
-            t = self._host["t"][at:end]
-        targets = [self._host["x"][at:end], self._host["y"][at:end], t]
+            t = self._host["t"][start:end]
+        targets = [self._host["x"][start:end], self._host["y"][start:end], t]
         if len(parts) == 1:
             p = parts[0].p
         else:
@@ -213,7 +213,7 @@ class BatchPipeline:
             wait = partial(ColumnCheck, *join_packets(parts, targets))
         return StagedBatch(
             parts=parts,
-            at=at,
+            at=start,
             end=end,
             t=t,
             p=p,
@@ -227,12 +227,12 @@ class BatchPipeline:
         padded = self._padded(n)
         if self._at + padded > self._room:
             self._at = 0
-        at = self._at
+        position = self._at
         self._at += padded
-        overlap = any(start < self._at and stop > at for start, stop in self._unvoted)
+        overlap = any(start < self._at and stop > position for start, stop in self._unvoted)
         self._vote(least=1 if overlap else LEAST_VOTED)
-        self._wait_for_votes(at, self._at)
-        return at, at + n
+        self._wait_for_votes(position, self._at)
+        return position, position + n
 
     def submit(self, staged: StagedBatch, unknown: int) -> BatchInFlight:
         """Send a batch to the device; its first ``unknown`` events have no prism angle and get no coordinates.
@@ -242,35 +242,35 @@ class BatchPipeline:
         check = staged.wait()
         parts = staged.parts
         locked_t = staged.locked_t
-        at = staged.at
+        start = staged.at
         end = staged.end
-        count = end - at
+        count = end - start
         if check.unsorted:
             raise AmiwarpError(
                 f"events of {parts[0].t[0]} to {parts[-1].t[-1]} us are not sorted; sort each packet by time"
             )
         if self._device.is_cuda:
             staged_names = ("x", "y", "t") if locked_t is None else ("x", "y")
-            self._copy(self._columns, self._host_columns, staged_names, at, end)
+            self._copy(self._columns, self._host_columns, staged_names, start, end)
             if locked_t is not None:
-                wp.copy(self._columns.t, locked_t, dest_offset=at, count=count)
+                wp.copy(self._columns.t, locked_t, dest_offset=start, count=count)
 
-        padded_end = at + self._padded(count)
+        padded_end = start + self._padded(count)
         if unknown < count:
             # The kernel also compensates the padding of the last block, so that must hold valid events.
             self._host["x"][end:padded_end] = 0
             self._host["y"][end:padded_end] = 0
             self._host["t"][end:padded_end] = staged.t[-1]
             outside = self._plan.any_outside(check.max_x, check.max_y)
-            blocks = (padded_end - at) // self._plan.block
-            self._launch(at // self._plan.block, blocks, outside)
-        self._invalidate(at, at + unknown)
+            blocks = (padded_end - start) // self._plan.block
+            self._launch(start // self._plan.block, blocks, outside)
+        self._invalidate(start, start + unknown)
         self._invalidate(end, padded_end)
-        self._unvoted.append((at, padded_end))
+        self._unvoted.append((start, padded_end))
         out = None
         done = None
         if self._device.is_cuda:
-            out = self._copy_back(at, end, locked_t is not None)
+            out = self._copy_back(start, end, locked_t is not None)
             done = self._device.stream.record_event()
         self._vote(least=LEAST_VOTED)
 
@@ -282,7 +282,7 @@ class BatchPipeline:
         else:
             t = parts[0].t
         return BatchInFlight(
-            at=at,
+            at=start,
             end=end,
             t=t,
             p=staged.p,
@@ -334,25 +334,27 @@ class BatchPipeline:
         self._votes.add_points(x, y, wp.zeros(count, dtype=wp.uint8, device=device))
         return x, y, flags
 
-    def _copy_back(self, at: int, end: int, direct: bool) -> list[NDArray[Any]] | None:
+    def _copy_back(self, start: int, end: int, direct: bool) -> list[NDArray[Any]] | None:
         """Start to copy results from a GPU: to the buffers, or, if ``direct`` is given, to arrays for the caller."""
         if not direct:
-            self._copy(self._host_columns, self._columns, RESULTS, at, end)
+            self._copy(self._host_columns, self._columns, RESULTS, start, end)
             return None
         views = []
         for name in RESULTS:
             column = getattr(self._columns, name)
-            array, view = self._pool.result(self._batch, end - at, column.dtype)
-            wp.copy(array, column, src_offset=at, count=end - at)
+            array, view = self._pool.result(self._batch, end - start, column.dtype)
+            wp.copy(array, column, src_offset=start, count=end - start)
             views.append(view)
         return views
 
-    def _copy(self, target: Any, source: Any, names: Iterable[str], at: int, end: int) -> None:
+    def _copy(self, target: Any, source: Any, names: Iterable[str], start: int, end: int) -> None:
         """Copy the events ``at`` to ``end`` of columns between the device and the host."""
         for name in names:
             target_column = getattr(target, name)
             source_column = getattr(source, name)
-            wp.copy(target_column, source_column, dest_offset=at, src_offset=at, count=end - at)
+            wp.copy(
+                target_column, source_column, dest_offset=start, src_offset=start, count=end - start
+            )
 
     def _launch(self, first: int, blocks: int, outside: bool) -> None:
         """Launch the compensation of ``blocks`` blocks. ``outside``: whether events may lie outside the sensor."""

@@ -29,9 +29,9 @@ Python's lock; more events need more memory."""
 class PieceBuffers:
     """Page-locked memory and memory on a GPU for one piece of events."""
 
-    def __init__(self, room: int, plan: LaunchPlan, encoder: Any, device: Any) -> None:
+    def __init__(self, capacity: int, plan: LaunchPlan, encoder: Any, device: Any) -> None:
         """Allocate memory for ``room`` events."""
-        self.room = room
+        self.room = capacity
         self._plan = plan
         self._encoder = encoder
         self._device = device
@@ -40,9 +40,9 @@ class PieceBuffers:
         self._locked = {}
         self._host = {}
         for name, dtype in (INPUTS | RESULTS).items():
-            on_device = wp.empty(room, dtype=dtype, device=device)
+            on_device = wp.empty(capacity, dtype=dtype, device=device)
             setattr(self._columns, name, on_device)
-            locked = page_locked(self, (room,), dtype, device, written_by_host=name in INPUTS)
+            locked = page_locked(self, (capacity,), dtype, device, written_by_host=name in INPUTS)
             self._locked[name] = locked
             self._host[name] = locked.numpy()
         self._launches: dict[bool, RecordedLaunch] = {}
@@ -118,5 +118,5 @@ class GpuPieces:
                 if buffers.room >= n:
                     return buffers
             # A power of two, so that blocks of growing size seldom need new buffers.
-            room = 1 << (n - 1).bit_length()
-            return PieceBuffers(room, self._plan, self._encoder, self._device)
+            capacity = 1 << (n - 1).bit_length()
+            return PieceBuffers(capacity, self._plan, self._encoder, self._device)

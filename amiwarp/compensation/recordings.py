@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.compensation.blocks import BlockCompensator
 from amiwarp.compensation.gpu_pieces import PIECE
-from amiwarp.errors import AmiwarpError
+from amiwarp.compensation.in_memory import BlockCompensator
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events, EventSource, Recording
 from amiwarp.io import RecordingWriter
 from amiwarp.io.conversion import bag_of, left_out, subtracted_us
 from amiwarp.io.export import export
 from amiwarp.io.hdf5.chunks import compile_checksums
-from amiwarp.io.native.copying import copy_records
+from amiwarp.io.native.copying import copy_sensors_and_truth
 from amiwarp.io.native.event_writer import FlaggedEvents
 from amiwarp.io.native.events import NativeEvents
 from amiwarp.io.output_formats import (
@@ -169,7 +169,8 @@ def compensate(
     if len(events):
         if not events[:1].whole_pixels:
             raise AmiwarpError(
-                f"{recording.name}: its events are already compensated; give the sensor's events"
+                f"{recording.name}: its events are already compensated; give the sensor's events",
+                ErrorCode.CONTENT_MISSING,
             )
         encoder = calibration.encoder_for(encoder, events.t_first, events.t_last)
         if encoder is not None:
@@ -243,7 +244,7 @@ def _write_native(
             with contextlib.closing(written):
                 for compensated, inside, _ in written:
                     tally.count(compensated, inside)
-        copy_records(recording, writer)
+        copy_sensors_and_truth(recording, writer)
 
 
 class _Tally:

@@ -41,7 +41,7 @@ def axes_in_words(to_camera: Matrix) -> str:
 
     Axes that do not lie along the camera's are followed by the angle between them.
     """
-    nearest = min(orientations(), key=lambda each: angle_between(each, to_camera))
+    nearest = min(orientations(), key=lambda orientation: angle_between(orientation, to_camera))
     names = []
     for row in nearest:
         k = int(np.argmax(np.abs(row)))

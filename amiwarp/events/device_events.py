@@ -196,12 +196,12 @@ class DeviceEvents:
     @property
     def t_first(self) -> int:
         """Time of the earliest event [us]. Raises :class:`AmiwarpError` if there are no events."""
-        return limits(self)[0]
+        return limits(self).t_first
 
     @property
     def t_last(self) -> int:
         """Time of the latest event [us]. Raises :class:`AmiwarpError` if there are no events."""
-        return limits(self)[1]
+        return limits(self).t_last
 
     def to_host(self) -> Events:
         """Return the events in NumPy arrays: copies from a GPU, views on a CPU.
@@ -264,10 +264,27 @@ def join(arrays: Sequence[wp.array]) -> wp.array:
     return out
 
 
-def limits(events: DeviceEvents) -> list[int]:
-    """Return first and last time [us], largest x and y [px], largest p, and 1 if times decrease anywhere.
+class Limits(NamedTuple):
+    """Extremes of events on a device."""
 
-    Largest x and y are 0 for compensated events. They are found once. For a part of :class:`DeviceMemoryEvents`, all
+    t_first: int
+    """Time of the first event [us]."""
+    t_last: int
+    """Time of the last event [us]."""
+    right: int
+    """Largest x [px]; 0 for compensated events."""
+    bottom: int
+    """Largest y [px]; 0 for compensated events."""
+    polarity: int
+    """Largest p."""
+    decreases: int
+    """1 if times decrease anywhere, else 0."""
+
+
+def limits(events: DeviceEvents) -> Limits:
+    """Return the extremes of events.
+
+    They are found once. For a part of :class:`DeviceMemoryEvents`, all
     but the times are limits of all its events. Raises :class:`AmiwarpError` if there are no events.
     """
     if not len(events):
@@ -275,7 +292,7 @@ def limits(events: DeviceEvents) -> list[int]:
             "there are no events, so there is no first or last time; check len() first"
         )
     if events._limits:
-        return events._limits
+        return Limits(*events._limits)
     device = events.device
     none = np.array([2**63 - 1, -(2**63), 0, 0, 0, 0])
     extremes = wp.array(none, dtype=wp.int64, device=device)
@@ -283,14 +300,14 @@ def limits(events: DeviceEvents) -> list[int]:
     inputs = [events.x, events.y, events.t, events.p, threads]
     wp.launch(kernels.find_limits, threads, inputs=inputs, outputs=[extremes], device=device)
     events._limits.extend(extremes.numpy().tolist())
-    return events._limits
+    return Limits(*events._limits)
 
 
 def check_order(events: Events | DeviceEvents, first_index: int = 0) -> None:
     """Raise :class:`AmiwarpError` if an event is earlier than the one before. ``first_index``: of the first event."""
     if isinstance(events, Events):
         check_events_order(events, where="events", first_index=first_index)
-    elif len(events) and limits(events)[5]:
+    elif len(events) and limits(events).decreases:
         check_order(events.to_host(), first_index)  # it names the event
 
 
@@ -370,10 +387,10 @@ def host_numbers(n: int, dtype: Any, device: Any) -> wp.array:
 
     A caller that has waited for the device puts it back to ``idle_numbers``.
     """
-    idle = idle_numbers[device.is_cpu, dtype]
-    while idle:
+    free_numbers = idle_numbers[device.is_cpu, dtype]
+    while free_numbers:
         with contextlib.suppress(IndexError):  # another thread took it
-            numbers = idle.pop()
+            numbers = free_numbers.pop()
             if len(numbers) >= n:
                 return numbers
     return wp.zeros(max(n, 64), dtype=dtype, device="cpu", pinned=device.is_cuda)

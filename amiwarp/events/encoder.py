@@ -42,6 +42,8 @@ MOST_SAMPLES = 1 << 28
 Integers = NDArray[np.int64]
 Vector = NDArray[np.float64]
 
+GAP_INTERVALS = 5
+"""Number of median sample intervals above which the time between two samples is reported as a gap."""
 LONGEST_BENT_STEP = math.tau / 64.0
 """Longest step between samples of an encoder whose error within a turn is corrected [rad]."""
 LARGEST_ANGLE = 1e10
@@ -131,8 +133,8 @@ class Encoder:
             )
         good = np.abs(self.angle) <= LARGEST_ANGLE  # NaN fails
         if not good.all():
-            at = int(np.argmin(good))
-            given = f"encoder sample {at} has angle {self.angle[at]}"
+            first_bad = int(np.argmin(good))
+            given = f"encoder sample {first_bad} has angle {self.angle[first_bad]}"
             raise AmiwarpError(
                 f"{given}; expected a finite number within {LARGEST_ANGLE:g} rad of 0"
             )

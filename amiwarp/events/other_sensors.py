@@ -65,9 +65,10 @@ class ImuSamples:
                 )
             bad = ~(np.isfinite(values).all(axis=1) | np.isnan(values).all(axis=1))
             if bad.any():
-                at = int(np.argmax(bad))
+                first_bad = int(np.argmax(bad))
                 raise AmiwarpError(
-                    f"IMU {name} of sample {at} is {values[at].tolist()}; expected finite numbers, or three NaN for a "
+                    f"IMU {name} of sample {first_bad} is {values[first_bad].tolist()}; expected finite numbers, "
+                    "or three NaN for a "
                     "quantity that the sample does not hold"
                 )
         if (self.t[1:] < self.t[:-1]).any():

@@ -89,9 +89,9 @@ def wrong_polarity(values: NDArray[Any]) -> AmiwarpError:
         first_off = values.flat[int(np.argmax(values != 1))]
         other_off = 0 if first_off == -1 else -1
         bad = values == other_off
-    at = int(np.argmax(bad))
-    value = values.flat[at]
-    given = f"events' p holds {shown(value.item())} (number {at})"
+    first_bad = int(np.argmax(bad))
+    value = values.flat[first_bad]
+    given = f"events' p holds {shown(value.item())} (number {first_bad})"
     if mixed:
         other = "0" if value == -1 else "-1"
         return AmiwarpError(f"{given}, but also {other}; OFF is either 0 or -1")
@@ -405,9 +405,9 @@ class Events:
         >>> events.to_structured([("t", "i8"), ("x", "i2"), ("y", "i2"), ("p", "?")])[0].item()
         (0, 10, 5, True)
         """
-        own = [(name, getattr(self, name).dtype) for name in COLUMNS]
+        own_types = [(name, getattr(self, name).dtype) for name in COLUMNS]
         try:
-            wanted = np.dtype(own if dtype is None else dtype)
+            wanted = np.dtype(own_types if dtype is None else dtype)
         except Exception as error:  # any that converting an unknown object raises
             raise AmiwarpError(
                 f"dtype is {shown(dtype)}; give a NumPy data type with the fields x, y, t, p"
@@ -428,9 +428,9 @@ class Events:
                 out[name] = values
             both_floating = values.dtype.kind == "f" and kind.kind == "f"
             if not np.array_equal(out[name], values, equal_nan=both_floating):
-                at = int(np.argmax(out[name] != values))
+                first_lossy = int(np.argmax(out[name] != values))
                 raise AmiwarpError(
-                    f"dtype has {name} of type {kind}, which cannot hold {values[at]}; give a wider type"
+                    f"dtype has {name} of type {kind}, which cannot hold {values[first_lossy]}; give a wider type"
                 )
         return out
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import Vote
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import votes as event_kernels
+from amiwarp.kernels import votes
 from amiwarp.kernels.iwe import CPU_WIDTH, Frame
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import choice, whole
@@ -69,7 +69,7 @@ class CanvasShape:
     def params(self) -> Any:
         """Return the canvas as the struct that the kernels take."""
         _, rows, columns = self.shape
-        canvas = event_kernels.Canvas()
+        canvas = votes.Canvas()
         canvas.pad = float(self.pad)
         canvas.scale = self.scale
         canvas.nearest = int(self.vote is Vote.NEAREST)

@@ -132,29 +132,29 @@ def run_filter(
     cli.report(common, data, _lines(data))
 
 
-def _lines(d: dict[str, Any]) -> Iterator[str]:
+def _lines(data: dict[str, Any]) -> Iterator[str]:
     from amiwarp.imaging.filters import NAMES
 
-    rate = d["events"] / max(d["seconds"], 1e-9) / 1e6
-    share = 100.0 * d["kept"] / d["events"]
-    kept = f"{d['kept']:,} of {d['events']:,} events ({share:.3g} %)"
-    yield f"{d['file']}: {kept}, {d['seconds']:.2f} s, {rate:.3g} Mev/s"
-    for name, count in d["removed"].items():
+    rate = data["events"] / max(data["seconds"], 1e-9) / 1e6
+    share = 100.0 * data["kept"] / data["events"]
+    kept = f"{data['kept']:,} of {data['events']:,} events ({share:.3g} %)"
+    yield f"{data['file']}: {kept}, {data['seconds']:.2f} s, {rate:.3g} Mev/s"
+    for name, count in data["removed"].items():
         yield f"removed by {NAMES[name]}: {count:,}"
-    records = [f"{count:,} {RECORD_NAMES[name]}" for name, count in d["removed_records"].items()]
+    records = [f"{count:,} {RECORD_NAMES[name]}" for name, count in data["removed_records"].items()]
     if records:
         yield f"removed by time: {', '.join(records)}"
-    before = 1e6 * d["events"] / max(d["duration_us"], 1)
-    after = 1e6 * d["kept"] / max(d["kept_us"], 1)
+    before = 1e6 * data["events"] / max(data["duration_us"], 1)
+    after = 1e6 * data["kept"] / max(data["kept_us"], 1)
     yield f"rate: {before:,.0f} events/s before, {after:,.0f} events/s after"
-    if d["hot_pixels"]:
-        listed = ", ".join(f"({x}, {y}) {count:,}" for x, y, count in d["hot_pixels"][:MOST_HOT])
-        more = len(d["hot_pixels"]) - MOST_HOT
+    if data["hot_pixels"]:
+        listed = ", ".join(f"({x}, {y}) {count:,}" for x, y, count in data["hot_pixels"][:MOST_HOT])
+        more = len(data["hot_pixels"]) - MOST_HOT
         yield f"hot pixels: {listed}" + (f" and {more} more" if more > 0 else "")
-    yield from cli.assumption_lines(d["assumptions"])
-    if d["left_out"]:
-        yield f"note: the format leaves out: {', '.join(d['left_out'])}"
-    yield from cli.time_notes(d)
+    yield from cli.assumption_lines(data["assumptions"])
+    if data["left_out"]:
+        yield f"note: the format leaves out: {', '.join(data['left_out'])}"
+    yield from cli.time_notes(data)
 
 
 RECORD_NAMES = {"imu_samples": "IMU samples", "frames": "frames"}

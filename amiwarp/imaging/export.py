@@ -222,11 +222,11 @@ class IweFiles:
             self._stacks[path] = flat.reshape(full)
         return self._stacks[path]
 
-    def _numbered(self, path: Path, at: int) -> Path:
+    def _numbered(self, path: Path, number: int) -> Path:
         """Return the path of one window's image."""
         if self._window_us is None:
             return path
-        return path.with_name(f"{path.stem}_{at:05d}{path.suffix}")
+        return path.with_name(f"{path.stem}_{number:05d}{path.suffix}")
 
     def _check_outputs(self) -> None:
         """Check all output paths before any work; raise :class:`AmiwarpError` if one of them cannot be written."""
@@ -235,7 +235,7 @@ class IweFiles:
             count = self._count if png else 1
             check_output(self._numbered(path, 0) if png else path)
             names_present = set(os.listdir(path.parent)) if count > 1 else set()
-            for name in (self._numbered(path, at) for at in range(count)):
+            for name in (self._numbered(path, number) for number in range(count)):
                 if name.name in names_present:
                     check_output(name)
 

@@ -26,7 +26,7 @@ from amiwarp.events.truth import EventTruth
 from amiwarp.io import output_formats
 from amiwarp.io.conversion import convert
 from amiwarp.io.file_scan import RECORDS
-from amiwarp.io.native.copying import copy_records
+from amiwarp.io.native.copying import copy_sensors_and_truth
 from amiwarp.io.native.writer import RecordingWriter
 from amiwarp.io.output_formats import OutputFormat
 from amiwarp.io.outputs import check_output
@@ -241,7 +241,7 @@ class RunningFilter:
             never = wp.int64(NEVER)
             self._latest[name] = wp.full(pixels, never, dtype=wp.int64, device="cpu")
         columns = [
-            wp.array(each, device="cpu", copy=False) for each in (events.x, events.y, events.t)
+            wp.array(column, device="cpu", copy=False) for column in (events.x, events.y, events.t)
         ]
         marks = wp.empty(len(events), dtype=wp.bool, device="cpu")
         load(kernel, wp.get_device("cpu"))
@@ -322,7 +322,7 @@ def is_given(chosen: EventFilter, name: str) -> bool:
     return True
 
 
-NOTHING = {each.name: each.default for each in fields(EventFilter)}
+NOTHING = {option.name: option.default for option in fields(EventFilter)}
 """Values with which the parts of a filter keep all events."""
 
 
@@ -499,7 +499,7 @@ def _write_kept(
         truth_labels=None if truth is None else truth.labels,
     ) as writer:
         kept_us = _write_kept_events(recording, running, writer, progress)
-        copy_records(replace(recording, imu=records.imu), writer)
+        copy_sensors_and_truth(replace(recording, imu=records.imu), writer)
         if records.frames is not None:
             for t, image in zip(records.frames.t.tolist(), records.frames, strict=True):
                 writer.append_image(t, image)

@@ -148,4 +148,4 @@ def strongest(frequencies: NDArray[np.float32], most: int) -> list[tuple[float, 
         near = np.abs(np.log(left / hz)) <= BIN
         strongest_first.append((hz, int(np.count_nonzero(near))))
         left = left[~near]
-    return sorted(strongest_first, key=lambda each: -each[1])
+    return sorted(strongest_first, key=lambda frequency: -frequency[1])

@@ -93,13 +93,13 @@ def _spread_across_edges(image: NDArray[np.float32], where: Part) -> Vector:
 
     # The event itself is taken away, and spread events are assumed instead.
     near = NEAR_PX**2
-    own = 1.0 / (math.tau * near)
-    others = np.maximum(derivative(0, 0) - own, 0.0)
-    density = others + WIDE_EVENTS * own
+    own_weight = 1.0 / (math.tau * near)
+    others = np.maximum(derivative(0, 0) - own_weight, 0.0)
+    density = others + WIDE_EVENTS * own_weight
     mean_y = near * derivative(1, 0) / density
     mean_x = near * derivative(0, 1) / density
-    second_y = derivative(2, 0) + own / near
-    second_x = derivative(0, 2) + own / near
+    second_y = derivative(2, 0) + own_weight / near
+    second_x = derivative(0, 2) + own_weight / near
     yy = near + near**2 * second_y / density - mean_y**2
     xx = near + near**2 * second_x / density - mean_x**2
     xy = near**2 * derivative(1, 1) / density - mean_x * mean_y

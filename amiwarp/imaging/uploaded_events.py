@@ -15,7 +15,8 @@ from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
-from amiwarp.kernels import votes as event_kernels
+from amiwarp.kernels import event_folding
+from amiwarp.kernels import events_with_angles as angle_kernels
 from amiwarp.kernels.compensation import azimuths
 from amiwarp.kernels.encoder_pieces import encoder_params
 from amiwarp.kernels.launch import launch
@@ -43,7 +44,7 @@ class UploadedEvents:
     """Events with their prism angles on a device; made by :func:`upload_events`."""
 
     arrays: Any
-    """Columns of the events: Warp struct ``amiwarp.kernels.votes.EventArrays``.
+    """Columns of the events: Warp struct ``amiwarp.kernels.events_with_angles.EventsWithAngles``.
 
     Its column ``layer`` gives the image of each event: OFF goes to the first and ON to the second image, or both to the
     only one.
@@ -71,7 +72,7 @@ class UploadedEvents:
     def _drift_angles(self, base: Any, value: float, out: Any) -> None:
         """Set the angles of one prism to those at drift 0, ``base``, moved by a drift."""
         launch(
-            event_kernels.drift_turns,
+            angle_kernels.drift_turns,
             self.count,
             [base, self.slope, value],
             [out],
@@ -83,7 +84,7 @@ class UploadedEvents:
         old = self.arrays.layer
         layer = wp.empty_like(old)
         launch(
-            event_kernels.layer_events,
+            angle_kernels.store_layers,
             len(old),
             [old, parts, int(per_polarity)],
             [layer],
@@ -137,10 +138,10 @@ class UploadedEvents:
 
     def _with(self, **columns: wp.array) -> UploadedEvents:
         """Return the same events with other columns."""
-        arrays = event_kernels.EventArrays()
+        arrays = angle_kernels.EventsWithAngles()
         for name in ("x", "y", "turn", "second", "azimuths", "time", "weight", "layer"):
-            own = getattr(self.arrays, name)
-            setattr(arrays, name, columns.get(name, own))
+            own_values = getattr(self.arrays, name)
+            setattr(arrays, name, columns.get(name, own_values))
         return replace(self, arrays=arrays)
 
 
@@ -187,7 +188,7 @@ def upload_events(
     device = wp.get_device(device)
     padded = _padded(count, device)
 
-    arrays = event_kernels.EventArrays()
+    arrays = angle_kernels.EventsWithAngles()
     arrays.x = _put(events.x, wp.uint16, device)
     arrays.y = _put(events.y, wp.uint16, device)
     arrays.layer = _put(events.p, wp.uint8, device)
@@ -207,13 +208,15 @@ def upload_events(
         if count:
             pieces = encoder_params(encoder, *device_events.time_span(events), device)
             inputs = [pieces, t]
-            launch(event_kernels.turn_events, count, inputs, [arrays.turn], device=device)
+            launch(angle_kernels.store_turns, count, inputs, [arrays.turn], device=device)
             if encoder.second is not None:
                 arrays.second = wp.zeros(padded, dtype=wp.uint16, device=device)
-                launch(event_kernels.turn_second, count, inputs, [arrays.second], device=device)
+                launch(
+                    angle_kernels.store_second_turns, count, inputs, [arrays.second], device=device
+                )
     if middle_us is not None:
         arrays.time = wp.empty(count, dtype=float, device=device)
-        launch(event_kernels.time_events, count, [t, middle_us], [arrays.time], device=device)
+        launch(angle_kernels.store_times, count, [t, middle_us], [arrays.time], device=device)
 
     if fold:
         keys = _fold_keys(arrays, count, fold)
@@ -280,15 +283,17 @@ def _fold_keys(arrays: Any, n: int, bins: int) -> Keys:
         raise AmiwarpError(
             f"fold = {bins} angles a turn; give 1 .. {LARGEST_FOLD}, or 0 to disable folding"
         )
-    room = n if device.is_cpu else 2 * n  # sorting on CUDA needs scratch memory behind the keys
-    keys = wp.empty(room, dtype=wp.int64, device=device)
+    key_count = (
+        n if device.is_cpu else 2 * n
+    )  # sorting on CUDA needs scratch memory behind the keys
+    keys = wp.empty(key_count, dtype=wp.int64, device=device)
     inputs = [arrays.x, arrays.y, arrays.layer, arrays.turn, bins]
-    launch(event_kernels.fold_keys, n, inputs, [keys], device=device)
+    launch(event_folding.fold_keys, n, inputs, [keys], device=device)
     if device.is_cpu:
         values = keys.numpy()  # shares the memory of keys
         values.sort()
         return values
-    order = wp.zeros(room, dtype=int, device=device)
+    order = wp.zeros(key_count, dtype=int, device=device)
     wp.utils.radix_sort_pairs(keys, order, n)
     return np.asarray(keys[:n].numpy())
 
@@ -303,7 +308,7 @@ def _folded(
     """Return weighted points on the device by their keys. They stand for ``n`` events."""
     count = len(key)
     padded = _padded(count, device)
-    points = event_kernels.EventArrays()
+    points = angle_kernels.EventsWithAngles()
     points.x = wp.zeros(padded, dtype=wp.uint16, device=device)
     points.y = wp.zeros(padded, dtype=wp.uint16, device=device)
     points.turn = wp.zeros(padded, dtype=wp.uint16, device=device)
@@ -313,7 +318,7 @@ def _folded(
     points.time = wp.empty(0, dtype=float, device=device)
     points.second = wp.empty(0, dtype=wp.uint16, device=device)
     keys = wp.array(key, dtype=wp.int64, device=device, copy=False)
-    launch(event_kernels.unfold_keys, count, [keys, bins], [points], device=device)
+    launch(event_folding.unfold_keys, count, [keys, bins], [points], device=device)
     return UploadedEvents(points, count, n, None, None)
 
 

@@ -199,13 +199,15 @@ def _add_spare_groups(
     if not parts:
         return
     # Each spare group belongs to the group of pixels in which its slice begins.
-    own = wp.zeros(1, dtype=int, device=images.device)
+    replaced = wp.zeros(1, dtype=int, device=images.device)
     values = images.numpy()
     pairs = []
     _, _, t, _, *others = inputs
     for part in parts:
-        wp.launch(tensors_cpu.find_own, 1, [t, *others, part], [own], device=images.device)
-        first_of_target = int(own.numpy()[0]) * group
+        wp.launch(
+            tensors_cpu.find_replaced_group, 1, [t, *others, part], [replaced], device=images.device
+        )
+        first_of_target = int(replaced.numpy()[0]) * group
         first_of_spare = part.spare * group
         target = values[first_of_target : first_of_target + group]
         spare = values[first_of_spare : first_of_spare + group]

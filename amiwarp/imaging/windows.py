@@ -155,14 +155,14 @@ def windows(
         raise AmiwarpError(
             "windows are cut in one way: give one of duration_us, count, ranges and encoder"
         )
-    for name, value, way in (
+    for name, value, option in (
         ("turns", turns, "encoder"),
         ("t_start", t_start, "duration_us"),
         ("t_end", t_end, "duration_us"),
     ):
-        if value is not None and given[way] is None:
+        if value is not None and given[option] is None:
             raise AmiwarpError(
-                f"{name} is given without {way}; give {way} too, or leave {name} out"
+                f"{name} is given without {option}; give {option} too, or leave {name} out"
             )
     if ranges is not None:
         if incomplete:
@@ -302,8 +302,8 @@ def turn_edges(
     elapsed = (times[moved] - first).astype(np.float64)
 
     edges = [np.array([first])]
-    for start, stop, level, way, number in _one_way(turned / turns):
-        ahead = way * (turned[start:stop] - level * turns)
+    for start, stop, level, direction, number in _one_way(turned / turns):
+        ahead = direction * (turned[start:stop] - level * turns)
         t = elapsed[start:stop]
         farthest = np.maximum.accumulate(ahead)
         ends = np.arange(1, number + 1) * turns
@@ -332,18 +332,18 @@ def turn_end(encoder: Encoder, first: int, start: float, last: int, turns: int) 
     angle = encoder.angle[max(begin - 1, 0) : end + 1]
     if end - begin < FEWEST_SAMPLES:
         return None
-    way = math.copysign(1.0, angle[1] - angle[0])
-    if not (way * np.diff(angle) > LEAST_STEP).all():
+    direction = math.copysign(1.0, angle[1] - angle[0])
+    if not (direction * np.diff(angle) > LEAST_STEP).all():
         return None
 
     # Some samples before and after the edge, which may lie a sample beside the place that the first angle tells
-    inside = way * encoder.angle[begin:end]
-    behind = begin + int(inside.searchsorted(way * start + math.tau * turns))
+    inside = direction * encoder.angle[begin:end]
+    behind = begin + int(inside.searchsorted(direction * start + math.tau * turns))
     near = encoder.t[max(behind - 3, begin) : min(behind + 3, end)]
     samples = np.rint(near - offset).astype(np.int64)
     # With the first time, the angles are rounded as there
     angles = encoder.angle_at(np.concatenate([[first], samples]))[1:]
-    ahead = way * ((angles - start) / math.tau)
+    ahead = direction * ((angles - start) / math.tau)
     after = int(ahead.searchsorted(float(turns)))
     if not 0 < after < len(ahead):
         return None
@@ -361,25 +361,25 @@ def _one_way(turned: NDArray[np.float64]) -> Iterator[tuple[int, int, int, int, 
     and the number of windows that end in it.
     """
     start = 0
-    way = 0
+    direction = 0
     level = 0
     before = 0
     # Floor plus ceiling changes where the angle passes a whole number, or reaches or leaves one.
     steps = np.diff(np.floor(turned) + np.ceil(turned))
     passes = np.flatnonzero(steps) + 1
     for k in passes.tolist():
-        at = float(turned[k])
-        if abs(at - level) < 1.0:
+        start_turns = float(turned[k])
+        if abs(start_turns - level) < 1.0:
             continue
-        ahead = 1 if at > level else -1
-        if way == -ahead:
-            yield start, k, before, way, abs(level - before)
+        ahead = 1 if start_turns > level else -1
+        if direction == -ahead:
+            yield start, k, before, direction, abs(level - before)
             start = k - 1
             before = level
-        way = ahead
-        level = ahead * math.floor(ahead * at)
-    if way:
-        yield start, len(turned), before, way, abs(level - before)
+        direction = ahead
+        level = ahead * math.floor(ahead * start_turns)
+    if direction:
+        yield start, len(turned), before, direction, abs(level - before)
 
 
 def _at_indices(

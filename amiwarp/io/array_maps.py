@@ -92,7 +92,8 @@ class ArrayMap:
                 with open_array(archive, name, allowed) as (stream, shape, dtype):
                     if len(shape) != cls._AXES.get(name, 2) or max(shape) > LARGEST_SIZE:
                         raise AmiwarpError(
-                            f"array {name} has shape {shape}; expected (height, width)"
+                            f"array {name} has shape {shape}; expected (height, width)",
+                            ErrorCode.FORMAT_UNKNOWN,
                         )
                     data = stream.read(math.prod(shape) * dtype.itemsize)
                     values[name] = np.frombuffer(data, dtype).reshape(shape)

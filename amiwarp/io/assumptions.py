@@ -63,7 +63,10 @@ class Assumption:
 
 def assumed_texts(metadata: Mapping[str, MetadataValue]) -> list[str]:
     """Return for each assumption in the metadata of a recording what is assumed, and the option that overrides it."""
-    return [f"{each.what} {each.value} ({each.option})" for each in assumptions_of(metadata)]
+    return [
+        f"{assumption.what} {assumption.value} ({assumption.option})"
+        for assumption in assumptions_of(metadata)
+    ]
 
 
 def assumptions_of(metadata: Mapping[str, MetadataValue]) -> list[Assumption]:

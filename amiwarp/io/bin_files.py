@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import DEFAULT_BLOCK, Recording
 from amiwarp.io.bin_events import BIN_EVENT_BYTES, BIN_MARK_ROW, bin_columns, looks_like_bin
 from amiwarp.io.event_packets import Packet
@@ -34,7 +34,8 @@ def open_bin(path: Path) -> Recording:
         head = file.read(4096)
         if not looks_like_bin(head, path.stat().st_size):
             raise AmiwarpError(
-                "does not hold events of 5 bytes in the order of time; give another file"
+                "does not hold events of 5 bytes in the order of time; give another file",
+                ErrorCode.FORMAT_UNKNOWN,
             )
     read = partial(_bin_packets, path)
     events = FileEvents(path, read, size=None, sensors=FRAMES)

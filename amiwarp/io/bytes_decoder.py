@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.aedat import aedat3, aedat4_events
 from amiwarp.io.aedat.aedat2_decoder import Aedat2Decoder
 from amiwarp.io.aedat.aedat2_header import CHIPS
@@ -69,9 +69,13 @@ class BytesDecoder:
         self._format = one_of(format, FORMATS, "format of the bytes")
         self._device = wp.get_device("cpu" if device is None else device)
         if self._format == "aedat2" and chip is None:
-            raise AmiwarpError(f"format aedat2 needs a chip; give one of {', '.join(CHIPS)}")
+            raise AmiwarpError(
+                f"format aedat2 needs a chip; give one of {', '.join(CHIPS)}", ErrorCode.OPTIONS
+            )
         if self._format != "aedat2" and chip is not None:
-            raise AmiwarpError(f"format {self._format} needs no chip; leave it out")
+            raise AmiwarpError(
+                f"format {self._format} needs no chip; leave it out", ErrorCode.OPTIONS
+            )
         self._dat: DatDecoder | None = None
         self._aedat2: Aedat2Decoder | None = None
         if self._format in ("dat1", "dat2"):
@@ -151,7 +155,7 @@ class BytesDecoder:
     def _decode_aedat4(self, data: Any) -> DeviceEvents:
         """Return the events of packets of AEDAT 4."""
         from amiwarp.kernels import aedat4 as kernels
-        from amiwarp.kernels.records import Span
+        from amiwarp.kernels.raw_numbers import Span
 
         packets = self._listed(data, kernels.list_packets, Span)
         decoded = aedat4_events.decode_packets(packets, self._device)
@@ -168,21 +172,22 @@ class BytesDecoder:
         from amiwarp.kernels.loading import load
 
         load(kernel, self._device)
-        room = MOST_PACKETS
+        capacity = MOST_PACKETS
         while True:
-            packets = wp.empty(room, dtype=kind, device=self._device)
+            packets = wp.empty(capacity, dtype=kind, device=self._device)
             result = wp.empty(2, dtype=int, device=self._device)
-            wp.launch(kernel, 1, [data, room], [packets, result], device=self._device)
+            wp.launch(kernel, 1, [data, capacity], [packets, result], device=self._device)
             count, wrong = result.numpy().tolist()
             if wrong >= 0:
                 raise self._damaged(wrong)
-            if count <= room:
+            if count <= capacity:
                 return np.asarray(packets.numpy()[:count])
-            room = count
+            capacity = count
 
-    def _damaged(self, at: int) -> AmiwarpError:
+    def _damaged(self, offset: int) -> AmiwarpError:
         """Return the error to raise for a packet at a position."""
         return AmiwarpError(
-            f"byte {at} of the data does not begin a whole packet of {self._format}; give whole packets, and leave out "
+            f"byte {offset} of the data does not begin a whole packet of {self._format}; give whole packets, "
+            "and leave out "
             "damaged ones"
         )

@@ -77,7 +77,10 @@ def load_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
         with errors_name(path, lambda: "is not a camera file"):
             return _camera_from_yaml(_read_yaml(path))
     if size is None:
-        raise AmiwarpError(f"{path}: holds no size of the image; give size=(width, height)")
+        raise AmiwarpError(
+            f"{path}: holds no size of the image; give size=(width, height)",
+            ErrorCode.CONTENT_MISSING,
+        )
     return read_calib(path, *size)
 
 
@@ -155,7 +158,8 @@ def _camera_from_yaml(data: Any) -> Camera:
                 cameras[name] = given
     if len(cameras) > 1:
         raise AmiwarpError(
-            f"holds {len(cameras)} cameras ({', '.join(map(str, cameras))}); leave one of them in the file"
+            f"holds {len(cameras)} cameras ({', '.join(map(str, cameras))}); leave one of them in the file",
+            ErrorCode.AMBIGUOUS,
         )
     if not cameras:
         raise AmiwarpError(
@@ -281,7 +285,8 @@ def read_calib(path: Path, width: int, height: int) -> Camera:
         numbers = [float(word) for word in words]
         if len(numbers) != 9 or not np.isfinite(numbers).all():
             raise AmiwarpError(
-                f"{path}: has {len(numbers)} numbers; expected finite fx fy cx cy k1 k2 p1 p2 k3"
+                f"{path}: has {len(numbers)} numbers; expected finite fx fy cx cy k1 k2 p1 p2 k3",
+                ErrorCode.FILE_DAMAGED,
             )
         fx, fy, cx, cy = numbers[:4]
         return Camera(width, height, fx, fy, cx, cy, RadialTangential(*numbers[4:]))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import GAP_INTERVALS, Encoder
 from amiwarp.events.recording import EventSource, MetadataValue, Recording
 from amiwarp.io.assumptions import ASSUMED, ASSUMED_SIZE, assumed_texts
 from amiwarp.io.export import export
@@ -30,9 +30,6 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import NominalPrism
 from amiwarp.schema.calls import guarded
 from amiwarp.tasks import Progress
-
-GAP_INTERVALS = 5
-"""Number of median sample intervals above which the time between two encoder samples is reported as a gap."""
 
 OF_INPUT = (
     "format",

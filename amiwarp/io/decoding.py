@@ -55,8 +55,8 @@ def cut_into_blocks(counts: Integers, device: Any) -> tuple[Integers, Integers, 
     first_block = sums_before(blocks_of_packet)[packet]
     block_in_packet = np.arange(packet.size) - first_block
     before = length * block_in_packet
-    own = np.minimum(counts[packet] - before, length)
-    return packet, before, own
+    packet_events = np.minimum(counts[packet] - before, length)
+    return packet, before, packet_events
 
 
 def words_on(

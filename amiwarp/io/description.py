@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import GAP_INTERVALS, Encoder
 from amiwarp.events.encoder_speed import rpm_between
 from amiwarp.events.other_sensors import ImageStore, ImuSamples, mean_rate
 from amiwarp.events.recording import DEFAULT_BLOCK, EventSource, Recording
 from amiwarp.events.truth import Cause, Truth
 from amiwarp.io.assumptions import assumptions_of
-from amiwarp.io.conversion import GAP_INTERVALS
+from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import camera_to_json
 from amiwarp.optics.prism import NominalPrism, Plate, Prism
 from amiwarp.tasks import Progress, silent
@@ -27,6 +27,7 @@ ANGLES = (
     "apex",
     "amplitude",
     "phase",
+    "deflection",
     "plate_tilt",
     "direction",
     "fold",
@@ -36,12 +37,13 @@ ANGLES = (
     "second_phase",
     "second_direction",
 )
-"""True parameters of the optic that are angles."""
+"""True parameters of the optic that are angles. The models know the units of theirs, but would load Warp here."""
 
 ANGLE_PAIRS = (
     "tilt",
     "cylinder",
     "wobble",
+    "wedge",
     "backward",
     "roll",
     "second",
@@ -80,8 +82,8 @@ def describe(
         "truth": None if truth is None else _in_degrees(truth.parameters),
         "truth_points": truth is not None and truth.points(0, 1) is not None,
         "world": None if truth is None else _world(truth, None if head else len(source)),
-        "records": getattr(source, "records", {}),
-        "repairs": getattr(source, "repairs", {}),
+        "records": source.records if isinstance(source, FileEvents) else {},
+        "repairs": source.repairs if isinstance(source, FileEvents) else {},
         "assumptions": [asdict(assumption) for assumption in assumptions_of(recording.metadata)],
         "metadata": recording.metadata,
     }
@@ -89,6 +91,60 @@ def describe(
 
 def _events(source: EventSource, *, head: bool, progress: Progress) -> dict[str, Any]:
     """Return number, times, rate and share of ON events, estimated if only a part is read."""
+    counted = _count(source, head=head, progress=progress)
+    # A file without an index may have been examined only in part, when it was opened.
+    scanned = source if isinstance(source, FileEvents) else None
+    examined_share = 1.0 if scanned is None else scanned.share
+    count = len(source)
+    t_first = t_last = None
+    share_read = counted.read / max(count, 1)
+    if count:
+        t_first = source.t_first
+        t_last = source.t_last
+    if scanned is not None and examined_share < 1.0:
+        share_read = examined_share
+        if count:
+            count = round(count / examined_share)
+            t_last = _estimated_end(scanned)
+    seconds = 0.0 if t_first is None or t_last is None else (t_last - t_first) * 1e-6
+
+    description = {
+        "events": count,
+        "t_first_us": t_first,
+        "t_last_us": t_last,
+        "duration_s": seconds,
+        "rate_mev_per_s": count / seconds / 1e6 if seconds > 0 else None,
+        "on_share": counted.on / counted.read if counted.read else None,
+        "estimated": examined_share < 1.0,
+        "count_s": None if scanned is None else scanned.seconds,
+        "share_read": share_read,
+        "compensated": counted.is_compensated,
+    }
+    if counted.is_compensated:
+        description["outside"] = counted.outside
+    return description
+
+
+def _estimated_end(source: FileEvents) -> int:
+    """Return the time of the last event [us] of a partly examined file; an estimate if the file's end does not tell."""
+    known = source.last_time()
+    if known is not None:
+        return known
+    return source.t_first + round((source.t_last - source.t_first) / source.share)
+
+
+class _Counted(NamedTuple):
+    """What the blocks of events held that were read."""
+
+    read: int
+    on: int
+    outside: int
+    """Number of events outside of the image, if they are compensated."""
+    is_compensated: bool
+
+
+def _count(source: EventSource, *, head: bool, progress: Progress) -> _Counted:
+    """Count the events, or with ``head`` about the first :data:`HEAD_EVENTS`."""
     width, height = source.size
     count = len(source)
     read = 0
@@ -107,38 +163,7 @@ def _events(source: EventSource, *, head: bool, progress: Progress) -> dict[str,
         progress("reading", read / max(count, 1))
         if head and read >= HEAD_EVENTS:
             break
-
-    t_first = t_last = None
-    share_read = read / max(count, 1)
-    share_of_file: float = getattr(source, "share", 1.0)
-    if count:
-        t_first = source.t_first
-        t_last = source.t_last
-    if share_of_file < 1.0:
-        share_read = share_of_file
-        if t_first is not None and t_last is not None:
-            count = round(count / share_of_file)
-            # The end is known only if the last bytes of the file hold its time.
-            known_end = source.last_time()  # type: ignore[attr-defined]
-            estimated_end = t_first + round((t_last - t_first) / share_of_file)
-            t_last = estimated_end if known_end is None else known_end
-    seconds = 0.0 if t_first is None or t_last is None else (t_last - t_first) * 1e-6
-
-    description = {
-        "events": count,
-        "t_first_us": t_first,
-        "t_last_us": t_last,
-        "duration_s": seconds,
-        "rate_mev_per_s": count / seconds / 1e6 if seconds > 0 else None,
-        "on_share": on / read if read else None,
-        "estimated": share_of_file < 1.0,
-        "count_s": getattr(source, "seconds", None),
-        "share_read": share_read,
-        "compensated": is_compensated,
-    }
-    if is_compensated:
-        description["outside"] = outside
-    return description
+    return _Counted(read, on, outside, is_compensated)
 
 
 def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
@@ -233,6 +258,7 @@ def _world(truth: Truth, count: int | None) -> dict[str, Any] | None:
     categories = None
     if labels is not None:
         categories = sorted({name for name in labels.categories if name})
+    # No rows: only the names are asked, and the poses of a file stay unread.
     poses = None if truth.poses is None else truth.poses[:0]
     return {
         "name": None if labels is None else labels.name,

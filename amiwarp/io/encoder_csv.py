@@ -36,14 +36,15 @@ def read_encoder_csv(
     path = Path(path)
     with errors_name(path, lambda: "reading the encoder"):
         names, table, lines = _read_table(path)
-        columns = {name: table[:, at] for at, name in enumerate(names)}
+        columns = {name: table[:, column] for column, name in enumerate(names)}
         t = np.rint(columns["t_us"]).astype(np.int64)
         late = np.flatnonzero(t[1:] <= t[:-1])
         if late.size:
             line = lines[int(late[0]) + 1]
             raise AmiwarpError(
                 f"{path}: line {line}: t_us is not later than in the line before; sort the lines by t_us and remove "
-                "duplicates"
+                "duplicates",
+                ErrorCode.FILE_DAMAGED,
             )
         try:
             encoder = _encoder(
@@ -61,7 +62,8 @@ def read_encoder_csv(
         bad = np.flatnonzero((columns["index"] != 0) & (columns["index"] != 1))
         if bad.size:
             raise AmiwarpError(
-                f"{path}: line {lines[int(bad[0])]}: index is neither 0 nor 1; correct this line"
+                f"{path}: line {lines[int(bad[0])]}: index is neither 0 nor 1; correct this line",
+                ErrorCode.FILE_DAMAGED,
             )
         pulses = columns["index"] == 1
         # A pulse that stays high over several samples is one pulse at its first sample.
@@ -81,7 +83,10 @@ def _encoder(
     """Return the encoder of the log's columns."""
     if "count" in columns:
         if counts_per_turn is None:
-            raise AmiwarpError(f"{path}: holds counts; give the counts per turn as counts_per_turn")
+            raise AmiwarpError(
+                f"{path}: holds counts; give the counts per turn as counts_per_turn",
+                ErrorCode.AMBIGUOUS,
+            )
         return Encoder.from_counts(
             t,
             columns["count"],
@@ -116,11 +121,13 @@ def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], Sequence[in
             values.extend(map(float, line.split(",")))
         except ValueError as error:
             raise AmiwarpError(
-                f"{path}: line {number} is '{line[:80]}'; expected {len(names)} numbers"
+                f"{path}: line {number} is '{line[:80]}'; expected {len(names)} numbers",
+                ErrorCode.FILE_DAMAGED,
             ) from error
         if len(values) != len(numbers) * len(names):
             raise AmiwarpError(
-                f"{path}: line {number} is '{line[:80]}'; expected {len(names)} numbers"
+                f"{path}: line {number} is '{line[:80]}'; expected {len(names)} numbers",
+                ErrorCode.FILE_DAMAGED,
             )
     if not names:
         raise AmiwarpError(
@@ -128,7 +135,9 @@ def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], Sequence[in
             ErrorCode.CONTENT_MISSING,
         )
     if len(numbers) < 2:
-        raise AmiwarpError(f"{path}: has {len(numbers)} samples; expected at least 2")
+        raise AmiwarpError(
+            f"{path}: has {len(numbers)} samples; expected at least 2", ErrorCode.CONTENT_MISSING
+        )
     table = np.frombuffer(values).reshape(-1, len(names))
     # From 2**53 on, float64 cannot represent every whole microsecond. NaN fails every comparison.
     right = (np.abs(table) < 2.0**53).all(axis=1)
@@ -136,7 +145,8 @@ def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], Sequence[in
         row = int(np.argmin(right))
         given = ",".join(f"{value:g}" for value in table[row])
         raise AmiwarpError(
-            f"{path}: line {numbers[row]} is '{given}'; expected {len(names)} finite numbers"
+            f"{path}: line {numbers[row]} is '{given}'; expected {len(names)} finite numbers",
+            ErrorCode.FILE_DAMAGED,
         )
     return names, table, numbers
 
@@ -147,8 +157,12 @@ def _column_names(path: Path, header: str) -> list[str]:
     known = {"t_us", "angle_deg", "count", "index"}
     if len(set(names)) != len(names) or not set(names) <= known or "t_us" not in names:
         raise AmiwarpError(
-            f"{path}: header '{header[:80]}'; expected t_us,angle_deg or t_us,count, then index"
+            f"{path}: header '{header[:80]}'; expected t_us,angle_deg or t_us,count, then index",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     if ("count" in names) == ("angle_deg" in names):
-        raise AmiwarpError(f"{path}: header '{header[:80]}'; expected one of angle_deg and count")
+        raise AmiwarpError(
+            f"{path}: header '{header[:80]}'; expected one of angle_deg and count",
+            ErrorCode.FORMAT_UNKNOWN,
+        )
     return names

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.unwrapping import check_direction
 from amiwarp.io.formats import TRIGGERS, Format, check_topic, detect_format, io_function
@@ -41,7 +41,8 @@ def read_encoder_triggers(
     if format not in TRIGGERS:
         formats = ", ".join(known.value for known in TRIGGERS)
         raise AmiwarpError(
-            f"{path}: files of the format {format.value} store no triggers; expected one of {formats}"
+            f"{path}: files of the format {format.value} store no triggers; expected one of {formats}",
+            ErrorCode.CONTENT_MISSING,
         )
     check_topic(path, topic, format)
     with errors_name(path, lambda: "reading the triggers"):
@@ -54,7 +55,10 @@ def read_encoder_triggers(
             counts.append(f"{count} of channel {number}")
         given = f"{path}: has {pulse_t.size} rising trigger edges of channel {channel}"
         listed = ", ".join(counts) or "none"
-        raise AmiwarpError(f"{given}; expected at least 2; the rising edges are: {listed}")
+        raise AmiwarpError(
+            f"{given}; expected at least 2; the rising edges are: {listed}",
+            ErrorCode.CONTENT_MISSING,
+        )
     step_rad = direction * math.tau / counts_per_turn
     angle = np.arange(pulse_t.size, dtype=np.float64) * step_rad
     index_t = pulse_t.copy() if counts_per_turn == 1 else None

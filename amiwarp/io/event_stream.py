@@ -40,7 +40,9 @@ def open_es(path: Path) -> Recording:
             )
         name = TYPES.get(kind, f"unknown (type {kind})")
         if name not in ("dvs", "atis"):
-            raise AmiwarpError(f"holds {name} events; expected dvs or atis")
+            raise AmiwarpError(
+                f"holds {name} events; expected dvs or atis", ErrorCode.FORMAT_UNKNOWN
+            )
     source = partial(_packets, path, name == "atis", height)
     events = FileEvents(path, source, size=(width, height))
     metadata = {"format": "es", **events.metadata}

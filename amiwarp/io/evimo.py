@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Recording
 from amiwarp.io.event_packets import Packet, microseconds
 from amiwarp.io.file_scan import FileEvents
@@ -23,7 +23,10 @@ def _header(stream: IO[bytes], name: str, file_bytes: int, kinds: str) -> Array:
     """Read the header of an array of ``file_bytes`` bytes, and check it. Refuse an array that is stored by columns."""
     array, by_columns = array_header(stream, f"array {name}", file_bytes, kinds)
     if by_columns:
-        raise AmiwarpError(f"array {name} is stored by columns; save numpy.ascontiguousarray of it")
+        raise AmiwarpError(
+            f"array {name} is stored by columns; save numpy.ascontiguousarray of it",
+            ErrorCode.FORMAT_UNKNOWN,
+        )
     return array
 
 
@@ -66,6 +69,7 @@ def _check_shapes(path: Path, arrays: Mapping[str, Array]) -> int:
     if len(counts) != 1 or widths != {"t": 1, "xy": 2, "p": 1}:
         shapes = ", ".join(listed)
         raise AmiwarpError(
-            f"{path}: the arrays have the shapes {shapes}; expected (n,), (n, 2), (n,)"
+            f"{path}: the arrays have the shapes {shapes}; expected (n,), (n, 2), (n,)",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     return counts.pop()

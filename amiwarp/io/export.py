@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import SENSOR_DTYPE, Events, EventSource, check_coordinates
 from amiwarp.io.formats import io_function
 from amiwarp.io.inputs import errors_name
@@ -179,7 +179,8 @@ class Pixels:
             if self._rounding is None:
                 return events
             raise AmiwarpError(
-                "events have whole pixels and are not rounded; leave --round (rounding= in Python) out"
+                "events have whole pixels and are not rounded; leave --round (rounding= in Python) out",
+                ErrorCode.OPTIONS,
             )
         if self._rounding is not None:
             return self._rounded(events, self._rounding)
@@ -190,7 +191,8 @@ class Pixels:
         exact = [end for end, one in EXTENSIONS.items() if one in LIMITS and LIMITS[one].fractional]
         raise AmiwarpError(
             f"events are compensated and have fractional pixels, {self._limits.label} holds whole pixels; "
-            f"give --round (rounding= in Python) {names}, or write .h5, {', '.join(exact[:-1])} or {exact[-1]}"
+            f"give --round (rounding= in Python) {names}, or write .h5, {', '.join(exact[:-1])} or {exact[-1]}",
+            ErrorCode.OPTIONS,
         )
 
     def _rounded(self, events: Events, rounding: Rounding) -> Events:

@@ -174,12 +174,14 @@ class FileEvents(EventSource):
                 width, height = self._size
                 frame = f"the {width}x{height} frame"
             raise AmiwarpError(
-                f"{self.path}: {counts.outside} of {total} events lie outside {frame}; {damaged}"
+                f"{self.path}: {counts.outside} of {total} events lie outside {frame}; {damaged}",
+                ErrorCode.FILE_DAMAGED,
             )
         if late * 100 > total:
             remedy = "if its events are in the order of pixels, sort them by time with --sort"
             raise AmiwarpError(
-                f"{self.path}: {late} of {total} events are out of order; {damaged}; {remedy}"
+                f"{self.path}: {late} of {total} events are out of order; {damaged}; {remedy}",
+                ErrorCode.FILE_DAMAGED,
             )
         if not counts.count:
             raise AmiwarpError(

@@ -79,7 +79,9 @@ class StreamedImages(Instants[NDArray[Any]]):
             kinds = np.unique(np.stack([width, height, depth]), axis=1)
             decrease = (np.diff(t) < 0).any()
             if kinds.shape[1] != 1 or decrease:
-                raise AmiwarpError("frames differ in size or bits, or their times decrease")
+                raise AmiwarpError(
+                    "frames differ in size or bits, or their times decrease", ErrorCode.FILE_DAMAGED
+                )
         super().__init__(rounded_times(t))
         self._size = (int(width[0]), int(height[0]))
         self._dtype = np.dtype(f"u{int(depth[0])}")

@@ -16,7 +16,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.io.bin_events import looks_like_bin
 from amiwarp.io.columns.options import GivenLayout
 from amiwarp.io.inputs import check_regular, errors_name, open_input
-from amiwarp.io.mistaken_files import name_kind
+from amiwarp.io.mistaken_files import what_it_is
 from amiwarp.io.opening import GivenSource, given_source
 from amiwarp.io.ros.bags import MCAP, ROS1, SQLITE
 from amiwarp.io.ros.packed import ZSTANDARD, packed_head
@@ -150,7 +150,8 @@ def detect_format(path: Path) -> Format:
     if path.is_dir() and any(inner.name.endswith(BAG_ENDS) for inner in path.iterdir()):
         raise AmiwarpError(
             f"{path}: is the folder of a ROS 2 bag without its metadata.yaml; "
-            "run ros2 bag reindex, or give one of its files"
+            "run ros2 bag reindex, or give one of its files",
+            ErrorCode.CONTENT_MISSING,
         )
     with errors_name(path, lambda: "opening"), open_input(path) as file:
         head = file.read(HEAD_BYTES)
@@ -184,9 +185,9 @@ def detect_format(path: Path) -> Format:
     if head.startswith(ZSTANDARD) and packed_head(path).startswith((ROS1, SQLITE, MCAP)):
         return Format.ROSBAG
 
-    why_not = name_kind(head) or why_no_rows(head)
+    why_not = what_it_is(head) or why_no_rows(head)
     if why_not:
-        raise AmiwarpError(f"{path}: {why_not}")
+        raise AmiwarpError(f"{path}: {why_not}", ErrorCode.FORMAT_UNKNOWN)
     known = ", ".join(member.value for member in Format)
     raise AmiwarpError(
         f"{path}: content is of no known format; expected one of {known}", ErrorCode.FORMAT_UNKNOWN

@@ -86,13 +86,16 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
         with open_input(path) as file:
             data = file.read(MOST_TOML_BYTES + 1)
         if len(data) > MOST_TOML_BYTES:
-            raise AmiwarpError(f"is larger than {MOST_TOML_BYTES >> 20} MiB; give another file")
+            raise AmiwarpError(
+                f"is larger than {MOST_TOML_BYTES >> 20} MiB; give another file", ErrorCode.FIELD
+            )
         text = data.decode("utf-8")
         dotted = _TOO_DOTTED.search(text)
         if dotted is not None:
             line = text.count("\n", 0, dotted.start()) + 1
             raise AmiwarpError(
-                f"line {line} has a key of more than {MOST_PARTS} parts; use fewer dots"
+                f"line {line} has a key of more than {MOST_PARTS} parts; use fewer dots",
+                ErrorCode.FIELD,
             )
         return tomllib.loads(text)
 

@@ -29,7 +29,8 @@ def open_array(archive: zipfile.ZipFile, name: str, kinds: str = "iub") -> Itera
     with open_any_array(archive, name, kinds) as (array, by_columns):
         if by_columns:
             raise AmiwarpError(
-                f"array {name} is stored by columns; save numpy.ascontiguousarray of it"
+                f"array {name} is stored by columns; save numpy.ascontiguousarray of it",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         yield array
 
@@ -70,7 +71,9 @@ def array_header(stream: IO[bytes], name: str, file_bytes: int, kinds: str) -> t
             expected = "floating-point numbers"
         elif "f" in kinds:
             expected = f"{expected} or floating-point numbers"
-        raise AmiwarpError(f"{name} is {dtype}; expected {expected}, no pickled objects")
+        raise AmiwarpError(
+            f"{name} is {dtype}; expected {expected}, no pickled objects", ErrorCode.FORMAT_UNKNOWN
+        )
     array_bytes = math.prod(shape) * dtype.itemsize
     if array_bytes != file_bytes - stream.tell():
         raise AmiwarpError(

@@ -248,8 +248,8 @@ def output_format(path: Path, given: OutputFormat | str | None) -> OutputFormat:
 
 def _endings(chosen: OutputFormat) -> list[str]:
     """Return the extensions of a format."""
-    own = CHOSEN_BY_NAME.get(chosen, chosen)
-    return [ending for ending, one in EXTENSIONS.items() if one is own]
+    format_name = CHOSEN_BY_NAME.get(chosen, chosen)
+    return [ending for ending, one in EXTENSIONS.items() if one is format_name]
 
 
 def check_native(path: Path) -> None:

@@ -66,7 +66,8 @@ def protecting_files(
                 target = check_output(path)
                 if target in targets:
                     raise AmiwarpError(
-                        f"{path}: is given for two outputs; give each output its own name"
+                        f"{path}: is given for two outputs; give each output its own name",
+                        ErrorCode.OPTIONS,
                     )
                 targets.add(target)
             # A folder that takes no files is found before the work, and before the first output.

@@ -109,7 +109,8 @@ class RecordedDataset:
     ) -> None:
         if target_transform is not None and not structured:
             raise AmiwarpError(
-                "target_transform applies to structured items; give structured = True, or leave it out"
+                "target_transform applies to structured items; give structured = True, or leave it out",
+                ErrorCode.OPTIONS,
             )
         self.folder = Path(folder)
         _, items = read_manifest(self.folder / MANIFEST)
@@ -118,13 +119,15 @@ class RecordedDataset:
             counts = Counter(item.split for item in items)
             listed = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
             raise AmiwarpError(
-                f"{self.folder}: no recording is in the split {shown(split)}; it has {listed or 'no recordings'}"
+                f"{self.folder}: no recording is in the split {shown(split)}; it has {listed or 'no recordings'}",
+                ErrorCode.CONTENT_MISSING,
             )
         tensors = [item for item in self._items if item.representation is not None]
         if structured and tensors:
             raise AmiwarpError(
                 f"{self.folder}: holds tensors ({tensors[0].representation}), but structured items are events; leave "
-                "out structured, or make the data set without [output]"
+                "out structured, or make the data set without [output]",
+                ErrorCode.OPTIONS,
             )
         self.transform = transform
         self.structured = structured

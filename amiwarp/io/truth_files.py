@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.poses import Poses, PoseStore
 from amiwarp.events.truth import FrameStore
 from amiwarp.io.numpy_arrays import write_array
@@ -248,7 +248,8 @@ def save_poses_tum(
     known = sorted(instance(none_of_them, Poses, "poses[:0]").bodies)
     if body is not None and not (isinstance(body, str) and body in known):
         raise AmiwarpError(
-            f"body {shown(body)} has no poses; choose among {', '.join(known) or 'none: no body moves'}"
+            f"body {shown(body)} has no poses; choose among {', '.join(known) or 'none: no body moves'}",
+            ErrorCode.CONTENT_MISSING,
         )
     with (
         NewFile(path, overwrite=overwrite) as new,
@@ -268,7 +269,8 @@ def _intervals(frames: FrameStore) -> list[tuple[int, int]]:
     t = [int(time) for time in frames.t]
     if len(t) < 2:
         raise AmiwarpError(
-            f"flow needs ground truth of two instants, but there are {len(t)}; simulate with --truth-hz"
+            f"flow needs ground truth of two instants, but there are {len(t)}; simulate with --truth-hz",
+            ErrorCode.CONTENT_MISSING,
         )
     return list(itertools.pairwise(t))
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from amiwarp.kernels.event_arrays import EventArrays, store_event
 from amiwarp.kernels.native_code import load_uint32
-from amiwarp.kernels.records import wraps_between
+from amiwarp.kernels.raw_numbers import wrap_between
 
 wp.set_module_options({"enable_backward": False})
 
@@ -139,7 +139,7 @@ def survey_aedat2(
     for i in range(first, wp.min(first + length, words.shape[0] // 2)):
         kind = kind_of(address_at(words, i), camera.davis)
         now = time_at(words, i)
-        count.wraps += wraps_between(last, now)
+        count.wraps += wrap_between(last, now)
         last = now
         if kind == EVENT:
             count.events += 1
@@ -175,7 +175,7 @@ def decode_aedat2(
     for i in range(first, wp.min(first + length, words.shape[0] // 2)):
         address = address_at(words, i)
         stored = time_at(words, i)
-        wraps += wraps_between(last, stored)
+        wraps += wrap_between(last, stored)
         last = stored
         now = stored + (wp.int64(wraps) << wp.int64(32))
         kind = kind_of(address, camera.davis)

@@ -7,7 +7,7 @@ one. The first pass counts the valid events of each block, the second writes the
 import warp as wp
 
 from amiwarp.kernels.event_arrays import EventArrays, store_event
-from amiwarp.kernels.records import load_number, number_at, span_of
+from amiwarp.kernels.raw_numbers import load_number, number_at, span_of
 
 wp.set_module_options({"enable_backward": False})
 

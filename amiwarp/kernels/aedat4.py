@@ -10,7 +10,7 @@ import warp as wp
 from amiwarp.kernels.event_arrays import EventArrays
 from amiwarp.kernels.event_order import Survey, count_falls, largest_coordinate, latest_time
 from amiwarp.kernels.native_code import load_int64
-from amiwarp.kernels.records import OUTSIDE, Span, number_at, span_of
+from amiwarp.kernels.raw_numbers import OUTSIDE, Span, number_at, span_of
 
 wp.set_module_options({"enable_backward": False})
 

@@ -54,6 +54,12 @@ def mark_refractory(
             latest[pixel] = t[i]
 
 
+@wp.func
+def hot_threshold(n: float) -> float:
+    """Return the number of events that no pixel has next to one with ``n``: chance adds a few of their square roots."""
+    return 3.0 * n + 5.0 * wp.sqrt(n) + 8.0
+
+
 @wp.kernel
 def mark_hot_pixels(count: wp.array2d(dtype=int), start: int, hot: wp.array(dtype=wp.bool)):
     """Mark pixels that fire far more than the second busiest of the other pixels of the 5 x 5 around them.
@@ -71,8 +77,7 @@ def mark_hot_pixels(count: wp.array2d(dtype=int), start: int, hot: wp.array(dtyp
                 n = count[other_row, other_column]
                 second = wp.max(second, wp.min(most, n))
                 most = wp.max(most, n)
-    near = float(second)
-    hot[i] = float(count[row, column]) > 3.0 * near + 5.0 * wp.sqrt(near) + 8.0
+    hot[i] = float(count[row, column]) > hot_threshold(float(second))
 
 
 @wp.kernel

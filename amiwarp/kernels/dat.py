@@ -4,7 +4,7 @@ import warp as wp
 
 from amiwarp.kernels.event_arrays import EventArrays, store_event
 from amiwarp.kernels.native_code import load_uint32
-from amiwarp.kernels.records import wraps_between
+from amiwarp.kernels.raw_numbers import wrap_between
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,7 +50,7 @@ def decode_dat(
     for i in range(first, wp.min(first + length, words.shape[0] // 2)):
         stored = wp.int64(load_uint32(words, 2 * i))
         rest = int(load_uint32(words, 2 * i + 1))
-        turn += wraps_between(last, stored)
+        turn += wrap_between(last, stored)
         last = stored
         now = stored + (wp.int64(turn) << wp.int64(32))
         column = wp.uint16(rest & layout.x_mask)

@@ -16,6 +16,7 @@ wp.set_module_options({"enable_backward": False})
 # bit 3, held out, with weight 0.
 ON = wp.constant(wp.uint8(1))
 QUIET = wp.constant(wp.uint8(2))
+EARLY = wp.constant(wp.uint8(4))
 HELD = wp.constant(wp.uint8(8))
 
 
@@ -37,7 +38,7 @@ class Pairs:
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
     tile: wp.array(dtype=wp.int32)
-    on: wp.array(dtype=wp.uint8)  # polarity of the second event, and flags; see ON, QUIET and HELD
+    on: wp.array(dtype=wp.uint8)  # polarity of the second event, and flags; see ON to HELD
     azimuth: wp.array(dtype=float)
     slope: wp.array(dtype=float)
     time: wp.array(dtype=float)

@@ -12,7 +12,10 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class ExactParams:
-    """Exact model: refraction at both faces of the prism."""
+    """Exact model: refraction at both faces of the prism.
+
+    A new field must be copied in :func:`amiwarp.kernels.plain_models.even`.
+    """
 
     sin_apex: float  # sine of the apex angle
     cos_apex: float  # cosine of the apex angle

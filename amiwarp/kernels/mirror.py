@@ -7,6 +7,13 @@ import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.compensation import state_at_time
+from amiwarp.kernels.events_with_angles import (
+    EventsWithAngles,
+    load_angles,
+    load_states,
+    stored_angles,
+    stored_state,
+)
 from amiwarp.kernels.prism_angle import EncoderParams, both_angles
 from amiwarp.kernels.refraction import (
     advanced,
@@ -17,13 +24,6 @@ from amiwarp.kernels.refraction import (
     state_of_angles,
 )
 from amiwarp.kernels.vibration import rotate_by_vector
-from amiwarp.kernels.votes import (
-    EventArrays,
-    load_angles,
-    load_states,
-    stored_angles,
-    stored_state,
-)
 
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -75,7 +75,7 @@ def state_at_time(
 
 
 @wp.func
-def stored_state(model: MirrorParams, events: EventArrays, i: int):
+def stored_state(model: MirrorParams, events: EventsWithAngles, i: int):
     """Return the angles of both commands at event ``i`` [rad]."""
     first, second = stored_angles(events, i)
     return first, second
@@ -83,7 +83,7 @@ def stored_state(model: MirrorParams, events: EventArrays, i: int):
 
 @wp.func
 def load_states(
-    model: MirrorParams, events: EventArrays, first: int, states: wp.array(dtype=float)
+    model: MirrorParams, events: EventsWithAngles, first: int, states: wp.array(dtype=float)
 ):
     """Load what :func:`stored_state` returns for a block of 64 events."""
     load_angles(events, first, states)

@@ -113,8 +113,8 @@ def start_read(array: wp.array) -> Callable[[], NDArray[Any]]:
         return values.reshape(array.shape).copy()
 
     # sizes are powers of two, so that arrays of other sizes can use the memory, too
-    room = 1 << (size - 1).bit_length()
-    host = page_locked(result, (room,), wp.uint8, array.device)
+    capacity = 1 << (size - 1).bit_length()
+    host = page_locked(result, (capacity,), wp.uint8, array.device)
     there = wp.array(ptr=array.ptr, dtype=wp.uint8, shape=size, device=array.device)
     wp.copy(host, there, count=size)
     copied = array.device.stream.record_event()

@@ -7,7 +7,8 @@ counted and written.
 
 import warp as wp
 
-from amiwarp.kernels.equations import HELD, QUIET, Pairs
+from amiwarp.kernels.background_activity import hot_threshold
+from amiwarp.kernels.equations import EARLY, HELD, ON, QUIET, Pairs
 from amiwarp.kernels.prism_angle import EncoderParams, of_second, piece_at, radians
 
 wp.set_module_options({"enable_backward": False})
@@ -265,10 +266,10 @@ def write_pairs(
             pairs.on[i] = s.p[s.order[at + 1]]
             store_pair(encoder, window, pairs, i, s.t[event], s.t[s.order[at + 1]])
         elif kind == 1:
-            pairs.on[i] = s.p[event] | wp.uint8(4)
+            pairs.on[i] = s.p[event] | EARLY
             store_pair(encoder, window, pairs, i, window.start, s.t[event])
         else:
-            pairs.on[i] = wp.uint8(2)
+            pairs.on[i] = QUIET
             store_pair(encoder, window, pairs, i, s.t[event], window.stop)
 
 
@@ -305,7 +306,7 @@ def write_quiet(
     pairs.x[i] = wp.uint16(column)
     pairs.y[i] = wp.uint16(row)
     pairs.tile[i] = tile_of[row, column]
-    pairs.on[i] = wp.uint8(2)
+    pairs.on[i] = QUIET
     for k in range(4):
         pairs.azimuth[k * pairs.stride + i] = spans.azimuth[k * spans.stride + span]
     for k in range(2):
@@ -381,7 +382,7 @@ def copy_pair(pairs: Pairs, i: int, out: Pairs, at: int):
 
 
 @wp.kernel
-def select(
+def copy_marked(
     pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, out: Pairs
 ):
     """Copy the marked pairs to contiguous arrays."""
@@ -391,7 +392,7 @@ def select(
 
 
 @wp.kernel
-def append(pairs: Pairs, at: int, start: int, out: Pairs):
+def copy_all(pairs: Pairs, at: int, start: int, out: Pairs):
     """Copy all pairs to the places from ``at`` on."""
     i = start + wp.tid()
     copy_pair(pairs, i, out, at + i)
@@ -401,7 +402,7 @@ def append(pairs: Pairs, at: int, start: int, out: Pairs):
 def hold_out(every: int, start: int, on: wp.array(dtype=wp.uint8)):
     """Mark every ``every``-th pair of two events as held out. These pairs come first in the arrays."""
     i = start + wp.tid()
-    if i % every == 0 and on[i] < QUIET:
+    if i % every == 0 and on[i] <= ON:
         on[i] = on[i] | HELD
 
 
@@ -415,7 +416,7 @@ def keep_nodes(
 ):
     """Leave out pairs of two events if either event lies off ``nodes``."""
     i = start + wp.tid()
-    if cell[i] < 0 or on[i] > wp.uint8(1):
+    if cell[i] < 0 or on[i] > ON:
         return
     if nodes[cell[i]] == wp.uint8(0) or nodes[cell[stride + i]] == wp.uint8(0):
         cell[i] = -1
@@ -431,23 +432,27 @@ def count_pixels(s: Sorted, start: int, count: wp.array(dtype=int)):
 
 @wp.func
 def mirrored(i: int, n: int) -> int:
-    """Return the index ``i`` reflected about the centres of the outermost pixels of ``n``."""
+    """Return the index ``i`` reflected about the centres of the outermost pixels of ``n``.
+
+    On a sensor of one or two pixels, what is reflected beyond the other border becomes the border.
+    """
     j = wp.abs(i)
-    return wp.where(j < n, j, 2 * n - 2 - j)
+    return wp.clamp(wp.where(j < n, j, 2 * n - 2 - j), 0, n - 1)
 
 
 @wp.kernel
 def mark_hot(count: wp.array2d(dtype=int), tile: int, start: int, tile_of: wp.array(dtype=int)):
     """Exclude hot pixels by setting their tile to -1; the other pixels get the tile ``tile``.
 
-    A pixel is hot if it fires far more than at least 19 of the 25 pixels of the 5 x 5 around it.
+    A pixel is hot if it fires far more than at least 19 of the 25 pixels of the 5 x 5 around it: edges pass all of them
+    during whole turns. :func:`amiwarp.kernels.background_activity.mark_hot_pixels` needs no turns, and spares corners.
     """
     i = start + wp.tid()
     rows = count.shape[0]
     columns = count.shape[1]
-    own = float(count[i / columns, i % columns])
-    low = int(0)
-    if own > 8.0:
+    busy = float(count[i / columns, i % columns])
+    quieter = int(0)
+    if busy > hot_threshold(0.0):
         for k in range(25):
             n = float(
                 count[
@@ -455,6 +460,6 @@ def mark_hot(count: wp.array2d(dtype=int), tile: int, start: int, tile_of: wp.ar
                     mirrored(i % columns + k % 5 - 2, columns),
                 ]
             )
-            if own > 3.0 * n + 5.0 * wp.sqrt(n) + 8.0:
-                low += 1
-    tile_of[i] = wp.where(low >= 19, -1, tile)
+            if busy > hot_threshold(n):
+                quieter += 1
+    tile_of[i] = wp.where(quieter >= 19, -1, tile)

@@ -11,8 +11,8 @@ cache. :mod:`amiwarp.kernels.phase_pixels` sums on GPUs.
 
 import warp as wp
 
+from amiwarp.kernels.events_with_angles import EventsWithAngles
 from amiwarp.kernels.native_code import load_uint8, load_uint16, store_int
-from amiwarp.kernels.votes import EventArrays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,7 +52,7 @@ def count_blocks(
 
 @wp.kernel
 def order_by_blocks(
-    events: EventArrays,
+    events: EventsWithAngles,
     width: int,
     lines: int,
     parts: int,

@@ -6,9 +6,9 @@ its registers. Nothing waits for the host: the table of what an event adds is we
 
 import warp as wp
 
+from amiwarp.kernels.events_with_angles import EventsWithAngles, theta_u16_at
 from amiwarp.kernels.phase import complex_sum, table_row
 from amiwarp.kernels.prism_angle import EncoderParams
-from amiwarp.kernels.votes import EventArrays, theta_u16_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -88,7 +88,7 @@ def ratio_of_counts(on: int, off: int, least: wp.float64) -> wp.float64:
 
 @wp.kernel
 def pixel_words(
-    events: EventArrays,
+    events: EventsWithAngles,
     width: int,
     bins: int,
     start: int,

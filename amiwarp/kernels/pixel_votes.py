@@ -14,6 +14,7 @@ import warp as wp
 
 from amiwarp.kernels.camera import CameraParams
 from amiwarp.kernels.camera_rotation import CameraRotationParams, undo_camera_rotation
+from amiwarp.kernels.events_with_angles import EventsWithAngles, load_states
 from amiwarp.kernels.native_code import (
     add_word_pairs,
     copy_bytes,
@@ -27,7 +28,7 @@ from amiwarp.kernels.native_code import (
 )
 from amiwarp.kernels.plain_models import even, is_even, is_plain, plain
 from amiwarp.kernels.refraction import displace, state_of
-from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, load_states
+from amiwarp.kernels.votes import Canvas, cell_at, dither_offset
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -39,7 +40,7 @@ CAPACITY = (1 << 23) - 1  # number of events that the sums of all slices hold to
 def displace_block(
     model: Any,
     camera: Any,
-    events: EventArrays,
+    events: EventsWithAngles,
     first: int,
     x: wp.array(dtype=float),
     y: wp.array(dtype=float),
@@ -89,7 +90,7 @@ def share_block(
 
 
 @wp.func
-def weigh_block(events: EventArrays, first: int, shares: wp.array(dtype=int)):
+def weigh_block(events: EventsWithAngles, first: int, shares: wp.array(dtype=int)):
     """Multiply the shares of each entry by the number of events that it stands for, if that is not one."""
     if events.weight.shape[0] != 0:
         for k in range(4 * BLOCK):
@@ -98,7 +99,7 @@ def weigh_block(events: EventArrays, first: int, shares: wp.array(dtype=int)):
 
 @wp.func
 def vote_block(
-    events: EventArrays,
+    events: EventsWithAngles,
     canvas: Canvas,
     first: int,
     n: int,
@@ -119,7 +120,7 @@ def vote_block(
 def vote_event_blocks(
     model: Any,
     camera: Any,
-    events: EventArrays,
+    events: EventsWithAngles,
     canvas: Canvas,
     count: int,
     start: int,
@@ -143,7 +144,7 @@ def vote_event_blocks(
 def vote_rotating_camera_blocks(
     model: Any,
     camera: CameraParams,
-    events: EventArrays,
+    events: EventsWithAngles,
     canvas: Canvas,
     camera_rotation: CameraRotationParams,
     count: int,

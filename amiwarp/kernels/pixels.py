@@ -29,6 +29,7 @@ TICK_BITS = wp.constant(4)
 # Lowest bits of a key: lag (19), cause (2), polarity (1); pixel and time are above them
 LOW_BITS = wp.constant(22)
 LOW_MASK = wp.constant((1 << 22) - 1)
+LAG_BIT = wp.constant(3)
 SIGNAL = wp.constant(0)  # codes of the causes of an event, as in amiwarp.Cause
 SHOT_NOISE = wp.constant(1)
 LEAK = wp.constant(2)
@@ -162,7 +163,9 @@ def append_key(sink: Sink, shift: int, index: int, t: wp.int64, stamp: wp.int64,
     segment = (index / sink.run) % sink.keys.shape[0]
     place = wp.atomic_add(sink.count, segment, 0, 1)
     if place < sink.keys.shape[1]:
-        low = wp.int64(index) << wp.int64(LOW_BITS) | wp.int64((LARGEST_LAG - lag) << 3 | kind)
+        low = wp.int64(index) << wp.int64(LOW_BITS) | wp.int64(
+            (LARGEST_LAG - lag) << LAG_BIT | kind
+        )
         sink.keys[segment, place] = stamp << wp.int64(shift) | low
 
 

@@ -22,7 +22,7 @@ def is_plain(model: Any) -> int:
 
 @wp.func
 def is_plain(model: ExactParams) -> int:
-    """Return 1 if :func:`plain` of the model is the same model."""
+    """Return 1 if :func:`plain` of the model is the same model. An uneven prism counts as tilted."""
     return (1 - model.tilted) * model.flat_to_scene
 
 
@@ -46,7 +46,10 @@ def even(model: Any):
 
 @wp.func
 def even(model: ExactParams) -> ExactParams:
-    """Return the exact model of a prism without cylinder power and wobble."""
+    """Return the exact model of a prism without cylinder power and wobble.
+
+    Every field is copied but the fields of cylinder power and wobble.
+    """
     m = ExactParams()
     m.sin_apex = model.sin_apex
     m.cos_apex = model.cos_apex

@@ -3,13 +3,12 @@
 import warp as wp
 
 from amiwarp.kernels.event_keys import OPTIONS
-from amiwarp.kernels.pixels import LOW_BITS, LOW_MASK, TICKS
+from amiwarp.kernels.pixels import LAG_BIT, LOW_BITS, LOW_MASK, TICKS
 
 wp.set_module_options(OPTIONS)
 
 
 PS_PER_US = wp.constant(wp.int64(1000000))
-LAG_BIT = wp.constant(3)  # lowest bit of the lag in a key
 
 
 @wp.struct
@@ -18,7 +17,7 @@ class RowScan:
 
     row_ps: wp.int64  # time to read a row [ps]
     scan_ps: wp.int64  # time to read all rows [ps]
-    origin: wp.int64  # time of a key's tick 0 since the first scan [us]
+    since_scan_us: wp.int64  # time of a key's tick 0 since the first scan [us]
     width: int  # width of the sensor [px]
     height: int  # height of the sensor [px]; the pixels of several cameras follow each other
     shift: int  # bit position of the time in a key
@@ -28,10 +27,10 @@ class RowScan:
 def time_of_row(scan: RowScan, row: int, t: wp.int64) -> wp.int64:
     """Return the time at which a row is read next, at or after ``t`` [us], rounded up [us]."""
     phase = wp.int64(row) * scan.row_ps
-    passed = wp.max((t + scan.origin) * PS_PER_US - phase, wp.int64(0))
+    passed = wp.max((t + scan.since_scan_us) * PS_PER_US - phase, wp.int64(0))
     scans = (passed + scan.scan_ps - wp.int64(1)) / scan.scan_ps
     read = scans * scan.scan_ps + phase
-    return (read + PS_PER_US - wp.int64(1)) / PS_PER_US - scan.origin
+    return (read + PS_PER_US - wp.int64(1)) / PS_PER_US - scan.since_scan_us
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
@@ -41,8 +40,9 @@ def stamp_rows(scan: RowScan, keys: wp.array(dtype=wp.int64), start: int):
     key = keys[i]
     t = key >> wp.int64(scan.shift)
     low = key - (t << wp.int64(scan.shift))
-    row = int(low >> wp.int64(LOW_BITS)) / scan.width % scan.height
+    row = (int(low >> wp.int64(LOW_BITS)) / scan.width) % scan.height
     read = time_of_row(scan, row, t)
+    # The lag is stored reversed: a later stamp makes it longer, so that the stored number falls; it stops at 0.
     reversed_lag = (low & wp.int64(LOW_MASK)) >> wp.int64(LAG_BIT)
     shorter = wp.min((read - t) * wp.int64(TICKS), reversed_lag)
     keys[i] = (read << wp.int64(scan.shift)) + low - (shorter << wp.int64(LAG_BIT))
@@ -54,7 +54,7 @@ class Bus:
 
     event_ps: wp.int64  # time to transmit an event [ps]
     longest_ps: wp.int64  # longest time in the queue [ps]; events that would wait longer are lost
-    rows: int  # 1 if the events of a row that is read share a time stamp; 0 if every event has its own
+    shares_stamps: int  # 1 if the events of a row that is read share a time stamp; 0 if every event has its own
     origin: wp.int64  # time from which picoseconds are counted [us]
 
 
@@ -88,7 +88,7 @@ def queue_events(
         begin = transmission(bus, now, until)
         if begin >= wp.int64(0):
             stamp[i] = begin / PS_PER_US + bus.origin
-            if bus.rows > 0 and i > first[sensor]:
+            if bus.shares_stamps > 0 and i > first[sensor]:
                 if t[i - 1] == t[i] and row[i - 1] == row[i] and stamp[i - 1] >= wp.int64(0):
                     stamp[i] = stamp[i - 1]
             until = begin + bus.event_ps
@@ -100,7 +100,7 @@ def queue_keys(
     bus: Bus,
     shift: int,
     width: int,
-    origin: wp.int64,
+    key_origin_us: wp.int64,
     duration: wp.int64,
     keys: wp.array(dtype=wp.int64),
     free: wp.array(dtype=wp.int64),
@@ -110,8 +110,8 @@ def queue_keys(
     """Transmit the events of one sensor in order, as :func:`queue_events` does, given as ``keys``; one thread.
 
     ``keys`` and ``stamp`` keep the events that are transmitted before ``duration`` [us]; ``kept`` is their number.
-    ``shift``: bit position of the time in a key; ``width``: width of the sensor [px]; ``origin``: time from which the
-    times of keys are counted [us].
+    ``shift``: bit position of the time in a key; ``width``: width of the sensor [px]; ``key_origin_us``:
+    time from which the times of keys are counted.
     """
     until = free[0]
     n = int(0)
@@ -121,12 +121,12 @@ def queue_keys(
     for i in range(keys.shape[0]):
         key = keys[i]
         t = key >> wp.int64(shift)
-        begin = transmission(bus, (t + origin) * PS_PER_US, until)
+        begin = transmission(bus, (t + key_origin_us) * PS_PER_US, until)
         at = wp.int64(-1)
         if begin >= wp.int64(0):
             at = begin / PS_PER_US
             until = begin + bus.event_ps
-        if bus.rows > 0:
+        if bus.shares_stamps > 0:
             row = ((key - (t << wp.int64(shift))) >> wp.int64(LOW_BITS)) / wp.int64(width)
             if (
                 at >= wp.int64(0)

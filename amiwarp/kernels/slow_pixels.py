@@ -54,40 +54,52 @@ def brightness_before(
     image: wp.array(dtype=float),
     k: int,
     i: int,
-    angle: float,
+    back: float,
 ) -> float:
-    """Return the brightness at the pixel of an event when the prism's angle was smaller by ``angle`` [rad]."""
+    """Return the brightness at the pixel of an event when the prism's angle was smaller by ``back`` [rad]."""
     w0, w1 = event_state(model, pairs, k, i)
-    w = advanced(model, w0, w1, -angle)
+    w = advanced(model, w0, w1, -back)
     xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), w)
     return brightness_at_position(image, atlas, pairs.tile[i], xy)
 
 
 @wp.kernel
-def find_time_constants(
+def write_brightness(
     model: Any,
     camera: CameraParams,
     pairs: Pairs,
     atlas: Atlas,
     image: wp.array(dtype=float),
-    filter: Photoreceptor,
+    ahead: float,
     every: int,
     start: int,
     out: wp.array2d(dtype=float),
 ):
-    """Compute the time constant at both events of every ``every``-th pair, relative to that at the median brightness.
-
-    It is 1 off the map. For the threshold 0, the brightness is computed instead, NaN off the map.
-    """
+    """Compute the brightness at both events of every ``every``-th pair; NaN off the map."""
     number = start + wp.tid()
     for k in range(2):
-        level = brightness_before(
-            model, camera, pairs, atlas, image, k, number * every, -filter.ahead
+        out[k, number] = brightness_before(
+            model, camera, pairs, atlas, image, k, number * every, -ahead
         )
-        if filter.threshold > 0.0:
-            away = wp.clamp(level - filter.middle, -MOST_THRESHOLDS, MOST_THRESHOLDS)
-            level = wp.where(wp.isnan(level), 1.0, wp.exp(-filter.threshold * away))
-        out[k, number] = level
+
+
+@wp.kernel
+def write_time_constants(
+    model: Any,
+    camera: CameraParams,
+    pairs: Pairs,
+    atlas: Atlas,
+    image: wp.array(dtype=float),
+    photoreceptor: Photoreceptor,
+    start: int,
+    out: wp.array2d(dtype=float),
+):
+    """Compute the time constant at both events of a pair, relative to that at the median brightness; 1 off the map."""
+    i = start + wp.tid()
+    for k in range(2):
+        level = brightness_before(model, camera, pairs, atlas, image, k, i, -photoreceptor.ahead)
+        away = wp.clamp(level - photoreceptor.middle, -MOST_THRESHOLDS, MOST_THRESHOLDS)
+        out[k, i] = wp.where(wp.isnan(level), 1.0, wp.exp(-photoreceptor.threshold * away))
 
 
 @wp.func
@@ -99,16 +111,18 @@ def filtered(
     image: wp.array(dtype=float),
     k: int,
     i: int,
-    filter: Photoreceptor,
+    photoreceptor: Photoreceptor,
 ) -> float:
     """Return the output of the filter at an event.
 
     A dark pixel remembers for longer than :data:`MEMORY`: its output begins on the contracted orbit.
     """
     width = MEMORY / float(STEPS)  # step [time constants at median light]
-    turn = filter.turn[pairs.tile[i]]
+    turn = photoreceptor.turn[pairs.tile[i]]
     before = float(
-        brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * turn - filter.ahead)
+        brightness_before(
+            model, camera, pairs, atlas, image, k, i, MEMORY * turn - photoreceptor.ahead
+        )
     )
     w0, w1 = event_state(model, pairs, k, i)
     begun = advanced(model, w0, w1, -MEMORY * turn)
@@ -122,24 +136,24 @@ def filtered(
     for j in range(steps):
         past = MEMORY - float(j + 1) * width
         after = brightness_before(
-            model, camera, pairs, atlas, image, k, i, past * turn - filter.ahead
+            model, camera, pairs, atlas, image, k, i, past * turn - photoreceptor.ahead
         )
         if wp.isnan(after):
             after = before
-        light = wp.exp(filter.threshold * (0.5 * (before + after) - filter.middle))
+        light = wp.exp(photoreceptor.threshold * (0.5 * (before + after) - photoreceptor.middle))
         level = filter_level(level, before, after, width * light)
         before = after
     return level
 
 
 @wp.kernel
-def find_offsets(
+def write_offsets(
     model: Any,
     camera: CameraParams,
     pairs: Pairs,
     atlas: Atlas,
     image: wp.array(dtype=float),
-    filter: Photoreceptor,
+    photoreceptor: Photoreceptor,
     start: int,
     offset: wp.array(dtype=float),
 ):
@@ -152,6 +166,6 @@ def find_offsets(
         pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
         xy = contracted_position(model, camera, pixel, w0, w1, lag_of(pairs, k, i))
         there = brightness_at_position(image, atlas, pairs.tile[i], xy)
-        total += sign * (filtered(model, camera, pairs, atlas, image, k, i, filter) - there)
+        total += sign * (filtered(model, camera, pairs, atlas, image, k, i, photoreceptor) - there)
         sign = 1.0
     offset[i] = wp.where(wp.isnan(total), 0.0, total)

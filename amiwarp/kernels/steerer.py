@@ -7,6 +7,13 @@ import warp as wp
 
 from amiwarp.kernels.camera import NAN, CameraParams, pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.compensation import state_at_time
+from amiwarp.kernels.events_with_angles import (
+    EventsWithAngles,
+    load_angles,
+    load_states,
+    stored_angles,
+    stored_state,
+)
 from amiwarp.kernels.prism_angle import EncoderParams, both_angles
 from amiwarp.kernels.refraction import (
     advanced,
@@ -15,13 +22,6 @@ from amiwarp.kernels.refraction import (
     state_at,
     state_of,
     state_of_angles,
-)
-from amiwarp.kernels.votes import (
-    EventArrays,
-    load_angles,
-    load_states,
-    stored_angles,
-    stored_state,
 )
 
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
@@ -75,7 +75,7 @@ def state_at_time(
 
 
 @wp.func
-def stored_state(model: SteererParams, events: EventArrays, i: int):
+def stored_state(model: SteererParams, events: EventsWithAngles, i: int):
     """Return the angles of both commands at event ``i`` [rad]."""
     first, second = stored_angles(events, i)
     return first, second
@@ -83,7 +83,7 @@ def stored_state(model: SteererParams, events: EventArrays, i: int):
 
 @wp.func
 def load_states(
-    model: SteererParams, events: EventArrays, first: int, states: wp.array(dtype=float)
+    model: SteererParams, events: EventsWithAngles, first: int, states: wp.array(dtype=float)
 ):
     """Load what :func:`stored_state` returns for a block of 64 events."""
     load_angles(events, first, states)

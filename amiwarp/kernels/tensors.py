@@ -217,3 +217,62 @@ def group_at(grid: Grid, window: int, time: wp.float64) -> int:
     interval = interval_of(grid, time)
     part = int((time - wp.float64(interval)) * wp.float64(grid.parts))
     return (window * grid.steps + interval) * grid.parts + wp.min(part, grid.parts - 1)
+
+
+@wp.func
+def count_event(
+    grid: Grid,
+    part: Part,
+    replaced: int,
+    windows: wp.array2d(dtype=wp.int64),
+    window: int,
+    i: int,
+    x: wp.array(dtype=Any),
+    y: wp.array(dtype=Any),
+    t: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8),
+    counts: wp.array(dtype=int),
+):
+    """Count an event at its nearest pixel. ``replaced``: group that the part's spare group replaces, or -1."""
+    col, row = nearest(x[i]), nearest(y[i])
+    if is_pixel(grid, col, row) == 1:
+        group = group_of(grid, windows, window, t[i])
+        written_group = wp.where(group == replaced, part.spare, group)
+        wp.atomic_add(counts, place_of(grid, written_group, p[i], col, row), 1)
+
+
+@wp.func
+def word_of(grid: Grid, weight: int, end: int) -> wp.int64:
+    """Return the word of an event, by its sign and its share of the interval's end in units of 2**-30."""
+    drop = 94 - 2 * grid.low
+    share = (end + ((1 << drop) >> 1)) >> drop
+    word = (wp.int64(1) << wp.int64(grid.low)) + wp.int64(share)
+    return wp.where(weight < 0, -word, word)
+
+
+@wp.func
+def add_event_word(
+    grid: Grid,
+    part: Part,
+    replaced: int,
+    windows: wp.array2d(dtype=wp.int64),
+    window: int,
+    i: int,
+    x: wp.array(dtype=wp.uint16),
+    y: wp.array(dtype=wp.uint16),
+    t: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8),
+    words: wp.array(dtype=wp.int64),
+):
+    """Add the word of an event. ``replaced``: group that the part's spare group replaces, or -1."""
+    col, row = int(x[i]), int(y[i])
+    if is_pixel(grid, col, row) == 1:
+        time = time_at(grid, windows[window, T_START], windows[window, SPAN], t[i])
+        group = group_at(grid, window, time)
+        written_group = wp.where(group == replaced, part.spare, group)
+        place = place_of(grid, written_group, p[i], col, row)
+        wp.atomic_add(
+            words,
+            place,
+            word_of(grid, weight_of(grid, p[i]), end_share(time, interval_of(grid, time))),
+        )

@@ -40,6 +40,8 @@ from amiwarp.kernels.tensors import (
     WHOLE,
     Grid,
     Part,
+    add_event_word,
+    count_event,
     end_share,
     first_event,
     group_of,
@@ -53,21 +55,18 @@ from amiwarp.kernels.tensors import (
     time_at,
     weight_of,
     window_of,
-)
-from amiwarp.kernels.tensors_cuda import (
-    add_event_word,
-    count_event,
-    count_events,
-    keep_latest,
-    share_events,
     word_of,
 )
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
+# The shapes of local arrays are literals, which Warp wants: 64 is BLOCK; of 128 places, two halves take turns; 512 is
+# eight shares of each event.
+assert int(BLOCK) == 64, "the local arrays of this module hold 64 events"
+
 
 @wp.func
-def own_group(
+def replaced_group_of(
     grid: Grid, windows: wp.array2d(dtype=wp.int64), t: wp.array(dtype=wp.int64), part: Part
 ) -> int:
     """Return the group that a part's spare group replaces, or -1."""
@@ -78,15 +77,15 @@ def own_group(
 
 
 @wp.kernel
-def find_own(
+def find_replaced_group(
     t: wp.array(dtype=wp.int64),
     windows: wp.array2d(dtype=wp.int64),
     grid: Grid,
     part: Part,
-    own: wp.array(dtype=int),
+    replaced: wp.array(dtype=int),
 ):
     """Find the group that a part's spare group replaces."""
-    own[0] = own_group(grid, windows, t, part)
+    replaced[0] = replaced_group_of(grid, windows, t, part)
 
 
 @wp.func
@@ -170,7 +169,7 @@ def start_block(
 def time_block(
     grid: Grid,
     part: Part,
-    own: int,
+    replaced: int,
     windows: wp.array2d(dtype=wp.int64),
     window: int,
     t: wp.array(dtype=wp.int64),
@@ -185,7 +184,9 @@ def time_block(
         time = time_at(grid, t_start, span, load_int64(t, k))
         interval = interval_of(grid, time)
         store_int(
-            groups, k, wp.where(first_group + interval == own, part.spare, first_group + interval)
+            groups,
+            k,
+            wp.where(first_group + interval == replaced, part.spare, first_group + interval),
         )
         store_int(ends, k, end_share(time, interval))
 
@@ -290,16 +291,16 @@ def count_event_blocks(
 ):
     """Count the events of each thread's block at their nearest pixels."""
     window, first, n = start_block(grid, windows, part.block + wp.tid(), x, y, t, faults)
-    own = own_group(grid, windows, t, part)
+    replaced = replaced_group_of(grid, windows, t, part)
     group = group_of(grid, windows, window, t[first])
     if n == BLOCK and group == group_of(grid, windows, window, t[first + n - 1]):
         places = wp.zeros(shape=(64,), dtype=int)
-        used = wp.where(group == own, part.spare, group)
-        place_interval(grid, part, used, first, x, y, p, places, 0)
+        written_group = wp.where(group == replaced, part.spare, group)
+        place_interval(grid, part, written_group, first, x, y, p, places, 0)
         count_places(counts, places, n)
     else:
         for k in range(n):
-            count_event(grid, part, own, windows, window, first + k, x, y, t, p, counts)
+            count_event(grid, part, replaced, windows, window, first + k, x, y, t, p, counts)
 
 
 @wp.kernel
@@ -316,20 +317,21 @@ def keep_latest_blocks(
 ):
     """Keep the latest times of the events of each thread's block at their nearest pixels."""
     window, first, n = start_block(grid, windows, part.block + wp.tid(), x, y, t, faults)
-    own = own_group(grid, windows, t, part)
+    replaced = replaced_group_of(grid, windows, t, part)
+    # Images of latest times have one interval, so that a window has one group.
     group = window * grid.steps
-    used = wp.where(group == own, part.spare, group)
+    written_group = wp.where(group == replaced, part.spare, group)
     for k in range(first, first + n):
         col, row = nearest(x[k]), nearest(y[k])
         if is_pixel(grid, col, row) == 1:
-            wp.atomic_max(latest, place_of(grid, used, p[k], col, row), t[k])
+            wp.atomic_max(latest, place_of(grid, written_group, p[k], col, row), t[k])
 
 
 @wp.func
 def store_interval_words(
     grid: Grid,
     part: Part,
-    own: int,
+    replaced: int,
     windows: wp.array2d(dtype=wp.int64),
     window: int,
     group: int,
@@ -347,12 +349,13 @@ def store_interval_words(
     The sums and products are whole numbers below 2**53, so that a share is the same as from :func:`time_at`.
     """
     prefetch_events(x, y, t, p, first + AHEAD)
-    used = wp.where(group == own, part.spare, group)
+    written_group = wp.where(group == replaced, part.spare, group)
+    # Warp divides whole numbers as C does.
     interval = group / grid.parts - window * grid.steps
     t_first = t[first]
     start = wp.float64((t_first - windows[window, T_START]) * wp.int64(grid.rate))
     span = windows[window, SPAN]
-    place_interval(grid, part, used, first, x, y, p, places, at)
+    place_interval(grid, part, written_group, first, x, y, p, places, at)
     for k in range(BLOCK):
         elapsed = wp.float64(int(load_int64(t, first + k) - t_first)) * wp.float64(grid.rate)
         end = end_share(in_intervals(grid, start + elapsed, wp.float64(span)), interval)
@@ -377,9 +380,11 @@ def add_event_word_blocks(
     """
     places = wp.zeros(shape=(128,), dtype=int)
     waiting = wp.zeros(shape=(128,), dtype=wp.int64)
-    own = own_group(grid, windows, t, part)
-    at = int(0)
-    before = int(0)
+    replaced = replaced_group_of(grid, windows, t, part)
+    # Of the 128 places, one half is filled for this block, while the words of the other half are added, whose pixels
+    # are fetched by now.
+    half = int(0)
+    waiting_events = int(0)
     first_block = part.block + wp.tid() * RUN
     for block in range(first_block, wp.min(first_block + RUN, part.stop)):
         window, first, n = start_block(grid, windows, block, x, y, t, faults)
@@ -391,16 +396,29 @@ def add_event_word_blocks(
             and t_last - t[first] < LONGEST
         ):
             store_interval_words(
-                grid, part, own, windows, window, group, first, x, y, t, p, places, waiting, at
+                grid,
+                part,
+                replaced,
+                windows,
+                window,
+                group,
+                first,
+                x,
+                y,
+                t,
+                p,
+                places,
+                waiting,
+                half,
             )
-            prefetch_words(words, places, at, BLOCK)
-            at = BLOCK - at
-            add_words(words, places, waiting, at, before)
-            before = BLOCK
+            prefetch_words(words, places, half, BLOCK)
+            half = BLOCK - half
+            add_words(words, places, waiting, half, waiting_events)
+            waiting_events = BLOCK
         else:
             for k in range(n):
-                add_event_word(grid, part, own, windows, window, first + k, x, y, t, p, words)
-    add_words(words, places, waiting, BLOCK - at, before)
+                add_event_word(grid, part, replaced, windows, window, first + k, x, y, t, p, words)
+    add_words(words, places, waiting, BLOCK - half, waiting_events)
 
 
 @wp.kernel
@@ -427,21 +445,14 @@ def share_event_blocks(
     window, first, n = start_block(grid, windows, part.block + wp.tid(), x, y, t, faults)
     copy_int64s(times, t, first, n)
     copy_bytes(signs, p, first, n)
-    own = own_group(grid, windows, t, part)
+    replaced = replaced_group_of(grid, windows, t, part)
     copy_positions(us, x, first, n)
     copy_positions(vs, y, first, n)
-    time_block(grid, part, own, windows, window, times, groups, ends)
+    time_block(grid, part, replaced, windows, window, times, groups, ends)
     position_block(grid, part, us, vs, signs, groups, ends, places, shares)
     add_squares(sums, places, shares, 2 * (grid.width + 2 * grid.border), n)
 
 
 for _coordinate in (wp.uint16, wp.float32):
-    for _kernel in (
-        count_events,
-        keep_latest,
-        share_events,
-        count_event_blocks,
-        keep_latest_blocks,
-        share_event_blocks,
-    ):
+    for _kernel in (count_event_blocks, keep_latest_blocks, share_event_blocks):
         wp.overload(_kernel, {"x": wp.array(dtype=_coordinate), "y": wp.array(dtype=_coordinate)})

@@ -11,10 +11,10 @@ from amiwarp.kernels.tensors import (
     WHOLE,
     Grid,
     Part,
+    add_event_word,
+    count_event,
     end_share,
     event_of,
-    group_at,
-    group_of,
     interval_of,
     is_near,
     is_pixel,
@@ -27,28 +27,6 @@ from amiwarp.kernels.tensors import (
 )
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-
-@wp.func
-def count_event(
-    grid: Grid,
-    part: Part,
-    own: int,
-    windows: wp.array2d(dtype=wp.int64),
-    window: int,
-    i: int,
-    x: wp.array(dtype=Any),
-    y: wp.array(dtype=Any),
-    t: wp.array(dtype=wp.int64),
-    p: wp.array(dtype=wp.uint8),
-    counts: wp.array(dtype=int),
-):
-    """Count an event at its nearest pixel. ``own``: group that the part's spare group replaces, or -1."""
-    col, row = nearest(x[i]), nearest(y[i])
-    if is_pixel(grid, col, row) == 1:
-        group = group_of(grid, windows, window, t[i])
-        used = wp.where(group == own, part.spare, group)
-        wp.atomic_add(counts, place_of(grid, used, p[i], col, row), 1)
 
 
 @wp.kernel
@@ -89,43 +67,6 @@ def keep_latest(
         col, row = nearest(x[i]), nearest(y[i])
         if is_pixel(grid, col, row) == 1:
             wp.atomic_max(latest, place_of(grid, window * grid.steps, p[i], col, row), t[i])
-
-
-@wp.func
-def word_of(grid: Grid, weight: int, end: int) -> wp.int64:
-    """Return the word of an event, by its sign and its share of the interval's end in units of 2**-30."""
-    drop = 94 - 2 * grid.low
-    share = (end + ((1 << drop) >> 1)) >> drop
-    word = (wp.int64(1) << wp.int64(grid.low)) + wp.int64(share)
-    return wp.where(weight < 0, -word, word)
-
-
-@wp.func
-def add_event_word(
-    grid: Grid,
-    part: Part,
-    own: int,
-    windows: wp.array2d(dtype=wp.int64),
-    window: int,
-    i: int,
-    x: wp.array(dtype=wp.uint16),
-    y: wp.array(dtype=wp.uint16),
-    t: wp.array(dtype=wp.int64),
-    p: wp.array(dtype=wp.uint8),
-    words: wp.array(dtype=wp.int64),
-):
-    """Add the word of an event. ``own``: group that the part's spare group replaces, or -1."""
-    col, row = int(x[i]), int(y[i])
-    if is_pixel(grid, col, row) == 1:
-        time = time_at(grid, windows[window, T_START], windows[window, SPAN], t[i])
-        group = group_at(grid, window, time)
-        used = wp.where(group == own, part.spare, group)
-        place = place_of(grid, used, p[i], col, row)
-        wp.atomic_add(
-            words,
-            place,
-            word_of(grid, weight_of(grid, p[i]), end_share(time, interval_of(grid, time))),
-        )
 
 
 @wp.kernel
@@ -189,3 +130,8 @@ def share_events(
             add_parts(sums, place + 2, weight, right * above, end)
             add_parts(sums, under, weight, left * below, end)
             add_parts(sums, under + 2, weight, right * below, end)
+
+
+for _coordinate in (wp.uint16, wp.float32):
+    for _kernel in (count_events, keep_latest, share_events):
+        wp.overload(_kernel, {"x": wp.array(dtype=_coordinate), "y": wp.array(dtype=_coordinate)})

@@ -3,6 +3,8 @@
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
+
+# Imported by name, so that the functions of the same names below become their overloads.
 from amiwarp.kernels.refraction import compensate_direction, deflect
 
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
@@ -19,32 +21,32 @@ class VibrationParams:
     phase_sin: float  # sine of the phase
     backward: wp.vec2  # rotation about x and y by the backward circle at φ = 0 [rad]
     roll: wp.vec2  # rotation about the optical axis: factors of cos φ and sin φ [rad]
-    # Rotation about x and y by the forward circle of the second harmonic at φ = 0 [rad]
+    # Rotations about x and y by the circles of the second and of the third harmonic at φ = 0 [rad]
     second: wp.vec2
-    second_backward: wp.vec2  # the same of its backward circle [rad]
-    # Rotation about x and y by the forward circle of the third harmonic at φ = 0 [rad]
+    second_backward: wp.vec2
     third: wp.vec2
-    third_backward: wp.vec2  # the same of its backward circle [rad]
+    third_backward: wp.vec2
 
 
 @wp.func
 def rotate_by_vector(x: float, y: float, z: float, a: float, b: float, c: float):
     """Rotate a direction about the axis (a, b, c) by its length [rad], by Rodrigues' formula.
 
-    sin(r)/r and (1 - cos r)/r² are computed by their series, with equal bits on every device.
+    sin(r)/r and (1 - cos r)/r² of the length r are computed by their series: accurate to 1e-7 up to 1 rad, with equal
+    bits on every device.
     """
     r2 = a * a + b * b + c * c
-    s = 1.0 / 120.0 + r2 * (-1.0 / 5040.0 + r2 * (1.0 / 362880.0 - r2 / 39916800.0))
-    v = 1.0 / 720.0 + r2 * (-1.0 / 40320.0 + r2 * (1.0 / 3628800.0 - r2 / 479001600.0))
-    s = 1.0 + r2 * (-1.0 / 6.0 + r2 * s)
-    v = 0.5 + r2 * (-1.0 / 24.0 + r2 * v)
-    p = b * z - c * y
-    q = c * x - a * z
-    r = a * y - b * x
+    sine = 1.0 / 120.0 + r2 * (-1.0 / 5040.0 + r2 * (1.0 / 362880.0 - r2 / 39916800.0))
+    versine = 1.0 / 720.0 + r2 * (-1.0 / 40320.0 + r2 * (1.0 / 3628800.0 - r2 / 479001600.0))
+    sine = 1.0 + r2 * (-1.0 / 6.0 + r2 * sine)  # sin(r) / r
+    versine = 0.5 + r2 * (-1.0 / 24.0 + r2 * versine)  # (1 - cos r) / r²
+    cross_x = b * z - c * y
+    cross_y = c * x - a * z
+    cross_z = a * y - b * x
     return (
-        x + s * p + v * (b * r - c * q),
-        y + s * q + v * (c * p - a * r),
-        z + s * r + v * (a * q - b * p),
+        x + sine * cross_x + versine * (b * cross_z - c * cross_y),
+        y + sine * cross_y + versine * (c * cross_x - a * cross_z),
+        z + sine * cross_z + versine * (a * cross_y - b * cross_x),
     )
 
 
@@ -70,8 +72,7 @@ def compensate_direction(
     model: VibrationParams, x: float, y: float, z: float, w0: float, w1: float
 ):
     """Return the direction that the camera at rest would observe."""
-    a, b, c = rotate_by_vibration(model, 1.0, x, y, z, w0, w1)
-    return a, b, c
+    return rotate_by_vibration(model, 1.0, x, y, z, w0, w1)
 
 
 @wp.func

@@ -15,9 +15,10 @@ import warp as wp
 
 from amiwarp.kernels.camera import CameraParams
 from amiwarp.kernels.camera_rotation import CameraRotationParams, undo_camera_rotation
+from amiwarp.kernels.events_with_angles import EventsWithAngles, stored_state
 from amiwarp.kernels.native_code import load_uint8, load_uint16
 from amiwarp.kernels.refraction import displace, state_of
-from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, stored_state
+from amiwarp.kernels.votes import Canvas, cell_at, dither_offset
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -93,7 +94,7 @@ def vote_at(canvas: Canvas, x: float, y: float, layer: int):
 
 
 @wp.func
-def event_state(model: Any, events: EventArrays, i: int):
+def event_state(model: Any, events: EventsWithAngles, i: int):
     """Return the optic's state at event ``i``."""
     a, b = stored_state(model, events, i)
     w0, w1 = state_of(model, a, b)
@@ -101,7 +102,7 @@ def event_state(model: Any, events: EventArrays, i: int):
 
 
 @wp.func
-def repeat_vote(events: EventArrays, i: int, word: wp.uint64) -> wp.uint64:
+def repeat_vote(events: EventsWithAngles, i: int, word: wp.uint64) -> wp.uint64:
     """Return the word of an event's vote times its ``weight``: at most 255, so that no field overflows."""
     if events.weight.shape[0] == 0:
         return word
@@ -109,7 +110,7 @@ def repeat_vote(events: EventArrays, i: int, word: wp.uint64) -> wp.uint64:
 
 
 @wp.func
-def event_vote(model: Any, camera: Any, events: EventArrays, canvas: Canvas, i: int):
+def event_vote(model: Any, camera: Any, events: EventsWithAngles, canvas: Canvas, i: int):
     """Compute prism angle, displacement and vote of one event."""
     w0, w1 = event_state(model, events, i)
     x, y = displace(
@@ -123,7 +124,7 @@ def event_vote(model: Any, camera: Any, events: EventArrays, canvas: Canvas, i: 
 
 @wp.kernel
 def vote_events(
-    model: Any, camera: Any, events: EventArrays, canvas: Canvas, start: int, cells: Cells
+    model: Any, camera: Any, events: EventsWithAngles, canvas: Canvas, start: int, cells: Cells
 ):
     """Vote one event per thread, with a check of every addition for overflow."""
     i = start + wp.tid()
@@ -135,7 +136,7 @@ def vote_events(
 def vote_rotating_camera(
     model: Any,
     camera: CameraParams,
-    events: EventArrays,
+    events: EventsWithAngles,
     canvas: Canvas,
     camera_rotation: CameraRotationParams,
     start: int,
@@ -158,7 +159,7 @@ def vote_rotating_camera(
 def vote_quickly(
     model: Any,
     camera: Any,
-    events: EventArrays,
+    events: EventsWithAngles,
     canvas: Canvas,
     trash: int,
     start: int,

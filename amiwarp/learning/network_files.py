@@ -65,7 +65,8 @@ class TorchFile:
                 "write it by torch.jit.script(network).save(path); weights alone are no network"
             )
             raise AmiwarpError(
-                f"{path}: not a TorchScript file: {str(error).partition('.')[0]}; {remedy}"
+                f"{path}: not a TorchScript file: {str(error).partition('.')[0]}; {remedy}",
+                ErrorCode.FORMAT_UNKNOWN,
             ) from error
         arguments = self._module.forward.schema.arguments[2:]  # without self and the input
         self.extra = len(arguments)
@@ -129,7 +130,8 @@ class OnnxFile:
         if len(self._outputs) <= self.extra:
             raise AmiwarpError(
                 f"{path}: has {self.extra} inputs after the first and {len(self._outputs) - 1} outputs after the first"
-                "; export the network with one output for each state"
+                "; export the network with one output for each state",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         self.dtype = self._type(self._inputs[0].type)
         self._check_sizes("states", self._inputs[1:])
@@ -153,7 +155,8 @@ class OnnxFile:
     def _type(self, name: str) -> Any:
         if name not in TYPES:
             raise AmiwarpError(
-                f"{self.path}: has a {name}; expected {', '.join(TYPES)}; export the network so"
+                f"{self.path}: has a {name}; expected {', '.join(TYPES)}; export the network so",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         return TYPES[name]
 

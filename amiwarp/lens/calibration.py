@@ -26,7 +26,7 @@ from amiwarp.calib.preparation import prepare
 from amiwarp.calib.settings import PhotometricSettings, Settings
 from amiwarp.calib.sharpness_search import Search
 from amiwarp.calib.start_burst import without_start_burst
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.lens.board import Board, Corners, opencv
 from amiwarp.lens.corner_fit import Fit, fit_lens
@@ -167,7 +167,7 @@ def calibrate_lens(
     for recording in given:
         instance(recording, Recording, "recording")
     if not given:
-        raise AmiwarpError("no recordings are given; give at least one")
+        raise AmiwarpError("no recordings are given; give at least one", ErrorCode.CONTENT_MISSING)
     sizes = {recording.events.size for recording in given}
     if len(sizes) > 1:
         raise AmiwarpError(

@@ -149,12 +149,13 @@ def run_lens(
     if live:
         if len(recordings) != 1:
             raise AmiwarpError(
-                f"--live takes one source, and {len(recordings)} are given; see 'amiwarp live --help'"
+                f"--live takes one source, and {len(recordings)} are given; see 'amiwarp live --help'",
+                ErrorCode.OPTIONS,
             )
-        poses, said = _watch(
+        poses, printed = _watch(
             str(recordings[0]), made, stream, prism, fov=fov, fisheye=fisheye, device=device
         )
-        messages["messages"] = said
+        messages["messages"] = printed
         with cli.progress("lens") as show:
             found = poses.calibrate(show)
     else:

@@ -115,7 +115,7 @@ class JointPrism:
 
         They are weighted alike in all poses, and their maps get little damping.
         """
-        costs = [each.cost for each in equations.values()]
+        costs = [equations_of_pose.cost for equations_of_pose in equations.values()]
         usual = float(np.median([cost.scale for cost in costs]))
         for cost in costs:
             cost.set_scale(usual)
@@ -171,9 +171,9 @@ class JointPrism:
         Poses whose events do not determine a fine map keep their coarse one.
         """
         equations = dict(self.equations)
-        for name, each in self.equations.items():
-            if each.cost.brightness.tiles.density == FINE:
-                finest = each.at_density(FINEST)
+        for name, coarse in self.equations.items():
+            if coarse.cost.brightness.tiles.density == FINE:
+                finest = coarse.at_density(FINEST)
                 finest.cost.brightness.set_damping(BOARD_DAMPING)
                 equations[name] = finest
         finer = replace(self, equations=equations)
@@ -211,8 +211,8 @@ class JointPrism:
             cost.replace_map(unknowns)
 
         # The parabola through the three costs of each pose.
-        low, at, high = np.array(rows)
-        bend = low - 2.0 * at + high
+        low, at_vector, high = np.array(rows)
+        bend = low - 2.0 * at_vector + high
         slope = high - low
         if not bend.sum() > 0.0:
             return middle, math.inf
@@ -253,8 +253,8 @@ class JointPrism:
         space = self._space(camera, names)
         costs = self._costs(space)
         vector = space.to_vector(self.values)
-        each = self._slopes(costs.values(), vector)
-        return replace(self, longer=longer, linear=Linearisation(space, each))
+        slopes_of_poses = self._slopes(costs.values(), vector)
+        return replace(self, longer=longer, linear=Linearisation(space, slopes_of_poses))
 
     def _probed_factor(self, camera: Camera) -> float:
         """Return the factor by which steps are to be lengthened, from some of the poses, for size and phase.
@@ -266,13 +266,13 @@ class JointPrism:
         poses = list(self.equations)[::PROBED]
         some = self._costs(space, poses).values()
         vector = space.to_vector(self.values)
-        at = _total(self._slopes(some, vector))
+        total = _total(self._slopes(some, vector))
         changes = []
         for unit in np.eye(2):
             moved = _total(self._slopes(some, vector + PROBE_PX * unit))
-            changes.append((moved.gradient - at.gradient) / PROBE_PX)
+            changes.append((moved.gradient - total.gradient) / PROBE_PX)
         hessian = np.stack(changes, axis=1)
-        by_hessian, *_ = np.linalg.lstsq(at.hessian, hessian, rcond=None)
+        by_hessian, *_ = np.linalg.lstsq(total.hessian, hessian, rcond=None)
         shares = np.linalg.eigvals(by_hessian).real
         share = np.clip(shares.mean(), 1.0 / LARGEST_GAIN, 1.0)
         return 1.0 / float(share)
@@ -292,9 +292,9 @@ class JointPrism:
         """
         assert self.linear is not None
         numbers = [self.linear.space.names.index(name) for name in names]
-        each = [slopes.restricted_to(numbers) for slopes in self.linear.each]
-        within_poses = _total(each)
-        gradients = np.stack([slopes.gradient for slopes in each], axis=1)
+        restricted = [slopes.restricted_to(numbers) for slopes in self.linear.each]
+        within_poses = _total(restricted)
+        gradients = np.stack([slopes.gradient for slopes in restricted], axis=1)
         between_poses = replace(within_poses, parts=gradients)
         scatter = within_poses.covariance() + between_poses.covariance()
         random = self.longer**2 * scatter
@@ -341,8 +341,8 @@ class JointPrism:
         for k in range(2, len(vector)):
             others = np.delete(by_prism, k, axis=1)
             explained, *_ = np.linalg.lstsq(others, by_prism[:, k], rcond=None)
-            own = by_prism[:, k] - others @ explained
-            by_shape[k] = SHAPE_ERROR / radius**3 / _radius_px(own)
+            unexplained = by_prism[:, k] - others @ explained
+            by_shape[k] = SHAPE_ERROR / radius**3 / _radius_px(unexplained)
         of_lens = follows @ follows.T
         of_size = np.outer(by_size, by_size)
         of_shape = np.diag(by_shape**2)
@@ -369,10 +369,10 @@ class JointPrism:
             camera = _with_other_lens(fit, step)
             models.append(replace(space, camera=camera).build(values))
 
-        at, *ends = displacements(models, xy)
+        at_point, *ends = displacements(models, xy)
         with_other_prism = np.stack(ends[:count], axis=1)
         with_other_lens = np.stack(ends[count:], axis=1)
-        by_prism = (with_other_prism - at[:, None]) / FOLLOW_PX
+        by_prism = (with_other_prism - at_point[:, None]) / FOLLOW_PX
         there, back = np.split(with_other_lens, 2, axis=1)
         by_lens = (there - back) / (2.0 * shares)
         seen = np.isfinite(by_prism).all(axis=1) & np.isfinite(by_lens).all(axis=1)
@@ -449,10 +449,10 @@ def _lengthened(gain: float, step: Vector, last: Vector) -> float:
     return 1.0 / (1.0 - min(max(left, 0.0), most_left))
 
 
-def _total(each: Sequence[Slopes]) -> Slopes:
+def _total(slopes_of_poses: Sequence[Slopes]) -> Slopes:
     """Return the derivatives of the cost of several poses together."""
     return Slopes(
-        np.sum([slopes.hessian for slopes in each], axis=0),
-        np.sum([slopes.gradient for slopes in each], axis=0),
-        np.concatenate([slopes.parts for slopes in each], axis=1),
+        np.sum([slopes.hessian for slopes in slopes_of_poses], axis=0),
+        np.sum([slopes.gradient for slopes in slopes_of_poses], axis=0),
+        np.concatenate([slopes.parts for slopes in slopes_of_poses], axis=1),
     )

@@ -110,24 +110,24 @@ def advice_on(poses: Sequence[BoardPose], fit: Fit) -> tuple[str, ...]:
     """Return what would improve a calibration most, one sentence each."""
     tilts = [tilt_of(np.concatenate([pose.rotation, pose.translation])) for pose in poses]
     seen = [pose.corners for pose in poses]
-    said = lacking(tilts, coverage_of(seen, fit.camera.width, fit.camera.height))
+    missing = lacking(tilts, coverage_of(seen, fit.camera.width, fit.camera.height))
     if len(poses) < GOOD_POSES:
-        said.append(
+        missing.append(
             f"record more poses: {len(poses)} were used, and {GOOD_POSES} halve the deviation of four"
         )
-    return tuple(said)
+    return tuple(missing)
 
 
 def lacking(tilts: Sequence[float], coverage: NDArray[np.int64]) -> list[str]:
     """Return what the poses lack in tilt [rad] and in coverage of the image, one sentence each."""
-    said = []
+    lines = []
     usual = float(np.median(tilts))
     if usual < STEEP:
-        said.append(
+        lines.append(
             f"tilt the board more: half of the poses are tilted by less than {math.degrees(usual):.0f} deg"
         )
     rows, columns = REGIONS
     empty = [f"{rows[a]} {columns[b]}" for a, b in np.argwhere(coverage == 0)]
     if empty:
-        said.append(f"no corner lies in the {', '.join(empty)} of the image: hold the board there")
-    return said
+        lines.append(f"no corner lies in the {', '.join(empty)} of the image: hold the board there")
+    return lines

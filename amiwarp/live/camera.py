@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.live.stream.camera_settings import CameraSettings
 from amiwarp.live.stream.cameras import CAMERAS
 from amiwarp.live.stream.packets import Packet
@@ -50,7 +50,19 @@ class CameraPackets:
         problem = getattr(self._source, "problem", None)
         if problem is None:
             raise StopIteration
-        raise AmiwarpError(f"{self._source.name}: the stream broke off: {problem}")
+        raise AmiwarpError(
+            f"{self._source.name}: the stream broke off: {problem}; open the camera again, or give wait_for_source_s",
+            ErrorCode.UNREACHABLE,
+        )
+
+    @property
+    def lost(self) -> int | None:
+        """Number of USB packets that were lost so far, because this computer was too slow.
+
+        None if the camera's library does not tell, as the libraries behind ``dv`` and ``prophesee``.
+        """
+        lost: int | None = self._source.lost
+        return lost
 
 
 @contextlib.contextmanager
@@ -97,7 +109,7 @@ def open_camera(
     kind, colon, _ = name.partition(":")
     if kind not in CAMERAS:
         raise AmiwarpError(
-            f"name is {name!r}; give a camera: {', '.join(f'{each}:' for each in CAMERAS)}"
+            f"name is {name!r}; give a camera: {', '.join(f'{prefix}:' for prefix in CAMERAS)}"
         )
     wait_s = real(wait_for_source_s, "wait_for_source_s", 0.0, 1e9, " s")
     text = "" if settings is None else str(settings)

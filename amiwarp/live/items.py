@@ -48,7 +48,8 @@ def open_rig(
     wait_s = real(wait_for_source_s, "wait_for_source_s", 0.0, 1e9, " s")
     if counts_per_turn is not None and port is None:
         raise AmiwarpError(
-            "counts_per_turn is given without port; give the controller's port, or leave it out"
+            "counts_per_turn is given without port; give the controller's port, or leave it out",
+            ErrorCode.OPTIONS,
         )
     link = None
     if port is not None:
@@ -122,7 +123,8 @@ class LiveItems(BackgroundLoop, Generic[Item]):
             if problem is not None:
                 raise AmiwarpError(
                     f"{self._source.name}: the stream broke off: {problem}; the iterator gave the {status.events:,} "
-                    "events received until then"
+                    "events received until then",
+                    ErrorCode.UNREACHABLE,
                 )
         finally:
             self.put(None)

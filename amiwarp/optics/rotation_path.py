@@ -125,7 +125,7 @@ class RotationPath:
         for step in Rotation.from_rotvec(turned):
             orientation = orientation * step
             orientations.append(orientation)
-        return cls(first, np.stack([each.as_quat() for each in orientations]))
+        return cls(first, np.stack([rotation.as_quat() for rotation in orientations]))
 
     @property
     def stop_us(self) -> int:

@@ -154,7 +154,7 @@ def cause_colours(codes: NDArray[Any]) -> NDArray[np.float64]:
     """Return the colours (0 to 1) of the codes of causes, shape ``(n, 3)``; unknown causes are grey."""
     from matplotlib.colors import to_rgb
 
-    table = np.array([to_rgb(each) for each in (*CAUSE_COLOURS, GREY)])
+    table = np.array([to_rgb(colour) for colour in (*CAUSE_COLOURS, GREY)])
     return np.asarray(table[np.minimum(codes, len(CAUSE_COLOURS))])
 
 

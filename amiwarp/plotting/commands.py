@@ -144,11 +144,12 @@ def run_render(
     cli.report(common, data, [_line(data), *cli.assumption_lines(data["assumptions"])])
 
 
-def _line(d: dict[str, Any]) -> str:
-    pace = "" if d["speed"] is None else f" at {d['speed']:.4g} of real time"
-    film = f"{d['frames']:,} frames of {d['width']} x {d['height']} px, {d['frames'] / d['fps']:.4g} s{pace}"
-    rate = d["events"] / max(d["seconds"], 1e-9) / 1e6
-    work = (
-        f"{d['frames'] / max(d['seconds'], 1e-9):.3g} frames/s, {rate:.3g} Mev/s on {d['device']}"
+def _line(data: dict[str, Any]) -> str:
+    pace = "" if data["speed"] is None else f" at {data['speed']:.4g} of real time"
+    film = (
+        f"{data['frames']:,} frames of {data['width']} x {data['height']} px, "
+        f"{data['frames'] / data['fps']:.4g} s{pace}"
     )
-    return f"{d['file']}: {film}; {d['events']:,} events in {d['seconds']:.2f} s, {work}"
+    rate = data["events"] / max(data["seconds"], 1e-9) / 1e6
+    work = f"{data['frames'] / max(data['seconds'], 1e-9):.3g} frames/s, {rate:.3g} Mev/s on {data['device']}"
+    return f"{data['file']}: {film}; {data['events']:,} events in {data['seconds']:.2f} s, {work}"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.thinning import thin
 from amiwarp.choices import Tone
-from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.in_memory import compensate_events
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import PictureQuality
 from amiwarp.imaging.regions import best_box
@@ -176,11 +176,11 @@ class Grid:
 
 def enlarge(figure: Any, cost: Any) -> None:
     """Enlarge the text so that it stays legible when the figure is shown at half its size."""
-    for each in figure.axes:
-        each.title.set_fontsize(TITLE)
-        each.tick_params(labelsize=TITLE - 2.0)
-        each.xaxis.label.set_fontsize(TITLE - 2.0)
-        each.yaxis.label.set_fontsize(TITLE - 2.0)
+    for ax in figure.axes:
+        ax.title.set_fontsize(TITLE)
+        ax.tick_params(labelsize=TITLE - 2.0)
+        ax.xaxis.label.set_fontsize(TITLE - 2.0)
+        ax.yaxis.label.set_fontsize(TITLE - 2.0)
     for text in cost.get_legend().get_texts():
         text.set_fontsize(TITLE - 3.0)
 

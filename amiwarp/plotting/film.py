@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.choices import FilmMode
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Recording
 from amiwarp.io.spans import blocks_between
 from amiwarp.plotting.film_frames import MOST_EVENTS, Timing, frames_of_count, frames_of_time
@@ -148,7 +148,8 @@ def render(
     fps = real(fps, "fps", 0.1, 1000.0, " frames/s")
     if not len(source):
         raise AmiwarpError(
-            f"{recording.name}: holds no events to show; give a recording with events"
+            f"{recording.name}: holds no events to show; give a recording with events",
+            ErrorCode.CONTENT_MISSING,
         )
     start = source.t_first
     stop = source.t_last + 1
@@ -159,7 +160,8 @@ def render(
     if not start < stop:
         raise AmiwarpError(
             f"{recording.name}: has no events in the window; they span 0 .. "
-            f"{(source.t_last - source.t_first) * 1e-6:g} s from the first"
+            f"{(source.t_last - source.t_first) * 1e-6:g} s from the first",
+            ErrorCode.CONTENT_MISSING,
         )
     width, height = source.size
     if scale is None:
@@ -225,15 +227,18 @@ def _check_options(
     """Raise :class:`AmiwarpError` for options that contradict one another."""
     if events is not None and not (speed is None and frame_us is None):
         raise AmiwarpError(
-            "--events and --speed or --frame-ms both choose the events of a frame; give one of them"
+            "--events and --speed or --frame-ms both choose the events of a frame; give one of them",
+            ErrorCode.OPTIONS,
         )
     if mode is FilmMode.SURFACE and not (events is None and frame_us is None):
         raise AmiwarpError(
-            "--events and --frame-ms apply to counts; for a time surface give --decay-ms"
+            "--events and --frame-ms apply to counts; for a time surface give --decay-ms",
+            ErrorCode.OPTIONS,
         )
     if mode is FilmMode.COUNTS and decay_us is not None:
         raise AmiwarpError(
-            "--decay-ms applies to a time surface; give --mode surface too, or leave it out"
+            "--decay-ms applies to a time surface; give --mode surface too, or leave it out",
+            ErrorCode.OPTIONS,
         )
 
 

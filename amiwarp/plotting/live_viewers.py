@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.compensation.streams import Compensated
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events
 from amiwarp.plotting.foxglove_messages import foxglove_messages, foxglove_module, foxglove_topics
 from amiwarp.plotting.frames import (
@@ -96,8 +96,8 @@ class LiveViewer(BackgroundLoop):
 
     def close(self) -> None:
         """Send the waiting frames and those that are not complete, and end the thread."""
-        for name, (at, held) in self._held.items():
-            self._put(name, at, Events.concatenate(held))
+        for name, (start_us, held) in self._held.items():
+            self._put(name, start_us, Events.concatenate(held))
         self._held = {}
         super().close()
 
@@ -108,15 +108,15 @@ class LiveViewer(BackgroundLoop):
         for start, stop in itertools.pairwise(edges):
             if start == stop:
                 continue
-            at, held = self._held.get(name, (int(window[start]), []))
-            if at != window[start] or sum(map(len, held)) > MOST_EVENTS:
-                self._put(name, at, Events.concatenate(held))
-                at = int(window[start])
+            start_us, held = self._held.get(name, (int(window[start]), []))
+            if start_us != window[start] or sum(map(len, held)) > MOST_EVENTS:
+                self._put(name, start_us, Events.concatenate(held))
+                start_us = int(window[start])
                 held = []
             held.append(events[start:stop])
-            self._held[name] = at, held
+            self._held[name] = start_us, held
 
-    def _put(self, name: str, at: int, events: Events) -> None:
+    def _put(self, name: str, start_us: int, events: Events) -> None:
         """Pass the events of a window to the thread, or drop them."""
         angles = {}
         if name == RECORDED:  # the thread that adds these events adds the encoder samples too
@@ -125,7 +125,7 @@ class LiveViewer(BackgroundLoop):
             for one, parts in held.items():
                 t, angle = zip(*parts, strict=True)
                 angles[one] = np.concatenate(t), np.concatenate(angle)
-        window = Window(at * self._frame_us, self._frame_us, {}, angles)
+        window = Window(start_us * self._frame_us, self._frame_us, {}, angles)
         try:
             self._jobs.put_nowait((window, {name: events}))
         except queue.Full:
@@ -169,7 +169,8 @@ def foxglove_server(address: str, size: tuple[int, int]) -> LiveViewer:
         )
     except Exception as error:
         raise AmiwarpError(
-            f"--foxglove {address}: cannot listen there: {error}; choose another address"
+            f"--foxglove {address}: cannot listen there: {error}; choose another address",
+            ErrorCode.UNREACHABLE,
         ) from error
     channels = {
         topic: foxglove.Channel(topic, schema=schema, message_encoding=kind, context=context)

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.choices import Axis, Vote
-from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.in_memory import compensate_events
 from amiwarp.compensation.recordings import check_size
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.regions import inside
@@ -138,7 +138,8 @@ def event_clouds(
     chosen = np.flatnonzero(inside(events, (left, top, right, bottom)))
     if not len(chosen):
         raise AmiwarpError(
-            f"{recording.name}: no events in the window and the region; take another window"
+            f"{recording.name}: no events in the window and the region; take another window",
+            ErrorCode.CONTENT_MISSING,
         )
 
     t_us = events.t - source.t_first

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError, optional_module
+from amiwarp.errors import AmiwarpError, ErrorCode, optional_module
 from amiwarp.io.output_formats import Outline
 from amiwarp.plotting.frames import Window, degrees_in_turn, points
 
@@ -19,9 +19,11 @@ TIMELINE = "sensor_time"
 
 def rerun_module() -> Any:
     """Import Rerun. Raises :class:`AmiwarpError` if it is missing."""
-    for name in ("rerun.chunk", "rerun"):
-        module = optional_module(name, "rerun", "Rerun needs its library")
-    return module
+    reason = "Rerun needs its library"
+    optional_module(
+        "rerun.chunk", "rerun", reason
+    )  # is not imported with rerun; older versions lack it
+    return optional_module("rerun", "rerun", reason)
 
 
 def rerun_chunks(window: Window) -> Iterator[Any]:
@@ -29,8 +31,8 @@ def rerun_chunks(window: Window) -> Iterator[Any]:
     rerun = rerun_module()
 
     def chunk(entity: str, t: Any, columns: Any) -> Any:
-        time = rerun.TimeColumn(TIMELINE, duration=np.asarray(t, "timedelta64[us]"))
-        return rerun.chunk.Chunk.from_columns(entity, [time], columns)
+        times = rerun.TimeColumn(TIMELINE, duration=np.asarray(t, "timedelta64[us]"))
+        return rerun.chunk.Chunk.from_columns(entity, [times], columns)
 
     for name, frame in window.frames.items():
         image = rerun.EncodedImage.columns(blob=[frame.png], media_type=["image/png"])
@@ -64,4 +66,7 @@ def write_rerun(part: Path, content: Iterable[Window], about: Outline) -> None:
     except RuntimeError as error:
         if failed:
             raise failed[0] from error
-        raise AmiwarpError(f"Rerun cannot write it: {error}; choose another place") from error
+        raise AmiwarpError(
+            f"{about.path}: Rerun cannot write it: {error}; choose a place with room that you may write to",
+            ErrorCode.OUTPUT_FAILED,
+        ) from error

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from amiwarp.compensation.blocks import BlockCompensator
+from amiwarp.compensation.in_memory import BlockCompensator
 from amiwarp.compensation.recordings import check_size
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Recording
 from amiwarp.io.export import check_limits
 from amiwarp.io.inputs import errors_name
@@ -86,7 +86,8 @@ def save_for_viewer(
     compensate = None
     if not len(source):
         raise AmiwarpError(
-            f"{recording.name}: holds no events to show; give a recording with events"
+            f"{recording.name}: holds no events to show; give a recording with events",
+            ErrorCode.CONTENT_MISSING,
         )
     ends = source.t_first, source.t_last
     if calibration is not None:

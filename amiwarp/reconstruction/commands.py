@@ -212,7 +212,8 @@ def run_reconstruct(
 
     if given is None:
         raise AmiwarpError(
-            f"{out}: --calibration is missing; give a calibration file, or a network by --network"
+            f"{out}: --calibration is missing; give a calibration file, or a network by --network",
+            ErrorCode.OPTIONS,
         )
     opened = open_recording(recording, **layout.given())
     why = ""
@@ -411,7 +412,8 @@ def _by_network(
         )
     if own and calibration is None:
         raise AmiwarpError(
-            f"{out}: --calibration is missing; amiwarp's own network takes compensated events"
+            f"{out}: --calibration is missing; amiwarp's own network takes compensated events",
+            ErrorCode.OPTIONS,
         )
     network = _network(by.network, by, device)
     optic: dict[str, Any] = {}

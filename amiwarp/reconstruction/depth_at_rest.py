@@ -107,11 +107,14 @@ def depth(
     if known.sum() < max(1.0, LEAST_KNOWN * seen.sum()):
         raise AmiwarpError(
             f"{name}: the events determine no depth: too little texture, or everything is beyond "
-            f"{orbit_limit_m(model):.2g} m; record a nearer scene with more texture, or a longer time"
+            f"{orbit_limit_m(model):.2g} m; record a nearer scene with more texture, or a longer time",
+            ErrorCode.CONTENT_MISSING,
         )
     inverse = np.where(known, found.inverse_depth, np.float32(np.nan))
-    std = np.where(known, std, np.nan).astype(np.float32)
-    return DepthMap(inverse, std, _points(model, inverse))
+    points = _points(model, inverse)
+    inverse[np.isnan(points).any(axis=2)] = np.nan  # no ray of the lens reaches these
+    std = np.where(np.isnan(inverse), np.nan, std).astype(np.float32)
+    return DepthMap(inverse, std, points)
 
 
 def orbit_limit_m(model: PlateModel) -> float:

@@ -59,7 +59,9 @@ def save_film(
             container.mux(stream.encode(frame))
             count += 1
         if stream is None:
-            raise AmiwarpError(f"{path}: no picture to write; give at least one frame")
+            raise AmiwarpError(
+                f"{path}: no picture to write; give at least one frame", ErrorCode.CONTENT_MISSING
+            )
         container.mux(stream.encode())
     return count
 

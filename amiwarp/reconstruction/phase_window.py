@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.compensation.recordings import check_size
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.device_events import device_of, read_between
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_speed import turn_between
@@ -116,7 +116,10 @@ class PhaseReconstruction:
         self, recording: Recording, calibration: Calibration, *, device: Any = None
     ) -> None:
         if not len(recording.events):
-            raise AmiwarpError(f"{recording.name}: has no events; give a recording with events")
+            raise AmiwarpError(
+                f"{recording.name}: has no events; give a recording with events",
+                ErrorCode.CONTENT_MISSING,
+            )
         check_size(calibration, recording.events.size, recording.name)
         rotation = calibration.camera_rotation
         if rotation is not None and rotation.moves:
@@ -130,7 +133,9 @@ class PhaseReconstruction:
         last_us = recording.events.t_last
         encoder = calibration.encoder_for(recording.encoder, first_us, last_us)
         if encoder is None:
-            raise AmiwarpError(f"{recording.name}: give a recording with an encoder")
+            raise AmiwarpError(
+                f"{recording.name}: give a recording with an encoder", ErrorCode.CONTENT_MISSING
+            )
         self._period = MotionPeriod.of(self.model, encoder, first_us, last_us)
         self.encoder = self._period.encoder
         """Encoder of the sums' angle: of two angles, of the motion's period, which may take some turns."""
@@ -208,7 +213,10 @@ class PhaseReconstruction:
     def _no_events(self, start_us: int, stop_us: int) -> AmiwarpError:
         """Return the error for a window without events."""
         where = f"{start_us} .. {stop_us} us"
-        return AmiwarpError(f"{self.recording.name}: no events in {where}; give another window")
+        return AmiwarpError(
+            f"{self.recording.name}: no events in {where}; give another window",
+            ErrorCode.CONTENT_MISSING,
+        )
 
     def window(self, start_us: int, length_us: int) -> Picture:
         """Make the picture of the whole turns of a window.

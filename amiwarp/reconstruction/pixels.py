@@ -23,7 +23,7 @@ from amiwarp.brightness.solver import BrightnessMap
 from amiwarp.brightness.tiles import Tiles
 from amiwarp.calib.bad_pixels import LEAST_TURNS
 from amiwarp.calib.hot_pixels import BINS, bin_times, outliers, unrepeated_counts
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.device_events import read_between
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
@@ -230,7 +230,8 @@ class _PixelPicture:
         self.pairs: PairSet = work._pairs(table, start, length, timing)
         if not self.pairs.of_two_events:
             raise AmiwarpError(
-                f"{work.recording.name}: no pixel fires twice; give a recording of more turns"
+                f"{work.recording.name}: no pixel fires twice; give a recording of more turns",
+                ErrorCode.CONTENT_MISSING,
             )
         self.off = off_excess_by_counts(work.recording.events, work.turn_us, start, length)
         left, top, tiles = work._tile(start, length)
@@ -409,7 +410,8 @@ def _pixel_map(
     if not known.any():
         raise AmiwarpError(
             f"{work.recording.name}: no pixel has {LEAST_PAIRS} pairs of events of a polarity; give a longer "
-            "recording, or a scene with more texture"
+            "recording, or a scene with more texture",
+            ErrorCode.CONTENT_MISSING,
         )
     # In every turn the pairs of a pixel meet the same errors of the picture: only those within a turn are independent.
     std = np.sqrt(sums.square * max(1.0, sums.turns)) / np.maximum(sums.weight, 1e-9)

@@ -38,7 +38,7 @@ from amiwarp.reconstruction.smoothness import (
     CHOICE_STEPS,
     SMOOTHNESS,
     choice_square,
-    start_lowest_weight,
+    start_weight_choice,
 )
 from amiwarp.reconstruction.windows import map_tile, window_count, window_span
 from amiwarp.results.calibration import Calibration
@@ -160,7 +160,10 @@ class Reconstruction:
             encoder = calibration.encoder_for(recording.encoder, first, last)
         encoder = encoder or recording.encoder
         if model is None or encoder is None:
-            raise AmiwarpError(f"{recording.name}: give a calibration, or a model and an encoder")
+            raise AmiwarpError(
+                f"{recording.name}: give a calibration, or a model and an encoder",
+                ErrorCode.CONTENT_MISSING,
+            )
         check_size(model, recording.events.size, recording.name, what="model")
         check_prisms(encoder, model.ANGLES)
         self.recording = recording
@@ -235,7 +238,8 @@ class Reconstruction:
         if not pair_count:
             where = f"{start_us} .. {start_us + length_us} us"
             raise AmiwarpError(
-                f"{recording.name}: no pixel fires twice in {where}; give a longer window"
+                f"{recording.name}: no pixel fires twice in {where}; give a longer window",
+                ErrorCode.CONTENT_MISSING,
             )
         off = off_excess_by_counts(recording.events, self.turn_us, start_us, length_us)
         left, top, tiles = self._tile(start_us, length_us)
@@ -329,7 +333,10 @@ class Reconstruction:
         events = read_between(self.recording.events, start_us, start_us + length_us)
         if not len(events):
             where = f"{start_us} .. {start_us + length_us} us"
-            raise AmiwarpError(f"{self.recording.name}: no events in {where}; give another window")
+            raise AmiwarpError(
+                f"{self.recording.name}: no events in {where}; give another window",
+                ErrorCode.CONTENT_MISSING,
+            )
         width, height = self.recording.events.size
         table = EventTable([events], np.zeros((height, width), np.int32), self.device)
         return table, table.exclude_hot_pixels()
@@ -414,7 +421,7 @@ class Reconstruction:
             solver.solve(*SCALES[:2], steps=CHOICE_STEPS)
             return solver.residuals.start_mean_cost(SCALES[0], held=True)
 
-        return start_lowest_weight(start_cost)
+        return start_weight_choice(start_cost)
 
     def _tile(self, start_us: int, length_us: int) -> tuple[int, int, Tiles]:
         """Return the map's margin left of and above the image (columns, rows), and the map of a window."""

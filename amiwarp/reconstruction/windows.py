@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.brightness.tiles import Tiles
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import EventSource, Recording
 from amiwarp.optics.camera import border
 from amiwarp.optics.camera_rotation import CameraRotation
@@ -51,7 +51,9 @@ def window_span(
     last = recording.events.t_last
     if turns is not None:
         if length_us is not None:
-            raise AmiwarpError("turns and length_us are both given; give one of them")
+            raise AmiwarpError(
+                "turns and length_us are both given; give one of them", ErrorCode.OPTIONS
+            )
         if turn_us is None:
             raise AmiwarpError("turns is given, but the prism does not turn; give a length")
         length_us = round(turns * turn_us)
@@ -60,7 +62,8 @@ def window_span(
     if length < 1 or start > last or start + length <= first:
         where = f"{start} .. {start + length} us"
         raise AmiwarpError(
-            f"{recording.name}: no events in {where}; give a window that overlaps {first} .. {last} us"
+            f"{recording.name}: no events in {where}; give a window that overlaps {first} .. {last} us",
+            ErrorCode.CONTENT_MISSING,
         )
     return start, length
 

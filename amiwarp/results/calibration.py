@@ -83,7 +83,7 @@ class StageSummary:
         """
         scores = stage.scores.tolist()
         values = list(values)
-        complete = all(isinstance(each, Mapping) and each.keys() >= {*names} for each in values)
+        complete = all(isinstance(row, Mapping) and row.keys() >= {*names} for row in values)
         if len(values) != len(scores) or not complete:
             raise AmiwarpError(
                 f"values are {shown(values)}; give {', '.join(names)} at each of {len(scores)} points"
@@ -548,7 +548,7 @@ class Calibration:
         prism = prism_from_json(data["prism"], "prism") if MODELS[model].PRISM else Prism(0.0)
         sharpness = build(_Sharpness, data["sharpness"], "sharpness")
         path = None if data.get("path") is None else build(_Path, data["path"], "path")
-        names = [f.name for f in fields(_PlainFields)]
+        names = [field.name for field in fields(_PlainFields)]
         rest = build(_PlainFields, {name: data[name] for name in names if name in data}, "")
         result = cls(
             model_name=model,
@@ -595,11 +595,11 @@ def replaces(path: Encoder, encoder: Encoder) -> bool:
 def _replaces_one(path: Encoder, encoder: Encoder) -> bool:
     """Return whether the path of one angle was found for the samples of its encoder, or for a part of them."""
     first, last = np.searchsorted(encoder.t, [path.t[0], path.t[-1] + 1])
-    own = slice(int(first), int(last))
-    if last - first < 2 or not np.isin(encoder.t[own], path.t).all():
+    own_turns = slice(int(first), int(last))
+    if last - first < 2 or not np.isin(encoder.t[own_turns], path.t).all():
         return False
-    at = np.searchsorted(path.t, encoder.t[own])
-    return bool((np.abs(path.angle[at] - encoder.angle[own]) < math.pi).all())
+    sample = np.searchsorted(path.t, encoder.t[own_turns])
+    return bool((np.abs(path.angle[sample] - encoder.angle[own_turns]) < math.pi).all())
 
 
 def prism_to_json(prism: Prism | Plate) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.array_maps import ArrayMap
 from amiwarp.io.output_formats import check_ending
 from amiwarp.io.outputs import NewFile
@@ -66,7 +66,8 @@ class DepthMap(ArrayMap):
     std: NDArray[np.float32]
     """Standard deviation of :attr:`inverse_depth` [1/m], shape (height, width); NaN where it is unknown."""
     points: NDArray[np.float32]
-    """Point in the camera's frame that each pixel sees [m], shape (height, width, 3); NaN where it is unknown."""
+    """Point in the camera's frame that each pixel sees [m], shape (height, width, 3); NaN where it is unknown
+    or infinitely far."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.inverse_depth)
@@ -87,6 +88,11 @@ class DepthMap(ArrayMap):
         if np.isnan(self.std[self.known]).any():
             raise AmiwarpError(
                 "depth map's std is NaN at a pixel whose depth is known; make both NaN, or none"
+            )
+        # A point at infinity, whose inverse depth is 0, has no finite coordinates.
+        if np.isnan(self.points[self.inverse_depth > 0.0]).any():
+            raise AmiwarpError(
+                "depth map's points are NaN at a pixel whose depth is known; make both NaN, or none"
             )
 
     def __repr__(self) -> str:
@@ -118,7 +124,10 @@ class DepthMap(ArrayMap):
 
         known = self.known
         if not known.any():
-            raise AmiwarpError("the depth map knows no depth; record a scene with more texture")
+            raise AmiwarpError(
+                "the depth map knows no depth; record a scene with more texture",
+                ErrorCode.CONTENT_MISSING,
+            )
         # Where no known depth is near enough for the mean, the nearest one stays.
         nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
         of_nearest = self.inverse_depth[tuple(nearest)]
@@ -153,7 +162,8 @@ class DepthMap(ArrayMap):
         check_ending(path, "points are written", [".ply"])
         if not self.known.any():
             raise AmiwarpError(
-                "the depth map knows no depth, so there are no points; record a scene with more texture"
+                "the depth map knows no depth, so there are no points; record a scene with more texture",
+                ErrorCode.CONTENT_MISSING,
             )
         values = self.inverse_depth[self.known]
         low, high = np.percentile(values, [2, 98])

@@ -208,7 +208,7 @@ def _ordered_names(model_class: type[Model], free: tuple[str, ...]) -> tuple[str
         raise AmiwarpError("no parameter is free; name at least one free parameter")
     foreign = sorted(wanted - set(_names_of(model_class)))
     if foreign:
-        other = next(each.NAME for each in MODELS.values() if foreign[0] in each.FREE)
+        other = next(model.NAME for model in MODELS.values() if foreign[0] in model.FREE)
         raise AmiwarpError(f"the {model_class.NAME} model has no {foreign[0]}; use model {other!r}")
     if set(DRIFTS) <= wanted:
         raise AmiwarpError(
@@ -241,7 +241,8 @@ def _check_given(
     for name in bounds:
         if name not in names:
             raise AmiwarpError(
-                f"bounds are given for {name}, which is not free; add {name} to the free parameters"
+                f"bounds are given for {name}, which is not free; add {name} to the free parameters",
+                ErrorCode.OPTIONS,
             )
 
 

@@ -39,8 +39,10 @@ class _LaterNames(dict[str, Any]):
         if name == "ArrayLike":
             return True
         # debuggers look for names such as __tracebackhide__ among the names of any code
-        own = str(name).startswith("__") or name in self._module or hasattr(builtins, str(name))
-        return not own
+        is_known = (
+            str(name).startswith("__") or name in self._module or hasattr(builtins, str(name))
+        )
+        return not is_known
 
     def __missing__(self, name: str) -> Any:
         if name not in self:

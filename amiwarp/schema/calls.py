@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.schema.annotations import annotated_type, leaves, parts_of
 from amiwarp.schema.kinds import TEXT, expectation, fits_array, no_device
 from amiwarp.validation import INT64, TIME_HINT, as_words, real, shown, whole
@@ -211,9 +211,11 @@ class _Parameter:
         else:
             expected = rule.expected(value)
         if expected:
+            is_absent = rule.is_device and isinstance(value, str)
             raise AmiwarpError(
                 f"{self._label}: {self._name} is {shown(value)}; expected {expected}"
-                f"{_remedies(value, expected)}"
+                f"{_remedies(value, expected)}",
+                ErrorCode.DEVICE_MISSING if is_absent else None,
             )
         is_own = type(value).__module__.startswith("amiwarp.")
         is_device = rule.is_device and not isinstance(value, str)

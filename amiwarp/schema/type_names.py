@@ -26,8 +26,9 @@ def not_called(instead: str) -> Callable[[Target], Target]:
                 )
             super(base, self).__init__(*args, **options)
 
-        init.__signature__ = inspect.signature(lambda self: None)  # type: ignore[attr-defined]  # as it was
-        type.__setattr__(base, "__init__", init)
+        # help() shows a call without arguments, as before.
+        init.__signature__ = inspect.signature(lambda self: None)  # type: ignore[attr-defined]
+        base.__init__ = init
         return target
 
     return decorate
@@ -43,20 +44,25 @@ class NamedType:
         self.__name__ = name
         self.__value__ = value
 
+        # Python checks no parameters: of ``Callable[[str], None]`` it checks only that a value can be called.
+        is_function = typing.get_origin(value) is Callable
+        self._checked: Any = Callable if is_function else value
+
     def __call__(self, *_: object, **__: object) -> NoReturn:
         parts = typing.get_args(self.__value__)
-        if isinstance(parts[0], list):  # the types of a function's arguments
-            instead = f"give a function of ({', '.join(part.__name__ for part in parts[0])})"
+        if self._checked is Callable:
+            takes = ", ".join(part.__name__ for part in parts[0])
+            instead = f"give a function of ({takes})"
         else:
             *others, last = [part.__name__ for part in parts]
             instead = f"use {', '.join(others)} or {last}"
         raise AmiwarpError(f"{self.__name__} is a type for annotations; {instead}")
 
     def __instancecheck__(self, value: object) -> bool:
-        return isinstance(value, self.__value__)
+        return isinstance(value, self._checked)
 
     def __subclasscheck__(self, kind: type) -> bool:
-        return issubclass(kind, self.__value__)
+        return issubclass(kind, self._checked)
 
     def __or__(self, other: Any) -> Any:
         return self.__value__ | other

@@ -17,7 +17,6 @@ from amiwarp.kernels import (
     photoreceptors,
     pixels,
     prism_view,
-    readout,
     world_pixels,
 )
 from amiwarp.optics.models.angles import wrap_angle
@@ -330,7 +329,7 @@ class Engine:
 
     def _sort(self, keys: wp.array, total: int, limit: int, top: int) -> int:
         """Sort the first ``total`` keys by their lowest ``top`` bits; return the number of keys below ``limit``."""
-        lowest = readout.LAG_BIT if self._readout.scans_rows else pixels.LOW_BITS
+        lowest = pixels.LAG_BIT if self._readout.scans_rows else pixels.LOW_BITS
         sort_keys(keys, total, int(lowest), top)
         if self._device.is_cpu:
             return int(np.searchsorted(keys.numpy()[:total], limit))

@@ -297,7 +297,7 @@ class EventSensor:
         if not total:  # Warp cannot slice an empty array
             return self._nothing, np.zeros(n + 1, np.int64)
         if int(self._scan.row_ps):
-            self._scan.origin = self._now_us - self._first_us
+            self._scan.since_scan_us = self._now_us - self._first_us
             self._scan.shift = self._layout.shift
             self._launch(readout.stamp_rows, total - len(self._carry), [self._scan, keys])
         self._launch(camera_keys.sort_by_camera, total, [self._layout, self._cameras.starts, keys])

@@ -59,15 +59,19 @@ def _open_folder(folder: Path, fps: float | None) -> PictureFolder:
     if table.exists() and fps is None:
         files, times = _read_times(table)
     else:
-        pictures = [f for f in folder.iterdir() if f.suffix.lower() in PICTURE_SUFFIXES]
+        pictures = [file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES]
         files = sorted(pictures, key=_natural)
         if fps is None:
             raise AmiwarpError(
-                f"{folder} has no times.csv (columns file, t_us); add this file, or give the pictures per second as fps"
+                f"{folder} has no times.csv (columns file, t_us); "
+                "add this file, or give the pictures per second as fps",
+                ErrorCode.CONTENT_MISSING,
             )
         times = np.rint(np.arange(len(files)) * (1e6 / fps)).astype(np.int64)
     if len(files) < 2:
-        raise AmiwarpError(f"{folder} contains {len(files)} pictures; give at least 2")
+        raise AmiwarpError(
+            f"{folder} contains {len(files)} pictures; give at least 2", ErrorCode.CONTENT_MISSING
+        )
     height, width = read_picture(files[0]).shape
     start_us = None if fps is not None else int(times[0])
     with errors_name(table, lambda: "times"):
@@ -101,17 +105,22 @@ def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
             name = row.get("file")
             t = row.get("t_us")
             if not name or t is None:
-                raise AmiwarpError(f"line {rows.line_num} has no {'t_us' if name else 'file'}")
+                raise AmiwarpError(
+                    f"line {rows.line_num} has no {'t_us' if name else 'file'}",
+                    ErrorCode.FILE_DAMAGED,
+                )
             try:
                 files.append(table.parent / name)
                 times.append(round(float(t)))
             except (ValueError, OverflowError) as error:
                 raise AmiwarpError(
-                    f"line {rows.line_num}: t_us is {shown(t)}; expected a finite number"
+                    f"line {rows.line_num}: t_us is {shown(t)}; expected a finite number",
+                    ErrorCode.FILE_DAMAGED,
                 ) from error
             if abs(times[-1]) >= TIME_LIMIT:
                 raise AmiwarpError(
-                    f"line {rows.line_num}: t_us is {shown(t)}, beyond {TIME_LIMIT} us"
+                    f"line {rows.line_num}: t_us is {shown(t)}, beyond {TIME_LIMIT} us",
+                    ErrorCode.FILE_DAMAGED,
                 )
         return files, np.array(times, np.int64)
 
@@ -127,10 +136,14 @@ def _open_stack(path: Path, fps: float | None) -> PictureStack:
         ) from error
     if pictures.ndim not in (3, 4) or len(pictures) < 2:
         raise AmiwarpError(
-            f"{path} has shape {pictures.shape}; expected (n, height, width), n at least 2"
+            f"{path} has shape {pictures.shape}; expected (n, height, width), n at least 2",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     if fps is None:
-        raise AmiwarpError(f"{path} contains no times; give the pictures per second as fps")
+        raise AmiwarpError(
+            f"{path} contains no times; give the pictures per second as fps",
+            ErrorCode.CONTENT_MISSING,
+        )
     return PictureStack(pictures, fps, str(path))
 
 
@@ -139,7 +152,9 @@ def _open_video(path: Path, fps: float | None) -> VideoFile:
     try:
         with av.open(str(input_path(path))) as container:
             if not container.streams.video:
-                raise AmiwarpError(f"{path} contains no video stream; give a video")
+                raise AmiwarpError(
+                    f"{path} contains no video stream; give a video", ErrorCode.CONTENT_MISSING
+                )
             stream = container.streams.video[0]
             native_fps = float(stream.average_rate or stream.guessed_rate or 0.0)
             if stream.duration:
@@ -160,7 +175,8 @@ def _open_video(path: Path, fps: float | None) -> VideoFile:
         )
     if native_fps <= 0.0 or min(size) < 2:
         raise AmiwarpError(
-            f"{path} has no frame rate or no picture size; convert it to a common format"
+            f"{path} has no frame rate or no picture size; convert it to a common format",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     stretch = native_fps / fps if fps else 1.0
     with errors_name(path, lambda: "video header"):

@@ -255,7 +255,8 @@ class VideoFile:
             ) from error
         if last < 0:
             raise AmiwarpError(
-                f"{self.path} contains no frame that can be decoded; give another video"
+                f"{self.path} contains no frame that can be decoded; give another video",
+                ErrorCode.FILE_DAMAGED,
             )
 
 

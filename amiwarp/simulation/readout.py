@@ -36,7 +36,7 @@ def bus_of(sensor: SensorModel) -> Any:
     bus = readout.Bus()
     bus.event_ps = round(1e6 / sensor.bus_rate_mev_s) if sensor.bus_rate_mev_s else 0
     bus.longest_ps = round(sensor.bus_queue) * int(bus.event_ps)
-    bus.rows = int(round(sensor.row_us * 1e6) > 0)
+    bus.shares_stamps = int(round(sensor.row_us * 1e6) > 0)
     return bus
 
 
@@ -71,7 +71,7 @@ class Readout:
         """
         if not self.scans_rows or not count:
             return
-        self._scan.origin = origin_us
+        self._scan.since_scan_us = origin_us
         self._scan.shift = shift
         launch.launch(readout.stamp_rows, count, [self._scan, keys], [], device=self._device)
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events import poses, truth
 from amiwarp.events.poses import Poses
 from amiwarp.events.truth import EventValues, FrameTruth, Truth
@@ -30,7 +30,9 @@ def chosen_instants(
     :class:`AmiwarpError` if times lie outside the recording or do not increase.
     """
     if truth_hz is not None and truth_times_us is not None:
-        raise AmiwarpError("truth_hz and truth_times_us are both given; give one of them")
+        raise AmiwarpError(
+            "truth_hz and truth_times_us are both given; give one of them", ErrorCode.OPTIONS
+        )
     if truth_hz is not None:
         rate = real(truth_hz, "truth_hz", 1e-3, 1e6, " 1/s")
         count = int(duration_us * rate / 1e6 + 1e-9) + 1  # rounding must not lose the last instant

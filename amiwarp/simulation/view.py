@@ -121,7 +121,7 @@ def _moved_bearings(
     if isinstance(model, SteererModel):
         return np.concatenate([_steered(rays, added) for added in model.added(angles)])
     turned = mirrored(simulation) @ model.rotations(angles)
-    return np.concatenate([rays @ each.T for each in turned])
+    return np.concatenate([rays @ rotation.T for rotation in turned])
 
 
 def _steered(rays: NDArray[np.float64], added: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExec
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from amiwarp.errors import AmiwarpError, optional_module
+from amiwarp.errors import AmiwarpError, ErrorCode, optional_module
 from amiwarp.kernels import quiet_start
 from amiwarp.studies.failures import failure_text
 from amiwarp.tasks import cpu_threads, no_garbage_collection
@@ -100,7 +100,8 @@ def start_workers(
                 ) from error
             raise AmiwarpError(
                 f"--scheduler {scheduler}: no Dask scheduler answers at this address ({error}); "
-                "start one with: dask scheduler"
+                "start one with: dask scheduler",
+                ErrorCode.UNREACHABLE,
             ) from error
         gpus = _visible_gpus() if scheduler is None and device == ANY_GPU else ()
         client.register_worker_callbacks(functools.partial(_prepare, gpus, scheduler is None))
@@ -207,7 +208,8 @@ def failure_of(future: Future[Any]) -> str:
     """
     if future.cancelled():
         raise AmiwarpError(
-            "the scheduler stopped or dropped the work; run the same command again to continue"
+            "the scheduler stopped or dropped the work; run the same command again to continue",
+            ErrorCode.UNREACHABLE,
         )
     error = future.exception()
     if error is None:

@@ -15,7 +15,7 @@ from amiwarp.brightness.sensor_timing import SensorTiming
 from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.calib.thinning import thin
-from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.in_memory import compensate_events
 from amiwarp.compensation.recordings import compensate
 from amiwarp.events.recording import Recording
 from amiwarp.imaging import metrics

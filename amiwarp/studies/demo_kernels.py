@@ -12,6 +12,7 @@ from amiwarp.kernels.conjugate_gradients import descend, link
 from amiwarp.kernels.edge_directions import find_largest
 from amiwarp.kernels.equations_cpu import apply_normal, make_chains
 from amiwarp.kernels.event_keys import unpack
+from amiwarp.kernels.events_with_angles import store_turns
 from amiwarp.kernels.exact import ExactParams
 from amiwarp.kernels.iwe import CPU_WIDTH, read_sums
 from amiwarp.kernels.known_nodes import mark_known
@@ -25,14 +26,13 @@ from amiwarp.kernels.prism_view import see_without_prism
 from amiwarp.kernels.refraction import compensate_points
 from amiwarp.kernels.residual_slopes import slope_between
 from amiwarp.kernels.residual_sums import sum_costs
-from amiwarp.kernels.slow_pixels import find_time_constants
+from amiwarp.kernels.slow_pixels import write_brightness, write_time_constants
 from amiwarp.kernels.smoothing import smooth, smooth_and_sum
 from amiwarp.kernels.square_sums import find_squares
-from amiwarp.kernels.votes import turn_events
 from amiwarp.optics.models.registry import MODELS
 
 EXACT_KERNELS = (
-    (turn_events,),
+    (store_turns,),
     (vote_event_blocks, ExactParams, PinholeParams),
     (read_sums,),
     # Coarse and fine images of a calibration
@@ -47,7 +47,8 @@ EXACT_KERNELS = (
     (descend,),
     (sum_costs,),
     (slope_between,),
-    (find_time_constants, ExactParams),
+    (write_brightness, ExactParams),
+    (write_time_constants, ExactParams),
     (find_squares,),
     (compensate_blocks, ExactParams, PinholeParams),
     (compute_checksums,),

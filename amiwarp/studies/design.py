@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
-from amiwarp.calib.model_fit import QUANTISATION_PX, SHARE
+from amiwarp.calib.model_fit import BUDGET_SHARE
+from amiwarp.calib.timing_blur import QUANTISATION_PX
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models.registry import rungs
@@ -65,7 +66,7 @@ class Limits:
     bandwidth: float | None = None
     """Event rate that sensor and cable can transfer [events/s]; None for no limit."""
     budget_px: float | None = None
-    """Largest error of the refraction model [px rms]; None for :data:`SHARE` of the blur."""
+    """Largest error of the refraction model [px rms]; None for :data:`BUDGET_SHARE` of the blur."""
 
     def __post_init__(self) -> None:
         for name in ("tolerance_px", "window_ms", "bandwidth", "budget_px"):
@@ -152,7 +153,7 @@ class Design:
         """Return the properties of a prism, given by its orbit, at a speed [turns/min]."""
         limits = self.limits
         blurs = self.timing.blur(orbit.radius, rpm)
-        budget = limits.budget_px or SHARE * math.hypot(QUANTISATION_PX, *blurs)
+        budget = limits.budget_px or BUDGET_SHARE * math.hypot(QUANTISATION_PX, *blurs)
         model = next(name for name in rungs() if orbit.errors[name] <= budget)
         made = Choice(orbit, rpm, self.volume.events_per_s(orbit, rpm), *blurs, model, budget, ())
         kept = {
@@ -188,11 +189,11 @@ class Design:
         smallest_apex = orbit.apex * LEAST_SWING / orbit.swing
 
         # Square of the blur that clock and encoder may add to the rounding to pixels
-        room = self.limits.tolerance_px**2 - QUANTISATION_PX**2
+        blur_left = self.limits.tolerance_px**2 - QUANTISATION_PX**2
         added = math.hypot(*self.timing.blur(orbit.radius, rpm))
         if added == 0.0:
             return smallest_apex, math.inf
-        return smallest_apex, orbit.apex * (math.sqrt(max(room, 0.0)) / added)
+        return smallest_apex, orbit.apex * (math.sqrt(max(blur_left, 0.0)) / added)
 
 
 def design(

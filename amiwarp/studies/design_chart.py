@@ -261,12 +261,12 @@ def _name(ax: Any, names: Sequence[tuple[float, str, Any]]) -> None:
     inside.sort(key=lambda name: name[0])
 
     # Heights in the panel, and heights of the texts, as shares of the panel
-    at = np.array([(math.log(value) - low) / (high - low) for value, _, _ in inside])
+    places = np.array([(math.log(value) - low) / (high - low) for value, _, _ in inside])
     lines = [text.count("\n") + 1 for _, text, _ in inside]
     tall = np.array([1.25 * TINY * count / 72.0 / PANEL for count in lines])
     need = (tall[1:] + tall[:-1]) / 2.0
 
-    spots = at.copy()
+    spots = places.copy()
     for _ in range(300):
         for k, gap in enumerate(need):
             lack = gap - (spots[k + 1] - spots[k])
@@ -274,7 +274,7 @@ def _name(ax: Any, names: Sequence[tuple[float, str, Any]]) -> None:
                 spots[k] -= lack / 2.0
                 spots[k + 1] += lack / 2.0
         spots = np.clip(spots, 0.02, 0.98)
-    for (_, text, colour), y, spot in zip(inside, at, spots, strict=True):
+    for (_, text, colour), y, spot in zip(inside, places, spots, strict=True):
         ax.annotate(
             text,
             (1.0, y),

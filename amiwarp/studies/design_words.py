@@ -2,7 +2,7 @@
 
 import math
 
-from amiwarp.calib.model_fit import QUANTISATION_PX
+from amiwarp.calib.timing_blur import QUANTISATION_PX
 from amiwarp.studies.design import Design
 from amiwarp.studies.orbits import LEAST_SWING
 from amiwarp.studies.quantities import degrees, quarter_turn_ms, rate

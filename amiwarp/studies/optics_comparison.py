@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.brightness.depths import SMALLEST_PX
-from amiwarp.calib.model_fit import QUANTISATION_PX
+from amiwarp.calib.timing_blur import QUANTISATION_PX
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models.plate import LARGEST_INVERSE_DEPTH, PlateModel

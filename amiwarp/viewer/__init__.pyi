@@ -14,6 +14,7 @@ from .images import make_images as make_images
 from .inspector import Inspector as Inspector
 from .library import Library as Library
 from .look import Look as Look
+from .panel import Panel as Panel
 from .view_state import ViewState as ViewState
 from .view_state import apply_state as apply_state
 from .view_state import current_state as current_state

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partialmethod
-from typing import Any
+from typing import Any, Literal, Protocol, TypeAlias
 
 from amiwarp.choices import Axis, View
 from amiwarp.errors import AmiwarpError
@@ -20,6 +20,14 @@ from amiwarp.viewer.knobs import Knobs
 from amiwarp.viewer.layout import KEYS
 from amiwarp.viewer.look import Look
 from amiwarp.viewer.view_state import History, ViewState, current_state
+
+Request: TypeAlias = Literal["window", "suggestion", "knobs", "state", "look", "newest"]
+"""What an update shall renew: the events, the suggested values, what depends on the parameters, the state of the
+history that was chosen, colours and layout, or the newest events of a live stream (page only)."""
+
+
+class _RequestUpdates(Protocol):
+    def __call__(self, *what: Request, change: str = "") -> None: ...
 
 
 class Actions:
@@ -37,7 +45,7 @@ class Actions:
     """Result of a calibration that is not accepted yet."""
     history: History | None = None
     """States that can be undone and redone; None before anything is shown."""
-    request: Callable[..., None]
+    request: _RequestUpdates
     """Request updates, by their names. Successive ones with an equal ``change`` are undone in one step."""
     say: Callable[..., None]
     """Show a text as a message."""

@@ -101,7 +101,7 @@ def _fields(size: tuple[int, int], duration_us: int) -> dict[str, _Field]:
     def region(text: str) -> tuple[int, ...] | None:
         if text == "all":
             return None
-        left, top, right, bottom = (_whole(each, 0, max(size)) for each in text.split(","))
+        left, top, right, bottom = (_whole(part, 0, max(size)) for part in text.split(","))
         return (
             left,
             top,
@@ -155,7 +155,7 @@ def _fields(size: tuple[int, int], duration_us: int) -> dict[str, _Field]:
         "difference": one_of("difference", flags),
         "overlaid": one_of("overlaid", flags),
         **{
-            name: one_of(name, {each.value: each for each in kind})
+            name: one_of(name, {member.value: member for member in kind})
             for name, kind in choices.items()
         },
         **{
@@ -209,8 +209,8 @@ def _with_knob(knobs: Knobs, name: str, text: str) -> Knobs:
 
 def _sources(text: str, known: tuple[tuple[str, Source], ...]) -> tuple[tuple[str, Source], ...]:
     given = {}
-    for each in text.split(","):
-        name, source = each.split(":")
+    for part in text.split(","):
+        name, source = part.split(":")
         given[name] = Source[source.upper()]
     if given.keys() - dict(known).keys():
         raise ValueError(text)

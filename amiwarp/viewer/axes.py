@@ -84,7 +84,7 @@ def outer_edge(
     The first two axes take the lowest such edge, the third one takes the leftmost. Returns None if the camera looks
     along the axis. ``corners``: where the corners of the box are in the picture [px], in the order of :data:`CORNERS`.
     """
-    one, other = (each for each in range(3) if each != axis)
+    one, other = (other_axis for other_axis in range(3) if other_axis != axis)
     # Of each edge at the outline: what decides first, and second, and its corners.
     found: list[tuple[float, float, int, int]] = []
     for start in np.flatnonzero(CORNERS[:, axis] == 0).tolist():

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.choices import Axis
-from amiwarp.compensation.blocks import BlockCompensator
+from amiwarp.compensation.in_memory import BlockCompensator
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
 from amiwarp.imaging.regions import inside

@@ -125,7 +125,7 @@ def with_values(inspector: Inspector, state: ViewState, values: dict[str, Any]) 
         if name in values:
             other[name] = choice(kind, values[name], name)
     if "colour" in values:
-        offered = [each.value for each in colours_on_offer(inspector.recording.truth)]
+        offered = [colour.value for colour in colours_on_offer(inspector.recording.truth)]
         other["colour"] = Colour(one_of(values["colour"], offered, "colour"))
     for name in ("overlaid", "difference", "same_scale"):
         if name in values:
@@ -270,7 +270,7 @@ class InspectorHandle:
         self._callbacks.append(callback)
 
         def stop() -> None:
-            self._callbacks[:] = [each for each in self._callbacks if each is not callback]
+            self._callbacks[:] = [known for known in self._callbacks if known is not callback]
 
         return stop
 
@@ -381,7 +381,7 @@ class InspectorHandle:
         if self._window is not None and not self._drawing:
             self._drawing = True
             try:
-                self._window.turn()
+                self._window.run_once()
             finally:
                 self._drawing = False
 

@@ -68,8 +68,8 @@ class HostNames:
     def __init__(self, host: str) -> None:
         names = {"localhost", "127.0.0.1", "::1", normalised(host), reachable(host)}
         if not is_local(host):
-            own = socket.gethostname().lower()
-            names |= {own, f"{own}.local", own.partition(".")[0]}
+            own_name = socket.gethostname().lower()
+            names |= {own_name, f"{own_name}.local", own_name.partition(".")[0]}
         self.known = names - ALL_INTERFACES.keys()
 
     def accept(self, request: web.Request) -> bool:

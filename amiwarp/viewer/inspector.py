@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.bad_pixels import strange_pixels, stretch
+from amiwarp.calib.bad_pixels import find_bad_pixels, searched_part
 from amiwarp.calib.plate import LARGEST_INVERSE
 from amiwarp.choices import Sharpness, Vote
-from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.in_memory import compensate_events
 from amiwarp.compensation.recordings import at_depths
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
@@ -218,7 +218,7 @@ class Inspector:
         copied._imager = RegionSharpness(size, self.device)
         copied._window = None
         copied._span = None
-        copied.besides = tuple(each.copy() for each in self.besides)
+        copied.besides = tuple(inspector.copy() for inspector in self.besides)
         copied.beside = None
         if self.beside is not None:
             copied.beside = copied.besides[self.besides.index(self.beside)]
@@ -407,9 +407,9 @@ class Inspector:
         """Hot pixels as a mask and as a list, found in the middle of the recording."""
         source = self.recording.events
         encoder = self.encoder
-        events = stretch(source, encoder)
+        events = searched_part(source, encoder)
         if math.isfinite(self.turn_us):
-            hot, _ = strange_pixels(events, encoder, source.size)
+            hot, _ = find_bad_pixels(events, encoder, source.size)
         else:
             hot = find_hot_pixels(events, source.size)
         return hot, list_hot_pixels(events, hot)
@@ -486,10 +486,10 @@ class Inspector:
         self.prism = calibration.prism
         self.recording = replace(self.recording, camera=calibration.camera)
         self._harmonics = calibration.harmonics
-        own = self.recording.encoder
+        recorded = self.recording.encoder
         path = calibration.path
         self._calibrated_encoder = None
-        if own is not None and path is not None and replaces(path, own):
+        if recorded is not None and path is not None and replaces(path, recorded):
             self._calibrated_encoder = path
         self._forget_angles()
         self.set(self.knobs_of(calibration))
@@ -652,12 +652,13 @@ class Inspector:
                 f"{recording.name}: has {source.size[0]}x{source.size[1]} pixels, {self.recording.name} has "
                 f"{size[0]}x{size[1]}; give two recordings of one size"
             )
-        own = self.recording.encoder
+        recorded = self.recording.encoder
         lent = recording.encoder is None
-        if recording.encoder is None and own is not None and len(source):
+        if recording.encoder is None and recorded is not None and len(source):
             shift = source.t_first - self.recording.events.t_first - offset_us
             recording = replace(
-                recording, encoder=Encoder(own.t + shift, own.angle, own.clock_offset_us)
+                recording,
+                encoder=Encoder(recorded.t + shift, recorded.angle, recorded.clock_offset_us),
             )
         other = Inspector(recording, device=self.device, most_points=self.most_points)
         other._shown_beside = True

@@ -94,7 +94,9 @@ SLIDING = {name: p for name, p in OTHERS.items() if p.label}
 
 def foreign_names(model: str) -> set[str]:
     """Return the names among :data:`OTHERS` of parameters that no model of the same optic has."""
-    return OTHERS.keys() - {name for each in alternatives(model).values() for name in each.FREE}
+    return OTHERS.keys() - {
+        name for other_model in alternatives(model).values() for name in other_model.FREE
+    }
 
 
 CURVE_HALF_WIDTH = {

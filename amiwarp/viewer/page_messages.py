@@ -32,7 +32,7 @@ def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
 
 def one_of(*known: Any) -> Check:
     """Return a check that accepts the ``known`` values, types included."""
-    return lambda value: any(type(value) is type(each) and value == each for each in known)
+    return lambda value: any(type(value) is type(choice) and value == choice for choice in known)
 
 
 flag = one_of(True, False)
@@ -122,7 +122,7 @@ class MessageFilter:
         )
 
 
-def finite(given: str) -> float:
+def finite_number(given: str) -> float:
     """Return the typed text as a number, clipped to ±:data:`LARGEST`. Raises :class:`ValueError` for other text."""
     value = float(given or 0.0)
     if math.isnan(value):

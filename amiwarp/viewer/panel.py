@@ -39,7 +39,7 @@ from amiwarp.viewer import (
     sliders,
     view_state,
 )
-from amiwarp.viewer.actions import Actions
+from amiwarp.viewer.actions import Actions, Request
 from amiwarp.viewer.address import MOST_COUNT, decode_state, encode_state
 from amiwarp.viewer.bookmarks import Bookmarks
 from amiwarp.viewer.filters import Selection, step_rows
@@ -50,7 +50,7 @@ from amiwarp.viewer.knobs import Knobs
 from amiwarp.viewer.library import Library
 from amiwarp.viewer.look import Look
 from amiwarp.viewer.page_files import use_page
-from amiwarp.viewer.page_messages import finite
+from amiwarp.viewer.page_messages import finite_number
 from amiwarp.viewer.shown_window import DisplayedWindow
 from amiwarp.viewer.sliders import FIELD_LIMITS, GIVEN, SLIDERS, UNITS
 from amiwarp.viewer.view_state import History, ViewState
@@ -71,6 +71,8 @@ QUICK = {
 """Updates that are made at once, with the parts of the page that wait for them."""
 SLOW = ("curve", "picture", "statistics")
 """Updates that take longer; each is named as the part of the page that waits for it."""
+SLOW_ORDER = (*SLOW, "preparation")
+"""Slow updates in the order in which they are made: what is on the page first."""
 PLAY_S = 0.05
 """Shortest interval between two pictures while a recording is played [s]."""
 FOLLOW_S = 0.1
@@ -96,6 +98,8 @@ class Panel(Actions):
         self._library = library
         self.buffers_lock = asyncio.Lock()
         """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
+        # Locks, in the order in which they are taken: device_lock, for CUDA; then buffers_lock, for the inspector's own
+        # buffers. Slow updates, calibrations and films work on a snapshot or a copy, and take the first only.
         self.device_lock: Any = contextlib.nullcontext()
         if "cuda" in str(inspector.device):
             self.device_lock = _CUDA_LOCK
@@ -114,7 +118,7 @@ class Panel(Actions):
         """Whether the playback runs; after a stop it runs until it notices the stop."""
         self._picked = -1
         """Index of the drawn event that is described; -1 for none."""
-        self._has_card = False
+        self._has_graphics_card = False
         """Whether the browser draws with a graphics card."""
         self._lasting = False
         """Whether a change lasts, such as a drag: meanwhile the brightness of images does not follow it."""
@@ -128,7 +132,9 @@ class Panel(Actions):
         """Window and selection for which each slow part of the page was made, by its name."""
         # Successive changes of one name are undone together, until a release.
         self._change = ""
+        """Name of the change that lasts, with the number of the drag; empty for none."""
         self._drags = 0
+        """Number of releases so far."""
         self._rates: list[EventRates] = []
         """Counted events of the recording, and of the recordings on its time axis."""
         self._rates_first_us = 0
@@ -151,8 +157,9 @@ class Panel(Actions):
         self._picked = -1
         self.history = None
         self.history_steps = ()
+        self._rates = []  # the next count has not begun
         self._made_for.clear()
-        self.use_card(self._has_card)
+        self.use_card(self._has_graphics_card)
         inspector.renew()  # a live stream may have gone on since the inspector was made
         files: list[list[str]] = []
         folder = ""
@@ -257,8 +264,8 @@ class Panel(Actions):
             {"start_ms": round(start_us * 1e-3, 3), "length_ms": round(length_us * 1e-3, 3)}
         )
 
-    def request(self, *what: str, change: str = "") -> None:
-        """Request quick updates: "newest" (of a live stream), "window", "knobs", "look", "suggestion" or "state".
+    def request(self, *what: Request, change: str = "") -> None:
+        """Request quick updates; "newest" is for a live stream.
 
         ``change``: name of a change that lasts, such as a drag; it is undone in one step.
         """
@@ -270,7 +277,7 @@ class Panel(Actions):
             self._quick_task = self.start_job(self._run_quick_updates())
 
     def request_slow(self, *what: str) -> None:
-        """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
+        """Request updates of :data:`SLOW_ORDER`, which run in a thread after all quick updates."""
         self._slow_requests.update(what)
         self._show_pending()
         if self._slow_task is None or self._slow_task.done():
@@ -322,6 +329,9 @@ class Panel(Actions):
         self._jobs.discard(task)
         error = None if task.cancelled() else task.exception()
         if error is not None:
+            if isinstance(error, (AmiwarpError, OSError)):
+                self.say(str(error), "error")
+                return
             logging.getLogger(__name__).error("the page's work failed", exc_info=error)
             text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
             self.say(text, "error")
@@ -346,8 +356,7 @@ class Panel(Actions):
         """Make the requested slow updates one after the other, each when no quick update is pending."""
         while self._slow_requests:
             await self.until_drawn()
-            # In alphabetical order: the curve first, the preparation last
-            name = min(self._slow_requests)
+            name = min(self._slow_requests, key=SLOW_ORDER.index)
             self._slow_requests.discard(name)
             async with self._marked_on_page({name}), self.device_lock:
                 with self.errors_shown(name):
@@ -382,9 +391,8 @@ class Panel(Actions):
 
     def released(self) -> None:
         """Update the slow parts of the page after a change, and end what is undone in one step."""
-        if (
-            self._lasting
-        ):  # the images get the scale of what is shown now, as part of the same change
+        # The images get the scale of what is shown now, as part of the same change.
+        if self._lasting:
             change = self._change
             self.request("knobs")
             self._change = change
@@ -403,7 +411,7 @@ class Panel(Actions):
         if name not in (*FIELD_LIMITS, *layout.FILTER_FIELDS, *times):
             return
         try:
-            value = finite(text)
+            value = finite_number(text)
         except ValueError:
             self.say(f"{text!r} is not a number; give a number such as 1.5", "error")
             return
@@ -426,14 +434,19 @@ class Panel(Actions):
 
     def _set_filter(self, name: str, value: float) -> None:
         """Set a field of a filter, or the decay time of images."""
-        label, unit, (low, high) = layout.FILTER_FIELDS[name]
-        if not low <= value <= high:
-            self.say(
-                f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error"
-            )
+        label, unit, limits = layout.FILTER_FIELDS[name]
+        if self._is_refused(label, value, unit, limits):
             return
         self.state[name] = round(value) if name == "every" else value
         self.request("knobs" if name == "decay_ms" else "window")
+
+    def _is_refused(self, label: str, value: float, unit: str, limits: tuple[float, float]) -> bool:
+        """Return whether a value is outside its limits, and say so."""
+        low, high = limits
+        if low <= value <= high:
+            return False
+        self.say(f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error")
+        return True
 
     def step(self, count: int) -> None:
         """Move the time window, as :meth:`Actions.step` does. To count events takes long, and is done in a thread."""
@@ -465,12 +478,8 @@ class Panel(Actions):
         """Set a parameter of the prism or the camera, in the unit of its slider or field."""
         if name not in FIELD_LIMITS:
             return
-        low, high = FIELD_LIMITS[name]
-        label, unit, _ = SLIDERS[name] if name in SLIDERS else GIVEN[name]
-        if not low <= value <= high:
-            self.say(
-                f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error"
-            )
+        field = SLIDERS[name] if name in SLIDERS else GIVEN[name]
+        if self._is_refused(field.label, value, field.unit, FIELD_LIMITS[name]):
             return
         self._wanted[name] = round(value, 4)
         if name in SLIDERS:
@@ -480,7 +489,7 @@ class Panel(Actions):
 
     def use_card(self, has_card: bool) -> None:
         """Show more points if the browser has a graphics card to draw them."""
-        self._has_card = has_card
+        self._has_graphics_card = has_card
         if has_card and self.inspector.most_points < WINDOW_POINTS:
             self.inspector.most_points = WINDOW_POINTS
             self.request("window")
@@ -489,7 +498,7 @@ class Panel(Actions):
         """Do nothing: the page asks only whether the server answers."""
 
     def toggle(self, name: str) -> None:
-        """Invert a state variable that is true or false."""
+        """Invert a state variable that is true or false. The page cannot call this, only press keys that do."""
         self.state[name] = not self.state[name]
 
     def look_from(self, view: str) -> None:
@@ -554,12 +563,16 @@ class Panel(Actions):
 
     def draw(self, left: float, top: float, right: float, bottom: float) -> None:
         """Show a region of the image [px] that was drawn or typed."""
+        # Typed sides may come in any order.
+        left, right = sorted((left, right))
+        top, bottom = sorted((top, bottom))
+        width, height = self.state.size
         sides = (left, top, right, bottom)
-        limits = 2 * self.state.size
+        limits = (width, height, width, height)
         region = [
-            min(max(round(each), 0), limit) for each, limit in zip(sides, limits, strict=True)
+            min(max(round(side), 0), limit) for side, limit in zip(sides, limits, strict=True)
         ]
-        whole = region == [0, 0, *self.state.size]
+        whole = region == [0, 0, width, height]
         self.state.update({"region_wanted": region, "region_kind": "whole" if whole else "drawn"})
         self.request("window")
         self.released()
@@ -591,7 +604,7 @@ class Panel(Actions):
         end = min(float(end_ms), float(self.state.whole_ms))
         if end - start > 1e-2:
             self.state.rate_span = [start, end]
-            self._show_rates()
+            self.start_job(self._show_zoomed_rates())
 
     def play(self) -> None:
         """Play the recording from the current window, or follow a live stream; stop if already playing."""
@@ -670,28 +683,50 @@ class Panel(Actions):
         rates = [EventRates(each.recording.events) for each in inspectors]
         self._rates = rates
         self._rates_first_us = self.inspector.recording.events.t_first
-        for each in rates:
-            finished = False
-            while not finished and rates is self._rates:
-                finished = await self.in_thread(each.fill, STEP_S)
-                with self.state:
-                    self._show_rates()
+        with self.errors_shown("timeline"):
+            for each in rates:
+                finished = False
+                while not finished and rates is self._rates:
+                    finished = await self.in_thread(each.fill, STEP_S)
+                    await self._show_rates()
+        self.state.flush()
 
-    def _show_rates(self) -> None:
+    async def _show_zoomed_rates(self) -> None:
+        with self.errors_shown("timeline"):
+            await self._show_rates()
+        self.state.flush()
+
+    async def _show_rates(self) -> None:
+        """Show what is counted of the shown part of the time, unless the page shows another part before it is ready."""
+        rates = self._rates
+        span = self.state.rate_span
+        if not rates:
+            return
+        values = await self.in_thread(self._rate_state, self.inspector, rates, span)
+        if rates is self._rates and span == self.state.rate_span:
+            with self.state:
+                self.state.update(values)
+
+    def _rate_state(
+        self, inspector: Inspector, rates: list[EventRates], span: list[float]
+    ) -> dict[str, Any]:
+        """Return the state variables of the timeline between two times [ms]. It may read events from a file."""
         # Of a live stream, the counted events may be a second older than the shown ones.
         first_us = self._rates_first_us
-        start_us, end_us = (round(1e3 * each) for each in self.state.rate_span)
-        own, *others = self._rates
-        _, rates = own.curve(first_us + start_us, first_us + end_us, layout.RATE_BINS)
-        off, on = map(page_state.float_bytes, rates)
+        start_us, end_us = (round(1e3 * each) for each in span)
+        own, *others = rates
+        _, own_rates = own.curve(first_us + start_us, first_us + end_us, layout.RATE_BINS)
+        off, on = map(page_state.float_bytes, own_rates)
         rows = []
-        for each, counted in zip(self.inspector.besides, others, strict=True):
-            _, rates = counted.curve(each.time_of(start_us), each.time_of(end_us), layout.RATE_BINS)
-            off_beside, on_beside = map(page_state.float_bytes, rates)
+        for each, counted in zip(inspector.besides, others, strict=True):
+            _, rates_beside = counted.curve(
+                each.time_of(start_us), each.time_of(end_us), layout.RATE_BINS
+            )
+            off_beside, on_beside = map(page_state.float_bytes, rates_beside)
             name = captions.beside_text(each)
             rows.append({"name": name, "on": on_beside, "off": off_beside})
         note = "" if own.share >= 1.0 else f"counting events: {100.0 * own.share:.0f} %"
-        self.state.update({"rate_on": on, "rate_off": off, "rate_note": note, "rate_rows": rows})
+        return {"rate_on": on, "rate_off": off, "rate_note": note, "rate_rows": rows}
 
     # Parameters of the prism, and those to compare with
 
@@ -795,6 +830,8 @@ class Panel(Actions):
                 answer = await self.in_thread(
                     _result_or_error, find, weakref.ref(inspector), progress
                 )
+            if self.inspector is not inspector:  # another recording was opened meanwhile
+                return
             if isinstance(answer, str):
                 if progress.cancelled:
                     self.say("calibration cancelled", "info")
@@ -814,8 +851,10 @@ class Panel(Actions):
                 with state:
                     state.surface = surface
         finally:
-            with state:
-                state.update({"busy": "", "calibrating": False})
+            # In another recording, the next calibration may run already.
+            if self._progress is progress:
+                with state:
+                    state.update({"busy": "", "calibrating": False})
 
     def _show_progress(self, what: str, share: float) -> None:
         """Show the current step of a calibration or a film, and the finished share, 0 to 1."""
@@ -848,33 +887,25 @@ class Panel(Actions):
 
     async def _write_export(self, what: str) -> None:
         """Write a file that is no film, and give it to the browser."""
+        async with self.device_lock, self.buffers_lock:
+            await self._download(what, partial(WRITERS[what], self))
+
+    def write_figure(self, path: Path) -> None:
+        """Write what the page shows as a figure."""
         from amiwarp.viewer.publish import Page, save_figure
 
-        inspector = self.inspector
-        figure = partial(
-            save_figure,
-            inspector,
+        save_figure(
+            self.inspector,
+            path,
             page=Page(),
             view=self.view,
             look=self.look,
             against=self.against,
         )
-        write: dict[str, Callable[[Path], object]] = {
-            **dict.fromkeys(("pdf", "svg"), figure),
-            "values": lambda path: save_values(path, self._make_images().after),
-            **dict.fromkeys(("csv", "npz"), partial(downloads.write_table, inspector)),
-            "events": partial(downloads.write_events, inspector, compensated=False),
-            "compensated": partial(downloads.write_events, inspector, compensated=True),
-            "calibration": lambda path: inspector.as_calibration().save(path),
-            "vtp": partial(
-                downloads.write_cloud, inspector, axis=self.look.axis, compensated=False
-            ),
-            "vtp_after": partial(
-                downloads.write_cloud, inspector, axis=self.look.axis, compensated=True
-            ),
-        }
-        async with self.device_lock, self.buffers_lock:
-            await self._download(what, write[what])
+
+    def write_values(self, path: Path) -> None:
+        """Write the values of the second image."""
+        save_values(path, self._make_images().after)
 
     async def _write_film(self, what: str) -> None:
         """Make a film in a thread, with its progress on the page, and give it to the browser."""
@@ -982,7 +1013,7 @@ class Panel(Actions):
     # Updates of what the page shows
 
     async def update_quickly(self, todo: set[str]) -> None:
-        """Make quick updates: "newest", "suggestion", "window", "knobs", "look" and "state"."""
+        """Make quick updates of :data:`QUICK`."""
         if "newest" in todo:  # here, because no other update uses the events that it replaces
             await self._take_newest()
             todo = {*todo, "window"}
@@ -1093,7 +1124,9 @@ class Panel(Actions):
         state = self.state
         inspector = self.inspector
         if not float(state.length_ms) > 0.0:
-            raise AmiwarpError(f"a window of {state.length_ms:g} ms; give a length above 0")
+            raise AmiwarpError(
+                f"the window's length is {state.length_ms:g} ms; give a length above 0"
+            )
         start_us, length_us = self.time_window
         length_us = min(length_us, self.whole_us)
         known_count = inspector.fixed_count
@@ -1243,15 +1276,15 @@ class Panel(Actions):
         x: list[float] = (values / UNITS[name]).tolist()
         if not x:
             return
-        label, unit, *_ = SLIDERS[name]
+        slider = SLIDERS[name]
         best = int(np.argmax(scores))
         peak = f"{x[best]:.4g}"
         if best in (0, len(x) - 1):
             peak = f"at the edge {peak}"
         now = sliders.knob_values(self.inspector)[name]
         state.curve = {
-            "name": label,
-            "title": f"{label} ({unit})",
+            "name": slider.label,
+            "title": f"{slider.label} ({slider.unit})",
             "text": f"peak {peak}, now {now:.4g}",
             "x": x,
             "y": scores.tolist(),
@@ -1275,3 +1308,24 @@ def _result_or_error(
         return str(error)
     finally:
         inspector = None  # this frame may be kept alive, too
+
+
+WRITERS: dict[str, Callable[[Panel, Path], object]] = {
+    "pdf": Panel.write_figure,
+    "svg": Panel.write_figure,
+    "values": Panel.write_values,
+    "csv": lambda panel, path: downloads.write_table(panel.inspector, path),
+    "npz": lambda panel, path: downloads.write_table(panel.inspector, path),
+    "events": lambda panel, path: downloads.write_events(panel.inspector, path, compensated=False),
+    "compensated": lambda panel, path: downloads.write_events(
+        panel.inspector, path, compensated=True
+    ),
+    "calibration": lambda panel, path: panel.inspector.as_calibration().save(path),
+    "vtp": lambda panel, path: downloads.write_cloud(
+        panel.inspector, path, axis=panel.look.axis, compensated=False
+    ),
+    "vtp_after": lambda panel, path: downloads.write_cloud(
+        panel.inspector, path, axis=panel.look.axis, compensated=True
+    ),
+}
+"""Functions that write the downloads that are no films, by the names in :data:`amiwarp.viewer.layout.EXPORTS`."""

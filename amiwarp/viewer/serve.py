@@ -135,9 +135,9 @@ async def _close_silent(server: Any, heard: set[Any]) -> None:
         await asyncio.sleep(SILENT_S)
         heard.intersection_update(server.connections)
         silent = {*server.connections} - heard
-        for each in silent & before:
-            if each.transport is not None:
-                each.transport.abort()
+        for silent_connection in silent & before:
+            if silent_connection.transport is not None:
+                silent_connection.transport.abort()
         before = silent
 
 

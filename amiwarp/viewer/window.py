@@ -12,6 +12,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.tasks import interrupts_later, no_garbage_collection
 from amiwarp.viewer import captions, depth_view, first_phase, orbit_lines, view_state
+from amiwarp.viewer.actions import Request
 from amiwarp.viewer.bookmarks import Bookmarks
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.job_progress import PROGRESS_S, JobCancelled
@@ -34,13 +35,15 @@ DRAWING_SHARE = 0.2
 REST_S = 0.3
 """Time without a change after which all points are drawn, and the sharpness curves computed [s]."""
 IDLE_S = 0.005
+"""Interval between two looks for input while there is nothing to do [s]."""
 FOLLOW_S = 0.25
-"""Interval between two looks for input, and between two pictures of a live stream [s]."""
+"""Interval between two pictures of a live stream [s]."""
 COUNT_S = 0.02
-TELL_S = 0.2
-COUNTED_S = 1.0
-"""Time for which events are counted for the timeline between two looks for input, and shortest intervals between two
-drawings of what is counted, and between two counts of a live stream [s]."""
+"""Time for which events are counted for the timeline between two looks for input [s]."""
+DRAW_COUNTED_S = 0.2
+"""Shortest interval between two drawings of what is counted [s]."""
+RECOUNT_S = 1.0
+"""Shortest interval between two counts of a live stream [s]."""
 
 
 class Window(WindowContents):
@@ -83,8 +86,8 @@ class Window(WindowContents):
         """Where the parts of the window are."""
         self.time_window = inspector.window or inspector.first_window()
         self._depth_drawn = False
-        self._wanted: set[str] = set()
-        self._change = ""
+        self._requests: set[Request] = set()
+        self._undo_step = ""
         self._interrupts: list[int] = []
         self._progress_due_s = 0.0
         self._built: tuple[Any, ...] = ()
@@ -93,7 +96,7 @@ class Window(WindowContents):
         # When something has changed, and the events of a live stream and the counted ones were shown, last.
         self._changed_s = 0.0
         self._counted_s = 0.0
-        self._told_s = 0.0
+        self._counted_drawn_s = 0.0
         self._coarse = 1
         self._slow: Iterator[None] = iter(())
         self._listen()
@@ -105,11 +108,11 @@ class Window(WindowContents):
             while not (self.closed or self.plotter.iren.interactor.GetDone()):
                 # VTK ends the process if an exception leaves one of its callbacks
                 with interrupts_later() as self._interrupts:
-                    if not self.turn():
+                    if not self.run_once():
                         time.sleep(IDLE_S)
 
     @no_garbage_collection()  # by a helper thread, which would end VTK's objects while this thread draws
-    def turn(self) -> bool:
+    def run_once(self) -> bool:
         """Handle the input so far, and draw if something has changed; return whether there was something to do."""
         interactor = self.plotter.iren.interactor
         interactor.EnableRenderOff()  # VTK would draw after each of many mouse moves
@@ -119,7 +122,7 @@ class Window(WindowContents):
         self._play(now)
         if tuple(self.plotter.render_window.GetSize()) != self.places.size:
             self.request("look")
-        if self._wanted or self._exposed or self.mouse.turned:
+        if self._requests or self._exposed or self.mouse.turned:
             self._changed_s = now
             self._draw_at(self._coarse)
             return True
@@ -148,53 +151,55 @@ class Window(WindowContents):
 
     def update(self) -> None:
         """Compute what was requested, and give it to VTK."""
-        wanted = self._wanted
-        self._wanted = set()
+        requests = self._requests
+        self._requests = set()
         inspector = self.inspector
         try:
-            self._compute(wanted)
+            self._compute(requests)
         except AmiwarpError as error:
-            if not hasattr(self, "shown"):
+            if not self.has_shown:
                 raise
             self.message = str(error)
+            # The sliders return to what is shown.
             inspector.knobs = self._shown_knobs
         self.time_window = inspector.window or inspector.first_window()
         self._build()
-        if wanted - {"look"}:
-            self._scale_held = bool(self._change) and self._images is not None
+        if requests - {"look"}:
+            self._scale_held = bool(self._undo_step) and self._images is not None
             self._make_images()
         self._show()
         if not self.plays:
-            self.remember(self._change)
+            self.remember(self._undo_step)
         self.announce()
 
-    def _compute(self, wanted: set[str]) -> None:
+    def _compute(self, requests: set[Request]) -> None:
         """Read, set and compute what was requested. Raises :class:`AmiwarpError` if there are no such events."""
         inspector = self.inspector
-        if wanted & {"window", "suggestion"}:
+        if requests & {"window", "suggestion"}:
             inspector.open(*self.time_window)
-        if "state" in wanted:
+        if "state" in requests:
             if not self.plays:
                 self.remember("")  # what came before an undo can be redone
             state = self.travelled()
             if state is not None:
                 self.show_state(state)
-        if "suggestion" in wanted:
+        if "suggestion" in requests:
             first_phase.estimate_phase(inspector)
             suggested = replace(inspector.selection, region=inspector.suggest_region())
             inspector.open(*self.time_window, suggested)
-        if wanted - {"look"}:
-            before = getattr(self, "shown", None)
+        if requests - {"look"}:
+            before = self.shown.events if self.has_shown else None
             self.shown = inspector.show(against=self.b)
+            self.has_shown = True
             self._shown_knobs = inspector.knobs
-            if before is None or before.events is not self.shown.events:
+            if before is not self.shown.events:
                 self._picked = -1  # the picked event is gone
             self.message = ""
 
-    def request(self, *what: str, change: str = "") -> None:
-        """Request an update: "window", "suggestion", "knobs", "state" or "look"."""
-        self._wanted.update(what)
-        self._change = f"{change} {self.mouse.drags}" if change else ""
+    def request(self, *what: Request, change: str = "") -> None:
+        """Request an update. Requests with the same ``change``, such as the name of a slider, are undone together."""
+        self._requests.update(what)
+        self._undo_step = f"{change} {self.mouse.drags}" if change else ""
         if set(what) - {"look"}:
             self._slow = self._slow_steps()
 
@@ -235,10 +240,12 @@ class Window(WindowContents):
             with self.errors_shown("window"):
                 self.inspector.renew()
             self.move(self.inspector.recording.events.t_last)
-            if now - self._counted_s > COUNTED_S:
+            if now - self._counted_s > RECOUNT_S:
                 self._counted_s = now
                 self._count_anew()
-                self._rates.fill(TELL_S)  # of two seconds: there is no rest in which to go on
+                self._rates.fill(
+                    DRAW_COUNTED_S
+                )  # of two seconds: there is no rest in which to go on
         else:
             if self._counted is not self.inspector.recording.events:
                 self._count_anew()
@@ -250,21 +257,23 @@ class Window(WindowContents):
             return False
         finished = self._rates.fill(COUNT_S)
         now = time.perf_counter()
-        if finished or now - self._told_s > TELL_S:
-            self._told_s = now
+        if finished or now - self._counted_drawn_s > DRAW_COUNTED_S:
+            self._counted_drawn_s = now
             self._sheets_old = True
         return True
 
     def _show_progress(self, what: str, share: float) -> None:
         """Show how far a calibration is, and handle the input meanwhile."""
-        cancelled = not self._progress or self._interrupts
+        cancelled = not self._job_keys or self._interrupts
         if cancelled or self.closed or self.plotter.iren.interactor.GetDone():
             raise JobCancelled
         now = time.perf_counter()
         if now >= self._progress_due_s:
-            self.message = f"{what}: {100.0 * min(share, 1.0):.0f} % ({self._progress})"
+            self.message = f"{what}: {100.0 * min(share, 1.0):.0f} % ({self._job_keys})"
             self.request("look")
-            self.turn()
+            # A job runs inside a key's callback, so inside run_once(): this draws and handles keys meanwhile. The keys
+            # of a running job stop it, so that no other job begins in it.
+            self.run_once()
             after = time.perf_counter()
             self._progress_due_s = after + max(PROGRESS_S, (after - now) / DRAWING_SHARE)
 
@@ -303,9 +312,9 @@ class Window(WindowContents):
     def _draw_at(self, stride: int) -> None:
         """Draw every ``stride``-th point. If only the camera has moved, only the clouds are drawn."""
         changed = self.scene.stride != stride
-        everything = bool(self._wanted) or self._exposed
+        everything = bool(self._requests) or self._exposed
         self.scene.stride = stride
-        if self._wanted:
+        if self._requests:
             self.update()
         elif changed:
             self._show_clouds()
@@ -313,7 +322,10 @@ class Window(WindowContents):
         self._exposed = False
         start = time.perf_counter()
         flat = self.sheets.flat
-        self._render([each for each in self.plotter.renderers if everything or each not in flat])
+        drawn = [
+            renderer for renderer in self.plotter.renderers if everything or renderer not in flat
+        ]
+        self._render(drawn)
         if everything:
             self._sheets_old = False
         if stride == 1:
@@ -330,7 +342,11 @@ class Window(WindowContents):
 
     def _render(self, which: list[Any]) -> None:
         """Draw some of the renderers that are not hidden. The others keep what they show."""
-        hidden = [each for each in self.plotter.renderers if each.GetDraw() and each not in which]
+        hidden = [
+            renderer
+            for renderer in self.plotter.renderers
+            if renderer.GetDraw() and renderer not in which
+        ]
         for renderer in hidden:
             renderer.SetDraw(False)
         self.plotter.render_window.Render()
@@ -368,7 +384,7 @@ class Window(WindowContents):
             self._show_curve(name)
         self._show_timeline()
         if self.depth_shown and self.inspector.depth is not None and not self._depth_drawn:
-            first = len(self.plotter.renderers) - RENDERERS + 3
+            first = list(self.plotter.renderers).index(self.sheets.depth[0])
             depth_view.draw_depth(self.plotter, first, self.inspector.depth, self.places.font_px)
             self._depth_drawn = True
         self._show_sheets()

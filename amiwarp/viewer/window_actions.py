@@ -53,6 +53,8 @@ class WindowActions(Actions):
     sheets: Sheets
     shown: DisplayedWindow
     """What the window shows."""
+    has_shown = False
+    """Whether there is anything in :attr:`shown`."""
     first_dark: bool
     """Whether the window was dark at first."""
     knob: str
@@ -76,7 +78,7 @@ class WindowActions(Actions):
     _picked = -1  # the event whose orbit is shown
     _played_s = 0.0  # when the time window was moved last by playing
     _ended_s = -math.inf  # when playing came to the end of the recording
-    _progress = ""  # of a calibration or film that runs: the keys that stop it
+    _job_keys = ""  # the keys that stop the calibration or film that runs
     _film_ends = False  # whether a film ends now
 
     def close(self) -> None:
@@ -261,8 +263,8 @@ class WindowActions(Actions):
 
     def calibrate(self) -> None:
         """Calibrate on the shown events, or cancel the running calibration. The window goes on meanwhile."""
-        if self._progress:
-            self._progress = ""
+        if self._job_keys:
+            self._job_keys = ""
             return
         with self._job("calibration", "c cancels it"):
             self.calibration_result, text = calibration_job.find_calibration(
@@ -272,8 +274,8 @@ class WindowActions(Actions):
 
     def film(self) -> None:
         """Save a film from here on under a new name in the current folder, or end it. The window goes on meanwhile."""
-        self._film_ends = bool(self._progress)
-        if self._progress:
+        self._film_ends = bool(self._job_keys)
+        if self._job_keys:
             return
         with self._job("film", "f ends it, c cancels it"):
             path = self._new_name("film")
@@ -293,13 +295,13 @@ class WindowActions(Actions):
     @contextlib.contextmanager
     def _job(self, what: str, keys: str) -> Iterator[None]:
         """Run a long job, which :meth:`calibrate` cancels. ``keys``: those that stop it, in words."""
-        self._progress = keys
+        self._job_keys = keys
         with self.errors_shown("window"):
             try:
                 yield
             except JobCancelled:
                 self.message = f"{what} cancelled"
-        self._progress = ""
+        self._job_keys = ""
         self.request("look")
 
     def export(self, what: str) -> None:
@@ -404,7 +406,7 @@ def _hot_text(hot: Sequence[HotPixel]) -> str:
     if not hot:
         return "no hot pixels found"
     busiest = "; ".join(
-        f"x {each.x}, y {each.y}: {each.rate:,.0f} events/s" for each in hot[:NAMED_HOT]
+        f"x {pixel.x}, y {pixel.y}: {pixel.rate:,.0f} events/s" for pixel in hot[:NAMED_HOT]
     )
     most = "with the highest rates: " if len(hot) > NAMED_HOT else ""
     return f"{len(hot):,} hot pixel{'s' if len(hot) > 1 else ''} hidden; {most}{busiest}"

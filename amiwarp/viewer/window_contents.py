@@ -125,7 +125,7 @@ class WindowContents(WindowActions):
         wanted = line.span, source.t_first, self._rates, self._rates.share
         if wanted != self._rates_shown:
             self._rates_shown = wanted
-            low, high = (source.t_first + round(each) for each in line.span)
+            low, high = (source.t_first + round(end) for end in line.span)
             edges, line.rates = self._rates.curve(low, high, layout.RATE_BINS)
             # Which a live stream has received since
             line.rates[:, edges[1:] > self._counted_stop_us] = np.nan

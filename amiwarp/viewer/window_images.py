@@ -240,8 +240,8 @@ class ImageRow:
         """Return the width that there is for each image [px]."""
         count = len(self.panels)
         bars = [self.panels[k].scale for k in range(count) if self._has_bar(k)]
-        room = sum(BAR_EM * em + self._bar_space(scale, em) for scale in bars)
-        return max(1.0, (rect.width - em * (1 + count) - room) / max(count, 1))
+        bars_px = sum(BAR_EM * em + self._bar_space(scale, em) for scale in bars)
+        return max(1.0, (rect.width - em * (1 + count) - bars_px) / max(count, 1))
 
     def _rgb(self, k: int, panel: ImagePanel, width: float) -> NDArray[np.uint8]:
         """Return the colours of an image, with about as many pixels as its place in the window."""

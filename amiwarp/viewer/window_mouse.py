@@ -66,7 +66,7 @@ class Mouse:
         """Return whether a place is on clouds or the depth map, and not on the help over them."""
         shown = [*self._window.scene.views, *self._sheets.depth]
         return not self._on_help(place) and any(
-            each.GetDraw() and each.IsInViewport(*place) for each in shown
+            renderer.GetDraw() and renderer.IsInViewport(*place) for renderer in shown
         )
 
     def _press(self, place: tuple[int, int]) -> bool:

@@ -208,11 +208,11 @@ class Sheets:
         half = (len(self.help_rows) + 1) // 2
         columns = [self.help_rows[:half], self.help_rows[half:]]
         width, height = places.size
-        room = width - places.column.right - 2 * HELP_GAP_PX
+        width_px = width - places.column.right - 2 * HELP_GAP_PX
         for em in range(places.font_px, SMALLEST_PX - 1, -1):
             widths = [_help_width(rows, em) for rows in columns]
             needed_height = LINE * em * (half + 1)
-            if sum(widths) <= room and needed_height <= height:
+            if sum(widths) <= width_px and needed_height <= height:
                 break
         left = places.column.right + HELP_GAP_PX
         top = float(height - HELP_GAP_PX)

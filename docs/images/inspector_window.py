@@ -26,7 +26,7 @@ def main(demo: str) -> None:
     shown = window.Window(
         Inspector(recording, calibration, most_points=WINDOW_POINTS), size=SIZE, off_screen=True
     )
-    while shown.turn():
+    while shown.run_once():
         pass
     picture = Image.fromarray(shown.scene.picture()).quantize(128, dither=Image.Dither.NONE)
     picture.save(Path(__file__).with_name("window.png"), optimize=True)

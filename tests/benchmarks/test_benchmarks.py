@@ -481,14 +481,14 @@ def test_a_walk_has_the_functions_that_run_and_the_frames_above_the_deepest_laun
     call()
     with walker.following() as walk:
         call()
-    assert "compensate_events" in walk.functions["compensation/blocks.py"]
+    assert "compensate_events" in walk.functions["compensation/in_memory.py"]
     assert "LaunchPlan.run" in walk.functions["kernels/compensation.py"]
     assert not any(path.startswith("calib") for path in walk.functions)
     assert walk.deepest == (
         "schema/calls.py _checked_call.<locals>.call",
-        "compensation/blocks.py compensate_events",
-        "compensation/blocks.py BlockCompensator.__call__",
-        "compensation/blocks.py BlockCompensator._compensate",
+        "compensation/in_memory.py compensate_events",
+        "compensation/in_memory.py BlockCompensator.__call__",
+        "compensation/in_memory.py BlockCompensator._on_cpu",
         "kernels/compensation.py LaunchPlan.run",
         "kernels/launch.py launch",
         "kernels/workers.py run_together",

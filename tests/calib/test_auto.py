@@ -17,6 +17,7 @@ from amiwarp import (
     CircleModel,
     Encoder,
     EncoderModel,
+    ErrorCode,
     Events,
     ExactModel,
     FlatSide,
@@ -30,17 +31,12 @@ from amiwarp import (
 )
 from amiwarp.calib import groundwork
 from amiwarp.calib.calibration_events import CalibrationEvents
+from amiwarp.calib.event_sample import SAMPLED, EventSample
 from amiwarp.calib.groundwork import TILT, Groundwork
 from amiwarp.calib.held_out_turns import split_turns
 from amiwarp.calib.model_choice import ModelChooser, compare_models
-from amiwarp.calib.model_fit import (
-    SAMPLED,
-    Places,
-    candidate_space,
-    encoder_noise,
-    fit,
-    linear_motions,
-)
+from amiwarp.calib.model_fit import candidate_space, fit_models, linear_motions
+from amiwarp.calib.timing_blur import encoder_noise
 from amiwarp.calib.trial import CONVERSION_FACTOR, trial_for
 from amiwarp.optics import rungs as wedge_models
 from amiwarp.optics.models.comparison import rms
@@ -84,9 +80,9 @@ def as_circle(wide: Recording) -> Calibration:
     return calibrate(wide, BOTH, budget_px=5.0)
 
 
-def places_of(recording: Recording, most: int = SAMPLED) -> Places:
+def places_of(recording: Recording, most: int = SAMPLED) -> EventSample:
     assert recording.encoder is not None
-    return Places.of(recording.events.slice(0, len(recording.events)), recording.encoder, most)
+    return EventSample.of(recording.events.slice(0, len(recording.events)), recording.encoder, most)
 
 
 def true_exact(recording: Recording) -> ExactModel:
@@ -113,7 +109,9 @@ def test_a_wide_lens_does_not(found: Calibration, wide: Recording) -> None:
     exact = replace(found.exact, parameters={"apex": truth.prism.apex, "phase": truth.phase})
     for name in ("circle", "radial"):
         space = candidate_space(name, exact, (), rad_per_us=7.5e-5, duration_us=3e5)
-        ((_, error),) = fit(linear_motions([space], places), places.compensated(truth), places)
+        ((_, error),) = fit_models(
+            linear_motions([space], places), places.compensated(truth), places
+        )
         assert rungs[name].predicted_px == pytest.approx(error, rel=0.05)
     assert rungs["circle"].predicted_px > 10 * found.ladder.budget_px
     assert rungs["exact"].predicted_px == 0.0
@@ -139,7 +137,9 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(
     apex = found.exact.parameters["apex"]
     larger = replace(found.exact, parameters={**found.exact.parameters, "apex": 1.01 * apex})
     space = candidate_space("circle", larger, (), rad_per_us=7.5e-5, duration_us=3e5)
-    ((values, _),) = fit(linear_motions([space], places), places.compensated(larger.model), places)
+    ((values, _),) = fit_models(
+        linear_motions([space], places), places.compensated(larger.model), places
+    )
     deflection = values["deflection"]
     assert ratio == pytest.approx(
         (deflection - found.parameters["deflection"]) / (0.01 * apex), rel=0.02
@@ -362,6 +362,14 @@ def test_halves_are_alternate_turns() -> None:
     assert [set(turns.tolist()) for turns in whole] == [{0, 2, 4}, {1, 3}]
 
 
+def test_turns_of_an_encoder_that_stands_still_cannot_be_held_out() -> None:
+    still = Encoder(np.array([0, 10_000]), np.zeros(2))
+    events = Events.from_arrays([1, 2], [1, 2], [0, 5000], [0, 1])
+    with pytest.raises(AmiwarpError, match="the encoder stands still") as caught:
+        split_turns(CalibrationEvents(events, still, None))
+    assert caught.value.code is ErrorCode.CALIBRATION_REFUSED
+
+
 def test_an_encoder_s_noise_is_told_from_its_speeding_up() -> None:
     rng = np.random.default_rng(0)
     t = np.cumsum(rng.integers(800, 1200, 4000)).astype(np.int64)
@@ -376,7 +384,7 @@ def test_every_device_judges_alike(found: Calibration, wide: Recording, device: 
     trial = trial_for(wide, found.exact, SHARPNESS, (), device=device)
     values = trial.sharpest([0, 1])
     assert (
-        trial.test.each(trial.space, values).mean()
-        > trial.test.each(trial.space, {**values, "apex": 0.0}).mean()
+        trial.test.of_parts(trial.space, values).mean()
+        > trial.test.of_parts(trial.space, {**values, "apex": 0.0}).mean()
     )
     assert np.abs(trial.start - trial.space.to_vector(values)).max() < 0.3  # px

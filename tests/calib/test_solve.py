@@ -38,6 +38,21 @@ def test_global_algorithms_find_the_hill(algorithm: str) -> None:
     assert stage.score == stage.scores.max() == hill(stage.x)
 
 
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"algorithm": "BOBYQA"}, "^algorithm is 'BOBYQA'"),
+        ({"algorithm": "GN_MLSL", "inner": "BOBYQA"}, "^inner algorithm is 'BOBYQA'"),
+        ({"algorithm": "GN_DIRECT", "inner": "BOBYQA"}, "^inner algorithm is 'BOBYQA'"),
+    ],
+)
+def test_an_unknown_algorithm_is_answered_with_all_that_can_be_given(
+    options: dict[str, str], what: str
+) -> None:
+    with pytest.raises(AmiwarpError, match=f"{what}; choose among .*LN_BOBYQA"):
+        maximise(hill, low=LOW, high=HIGH, start=PEAK, evaluations=9, tolerance=0.1, **options)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("algorithm", LOCAL_ALGORITHMS)
 def test_local_algorithms_climb_it(algorithm: str) -> None:
     stage = maximise(

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from amiwarp.errors import optional_module
 from amiwarp.io.outputs import NewFile
 from amiwarp.live.stream import open_source
 from tests import ROOT
+from tests.errors import refused
 
 COUNT = 500
 
@@ -143,6 +145,54 @@ def test_every_code_is_tested_and_on_the_page_of_errors() -> None:
     rows = re.findall(r"^\| `([a-z-]+)` \| \S.* \|$", page.partition("## Errors")[2], re.MULTILINE)
     assert rows == [code.value for code in ErrorCode]
     assert list(CAUSES) == list(ErrorCode)
+
+
+def picture() -> None:
+    Path("a.raw").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(99))
+    amiwarp.open_recording("a.raw")
+
+
+def words_without_rows() -> None:
+    amiwarp.open_recording(text_file("x y t p\nno numbers\n", "a.txt"))
+
+
+def array_of_one_dimension() -> None:
+    np.save("a.npy", np.arange(4))
+    amiwarp.open_recording("a.npy")
+
+
+def columns_of_text() -> None:
+    amiwarp.save_recording("a.h5", recording())
+    with h5py.File("a.h5", "r+") as file:
+        del file["events/t"]
+        file["events/t"] = np.full(COUNT, 0.5)
+    amiwarp.open_recording("a.h5")
+
+
+def device_of_another_machine() -> None:
+    events = recording().events.slice(0, 9)
+    amiwarp.iwe(events, 64, 48, device="cuda:77")
+
+
+@pytest.mark.parametrize(
+    ("cause", "code"),
+    [
+        (picture, ErrorCode.FORMAT_UNKNOWN),
+        (words_without_rows, ErrorCode.FORMAT_UNKNOWN),
+        (array_of_one_dimension, ErrorCode.FORMAT_UNKNOWN),
+        (columns_of_text, ErrorCode.FORMAT_UNKNOWN),
+        (device_of_another_machine, ErrorCode.DEVICE_MISSING),
+    ],
+)
+def test_the_same_cause_has_the_same_code_everywhere(
+    cause: Callable[[], None],
+    code: ErrorCode,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with refused(code):
+        cause()
 
 
 def raised(message: str, code: ErrorCode | None, cause: Exception | None) -> AmiwarpError:

@@ -433,6 +433,13 @@ def test_names_of_unions_serve_in_checks_and_annotations() -> None:
     assert len(Own(3)) == 3
 
 
+def test_the_name_of_a_function_type_serves_in_checks() -> None:
+    assert isinstance(print, amiwarp.Progress)
+    assert not isinstance(3, amiwarp.Progress)
+    assert issubclass(type(print), amiwarp.Progress)
+    assert not issubclass(int, amiwarp.Progress)
+
+
 @pytest.mark.usefixtures("folder")
 def test_one_word_does_as_a_tuple_of_it() -> None:
     """One text or path is neither taken for its letters nor refused for its type, in any public call."""

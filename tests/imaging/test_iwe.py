@@ -251,6 +251,28 @@ def test_camera_rotation_without_a_model_is_refused() -> None:
         iwe(random_events(10, 64, 48), 64, 48, camera_rotation=CameraRotation((0.0, 1.0, 0.0)))
 
 
+def test_a_rotation_from_over_36_minutes_before_the_events() -> None:
+    """The camera has turned as far as at a 3,000 times faster rate from one second before: 32 bits hold 2,147 s."""
+    camera = Camera.from_fov(64, 48, 1.0)
+    spread = random_events(500, 64, 48)
+    events = Events(spread.x, spread.y, np.full(500, 3_000_000_000), spread.p)
+    encoder = Encoder.constant_speed(720.0, 2_999_000_000, 3_001_000_000)
+    early = CameraRotation((0.0, 1e-5, 0.0), middle_us=0)
+    late = CameraRotation((0.0, 0.03, 0.0), middle_us=2_999_000_000)
+    images = [
+        iwe(
+            events,
+            64,
+            48,
+            model=ExactModel(camera, Prism(0.0)),
+            encoder=encoder,
+            camera_rotation=rotation,
+        )
+        for rotation in (early, late)
+    ]
+    np.testing.assert_allclose(*images, rtol=0, atol=1e-3)
+
+
 def test_model_without_encoder_is_refused() -> None:
     model = ExactModel(Camera.from_fov(64, 48, 1.0), Prism(0.02))
     with pytest.raises(AmiwarpError, match="both a model and an encoder"):

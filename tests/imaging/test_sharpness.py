@@ -99,5 +99,16 @@ def test_bad_images_are_refused(image: np.ndarray) -> None:
         sharpness(np.zeros((3, 4, 4), dtype=np.float32))
 
 
+@pytest.mark.parametrize("where", [(0, 0), (17, 93), (39, 149)])
+def test_a_difference_of_polarities_is_refused(
+    image: np.ndarray, where: tuple[int, int], device: str
+) -> None:
+    """Its sum may be 0, and the score says nothing."""
+    image[where] = -2.5
+    for given in (image, wp.array(image, device=device), wp.array([image, image], device=device)):
+        with pytest.raises(AmiwarpError, match=r"holds the negative value -2\.5; give numbers of"):
+            sharpness(given)
+
+
 def test_an_empty_image_has_no_sharpness() -> None:
     assert sharpness(np.zeros((10, 10), dtype=np.float32)) == 0.0

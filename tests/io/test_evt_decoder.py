@@ -134,6 +134,9 @@ def test_data_that_are_no_words_are_refused() -> None:
             decoder.decode(view)
     with pytest.raises(AmiwarpError, match="version of EVT is '4'; choose among"):
         EvtDecoder("4")
+    for version in ("2.0", "3.0"):
+        with pytest.raises(AmiwarpError, match=f"swapped is True for EVT {version}, but only"):
+            EvtDecoder(version, swapped=True)
 
 
 @pytest.mark.parametrize("rare", [0.003, 0.03])

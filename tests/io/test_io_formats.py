@@ -24,6 +24,7 @@ from amiwarp import (
     AmiwarpError,
     Camera,
     DeviceEvents,
+    ErrorCode,
     Events,
     EvtDecoder,
     MemoryEvents,
@@ -627,10 +628,11 @@ def test_prophesee_hdf5_that_is_damaged(tmp_path):
     for mode in ("packed", "rows", "masks"):
         whole = ecf_chunk(events, mode)
         for chunk, message in (
-            (whole[:-3], "holds other .* than events"), (whole[:5], "lacks its head"),
+            (whole[:-3], "of a chunk of the ECF codec, number 1 of 1, are damaged"),
+            (whole[:5], "dataset 'CD/events': a chunk .* has 5 bytes; expected 12 of its head"),
             (struct.pack("<I", 1 << 31) + whole[4:], r"has 536870912 events in \d+ bytes; expected at most 65535"),
             (ecf_chunk(events[:700], mode), "a chunk has 700 events; expected 800"),
-            (whole[:12] + b"\xf1" * 20 + whole[12:], "holds other times than events"),
+            (whole[:12] + b"\xf1" * 20 + whole[12:], "the times of a chunk"),
         ):  # fmt: skip
             write_ecf(path, [chunk], 800, 800)
             with pytest.raises(AmiwarpError, match=rf"a\.hdf5: .*{message}"):
@@ -741,6 +743,13 @@ def test_messages_of_ros_that_are_refused(tmp_path):
     other[0].encoding = "zip"
     path = write_ros2(tmp_path / "b", {"/events": other})
     assert "encoding 'zip'; expected one of evt3" in str(refusal(open_recording, path))
+    changed = [*packets("mono", EVENTS), *packets("evt3", EVENTS)]
+    path = write_ros2(tmp_path / "d", {"/events": changed})
+    several = (
+        "has packets of several encodings, now 'evt3'; record the topic again with one encoding"
+    )
+    with pytest.raises(AmiwarpError, match=several):
+        open_recording(path)
     store = typestore(True)
     empty = array_message(store, EVENTS[:0], ros1=True)
     write_ros1(tmp_path / "c.bag", {"/events": [empty]})
@@ -900,6 +909,11 @@ FOREIGN = {
     "finding events in the Parquet table: Parquet magic bytes not found": b"PAR1" + bytes(99),
     "is an Arrow table": b"ARROW1\0\0" + bytes(99),
     "is a Python pickle; .* never loaded": pickle.dumps({"x": list(range(999))}, protocol=4),
+    "is a Python pickle; save": pickle.dumps({"x": list(range(999))}, protocol=5),
+    "is a HEIC picture; .*simulate": struct.pack(">I", 24) + b"ftypheic" + bytes(99),
+    "is a HEIF picture; .*simulate": struct.pack(">I", 24) + b"ftypmif1" + bytes(99),
+    "is an AVIF picture; .*simulate": struct.pack(">I", 24) + b"ftypavif" + bytes(99),
+    "is a pcap capture of network": b"\xa1\xb2\x3c\x4d" + bytes(99),
     "is a program": b"\x7fELF\x02\x01\x01" + bytes(99),
     "is an XML document": b'<?xml version="1.0"?><a/>',
 }
@@ -916,7 +930,9 @@ def test_a_damaged_header_of_aedat4_is_named(tmp_path, old, new):
     path.write_bytes(
         whole[:start] + struct.pack("<I", len(header)) + header + whole[start + 4 + size :]
     )
-    with pytest.raises(AmiwarpError, match=r"b\.aedat4: the header is damaged"):
+    with pytest.raises(
+        AmiwarpError, match=r"b\.aedat4: bytes .* the header is damaged: .*; copy the file again"
+    ):
         open_recording(path)
 
 
@@ -954,8 +970,9 @@ def test_a_bag_tells_how_many_of_its_messages_are_read(tmp_path):
 @pytest.mark.parametrize("message", FOREIGN)
 def test_other_files_are_named(tmp_path, message):
     (tmp_path / "file.raw").write_bytes(FOREIGN[message])
-    with pytest.raises(AmiwarpError, match=rf"file\.raw: {message}"):
+    with pytest.raises(AmiwarpError, match=rf"file\.raw: {message}") as caught:
         open_recording(tmp_path / "file.raw")
+    assert caught.value.code is not ErrorCode.INVALID
     assert os.listdir(tmp_path) == ["file.raw"]
 
 

@@ -14,7 +14,15 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from amiwarp import AmiwarpError, Encoder, MemoryEvents, Recording, open_recording, save_recording
+from amiwarp import (
+    AmiwarpError,
+    Encoder,
+    Events,
+    MemoryEvents,
+    Recording,
+    open_recording,
+    save_recording,
+)
 from amiwarp.io import reading_process, reading_server
 from amiwarp.io.hdf5 import chunks
 from amiwarp.io.hdf5 import file as hdf5_file
@@ -143,8 +151,25 @@ def test_large_attributes_are_refused(tmp_path):
         for name in "xytp":
             file[f"events/{name}"] = np.zeros(3, np.uint16 if name != "p" else np.uint8)
         large(file)
-    with pytest.raises(AmiwarpError, match="attribute 'x' has over 65536 bytes"):
+    with pytest.raises(AmiwarpError, match="attribute 'x' has 524,288 bytes, over 65,536"):
         open_recording(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("value", ["y" * 65_537, ["y" * 40_000, "z" * 30_000]])
+def test_long_texts_of_variable_length_are_refused(dsec, value):
+    with h5py.File(dsec, "r+") as file:
+        group = file.create_group("metadata")
+        group.attrs.create("x", value, dtype=h5py.string_dtype())
+    with pytest.raises(AmiwarpError, match=r"attribute 'x' has [\d,]+ bytes, over 65,536; remove"):
+        open_recording(dsec)
+
+
+def test_the_longest_text_is_written_and_read(tmp_path):
+    events = MemoryEvents(Events.from_arrays([1], [1], [1], [1]), 4, 4)
+    save_recording(tmp_path / "a.h5", Recording(events, metadata={"x": "y" * 65_536}))
+    assert open_recording(tmp_path / "a.h5").metadata["x"] == "y" * 65_536
+    with pytest.raises(AmiwarpError, match="metadata 'x' has 65,537 bytes; give at most 65,536"):
+        save_recording(tmp_path / "b.h5", Recording(events, metadata={"x": "y" * 65_537}))
 
 
 def test_text_that_is_no_utf_8_can_be_printed(dsec):

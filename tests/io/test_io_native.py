@@ -425,6 +425,28 @@ def test_index_that_disagrees_is_noticed(tmp_path):
         source.between(5_003_000, 5_004_000)
 
 
+@pytest.mark.parametrize("checksum", [False, True])
+def test_a_compressed_size_that_blosc_would_read_beyond_is_noticed(tmp_path, checksum):
+    """Blosc trusts the compressed size of its header, and would read a block far behind the chunk."""
+    path = tmp_path / "a.h5"
+    blosc = hdf5plugin.Blosc(cname="lz4")
+    with h5py.File(path, "w") as file:
+        for name, kind in (("x", "u2"), ("y", "u2"), ("t", "u4"), ("p", "u1")):
+            values = np.zeros(4096, kind) if name != "t" else np.arange(4096, dtype=kind) * 100
+            file.create_dataset(
+                f"events/{name}", data=values, chunks=(4096,), fletcher32=checksum, **blosc
+            )
+    assert len(open_recording(path, time_unit="us").events.slice(0, 9)) == 9
+    with h5py.File(path) as file:
+        offset = file["events/x"].id.get_chunk_info(0).byte_offset
+    raw = bytearray(path.read_bytes())
+    raw[offset + 12 : offset + 16] = (0x7FFFFFFF).to_bytes(4, "little")
+    raw[offset + 16 : offset + 20] = (0x40000000).to_bytes(4, "little")
+    path.write_bytes(raw)
+    with pytest.raises(AmiwarpError, match="'events/x' has a damaged chunk"):
+        open_recording(path, time_unit="us").events.slice(0, 9)
+
+
 def test_blosc_parameters_that_would_crash_are_noticed(tmp_path):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:

@@ -16,6 +16,7 @@ from amiwarp import (
     MemoryImages,
     Recording,
     RecordingWriter,
+    Truth,
     convert,
     open_recording,
     save_recording,
@@ -26,6 +27,7 @@ from amiwarp.io.aedat import aedat2_imu
 from amiwarp.io.description import describe
 from amiwarp.io.description_table import table_rows
 from amiwarp.io.opening import head_only
+from amiwarp.optics import MODELS
 from reference.io_samples import SIZE, make_events, refusal
 from reference.io_samples_extra import (
     aedat3_packet,
@@ -400,6 +402,14 @@ def test_real_samples_of_a_dvxplorer(data_dir: Path) -> None:
     assert imu is not None
     assert (len(imu), recording.frames) == (475, None)
     assert np.linalg.norm(imu.acceleration, axis=1).mean() == pytest.approx(G, rel=0.1)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_true_angles_of_every_optic_are_described_in_degrees(name: str) -> None:
+    angles = [each.name for each in MODELS[name].PARAMETERS if each.unit == "rad"]
+    truth = Truth(dict.fromkeys(angles, 0.01))
+    data = describe(Recording(MemoryEvents(EVENTS, *SIZE), truth=truth), "a.h5")
+    assert data["truth"] == {f"{angle}_deg": pytest.approx(0.5729578) for angle in angles}
 
 
 def test_info_shows_both(tmp_path: Path) -> None:

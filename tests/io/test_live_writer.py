@@ -502,10 +502,14 @@ def test_a_second_encoder_is_written_beside_the_first(tmp_path):
         for k in range(5):
             part, second = t[100 * k : 100 * k + 100], second_t[80 * k : 80 * k + 80]
             writer.append_encoder(part, part * 1e-4, part[:1])
-            writer.append_encoder(second, second * -3e-5, second=True)
+            writer.append_encoder(second, second * -3e-5, second[1:2], second=True)
     encoder = open_recording(tmp_path / "a.h5").encoder
     expected = Encoder(
-        t + 12, t * 1e-4, 12.0, t[::100] + 12, Encoder(second_t + 12, second_t * -3e-5, 12.0)
+        t + 12,
+        t * 1e-4,
+        12.0,
+        t[::100] + 12,
+        Encoder(second_t + 12, second_t * -3e-5, 12.0, second_t[1::80] + 12),
     )
     for got, given in ((encoder, expected), (encoder.second, expected.second)):
         for name in ("t", "angle", "clock_offset_us", "index_t"):
@@ -562,6 +566,19 @@ def test_an_encoder_with_another_number_of_prisms_is_not_set(tmp_path):
     )
 
 
+def test_the_index_pulses_of_both_encoders_of_a_set_encoder_are_kept(tmp_path):
+    t = np.arange(5) * 1000
+    second = Encoder(t, -t * 1e-3, index_t=t[3:4])
+    with live(tmp_path / "a.h5", encoders=2) as writer:
+        writer.append(make(10))
+        writer.append_encoder(t, t * 1e-3, t[:1])
+        writer.append_encoder(t, -t * 1e-3, t[1:3], second=True)
+        writer.set_encoder(Encoder(t, t * 1e-3, second=second))
+    encoder = open_recording(tmp_path / "a.h5").encoder
+    assert encoder.index_t is None
+    assert encoder.second.index_t.tolist() == [3000]
+
+
 @pytest.mark.parametrize("samples", [2, 20_000])
 def test_an_encoder_set_takes_the_place_of_samples(tmp_path, samples):
     t = np.arange(samples) * 1000
@@ -613,3 +630,14 @@ def test_a_damaged_part_is_refused_at_once(tmp_path):
         outcomes["read" if said is None else "refused"] += 1
         assert time.monotonic() - began < 60.0
     assert min(outcomes.values()) > 5
+
+
+@pytest.mark.parametrize("flags", [[0, 256], [1, -1], [0.5, 1.0], [0.0, np.nan], ["a", "b"]])
+def test_flags_are_zero_or_one(tmp_path, flags):
+    x = np.array([1.5, 2.5], np.float32)
+    events = Events.from_arrays(x, x, [1, 2], [0, 1])
+    with live(tmp_path / "a.h5", compensated=True) as writer:
+        with pytest.raises(AmiwarpError, match=r"flag inside is .*; give booleans, or numbers 0"):
+            writer.append(events, inside=flags)
+        writer.append(events, inside=[True, False])
+    assert len(open_recording(tmp_path / "a.h5").events) == 2

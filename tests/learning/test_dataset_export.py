@@ -352,3 +352,22 @@ def test_rows_are_written_in_groups(
     assert sum(groups) == 121
     assert len(groups) >= 2
     assert all(count >= 25 for count in groups[:-1])
+
+
+def test_the_lists_of_a_row_group_never_hold_more_than_their_offsets_can_count(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import pyarrow.parquet
+
+    items = json.loads((made / "manifest.json").read_text())["items"]
+    longest = max(item["events"] for item in items)
+    monkeypatch.setattr(parquet, "MOST_EVENTS", longest)
+    export_dataset(made, tmp_path / "out", "parquet")
+    total = 0
+    for path in sorted((tmp_path / "out" / "data").glob("*.parquet")):
+        file = pyarrow.parquet.ParquetFile(path)
+        for k in range(file.num_row_groups):
+            count = sum(map(len, file.read_row_group(k)["t"].to_pylist()))
+            assert count <= longest
+            total += count
+    assert total == sum(item["events"] for item in items)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from amiwarp import AmiwarpError, Events, Packet, open_recording
+from amiwarp import AmiwarpError, ErrorCode, Events, Packet, open_recording
 from amiwarp.live.stream import camera_dv, open_source, returning_source
 from reference import dv_stub
 from reference.camera_stub import DAVIS_TRIGGER, POLARITY, TRIGGER, Part, StubCamera, connected
@@ -242,8 +242,9 @@ def test_a_camera_without_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
         spec = "dv:" if name.startswith("dv") else "prophesee:0004"
         with pytest.raises(
             AmiwarpError, match=f"^{spec}: needs the library {name.partition('.')[0]} .*{remedy}"
-        ):
+        ) as caught:
             open_source(spec)
+        assert caught.value.code is ErrorCode.PACKAGE_MISSING
 
 
 class Host:

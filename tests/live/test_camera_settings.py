@@ -19,6 +19,7 @@ from amiwarp import (
     Camera,
     CameraSettings,
     Encoder,
+    ErrorCode,
     Events,
     MemoryEvents,
     Prism,
@@ -483,10 +484,12 @@ def test_a_camera_in_python(spec: str) -> None:
         with open_camera(spec, settings, say=said.append) as packets:
             assert packets.size == size
             assert str(packets.metadata["camera_settings"]).endswith("region=5:6:50:60,trigger=on")
-            gone = "the stream broke off: the camera stopped: gone"
-            with pytest.raises(AmiwarpError, match=gone):  # noqa: PT012
+            gone = "the stream broke off: the camera stopped: gone.*; open the camera again"
+            with pytest.raises(AmiwarpError, match=gone) as caught:  # noqa: PT012
                 for packet in packets:
                     events += len(packet.events)
+            assert caught.value.code is ErrorCode.UNREACHABLE
+            assert packets.lost == (0 if spec == "camera:evk4" else None)
         with pytest.raises(AmiwarpError, match=r"has no masked|masked pixel 9999:1"):
             open_camera(spec, CameraSettings(masked=((9999, 1),))).__enter__()
     assert events == 45 * 54

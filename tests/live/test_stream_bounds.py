@@ -50,6 +50,7 @@ from amiwarp.live.stream import (
     SocketSink,
     SpeedController,
     SpeedKeeper,
+    encode_events,
     encode_hello,
     make_packet,
     phase_check,
@@ -436,6 +437,32 @@ def test_a_client_that_reads_nothing_is_bounded(tmp_path: Path) -> None:
         assert sink.clients == 1
         assert sink.lost > 1000
         sink._clients[0].waiting.clear()  # no parting
+
+
+def test_each_lost_packet_of_a_large_block_is_counted(tmp_path: Path) -> None:
+    events = Events.from_arrays(*np.zeros((4, 600_000), np.int64))
+    block = encode_events(events)  # three packets
+    with (
+        SocketSink(f"unix:{tmp_path}/s", HELLO, most_bytes=1) as sink,
+        socket.socket(socket.AF_UNIX) as client,
+    ):
+        client.connect(f"{tmp_path}/s")
+        sink.tick()
+        sink.send(block)
+        assert sink.lost == 0
+        sink.send(block)
+        assert sink.lost == 3
+        sink.send(encode_events(events[:5]))
+        assert sink.lost == 4
+        sink._clients[0].waiting.clear()  # no parting
+
+
+def test_a_closed_file_is_named(tmp_path: Path) -> None:
+    file = (tmp_path / "out").open("wb")
+    sink = PipeSink(HELLO, file, name="out")
+    file.close()
+    with pytest.raises(AmiwarpError, match="out: the file is closed; open it again"):
+        sink.send(b"more")
 
 
 def test_no_more_clients_than_there_is_memory_for(tmp_path: Path) -> None:

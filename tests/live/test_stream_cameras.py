@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from amiwarp import AmiwarpError, Camera, Events, Packet, Prism, open_recording
+from amiwarp import AmiwarpError, Camera, Events, Packet, Prism, open_camera, open_recording
 from amiwarp.live.stream import camera_neuromorphic, open_source, reopen_source, returning_source
 from reference.calibration_sample import exact_calibration
 from reference.camera_stub import (
@@ -229,6 +229,24 @@ def test_lost_usb_packets_are_counted_and_reported(tmp_path: Path) -> None:
     assert said["events"] == 3000
     assert "this computer is too slow" in said["messages"][0]
     assert "12 USB packets with events were lost" in said["messages"][1]
+
+
+def test_lost_usb_packets_are_counted_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The count goes on when the camera has returned."""
+    monkeypatch.setattr(returning_source, "REOPEN_S", 0.05)
+    made = rows(3000, 0)
+    parts = [[Part(made, dropped=3), UNPLUGGED], [Part(made, dropped=4), UNPLUGGED]]
+    camera = StubCamera(parts=parts, most_openings=2)
+    lost = []
+    with (  # noqa: PT012
+        connected(camera),
+        open_camera("camera:", wait_for_source_s=0.2, say=lambda _: None) as packets,
+        pytest.raises(AmiwarpError, match="was not back"),
+    ):
+        for packet in packets:
+            if len(packet.events):
+                lost.append(packets.lost)
+    assert lost == [3, 7]
 
 
 def test_a_camera_that_is_plugged_in_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -880,6 +880,16 @@ def test_a_depth_map_refuses_values_that_would_spoil_the_filling(
         amiwarp.DepthMap(depths, deviations, np.zeros((2, 2, 3), np.float32))
 
 
+def test_a_depth_map_refuses_unknown_points_at_known_depths() -> None:
+    depths = np.array([[1.0, 0.0], [2.0, math.nan]])
+    points = np.full((2, 2, 3), math.nan)
+    points[:, 0] = 1.0
+    amiwarp.DepthMap(depths, depths, points)  # at an infinite and at an unknown depth
+    points[0, 0, 2] = math.nan
+    with pytest.raises(amiwarp.AmiwarpError, match="points are NaN at a pixel whose depth is know"):
+        amiwarp.DepthMap(depths, depths, points)
+
+
 def wedge_of(calibration: amiwarp.Calibration) -> amiwarp.Calibration:
     """Return the calibration with a wedge instead of the plate."""
     return replace(

@@ -203,7 +203,7 @@ MISTAKES: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
     ),
     "looks at itself": (
         changed(camera__trajectory=[{"t": 0, "position": [0, 0, 0], "look_at": [0, 0, 0]}]),
-        r"field camera.trajectory\[0\]: the camera looks at its own position",
+        r"field camera.trajectory\[0\]: look_at is the position \(0\.0, 0\.0, 0\.0\) itself",
     ),
     "sun without direction": (
         changed(sun__direction=[0, 0, 0]),
@@ -444,6 +444,13 @@ def test_a_header_of_poses_may_follow_comments(tmp_path: Path) -> None:
         "# made by hand\n\nt,x,y,z,qx,qy,qz,qw\n0,0,0,1,0,0,0,1\n2,0,0,1,0,0,0,1\n"
     )
     assert Trajectory.from_file(tmp_path / "a.csv").t.tolist() == [0.0, 2.0]
+    (tmp_path / "a.csv").write_text(
+        "timestamp_s,x,y,z,qx,qy,qz,qw\n3,0,0,1,0,0,0,1\n4,0,0,1,0,0,0,1\n"
+    )
+    assert Trajectory.from_file(tmp_path / "a.csv").t.tolist() == [0.0, 1.0]
+    (tmp_path / "a.csv").write_text("t,x,y,z,qx,qy,qz,qw\nm,m,m,m,1,1,1,1\n")
+    with pytest.raises(AmiwarpError, match=r"a\.csv: line 2 is 'm,m.*; expected 8 numbers"):
+        Trajectory.from_file(tmp_path / "a.csv")
     (tmp_path / "a.csv").write_text("0,0,0,1,0,0,0,1\nt,x,y,z,qx,qy,qz,qw\n")
     with pytest.raises(AmiwarpError, match=r"a\.csv: line 2 is 't,x.*; expected 8 numbers"):
         Trajectory.from_file(tmp_path / "a.csv")
@@ -511,7 +518,7 @@ def test_the_length_of_the_direction_of_the_sun_has_no_effect() -> None:
 
 def test_huge_poses_are_refused_without_warnings() -> None:
     t, still = np.arange(2.0), [0.0, 0.0, 0.0, 1.0]
-    with pytest.raises(AmiwarpError, match="quaternion of length inf; give unit"):
+    with pytest.raises(AmiwarpError, match="quaternion of length inf in pose 1; give unit"):
         Trajectory(t, np.zeros((2, 3)), np.array([still, [1e200, 0.0, 0.0, 0.0]]))
     with pytest.raises(AmiwarpError, match="moves at inf m/s"):
         Trajectory(t, np.array([[1e300, 0.0, 0.0], [-1e300, 0.0, 0.0]]), np.array([still, still]))

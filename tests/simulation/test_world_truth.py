@@ -99,6 +99,28 @@ def named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.parametrize(
+    ("name", "trajectory", "says"),
+    [
+        (
+            "nope.yaml",
+            None,
+            r"world is 'nope\.yaml'; give a file of the kind \.toml or \.json, or one of room, desk",
+        ),
+        (
+            "room",
+            "poses.npz",
+            r"trajectory is 'poses\.npz'; .*\.txt or \.csv or \.tum, or one of still, handheld",
+        ),
+    ],
+)
+def test_a_file_of_another_kind_is_not_taken_for_a_name(
+    name: str, trajectory: str | None, says: str
+) -> None:
+    with pytest.raises(AmiwarpError, match=says):
+        world_choice.open_world(name, trajectory, seed=0, duration_s=1.0)
+
+
 def truth_of(recording: amiwarp.Recording) -> amiwarp.Truth:
     assert recording.truth is not None
     return recording.truth

@@ -533,12 +533,51 @@ def test_a_flickering_lamp_makes_events_of_its_rate() -> None:
             r"light is -1 \.\. 5; give factors in 0 \.\. 1",
         ),
         (lambda: World("none", ()), "no bodies"),
+        (lambda: World(5, ()), "world's name is 5; expected a str"),
         (
             lambda: Trajectory([0.0, 1e-3], [[0, 0, 0], [9, 0, 0]], [[0, 0, 0, 1]] * 2),
             "split the trajectory",
         ),
-        (lambda: Trajectory([0.0, 0.0], np.zeros((2, 3)), [[0, 0, 0, 1]] * 2), "do not increase"),
-        (lambda: Trajectory([0.0], [[0, 0, 0]], [[0, 0, 0, 2]]), "unit quaternions"),
+        (
+            lambda: Trajectory([0.0, 2.0, 1.0], np.zeros((3, 3)), [[0, 0, 0, 1]] * 3),
+            "do not increase: pose 2 at 1 s follows 2 s; sort the poses",
+        ),
+        (
+            lambda: Trajectory([0.0, 1.0], [[0, 0, 0], [0, np.nan, 0]], [[0, 0, 0, 1]] * 2),
+            "not finite, first in pose 1; remove",
+        ),
+        (
+            lambda: Trajectory([0.0, 1.0], [[0, 0, 0]] * 2, [[0, 0, 0, 1], [0, 0, 0, 2]]),
+            "length 2 in pose 1; give unit quaternions",
+        ),
+        (
+            lambda: Trajectory.still((0, 0, 0), look_at=(1, 0, 0), rotation=(9, 9, 9, 9)),
+            "look_at and rotation are both given; give one of them",
+        ),
+        (
+            lambda: Trajectory.still((0, 0), look_at=(1, 0, 0)),
+            r"^position is \(0, 0\); give 3 numbers in m",
+        ),
+        (
+            lambda: Trajectory.still((0, 0, 0), look_at=(1, 0)),
+            r"^look_at is \(1, 0\); give 3 numbers in m",
+        ),
+        (
+            lambda: Trajectory.still((0, 1, 0), look_at=(0, 1, 0)),
+            r"look_at is the position \(0, 1, 0\) itself; give a target at another place",
+        ),
+        (
+            lambda: Trajectory.from_function(lambda t: 3, 1.0),
+            r"pose returns 3 at 0 s; return a scipy",
+        ),
+        (
+            lambda: Trajectory.from_function(lambda t: (None, [0, 0, 0]), 1.0),
+            r"pose returns \(None, \[0, 0, 0\]\) at 0 s; return a scipy Rotation and a position of 3 numbers in m",
+        ),
+        (
+            lambda: Trajectory.from_function(lambda t: (Rotation.identity(), [0, 0]), 1.0),
+            "return a scipy Rotation and a position of 3 numbers in m",
+        ),
         (
             lambda: Trajectory.still((0.0, 0.0, 0.0)).poses([0.0, np.nan]),
             r"t holds NaN; give times in seconds",
@@ -551,6 +590,18 @@ def test_a_flickering_lamp_makes_events_of_its_rate() -> None:
 def test_bad_worlds_are_refused(make: Any, says: str) -> None:
     with pytest.raises(AmiwarpError, match=says):
         make()
+
+
+def test_poses_are_computed_without_the_orientations_of_all_given_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = moving_camera()
+    expected = path.poses([0.05])
+    monkeypatch.setattr(
+        Rotation, "from_quat", lambda *_: pytest.fail("made once, not in each call")
+    )
+    for found, known in zip(path.poses([0.05]), expected, strict=True):
+        np.testing.assert_array_equal(found, known)
 
 
 @pytest.mark.parametrize("width", [64, 128])

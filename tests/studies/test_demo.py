@@ -92,8 +92,8 @@ def test_threads_share_the_compiled_header(tmp_path: Path) -> None:
         "import threading\n"
         "from amiwarp.kernels import checksum, loading\n"
         "from amiwarp.kernels.known_nodes import mark_known\n"
-        "from amiwarp.kernels.votes import turn_events\n"
-        "loading.load_ahead([(checksum.compute_checksums,), (mark_known,), (turn_events,)], 'cpu')\n"
+        "from amiwarp.kernels.events_with_angles import store_turns\n"
+        "loading.load_ahead([(checksum.compute_checksums,), (mark_known,), (store_turns,)], 'cpu')\n"
         "[one.join() for one in threading.enumerate() if one.name.startswith('amiwarp-compiler')]\n"
         f"import pathlib; print(len(list(pathlib.Path({str(tmp_path)!r}).rglob('*.pch'))))\n"
     )

@@ -28,7 +28,7 @@ from amiwarp import (
     Simulation,
     apex_from_deflection,
 )
-from amiwarp.calib.model_fit import QUANTISATION_PX
+from amiwarp.calib.timing_blur import QUANTISATION_PX
 from amiwarp.cli.common import Common, command, report
 from amiwarp.studies import Design, Limits, Timing, design_results, event_volume
 from amiwarp.studies import commands as command_line

@@ -33,11 +33,14 @@ from amiwarp.studies.evaluate import (
     Table,
     Verdict,
     apex_speed,
-    corner_tracks,
     corners,
     evaluation,
     fading,
+    link_corners,
+    project,
+    seen_places,
     texture,
+    track_frames,
 )
 from amiwarp.studies.evaluate.catalogue import EVALUATIONS, load
 from amiwarp.studies.evaluate.conditions import DISCS, IDEAL
@@ -327,7 +330,7 @@ def test_corners_of_shifted_frames() -> None:
         grey[k, 20:35, 10 + 3 * k : 25 + 3 * k] = 200
         if k >= 3:
             grey[k, 50:65, 60:75] = 220
-    tracks = corner_tracks.track_frames(list(grey), [k * 10_000 for k in range(6)])
+    tracks = track_frames(list(grey), [k * 10_000 for k in range(6)])
     begin, last = tracks.first, np.append(tracks.first[1:], len(tracks.t)) - 1
     moved = (tracks.xy[last] - tracks.xy[begin]) / np.maximum(
         tracks.index[last] - tracks.index[begin], 1
@@ -346,10 +349,10 @@ def test_places_that_a_camera_sees(streams: Streams) -> None:
     scene = streams.simulation.scene
     assert isinstance(scene, amiwarp.WorldScene)
     xy = np.array([[10.0, 20.0], [40.0, 30.0]])
-    places = corner_tracks.seen_places(
+    places = seen_places(
         streams.frame(50_000), streams.camera, scene.trajectory, xy, [50_000, 50_000]
     )
-    found, depth = corner_tracks.project(streams.camera, scene.trajectory, places, [50_000, 50_000])
+    found, depth = project(streams.camera, scene.trajectory, places, [50_000, 50_000])
     np.testing.assert_allclose(found, xy, rtol=0, atol=1e-3)  # px
     np.testing.assert_allclose(depth, streams.frame(50_000).depth[[20, 30], [10, 40]], rtol=1e-5)
 
@@ -363,9 +366,7 @@ def test_corners_at_random_places_are_joined_within_the_radius(streams: Streams)
     )
     assert 1.5 < row["error_px"] < 3.0
     assert row["number"] > 100
-    tracks = corner_tracks.link_corners(
-        t, np.random.default_rng(1).uniform(-0.5, [63.5, 47.5], (len(t), 2))
-    )
+    tracks = link_corners(t, np.random.default_rng(1).uniform(-0.5, [63.5, 47.5], (len(t), 2)))
     curve = corners._curve(streams, tracks, corners._begun_on(streams, tracks, frames), frames)
     expected = curve[3]["lifetime_ms"] * 1e-3 * len(tracks.first) / (streams.end_us * 1e-6)
     assert curve[3]["alive"] == pytest.approx(expected)
@@ -546,9 +547,9 @@ WRONG_EDGES: dict[str, tuple[Change, str]] = {
     "unknown": (lambda v: v.update(colour=1), r"values\.colour is unknown"),
     "missing": (lambda v: v["rows"][0].pop("truth"), r"values\.rows\[0\]\.truth is missing"),
     "no list": (lambda v: v.update(rows=1), r"values\.rows is 1; expected a list"),
-    "short": (lambda v: v["rows"][0]["matched"].pop(), "values has lists of other lengths than the 33 thresholds"),
-    "no images": (lambda v: v["images"].pop(0), "has a row of S-EV, but not its images"),
-    "no chance": (lambda v: v["rows"][1]["chance"].pop(), "values has lists of other lengths than the 33 thresholds"),
+    "short": (lambda v: v["rows"][0]["matched"].pop(), r"values\.rows\[0\]\.matched has 32 numbers; expected 33"),
+    "no images": (lambda v: v["images"].pop(0), "values.rows has a row of S-EV, whose images are missing"),
+    "no chance": (lambda v: v["rows"][1]["chance"].pop(), r"values\.rows\[1\]\.chance has 32 numbers; expected 33"),
     "no picture": (lambda v: v["pictures"].update(Canny="AAAA"), r"values\.pictures cannot be decoded"),
     "two sizes": (
         lambda v: v["pictures"].update(Canny=encode_picture(np.zeros((3, 5), np.uint8))), "expected one shape of 2 axes"

@@ -19,6 +19,7 @@ from amiwarp.studies.evaluate import (
     Verdict,
     apex_speed,
     convexity,
+    edge_matches,
     edges,
     fading,
     overlaps,
@@ -215,8 +216,10 @@ def test_chance_is_the_score_of_the_turned_image(column: int, chance: int) -> No
     """A line in the middle of the image matches itself when it is turned, another line does not."""
     mask = np.zeros((40, 60), np.bool_)
     mask[:, column] = True
-    image = edges._Image(mask.astype(np.float64), {edges.CANNY: mask, edges.GEOMETRY: mask}, None)  # type: ignore[arg-type]
-    rows = edges._count("S-EV", image, image.masks(), (1.5,))
+    image = edge_matches.WindowImage(
+        mask.astype(np.float64), {edges.CANNY: mask, edges.GEOMETRY: mask}, None
+    )  # type: ignore[arg-type]
+    rows = edge_matches.match_rows("S-EV", image, image.masks(), (1.5,))
     assert {(row["matched"][-1], row["chance"][-1], row["true"]) for row in rows} == {
         (40, chance, 40)
     }

@@ -29,7 +29,7 @@ from amiwarp import (
     Simulation,
     Vibration,
 )
-from amiwarp.calib.model_fit import QUANTISATION_PX
+from amiwarp.calib.timing_blur import QUANTISATION_PX
 from amiwarp.cli.common import Common, command, report
 from amiwarp.studies import (
     Design,

@@ -9,8 +9,16 @@ import pytest
 from numpy.typing import NDArray
 
 import amiwarp
-from amiwarp.studies.evaluate import corner_tracks
-from amiwarp.studies.evaluate.corner_tracks import Tracks
+from amiwarp.studies.evaluate import (
+    Tracks,
+    corner_tracks,
+    lifetimes,
+    link_corners,
+    lives,
+    quality_curve,
+    track_quality,
+    true_paths,
+)
 
 
 def two_lines(
@@ -26,8 +34,8 @@ def two_lines(
 
 def test_corner_events_are_linked_to_their_tracks() -> None:
     t, xy = two_lines()
-    found = corner_tracks.link_corners(t, xy)
-    np.testing.assert_array_equal(found.number, np.repeat([0, 1], 50))
+    found = link_corners(t, xy)
+    np.testing.assert_array_equal(found.track, np.repeat([0, 1], 50))
     np.testing.assert_array_equal(
         found.index, np.concatenate([np.arange(0, 100, 2), np.arange(1, 100, 2)])
     )
@@ -39,21 +47,21 @@ def test_corner_events_are_linked_to_their_tracks() -> None:
 def test_a_gap_or_a_jump_starts_a_new_track() -> None:
     t, xy = two_lines()
     late = t + np.where(t > 25_000, 30_000, 0)
-    assert len(corner_tracks.link_corners(late, xy).first) == 4
+    assert len(link_corners(late, xy).first) == 4
     jumped = xy + np.where(t > 25_000, 7.0, 0.0)[:, None]
-    assert len(corner_tracks.link_corners(t, jumped).first) == 4
-    assert len(corner_tracks.link_corners(t, jumped, radius_px=12.0).first) == 2
+    assert len(link_corners(t, jumped).first) == 4
+    assert len(link_corners(t, jumped, radius_px=12.0).first) == 2
     lost = xy.copy()
     lost[10:20] = np.nan
-    found = corner_tracks.link_corners(t, lost)
+    found = link_corners(t, lost)
     assert len(found.first) == 2
     assert len(found.t) == 90
 
 
 def test_the_nearest_track_is_chosen() -> None:
     xy = np.array([[10.0, 10.0], [14.0, 10.0], [12.5, 10.0], [10.5, 10.0]])
-    found = corner_tracks.link_corners(np.arange(4), xy)
-    assert found.number.tolist() == [0, 0, 1, 1]
+    found = link_corners(np.arange(4), xy)
+    assert found.track.tolist() == [0, 0, 1, 1]
     assert found.index.tolist() == [0, 3, 1, 2]
 
 
@@ -73,17 +81,17 @@ def test_random_corners_agree_with_a_search_through_all_tracks() -> None:
             last.append(i)
         last[best], expected[i] = i, best
     kept = np.bincount(expected)[expected] >= 2
-    found = corner_tracks.link_corners(t, xy)
+    found = link_corners(t, xy)
     assert len(found.t) == kept.sum() > 300
     numbers = np.unique(expected[kept])
-    np.testing.assert_array_equal(numbers[found.number], expected[found.index])
+    np.testing.assert_array_equal(numbers[found.track], expected[found.index])
 
 
 def test_no_corners_give_no_tracks() -> None:
-    found = corner_tracks.link_corners(np.zeros(0, np.int64), np.zeros((0, 2)))
+    found = link_corners(np.zeros(0, np.int64), np.zeros((0, 2)))
     assert len(found.first) == 0
-    quality = corner_tracks.track_quality(found, np.zeros((0, 2)), 5.0)
-    assert quality.number == 0
+    quality = track_quality(found, np.zeros((0, 2)), 5.0)
+    assert quality.tracks == 0
     assert math.isnan(quality.lifetime_s)
 
 
@@ -101,17 +109,17 @@ def test_lifetime_error_and_rate_are_known() -> None:
     for limit in (2.05, 5.05):
         updates = math.floor(limit * 10)
         np.testing.assert_allclose(
-            corner_tracks.lifetimes(tracks, truth, limit),
+            lifetimes(tracks, truth, limit),
             [updates * 1e-3, 0.060],
             rtol=0,
             atol=1e-9,
         )
-        quality = corner_tracks.track_quality(tracks, truth, limit)
-        assert quality.number == 2
+        quality = track_quality(tracks, truth, limit)
+        assert quality.tracks == 2
         assert quality.lifetime_s == pytest.approx((updates * 1e-3 + 0.060) / 2)
         assert quality.update_hz == pytest.approx(1000.0)
         assert quality.error_px == pytest.approx(0.1 * updates * (updates + 1) / 2 / (updates + 60))
-    curve = corner_tracks.quality_curve(tracks, truth)
+    curve = quality_curve(tracks, truth)
     assert [quality.limit_px for quality in curve] == [2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0]
     assert (np.diff([quality.lifetime_s for quality in curve]) > 0).all()
 
@@ -124,12 +132,12 @@ def test_a_track_does_not_return_from_its_end() -> None:
         np.arange(4),
     )
     truth = np.zeros((4, 2))
-    assert corner_tracks.lives(tracks, truth, 5.0).tolist() == [True, False, False, False]
-    assert corner_tracks.lifetimes(tracks, truth, 5.0).tolist() == [0.0]
-    assert corner_tracks.track_quality(tracks, truth, 5.0).number == 0
-    assert corner_tracks.lifetimes(tracks, truth, 10.0).tolist() == [0.003]
+    assert lives(tracks, truth, 5.0).tolist() == [True, False, False, False]
+    assert lifetimes(tracks, truth, 5.0).tolist() == [0.0]
+    assert track_quality(tracks, truth, 5.0).tracks == 0
+    assert lifetimes(tracks, truth, 10.0).tolist() == [0.003]
     with pytest.raises(amiwarp.AmiwarpError, match="expected the shape of the tracks"):
-        corner_tracks.lives(tracks, truth[:2], 5.0)
+        lives(tracks, truth[:2], 5.0)
 
 
 def test_a_point_is_projected_where_the_camera_sees_it() -> None:
@@ -152,13 +160,13 @@ def test_a_point_is_projected_where_the_camera_sees_it() -> None:
     t = np.arange(0, 400_001, 20_000)
     tracks = Tracks(np.zeros(len(t), np.int64), t, np.zeros((len(t), 2)), np.arange(len(t)))
     place = np.array([[0.4, 2.0, 0.0]])
-    truth = corner_tracks.true_paths(tracks, place, camera, way)
+    truth = true_paths(tracks, place, camera, way)
     # Px
     np.testing.assert_allclose(
         truth[:, 0], 31.5 + focal * (0.4 - t * 1e-6) / 2.0, rtol=0, atol=1e-3
     )
     np.testing.assert_allclose(truth[:, 1], 23.5, rtol=0, atol=1e-3)
-    seen = corner_tracks.true_paths(tracks, place, camera, way, [renderer.at(int(k)) for k in t])
+    seen = true_paths(tracks, place, camera, way, [renderer.at(int(k)) for k in t])
     # Where the line of sight crosses the post's plane, at half way [m]
     crossing = 0.5 * (t * 1e-6 + 0.4)
     hidden = np.isnan(seen[:, 0])
@@ -166,5 +174,5 @@ def test_a_point_is_projected_where_the_camera_sees_it() -> None:
     assert not hidden[abs(crossing - 0.3) > 0.08].any()
     assert hidden.sum() >= 3
     np.testing.assert_array_equal(seen[~hidden], truth[~hidden])
-    unknown = corner_tracks.true_paths(tracks, np.full((1, 3), np.nan), camera, way)
+    unknown = true_paths(tracks, np.full((1, 3), np.nan), camera, way)
     assert np.isnan(unknown).all()

@@ -216,11 +216,11 @@ def test_the_window_saves_and_opens_bookmarks(window: Window, path: Path) -> Non
     assert window.message == "there are no bookmarks; u saves one"
     first = window.state_now()
     window.key("u")
-    window.turn()
+    window.run_once()
     assert window.message == "saved 'view 1' in recording.h5.view.json"
     window.slide("phase", 77.0)
     window.key("3")
-    window.turn()
+    window.run_once()
     window.key("u")
     second = window.state_now()
     window.key("j")
@@ -234,7 +234,7 @@ def test_the_window_saves_and_opens_bookmarks(window: Window, path: Path) -> Non
     assert window.view is View.X_THIRD
     assert window.state_now().selection == second.selection
     window.key("z")  # undo
-    window.turn()
+    window.run_once()
     assert window.inspector.knobs.phase == pytest.approx(first.knobs.phase)
     window.key("j")
     assert window.message == "bookmark view 1"  # after the last one
@@ -258,8 +258,8 @@ def test_a_window_starts_with_a_bookmark(inspector: Inspector, path: Path) -> No
 
 def test_the_page_lists_saves_opens_and_deletes_bookmarks(path: Path, browser: Any) -> None:
     pytest.importorskip("trame_client")
+    from amiwarp.viewer import Panel
     from amiwarp.viewer.layout import SETTABLE
-    from amiwarp.viewer.panel import Panel
     from tests.viewer.test_serve import served
 
     wrong = replace(another(Inspector(open_recording(path))), against=None)

@@ -52,7 +52,7 @@ class Panels:
         self.parts: list[weakref.ref[Any]] = []
 
     def __call__(self, server: Any) -> Callable[[], None]:
-        from amiwarp.viewer.panel import Panel
+        from amiwarp.viewer import Panel
 
         panel = Panel(server, Inspector(self.recording))
         parts = (server, panel, panel.inspector)

@@ -72,7 +72,7 @@ def test_values_are_read_and_set_in_radians(handle: InspectorHandle, recording: 
         **start, "apex": math.radians(1.0), "phase": -3.0, "polarity": 1, "colour": "residual", "view": "x-y",
     }  # fmt: skip
     window.undo()
-    window.turn()
+    window.run_once()
     assert handle.values == start
 
 
@@ -166,9 +166,9 @@ def test_callbacks_get_what_has_changed(handle: InspectorHandle, recording: Reco
     handle.set(phase=1.5, apex=0.01)
     window = window_of(handle)
     window.slide("phase", 10.0)  # [deg], as the mouse does
-    window.turn()
+    window.run_once()
     window.step(-1)
-    window.turn()
+    window.run_once()
     start = handle.values["start_us"]
     assert heard == [
         {"phase": 1.5},
@@ -208,8 +208,8 @@ def test_a_callback_may_set_values(handle: InspectorHandle) -> None:
     )
     window = window_of(handle)
     window.slide("phase", 90.0)
-    window.turn()
-    window.turn()  # what the callback has set
+    window.run_once()
+    window.run_once()  # what the callback has set
     assert window.inspector.knobs.apex == pytest.approx(math.radians(0.9))
     assert handle.values["apex"] == pytest.approx(math.radians(0.9))
 

@@ -84,7 +84,7 @@ def test_the_window_goes_through_the_recordings(inspector: Inspector) -> None:
         names.append(window.inspector.beside.recording.name)
         assert window.shown.first.span.first_us == window.inspector.beside.recording.events.t_first
         window.key("g")
-        window.turn()
+        window.run_once()
     assert names == ["early", "late", "early"]
     window.scene.close()
     alone = Window(Inspector(recorded("own", 0, 1)), size=(500, 350), off_screen=True)
@@ -130,7 +130,7 @@ def test_the_command_takes_several_recordings_with_offsets(
 
 def test_the_page_has_a_row_of_rates_for_each_recording(inspector: Inspector, browser: Any) -> None:
     pytest.importorskip("trame_client")
-    from amiwarp.viewer.panel import Panel
+    from amiwarp.viewer import Panel
     from tests.viewer.test_serve import served, until
 
     panels: list[Panel] = []

@@ -113,7 +113,7 @@ def check(window: Window) -> None:
 def drag(window: Window, name: str, value: float) -> None:
     """Move a slider to a value, and draw."""
     window.slide(name, value)
-    assert window.turn()
+    assert window.run_once()
 
 
 def said(window: Window) -> str:
@@ -196,7 +196,7 @@ def check_the_mouse_moves_the_camera(window: Window) -> None:
     camera = window.scene._views[0].camera
     for place in nine_places(window):
         window.look_from(View.FREE)
-        assert window.turn()
+        assert window.run_once()
         picture = window.scene.picture()
         for action in (
             "Left",
@@ -215,7 +215,7 @@ def check_the_mouse_moves_the_camera(window: Window) -> None:
                 pull(window, place, action)
             after = *camera.position, *camera.focal_point, *camera.up
             assert np.abs(np.subtract(after, before)).max() > 0.1, (place, action)
-        assert window.turn(), place
+        assert window.run_once(), place
         # only the clouds, their frames and labels have changed, not texts, legends and charts
         changed = (window.scene.picture() != picture).any(axis=2)
         outside = changed.copy()
@@ -229,14 +229,14 @@ def check_the_mouse_moves_the_camera(window: Window) -> None:
 
 def test_the_mouse_turns_shifts_and_zooms_the_clouds(window: Window) -> None:
     """At nine places, beside each other and overlaid, and after help and statistics were shown."""
-    while window.turn():  # until the curves are there
+    while window.run_once():  # until the curves are there
         pass
     check_the_mouse_moves_the_camera(window)
     for key in ("h", "h", "i", "i"):
         window.key(key)
-        assert window.turn()
+        assert window.run_once()
     window.toggle("overlaid")
-    assert window.turn()
+    assert window.run_once()
     check_the_mouse_moves_the_camera(window)
 
 
@@ -252,7 +252,7 @@ def test_the_mouse_turns_a_cloud_without_charts(recording: Recording) -> None:
 def test_a_drag_that_leaves_a_cloud_turns_it_nevertheless(window: Window) -> None:
     """The mouse moves over help, charts and sliders, and is released there."""
     window.key("h")
-    assert window.turn()
+    assert window.run_once()
     camera = window.scene._views[0].camera
     for end in ((450, 450), (600, 60), (60, 300)):  # help, charts, sliders
         mouse(window, "LeftButtonPress", (320, 260))
@@ -260,7 +260,7 @@ def test_a_drag_that_leaves_a_cloud_turns_it_nevertheless(window: Window) -> Non
         before = camera.position
         mouse(window, "MouseMove", end)
         mouse(window, "LeftButtonRelease", end)
-        assert window.turn()
+        assert window.run_once()
         assert math.dist(camera.position, before) > 1.0
         assert window.knob == "apex"  # no slider has moved
 
@@ -278,7 +278,7 @@ def test_the_slider_of_the_size_is_that_of_a_vibrating_camera(recording: Recordi
 
 def test_a_depth_map_is_shown_as_an_image_and_as_points(window: Window) -> None:
     window.key("5")
-    assert window.turn()
+    assert window.run_once()
     assert "there is no depth map" in said(window)
     camera = Camera.from_fov(40, 30, 1.0)
     rng = np.random.default_rng(0)
@@ -307,7 +307,7 @@ def test_a_depth_map_is_shown_as_an_image_and_as_points(window: Window) -> None:
     place = (500, 400)  # on the left cloud
     assert made.plotter.iren.interactor.FindPokedRenderer(*place) is made.scene._views[0]
     made.key("5")
-    assert made.turn()
+    assert made.run_once()
     assert [bool(each.GetDraw()) for each in (bar, image, cloud)] == [True] * 3
     assert made.plotter.iren.interactor.FindPokedRenderer(*place) is image
     shown = [next(actor.mapper.dataset for actor in each.actors.values() if hasattr(actor, "mapper"))
@@ -322,7 +322,7 @@ def test_a_depth_map_is_shown_as_an_image_and_as_points(window: Window) -> None:
     np.testing.assert_array_equal(found, np.column_stack([px, pz, -py]))
     np.testing.assert_array_equal(shown[1]["colour"], scale.rgb(metres[known]))
     made.key("1")
-    assert made.turn()
+    assert made.run_once()
     assert not any(each.GetDraw() for each in made.sheets.depth)
     assert made.plotter.iren.interactor.FindPokedRenderer(*place) is made.scene._views[0]
     made.scene.close()
@@ -407,7 +407,7 @@ def test_many_moves_of_a_slider_cost_one_picture(
     )
     for value in (0.5, 0.6, 0.7):
         window.slide("apex", value)
-    window.turn()
+    window.run_once()
     assert len(shows) == 1
     assert window.inspector.knobs.apex == pytest.approx(math.radians(0.7), abs=1e-6)
 
@@ -421,7 +421,7 @@ def test_a_slow_renderer_draws_fewer_points_until_nothing_moves(
     assert len(points(window, 1)) == -(-everything // 7)
     assert f", {-(-everything // 7):,} of these drawn" in window.scene._caption.input
     monkeypatch.setattr("amiwarp.viewer.window.REST_S", 0.0)
-    assert window.turn()
+    assert window.run_once()
     check(window)
     assert ", all of these drawn" in window.scene._caption.input
 
@@ -483,7 +483,7 @@ def test_a_click_describes_the_event_and_shows_its_orbit(window: Window, cloud: 
     interactor.SetEventPosition(*at)
     interactor.InvokeEvent("LeftButtonPressEvent")
     interactor.InvokeEvent("LeftButtonReleaseEvent")
-    window.turn()
+    window.run_once()
     k = window._picked
     place.SetValue(*drawn[k])
     assert math.dist(place.GetComputedDisplayValue(renderer), at) <= 6.0
@@ -494,7 +494,7 @@ def test_a_click_describes_the_event_and_shows_its_orbit(window: Window, cloud: 
     np.testing.assert_allclose(x.y, orbit[:, 0] - column[:, 0], atol=1e-3)
     np.testing.assert_allclose(column[0, :2], shown.after[k], atol=1e-3)
     window.pick((int(renderer.GetOrigin()[0]) + 3, int(renderer.GetOrigin()[1]) + 3))
-    window.turn()
+    window.run_once()
     assert window._picked == -1
     drag(window, "length_ms", 20.0)
     assert window._picked == -1
@@ -502,19 +502,19 @@ def test_a_click_describes_the_event_and_shows_its_orbit(window: Window, cloud: 
 
 def test_keys_do_what_the_help_says(window: Window) -> None:
     window.key("h")
-    window.turn()
+    window.run_once()
     assert window.sheets.help.renderer.GetDraw()
     words = [words for _, words in window.sheets.help_rows]
     assert all(text in words for key, _, text in MORE_KEYS if key not in OF_PLAIN | {"5"})
     assert "redo; also Ctrl+Y" in words
     window.key("question")
-    window.turn()
+    window.run_once()
     assert not window.sheets.help.renderer.GetDraw()
 
     pictures = [window.scene.picture()]
     for key in ("d", "k", "2", "o", "t", "plus", "n", "m", "w"):
         window.key(key)
-        assert window.turn(), key
+        assert window.run_once(), key
         pictures.append(window.scene.picture())
         assert (pictures[-1] != pictures[-2]).any(), key
     assert window.look.dark
@@ -534,30 +534,30 @@ def test_steps_nudges_and_undo(window: Window) -> None:
     start = window.inspector.window
     assert start is not None
     window.key("Right")
-    window.turn()
+    window.run_once()
     assert window.inspector.window == (
         pytest.approx(start[0] + window.inspector.turn_us, abs=50.0),
         start[1],
     )
     window.key("Tab")
-    window.turn()
+    window.run_once()
     assert window.knob == "phase"
     phase = sliders.knob_values(window.inspector)["phase"]
     window.key("Up")
-    window.turn()
+    window.run_once()
     assert sliders.knob_values(window.inspector)["phase"] == pytest.approx(phase + 0.25, abs=1e-3)
     for _ in range(2):
         window.key("z")
-        window.turn()
+        window.run_once()
     assert sliders.knob_values(window.inspector)["phase"] == pytest.approx(phase)
     assert window.inspector.window == start
     drag(window, "length_ms", 15.0)
     for key in ("Right", "z"):  # an undo right after a change undoes that change, and can be redone
         window.key(key)
-    window.turn()
+    window.run_once()
     assert window.inspector.window[0] == start[0]
     window.key("y")
-    window.turn()
+    window.run_once()
     assert window.inspector.window[0] == pytest.approx(
         start[0] + window.inspector.turn_us, abs=50.0
     )
@@ -572,7 +572,7 @@ def test_statistics_of_the_region_are_those_of_the_page(
     window.key("i")
     for key in ("d", "n"):
         window.key(key)
-        while window.turn():
+        while window.run_once():
             pass
         assert window.sheets.side.renderer.background_color.hex_rgb == PANEL_COLOURS[True][0]
         found = window.inspector.statistics()
@@ -584,7 +584,7 @@ def test_statistics_of_the_region_are_those_of_the_page(
     assert ["ON", "100.0 %"] in found["rows"]
     assert window.sheets.side.renderer.GetDraw()
     window.key("i")
-    window.turn()
+    window.run_once()
     assert not window.sheets.side.renderer.GetDraw()
 
 
@@ -608,14 +608,14 @@ def test_statistics_of_the_window_before_are_marked(
     window.key("space")
     for _ in range(2):
         window._played_s -= 0.1
-        window.turn()
+        window.run_once()
         assert title() == old
     window.key("space")
     settle(window, monkeypatch)
     assert title() == new
     for change in ("n", "w"):
         window.key(change)
-        window.turn()
+        window.run_once()
         assert title() == old, change
         settle(window, monkeypatch)
         assert title() == new, change
@@ -668,17 +668,17 @@ def test_a_film_of_the_window_is_ended_or_cancelled(
         shares.append(share)
         if len(shares) == 3:
             window.key(key)
-        window._progress_due_s = 0.0
+        window._job_keys_due_s = 0.0
         show(what, share)
         assert "(f ends it, c cancels it)" in " ".join(said(window).split())
 
     monkeypatch.setattr(window, "_show_progress", progress)
     window.key("f")
-    window.turn()
+    window.run_once()
     assert [len(film_of(path)) for path in tmp_path.iterdir()] == [3] * films
     assert ("saved" if films else "film cancelled") in said(window)
     assert len(shares) == 3
-    assert not window._progress
+    assert not window._job_keys
 
 
 FILM_OF_A_WINDOW = """
@@ -693,12 +693,12 @@ def seen():
         return np.frombuffer(screen.read(), "<u4")[-640 * 480:].reshape(480, 640) & 0xffffff
 
 window = Window(Inspector(open_recording(sys.argv[1])), size=(640, 480))
-while window.turn():
+while window.run_once():
     pass
 before, show, pictures = seen(), window._show_progress, []
 
 def progress(what, share):
-    window._progress_due_s = 0.0
+    window._job_keys_due_s = 0.0
     show(what, share)
     pictures.append(seen())
     if len(pictures) == 4:
@@ -706,7 +706,7 @@ def progress(what, share):
 
 window._show_progress = progress
 window.key("f")
-while window.turn():
+while window.run_once():
     pass
 for after in (*pictures, seen()):
     differs = after != before
@@ -783,11 +783,11 @@ def test_playing_moves_the_window_to_the_end(window: Window, recording: Recordin
     assert start is not None
     window.key("space")
     window._played_s -= 0.1  # 10 ms of the recording
-    window.turn()
+    window.run_once()
     assert window.inspector.window is not None
     assert window.inspector.window[0] >= start[0] + 10_000
     window._played_s -= 100.0
-    window.turn()
+    window.run_once()
     assert not window.plays
     assert sum(window.inspector.window) == recording.events.t_last + 1
 
@@ -797,34 +797,34 @@ def test_playing_is_said_and_does_not_start_again_when_it_was_to_stop(
 ) -> None:
     assert "playing" not in said(window)
     window.key("space")
-    window.turn()
+    window.run_once()
     assert "playing at 0.1 × real time" in said(window)
     window.key("space")
-    window.turn()
+    window.run_once()
     assert "playing" not in said(window)
     assert "stopped" in said(window)
     assert "end of the recording" not in said(window)
     window.key("space")
-    window.turn()
+    window.run_once()
     assert window.plays
     assert "stopped" not in said(window)
     window._played_s -= 100.0
-    window.turn()
+    window.run_once()
     assert "stopped at the end of the recording" in said(window)
     end = window.time_window
     window.key("space")  # of a user who saw the window move until just now
-    window.turn()
+    window.run_once()
     assert not window.plays
     assert window.time_window == end
     window._ended_s -= 1.1
     window.key("space")
-    window.turn()
+    window.run_once()
     assert window.plays
     assert window.time_window[0] < end[0]
     assert "stopped" not in said(window)
     window.key("space")
     window.key("Left")
-    window.turn()
+    window.run_once()
     assert "end of the recording" not in said(window)
 
 
@@ -856,16 +856,16 @@ def test_a_plain_recording_has_controls_of_a_prism_only_when_they_are_asked_for(
     assert "encoder" not in said(window)
     for key in ("Up", "Down", "Tab"):  # of the parameter moved last: there is none
         window.key(key)
-        window.turn()
+        window.run_once()
     window.key("comma")
-    window.turn()
+    window.run_once()
     half = window.shown.span.count
     assert half == pytest.approx(count / 2, abs=20)
     window.key("period")
-    window.turn()
+    window.run_once()
     assert window.shown.span.count == pytest.approx(2 * half, abs=20)
     window.key("x")
-    window.turn()
+    window.run_once()
     assert list(window.sliders)[:3] == ["apex", "phase", "rpm"]
     assert "no encoder" in said(window)
     window.scene.close()
@@ -880,7 +880,7 @@ def test_the_calibration_and_a_picture_are_saved_under_new_names(
     )
     for key in ("s", "p", "p"):
         window.key(key)
-        window.turn()
+        window.run_once()
     names = sorted(path.name for path in tmp_path.iterdir())
     assert len(names) == 3
     assert [name.rpartition(".")[2] for name in names] == ["json", "png", "png"]
@@ -904,19 +904,19 @@ def test_the_first_state_is_also_that_of_light_and_dark(window: Window) -> None:
         for keys in ("do", "ddo", "do"):
             for key in (*keys, "r"):
                 window.key(key)
-                window.turn()
+                window.run_once()
             assert (window.look.dark, window.look.overlaid) == (first, False)
 
 
 def test_calibrate_shows_its_progress_and_is_accepted(window: Window) -> None:
     window.whole()
-    window.turn()
+    window.run_once()
     window.key("c")
-    window.turn()
+    window.run_once()
     assert window.calibration_result is not None
     assert "Press a to accept" in " ".join(said(window).split())
     window.key("a")
-    window.turn()
+    window.run_once()
     assert window.inspector.knobs.apex == pytest.approx(TRUE.apex, rel=0.05)
     check(window)
 
@@ -931,7 +931,7 @@ def test_a_calibration_is_cancelled_by_the_same_key(
 
     monkeypatch.setattr("amiwarp.viewer.calibration_job.find_calibration", find_calibration)
     window.key("c")
-    window.turn()
+    window.run_once()
     assert "calibration cancelled" in said(window)
     assert window.calibration_result is None
 
@@ -945,7 +945,7 @@ def test_a_live_stream_is_followed(recording: Recording) -> None:
     assert window.plays
     for _ in range(3):
         window._played_s -= 1.0
-        window.turn()
+        window.run_once()
     assert sum(window.inspector.window or ()) == recording.events.t_last + 1
     window.scene.close()
 
@@ -987,14 +987,14 @@ def strike(window: Window, *places: tuple[float, float], shift: bool = False) ->
     for place in others:
         mouse(window, "MouseMove", place, shift=shift)
     mouse(window, "LeftButtonRelease", (others or [first])[-1], shift=shift)
-    assert window.turn()
+    assert window.run_once()
 
 
 def settle(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the window do all that it does when nothing moves."""
     with monkeypatch.context() as patch:
         patch.setattr("amiwarp.viewer.window.REST_S", 0.0)
-        while window.turn():
+        while window.run_once():
             pass
 
 
@@ -1023,18 +1023,18 @@ def test_the_handle_of_a_slider_follows_the_mouse(window: Window) -> None:
     assert window.scene._views[0].camera.position == camera
     knobs = window.inspector.knobs
     mouse(window, "MouseMove", (round(x), round(y)))  # the button is no longer pressed
-    window.turn()
+    window.run_once()
     assert window.inspector.knobs == knobs
     strike(window, (slider.track.left + 0.25 * slider.track.width, y))  # a click beside the handle
     quarter = slider.least + 0.25 * (slider.most - slider.least)
     assert math.degrees(window.inspector.knobs.apex) == pytest.approx(quarter, abs=0.02)
     now = math.degrees(window.inspector.knobs.apex)
     mouse(window, "MouseWheelForward", (round(x), round(y)))
-    window.turn()
+    window.run_once()
     assert math.degrees(window.inspector.knobs.apex) == pytest.approx(now + slider.step, abs=1e-6)
     for _ in range(3):  # the wheel, the click, and the drag, each in one step
         window.key("z")
-        window.turn()
+        window.run_once()
     assert math.degrees(window.inspector.knobs.apex) == pytest.approx(1.2, abs=1e-6)
 
 
@@ -1057,7 +1057,7 @@ def test_each_slider_is_under_its_own_title(window: Window) -> None:
 
 def test_a_region_is_drawn_on_the_first_image(window: Window) -> None:
     window.whole()
-    window.turn()
+    window.run_once()
     frame, size = window.sheets.images.frames[0], window.inspector.recording.events.size
     picture, places = window.scene.picture(), window.places
 
@@ -1066,13 +1066,13 @@ def test_a_region_is_drawn_on_the_first_image(window: Window) -> None:
 
     mouse(window, "LeftButtonPress", tuple(map(round, place(20.5, 10.5))))
     mouse(window, "MouseMove", tuple(map(round, place(60.5, 50.5))))
-    assert window.turn()
+    assert window.run_once()
     assert window.sheets.images._region_text() == "x 20 to 61, y 10 to 51 px"
     assert changed(window, picture, frame) > 0.02  # the region is drawn while the mouse moves
     assert changed(window, picture, places.clouds) == 0.0
     mouse(window, "MouseMove", tuple(map(round, place(80.5, 70.5))))
     mouse(window, "LeftButtonRelease", tuple(map(round, place(80.5, 70.5))))
-    assert window.turn()
+    assert window.run_once()
     assert window.shown.region == (20, 10, 81, 71)
     assert window.inspector.selection.region == (20, 10, 81, 71)
     assert changed(window, picture, places.clouds) > 0.01
@@ -1087,19 +1087,19 @@ def test_a_region_is_drawn_on_the_first_image(window: Window) -> None:
     strike(window, (frame.left + 20, frame.top - 20), (frame.left + 21, frame.top - 21))
     assert window.shown.region == (left, top, left + 41, top + 31)
     window.key("z")
-    window.turn()
+    window.run_once()
     assert window.shown.region == (20, 10, 81, 71)
     window.key("w")
-    window.turn()
+    window.run_once()
     assert window.shown.region == (0, 0, *size)
     window.key("e")
-    window.turn()
+    window.run_once()
     assert window.inspector.selection.region == window.inspector.suggest_region()
 
 
 def test_the_mouse_reads_the_values_of_both_images(window: Window) -> None:
     window.whole()
-    window.turn()
+    window.run_once()
     row, shown = window.sheets.images, window.shown
     y, x = np.unravel_index(np.argmax(shown.image_after), shown.image_after.shape)
     width, height = window.inspector.recording.events.size
@@ -1110,18 +1110,18 @@ def test_the_mouse_reads_the_values_of_both_images(window: Window) -> None:
             frame.top - (y + 0.5) / height * frame.height,
         )
         mouse(window, "MouseMove", (round(at[0]), round(at[1])))
-        assert window.turn()
+        assert window.run_once()
         before, after = shown.image_before[y, x], shown.image_after[y, x]
         assert row._under == f"x {x}, y {y} px: {before:g} events → {after:g} events"
         mouse(window, "MouseMove", beside)
-        assert window.turn()
+        assert window.run_once()
         assert row._under == ""
 
 
 def test_the_values_below_the_images_are_always_under_the_mouse(window: Window) -> None:
     """Also after a region was drawn, while nothing moves, and after the parameters have changed."""
     window.whole()
-    window.turn()
+    window.run_once()
     row = window.sheets.images
 
     def check_at(place: tuple[int, int]) -> None:
@@ -1139,14 +1139,14 @@ def test_the_values_below_the_images_are_always_under_the_mouse(window: Window) 
         (round(frame.left + 60), round(frame.top - 50)),
     )
     mouse(window, "MouseMove", start)
-    window.turn()
+    window.run_once()
     check_at(start)
     strike(window, start, end)
     check_at(end)
     drag(window, "apex", 0.5)
     check_at(end)
     window.key("w")
-    window.turn()
+    window.run_once()
     check_at(end)
 
 
@@ -1202,7 +1202,7 @@ def test_the_images_are_those_of_the_page(window: Window, monkeypatch: pytest.Mo
                 k,
             )
         window.key("6")
-        assert window.turn()
+        assert window.run_once()
         if (window.image, window.difference) == kinds[0]:
             break
     names = {kind for kind, _ in kinds}
@@ -1215,19 +1215,19 @@ def test_the_images_are_those_of_the_page(window: Window, monkeypatch: pytest.Mo
 
 def test_the_kind_of_images_is_undone_and_set_by_a_state(window: Window) -> None:
     window.key("6")
-    window.turn()
+    window.run_once()
     assert window.image is ImageKind.POLARITY
     assert window.history is not None
     assert window.history.state.image is ImageKind.POLARITY
     window.key("z")
-    window.turn()
+    window.run_once()
     assert window.image is ImageKind.COUNT
     state = replace(
         window.history.state, difference=True, axis=Axis.TIME, view=View.XY, decay_us=500
     )
     window.show_state(state)
     window.request("knobs")
-    window.turn()
+    window.run_once()
     assert window.difference
     assert window.remember("").state == state
     assert address.decode_state(
@@ -1246,10 +1246,10 @@ def test_brightness_stays_while_a_slider_moves(
     mouse(window, "LeftButtonPress", (x, y))
     for step in (20, 40, 60):
         mouse(window, "MouseMove", (x + step, y))
-        window.turn()
+        window.run_once()
         assert window.sheets.images.panels[1].scale == first
     monkeypatch.setattr("amiwarp.viewer.window.REST_S", 0.0)
-    assert not window.turn()  # while the button is pressed, it does not rest
+    assert not window.run_once()  # while the button is pressed, it does not rest
     assert window.sheets.images.panels[1].scale == first
     mouse(window, "LeftButtonRelease", (x + 60, y))
     settle(window, monkeypatch)
@@ -1285,21 +1285,21 @@ def test_the_timeline_moves_resizes_and_zooms(
     before, picture = line.span, window.scene.picture()
     at = line.column_of(100_000)
     mouse(window, "MouseWheelForward", (round(at), round(y)))
-    assert window.turn()
+    assert window.run_once()
     assert line.span[1] - line.span[0] == pytest.approx((before[1] - before[0]) / 1.25)
     assert line.column_of(100_000) == pytest.approx(at, abs=1.0)
     assert changed(window, picture, window.places.timeline) > 0.005
     assert changed(window, picture, window.places.clouds) == 0.0
     for _ in range(4):
         mouse(window, "MouseWheelForward", (round(at), round(y)))
-        window.turn()
+        window.run_once()
     shown, held = line.span, line.time_at(at)
     strike(window, (at, y), (at + 60, y), shift=True)
     assert line.span[1] - line.span[0] == pytest.approx(shown[1] - shown[0])
     assert line.time_at(at + 60) == pytest.approx(held, abs=200)
     for _ in range(9):
         mouse(window, "MouseWheelBackward", (round(at), round(y)))
-        window.turn()
+        window.run_once()
     assert line.span == (0.0, window.whole_us)
 
 
@@ -1381,7 +1381,7 @@ def test_no_change_of_the_view_cuts_the_clouds_off(recording: Recording) -> None
             mouse(window, "MouseWheelForward", place)
         else:
             window.key(action)
-        assert window.turn()
+        assert window.run_once()
         depths = seen_depths(window)
         assert len(depths) == 2
         for depth in depths:
@@ -1393,9 +1393,9 @@ def test_no_change_of_the_view_cuts_the_clouds_off(recording: Recording) -> None
 
 def test_a_new_region_does_not_turn_the_camera(window: Window) -> None:
     window.whole()
-    window.turn()
+    window.run_once()
     pull(window, nine_places(window)[4], "Left")
-    assert window.turn()
+    assert window.run_once()
     camera = window.scene._views[0].camera
     direction, up, place = camera.direction, camera.up, camera.position
     frame = window.sheets.images.frames[0]
@@ -1417,24 +1417,24 @@ def test_a_new_region_does_not_turn_the_camera(window: Window) -> None:
     assert (places_of < renderer.GetSize()).all()
     assert (np.ptp(places_of, axis=0) / renderer.GetSize()).max() > 0.5
     window.plotter.window_size = (1000, 700)
-    assert window.turn()
+    assert window.run_once()
     np.testing.assert_allclose(camera.direction, direction, atol=1e-9)
     window.key("1")
-    window.turn()
+    window.run_once()
     assert math.dist(camera.direction, direction) > 0.05
 
 
 def test_labels_are_readable_in_front_of_events_and_not_cut(window: Window) -> None:
     """Events lie behind the numbers, as a wrong apex angle moves them; a line is between zoomed clouds, which touch."""
     window.draw_region((40, 30, 80, 60))
-    window.turn()
+    window.run_once()
     drag(window, "apex", 2.2)
     window.key("3")
-    window.turn()
+    window.run_once()
     covered = 0
     for _ in range(4):
         mouse(window, "MouseWheelForward", nine_places(window)[4])
-        assert window.turn()
+        assert window.run_once()
         picture, height = window.scene.picture(), window.plotter.window_size[1]
         for k, renderer in enumerate(window.scene._views):
             x, y = renderer.GetOrigin()
@@ -1532,7 +1532,7 @@ def test_no_text_is_cut_off(
     settle(window, monkeypatch)
     picture = window.scene.picture()
     window.plotter.window_size = size
-    assert window.turn()
+    assert window.run_once()
     assert window.places.size == size
     for keys in ((), ("i",), ("h",), ("k", "6"), ("k", "k", "6", "d"), ("2",), ("x", "6")):
         for key in keys:
@@ -1608,7 +1608,7 @@ def check_labels(labels: list[Label], corners: np.ndarray, least: set[str]) -> N
 
 def test_numbers_of_the_axes_are_where_their_values_are(window: Window) -> None:
     window.key("2")
-    window.turn()
+    window.run_once()
     scene, box = window.scene, window.scene.box
     labels = scene._axes[0].labels()
     renderer = scene._views[0]
@@ -1630,15 +1630,15 @@ def test_points_are_as_large_as_pixels_in_the_image(window: Window) -> None:
     """So that an area with an event at each pixel has no gaps, and no point covers its neighbours."""
     window.whole()
     window.key("2")
-    window.turn()
+    window.run_once()
     renderer, camera = window.scene._views[0], window.scene._views[0].camera
     pixel_px = renderer.GetSize()[1] / (2.0 * camera.parallel_scale)
     assert window.scene._clouds[0].prop.point_size == pytest.approx(pixel_px)
     window.key("plus")
-    window.turn()
+    window.run_once()
     assert window.scene._clouds[0].prop.point_size == pytest.approx(1.5 * pixel_px)
     window.key("1")
-    window.turn()
+    window.run_once()
     assert window.scene._clouds[0].prop.point_size == 3.0
 
 
@@ -1669,7 +1669,7 @@ def test_while_the_camera_moves_only_the_clouds_are_drawn(
 ) -> None:
     settle(window, monkeypatch)
     window.key("h")
-    window.turn()
+    window.run_once()
     drawn: list[set[str]] = []
     names = {window.sheets.strip.renderer: "strip", window.sheets.column.renderer: "column",
              window.sheets.help.renderer: "help", window.scene._views[0]: "cloud"}  # fmt: skip
@@ -1681,13 +1681,13 @@ def test_while_the_camera_moves_only_the_clouds_are_drawn(
     for step in (5, 10):
         drawn.append(set())
         mouse(window, "MouseMove", (x + step, y))
-        assert window.turn()
+        assert window.run_once()
         window.plotter.iren.interactor.EnableRenderOff()
     assert drawn == [{"cloud", "help"}] * 2  # the help lies over the clouds
     drawn.append(set())
     mouse(window, "LeftButtonRelease", (x + 10, y))
     window.key("d")
-    assert window.turn()
+    assert window.run_once()
     assert drawn[-1] == {"cloud", "help", "strip", "column"}
 
 
@@ -1713,15 +1713,15 @@ def test_a_plain_recording_has_no_keys_of_a_prism(plain: Window) -> None:
     knobs, look = plain.inspector.knobs, plain.look
     for key in ("t", "m", "c", "b", "v"):
         plain.key(key)
-        plain.turn()
+        plain.run_once()
         assert "with a prism; x: set a prism" in said(plain)
     assert (plain.inspector.knobs, plain.look) == (knobs, look)
     assert plain.b is None
     plain.key("x")
-    plain.turn()
+    plain.run_once()
     assert {key for key, _ in plain.sheets.help_rows} >= OF_OPTICS
     plain.key("t")  # there is still no motion, and so no angle
-    plain.turn()
+    plain.run_once()
     assert plain.look.axis is Axis.TIME
 
 
@@ -1729,7 +1729,7 @@ def test_steps_and_playing_keep_the_number_of_events(
     plain: Window, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plain.key("comma")
-    plain.turn()
+    plain.run_once()
     count = plain.inspector.fixed_count
     assert count is not None
     assert f"({count:,} events)" in plain.sliders["length_ms"].title
@@ -1738,7 +1738,7 @@ def test_steps_and_playing_keep_the_number_of_events(
     assert before is not None
     for key in ("Right", "Right", "Left"):
         plain.key(key)
-        plain.turn()
+        plain.run_once()
         assert plain.inspector.window is not None
         assert plain.shown.span.count == pytest.approx(count, abs=5)
         lengths.add(plain.inspector.window[1])
@@ -1747,7 +1747,7 @@ def test_steps_and_playing_keep_the_number_of_events(
     assert plain.inspector.window[0] == pytest.approx(sum(before), abs=3)
     plain.key("space")
     plain._played_s -= 0.1
-    plain.turn()
+    plain.run_once()
     assert plain.shown.span.count == pytest.approx(count, abs=5)
     plain.key("space")
     line = plain.sheets.timeline
@@ -1756,14 +1756,14 @@ def test_steps_and_playing_keep_the_number_of_events(
     assert plain.inspector.fixed_count is None
     length = plain.time_window[1]
     plain.key("Left")
-    plain.turn()
+    plain.run_once()
     assert plain.time_window[1] == length
 
 
 def test_filters_say_the_rates_before_and_after_them(plain: Window) -> None:
     everything = plain.shown.selected
     plain.key("8")
-    plain.turn()
+    plain.run_once()
     assert plain.inspector.selection.noise_us == 2_000
     assert plain.shown.selected < everything
     rows = step_rows(plain.shown.steps, plain.shown.read_us)
@@ -1773,16 +1773,16 @@ def test_filters_say_the_rates_before_and_after_them(plain: Window) -> None:
     assert rows
     plain.key("8")
     plain.key("7")
-    plain.turn()
+    plain.run_once()
     assert plain.inspector.selection.noise_us is None
     assert plain.inspector.selection.hide_hot
     assert "1 hot pixel hidden; x 73, y 28: 84 events/s" in said(plain)
     plain.key("bracketleft")
-    plain.turn()
+    plain.run_once()
     assert plain.image is ImageKind.DECAY
     assert plain.decay_us == DECAY_US // 2
     plain.key("bracketright")
-    plain.turn()
+    plain.run_once()
     assert plain.decay_us == DECAY_US
 
 
@@ -1806,7 +1806,7 @@ def test_hot_pixels_are_named_when_they_are_hidden(recording: Recording) -> None
     window = Window(Inspector(replace(recording, events=noisy, encoder=None, prism=None, truth=None)), size=SIZE,
                     off_screen=True)  # fmt: skip
     window.key("7")
-    window.turn()
+    window.run_once()
     found = window.inspector.hot_pixels
     assert [(each.x, each.y) for each in found[:3]] == [(100, 80), (7, 5), (60, 20)]
     words = " ".join(said(window).split())
@@ -1818,7 +1818,7 @@ def test_hot_pixels_are_named_when_they_are_hidden(recording: Recording) -> None
     assert "x 30, y 70" not in words
     assert found[0].rate == pytest.approx(5_000 / 0.25, rel=0.05)
     window.key("7")
-    window.turn()
+    window.run_once()
     assert "hot pixels hidden" not in said(window)
     window.scene.close()
 
@@ -1830,7 +1830,7 @@ def test_a_plain_recording_has_the_whole_image_beside_a_region(
     assert plain.statistics_shown  # where a recording with a prism has its charts
     assert len(plain.sheets.images.panels) == 1
     plain.draw_region((20, 10, 80, 70))
-    plain.turn()
+    plain.run_once()
     whole, part = plain.sheets.images.panels
     events = plain.shown.span.events
     expected = np.zeros((90, 120))

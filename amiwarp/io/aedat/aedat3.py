@@ -103,7 +103,8 @@ def _read_aedat3_header(path: Path) -> tuple[tuple[int, int] | None, int]:
             format = re.match(r"#Format:\s*(\S+)", text)
             if format is not None and format[1] != "RAW":
                 raise AmiwarpError(
-                    f"the packets have the format '{format[1][:40]}'; export the file again as RAW"
+                    f"the packets have the format '{format[1][:40]}'; export the file again as RAW",
+                    ErrorCode.FORMAT_UNKNOWN,
                 )
             source = re.match(r"#Source \d+:\s*(\S+)", text)
             if size is None and source is not None:
@@ -150,7 +151,7 @@ def _contents(
     with open_input(path) as file:
         file.seek(offset)
         while head := file.read(PACKET_HEADER.size):
-            at = file.tell() - len(head)
+            head_start = file.tell() - len(head)
             if len(head) < PACKET_HEADER.size:
                 notes["truncated_bytes"] = len(head)
                 return
@@ -159,11 +160,11 @@ def _contents(
             is_negative = min(width, count, overflow, source) < 0
             if is_negative or length > LARGEST_PACKET or kind not in range(256):
                 raise AmiwarpError(
-                    f"{path}: byte {at} does not begin the header of a packet; the file is damaged",
+                    f"{path}: byte {head_start} does not begin the header of a packet; the file is damaged",
                     ErrorCode.FILE_DAMAGED,
                 )
-            if at + PACKET_HEADER.size + length > total:
-                notes["truncated_bytes"] = total - at
+            if head_start + PACKET_HEADER.size + length > total:
+                notes["truncated_bytes"] = total - head_start
                 return
             if kind in COUNTED_TYPES:
                 name = COUNTED_TYPES[kind]
@@ -175,7 +176,9 @@ def _contents(
                 file.seek(length, 1)
             elif width != expected:
                 raise AmiwarpError(
-                    f"{path}: byte {at}: events of {width} bytes in a packet of type {kind}; expected {expected}"
+                    f"{path}: byte {head_start}: events of {width} bytes in a packet of type {kind}; "
+                    f"expected {expected}",
+                    ErrorCode.FILE_DAMAGED,
                 )
             else:
                 yield kind, source, file.read(length), overflow << 31

@@ -75,27 +75,27 @@ class Clock:
         if steps_back.size > MOST_RESTARTS:
             candidates = []
         self._is_open = False
-        for at in candidates:
-            if stored.size - at < LEAST_BEHIND:
+        for index in candidates:
+            if stored.size - index < LEAST_BEHIND:
                 self._is_open = True
                 break
-            shift = self.shift + int(stored[at - 1]) - int(stored[at])
+            shift = self.shift + int(stored[index - 1]) - int(stored[index])
             is_possible = shift < TIME_LIMIT and len(self.restarts) < MOST_RESTARTS
-            if is_possible and _is_restart(stored, at):
-                first = max(at - count, 0)
+            if is_possible and _is_restart(stored, index):
+                first = max(index - count, 0)
                 packet = bisect.bisect_right(starts, first) - 1
                 self.restarts.append((places[packet], shift))
                 t[first:] = stored[count + first :] + shift
         self._last = last
 
 
-def _is_restart(stored: Integers, at: int) -> bool:
+def _is_restart(stored: Integers, index: int) -> bool:
     """Return whether the clock starts again before the time with the index ``at``.
 
     Times in the middle of those before and behind it are compared: a single wrong one changes them little.
     """
-    before = np.sort(stored[max(at - RESTART_EVENTS, 0) : at])
-    behind = np.sort(stored[at : at + RESTART_EVENTS])
+    before = np.sort(stored[max(index - RESTART_EVENTS, 0) : index])
+    behind = np.sort(stored[index : index + RESTART_EVENTS])
     middle_before = int(before[(before.size - 1) // 2])
     middle_behind = int(behind[behind.size // 2])
     return middle_behind - middle_before < -RESTART_US

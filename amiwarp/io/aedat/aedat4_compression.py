@@ -62,14 +62,16 @@ class Decompressor:
         if self._lz4 is None:
             self._lz4 = lz4.frame.create_decompression_context()
         # Most packets need one call. Memory for the largest packet would be taken and given back for each.
-        room = min(most, 8 * len(data))
-        content, used, is_whole = lz4.frame.decompress_chunk(self._lz4, data, max_length=room)
+        capacity = min(most, 8 * len(data))
+        content, used, is_whole = lz4.frame.decompress_chunk(self._lz4, data, max_length=capacity)
         parts = [content]
         size = len(content)
         while not is_whole and size < most:
             data = data[used:]
-            room = most - size
-            content, used, is_whole = lz4.frame.decompress_chunk(self._lz4, data, max_length=room)
+            capacity = most - size
+            content, used, is_whole = lz4.frame.decompress_chunk(
+                self._lz4, data, max_length=capacity
+            )
             if not content and not used:
                 return None
             parts.append(content)

@@ -31,7 +31,7 @@ class PacketEvents(NamedTuple):
 
 def packets_in_memory(contents: list[bytes]) -> NDArray[Any]:
     """Return where some packets lie in memory. They must be kept as long as this is used."""
-    from amiwarp.kernels.records import Span
+    from amiwarp.kernels.raw_numbers import Span
 
     packets = new_rows(len(contents), Span)
     packets["address"] = [address_of(content) for content in contents]
@@ -45,7 +45,7 @@ def find_events(packets: NDArray[Any], device: Any) -> NDArray[Any]:
 
     from amiwarp.kernels import aedat4
     from amiwarp.kernels.launch import launch
-    from amiwarp.kernels.records import Span
+    from amiwarp.kernels.raw_numbers import Span
 
     places = wp.empty(packets.size, dtype=aedat4.Found, device=device)
     launch(

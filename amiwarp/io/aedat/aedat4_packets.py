@@ -89,52 +89,54 @@ class Packets:
 
     def __iter__(self) -> Iterator[Content]:
         with open_input(self._about.path) as file:
-            at = self._about.start
-            while at < self._about.end:
-                content, at = self._read(file, at)
+            offset = self._about.start
+            while offset < self._about.end:
+                content, offset = self._read(file, offset)
                 if content is not None:
                     yield content
 
-    def _read(self, file: BufferedReader, at: int) -> tuple[Content | None, int]:
+    def _read(self, file: BufferedReader, offset: int) -> tuple[Content | None, int]:
         """Return the packet at a position, or None if it is damaged, and the position of the next one."""
         end = self._about.end
-        behind = at + PACKET_HEADER.size
-        self._fill(file, at, behind)
-        number, size = self._header(at)
+        behind = offset + PACKET_HEADER.size
+        self._fill(file, offset, behind)
+        number, size = self._header(offset)
         stated = behind + size
         stop: int | None = None
         if 0 <= size <= LARGEST_PACKET and stated <= end:
             stop = stated
             # The size is damaged if no packet begins behind this one, but within it.
-            if stop < end and not self._begins(file, at, stop):
-                self._fill(file, at, stop)
-                stop = self._find(at + 1, stop) or stop
+            if stop < end and not self._begins(file, offset, stop):
+                self._fill(file, offset, stop)
+                stop = self._find(offset + 1, stop) or stop
         elif size >= 0 and number in self._about.streams:
-            stop = self._search(file, at + 1)
+            stop = self._search(file, offset + 1)
             if stop is None:
-                self._note("truncated_bytes", end - at)
+                self._note("truncated_bytes", end - offset)
                 return None, end
-        content = self._content(file, at, stop, number)
+        content = self._content(file, offset, stop, number)
         if content is None:
             # The stated size may be too small, or what seemed to be a packet may hide others.
             tried = stop
-            stop = self._search(file, at + 1) or end
-            content = self._content(file, at, stop, number) if stop != tried else None
+            stop = self._search(file, offset + 1) or end
+            content = self._content(file, offset, stop, number) if stop != tried else None
         assert stop is not None
         if content is None:
-            self._note("dropped_damaged_bytes", stop - at)
+            self._note("dropped_damaged_bytes", stop - offset)
         elif stop != stated:
             self._note("repaired_packet_sizes", 1)
         return content, stop
 
     def _content(
-        self, file: BufferedReader, at: int, stop: int | None, number: int
+        self, file: BufferedReader, offset: int, stop: int | None, number: int
     ) -> Content | None:
         """Return the content of the packet in a part of the file, or None if it is damaged or has no end."""
-        if stop is None or not 0 <= stop - at - PACKET_HEADER.size <= LARGEST_PACKET:
+        if stop is None or not 0 <= stop - offset - PACKET_HEADER.size <= LARGEST_PACKET:
             return None
-        self._fill(file, at, stop)
-        data = memoryview(self._window)[at + PACKET_HEADER.size - self._base : stop - self._base]
+        self._fill(file, offset, stop)
+        data = memoryview(self._window)[
+            offset + PACKET_HEADER.size - self._base : stop - self._base
+        ]
         stream = self._about.streams.get(number)
         kind = "" if stream is None else stream.kind
         if stream is None or kind in self._kinds:
@@ -152,18 +154,18 @@ class Packets:
             return None
         if kind not in KINDS:
             self._note("packets_of_unknown_streams", 1)
-        return Content(at, stop - at, number, kind, content)
+        return Content(offset, stop - offset, number, kind, content)
 
-    def _fill(self, file: BufferedReader, at: int, stop: int) -> None:
+    def _fill(self, file: BufferedReader, offset: int, stop: int) -> None:
         """Let the window hold the file from ``at`` on, at least up to ``stop`` or the end of the packets."""
         stop = min(stop, self._about.end)
-        if self._base <= at and stop <= self._base + self._held:
+        if self._base <= offset and stop <= self._base + self._held:
             return
-        size = min(max(stop - at, WINDOW_BYTES), self._about.end - at)
+        size = min(max(stop - offset, WINDOW_BYTES), self._about.end - offset)
         if size > len(self._window):
             self._window = bytearray(size)
-        file.seek(at)
-        self._base = at
+        file.seek(offset)
+        self._base = offset
         self._held = file.readinto(memoryview(self._window)[:size])
         if self._held < size:
             raise AmiwarpError(
@@ -171,30 +173,30 @@ class Packets:
                 ErrorCode.FILE_UNREADABLE,
             )
 
-    def _header(self, at: int) -> tuple[int, int]:
+    def _header(self, offset: int) -> tuple[int, int]:
         """Return number of the stream and size of the packet at a position; -1 and -1 beyond the window."""
-        place = at - self._base
+        place = offset - self._base
         if place + PACKET_HEADER.size > self._held:
             return -1, -1
         number, size = PACKET_HEADER.unpack_from(self._window, place)
         return int(number), int(size)
 
-    def _begins(self, file: BufferedReader, at: int, place: int) -> bool:
+    def _begins(self, file: BufferedReader, offset: int, place: int) -> bool:
         """Return whether a packet of a known stream begins at a place behind ``at``, from where the window starts."""
-        self._fill(file, at, place + self._lead + MARK_BYTES)
+        self._fill(file, offset, place + self._lead + MARK_BYTES)
         return self._find(place, place + self._lead + MARK_BYTES) == place
 
     def _find(self, start: int, stop: int) -> int | None:
         """Return the position of the first packet of a known stream in a part of the window, or None."""
         stop = min(stop - self._base, self._held)
         for match in self._pattern.finditer(self._window, start - self._base + self._lead, stop):
-            at = match.start() - self._lead + self._base
-            number, size = self._header(at)
+            offset = match.start() - self._lead + self._base
+            number, size = self._header(offset)
             if (
                 number in self._about.streams
-                and 0 < size <= self._about.end - at - PACKET_HEADER.size
+                and 0 < size <= self._about.end - offset - PACKET_HEADER.size
             ):
-                return at
+                return offset
         return None
 
     def _search(self, file: BufferedReader, start: int) -> int | None:

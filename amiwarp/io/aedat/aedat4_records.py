@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.aedat.aedat4_clock import OtherClock
 from amiwarp.io.aedat.aedat4_header import Aedat4File
 from amiwarp.io.aedat.aedat4_packets import read_batches
@@ -106,7 +106,8 @@ def _frames(about: Aedat4File, restarts: list[tuple[int, int]]) -> Iterator[Fram
                     continue
                 if kind not in GREY_BYTES:
                     raise AmiwarpError(
-                        f"the frames are in colour (format {kind} of OpenCV), not grey"
+                        f"the frames are in colour (format {kind} of OpenCV), not grey",
+                        ErrorCode.FORMAT_UNKNOWN,
                     )
                 depth = GREY_BYTES[kind]
                 if min(width, height) > 0 and size == width * height * depth:

@@ -67,9 +67,9 @@ def write_aedat4(part: Path, blocks: Iterable[Events], about: Outline) -> None:
     """Write all events."""
     rows: list[tuple[int, ...]] = []
     pieces = (
-        events[at : at + PACKET_EVENTS]
+        events[begin : begin + PACKET_EVENTS]
         for events in blocks
-        for at in range(0, len(events), PACKET_EVENTS)
+        for begin in range(0, len(events), PACKET_EVENTS)
     )
     with (
         part.open("xb") as file,

@@ -215,18 +215,18 @@ def roles_of(names: Sequence[str]) -> dict[str, list[int]]:
     places: dict[str, list[int]] = {role: [] for role in ROLES}
     rarely: dict[str, list[int]] = {role: [] for role in ROLES}
     units: list[str | None] = []
-    for at, name in enumerate(names):
+    for column, name in enumerate(names):
         role, unit = role_of(name)
         if role is not None:
-            places[role].append(at)
+            places[role].append(column)
         else:
             role, unit = _rare_role_of(name)
             if role is not None:
-                rarely[role].append(at)
+                rarely[role].append(column)
         units.append(unit)
 
-    if [units[at] for at in places["t"]] == ["s"]:
-        places["t"] += [at for at in rarely["t"] if units[at] not in (None, "s")]
+    if [units[column] for column in places["t"]] == ["s"]:
+        places["t"] += [column for column in rarely["t"] if units[column] not in (None, "s")]
     places["t"] = places["t"] or rarely["t"]
     places["p"] = places["p"] or rarely["p"]
     if not places["x"] and not places["y"]:

@@ -87,7 +87,9 @@ def _number(archive: zipfile.ZipFile, name: str) -> int:
     """Return the single number in an array of the archive."""
     with open_array(archive, name) as (stream, shape, dtype):
         if math.prod(shape) != 1:
-            raise AmiwarpError(f"{name} has shape {shape}; expected one number")
+            raise AmiwarpError(
+                f"{name} has shape {shape}; expected one number", ErrorCode.FORMAT_UNKNOWN
+            )
         return int(np.frombuffer(stream.read(dtype.itemsize), dtype)[0])
 
 
@@ -110,7 +112,7 @@ def _npz_table(path: Path, names: Sequence[str], given: GivenLayout) -> Table:
     are_chosen = False
     if given.columns is not None:
         wanted = tuple(given_roles(given.columns).values())
-        all_exist = all(_is_among(names, each) for each in wanted)
+        all_exist = all(_is_among(names, wanted_name) for wanted_name in wanted)
         are_chosen = len(names) >= len(ROLES) and (all_exist or not whole)
     if names_roles(names) or are_chosen:
         return _arrays_table(_readable(path, names, wanted), opened)
@@ -158,7 +160,8 @@ def _own_table(opened: OpenedByName, has_size: bool) -> Table:
     if x_is_float != y_is_float:
         given = f"array x is {types['x']}, y is {types['y']}"
         raise AmiwarpError(
-            f"{given}; expected integers, or floating numbers for compensated events"
+            f"{given}; expected integers, or floating numbers for compensated events",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     unit = "us" if types["t"].kind in "iub" else None
     hints = Hints(unit=unit, compensated=True, is_own=has_size)
@@ -180,15 +183,18 @@ def _arrays_table(names: Sequence[str], opened: OpenedByName) -> Table:
                 columns.append(Column(name, head))
                 counts[name] = count
             elif role is not None:
-                raise AmiwarpError(f"array {name} has shape {shape}; expected one length (n,)")
+                raise AmiwarpError(
+                    f"array {name} has shape {shape}; expected one length (n,)",
+                    ErrorCode.FILE_DAMAGED,
+                )
 
     def pieces(chosen: tuple[int, ...], notes: dict[str, int]) -> Rows:
-        first, *others = [str(columns[at].name) for at in chosen]
+        first, *others = [str(columns[column].name) for column in chosen]
         count = counts[first]
         for name in others:
             if counts[name] != count:
                 shapes = f"array {name} has shape ({counts[name]},), {first} ({count},)"
-                raise AmiwarpError(f"{shapes}; expected one length (n,)")
+                raise AmiwarpError(f"{shapes}; expected one length (n,)", ErrorCode.FILE_DAMAGED)
         with contextlib.ExitStack() as stack:
             arrays = [opened(name, stack)[0] for name in (first, *others)]
             for length in lengths(count, notes):
@@ -206,7 +212,8 @@ def _array_table(opened: Opened, name: str, hints: Hints) -> Table:
             return _fields_table(array, opened, name)
     if len(shape) != 2 or dtype.kind not in "iuf" or min(shape) > MOST_COLUMNS:
         raise AmiwarpError(
-            f"{name} is {dtype} of shape {shape}; expected a table (n, 4) of t, x, y and p, or fields"
+            f"{name} is {dtype} of shape {shape}; expected a table (n, 4) of t, x, y and p, or fields",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     has_row_per_event = shape[1] <= MOST_COLUMNS
     count, width = shape if has_row_per_event else shape[::-1]
@@ -220,11 +227,11 @@ def _array_table(opened: Opened, name: str, hints: Hints) -> Table:
             by_event = (stream, (count, width), dtype)
             for length in lengths(count, notes):
                 rows = next_rows(by_event, length)
-                yield tuple(np.ascontiguousarray(rows[:, at]) for at in chosen)
+                yield tuple(np.ascontiguousarray(rows[:, number]) for number in chosen)
 
     def rows_of_properties(chosen: tuple[int, ...], notes: dict[str, int]) -> Rows:
         with contextlib.ExitStack() as stack:
-            columns = [_column_of(opened(stack)[0], at, count) for at in chosen]
+            columns = [_column_of(opened(stack)[0], number, count) for number in chosen]
             for length in lengths(count, notes):
                 yield tuple(next_rows(column, length) for column in columns)
 
@@ -236,10 +243,10 @@ def _array_table(opened: Opened, name: str, hints: Hints) -> Table:
     return Table(columns, pieces, hints)
 
 
-def _column_of(array: Array, at: int, count: int) -> Array:
+def _column_of(array: Array, column: int, count: int) -> Array:
     """Return a column of an array that is stored by columns. It needs a stream of its own."""
     stream, _, dtype = array
-    bytes_before = at * count * dtype.itemsize
+    bytes_before = column * count * dtype.itemsize
     stream.seek(bytes_before, 1)
     return stream, (count,), dtype
 
@@ -249,7 +256,8 @@ def _fields_table(array: Array, opened: Opened, name: str) -> Table:
     _, shape, dtype = array
     if len(shape) != 1:
         raise AmiwarpError(
-            f"{name} is {dtype} of shape {shape}; expected fields t, x, y, p of shape (n,)"
+            f"{name} is {dtype} of shape {shape}; expected fields t, x, y, p of shape (n,)",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     (count,) = shape
     head = next_rows(array, min(count, SAMPLE))
@@ -270,6 +278,6 @@ def _fields_table(array: Array, opened: Opened, name: str) -> Table:
             array, _ = opened(stack)
             for length in lengths(count, notes):
                 rows = next_rows(array, length)
-                yield tuple(rows[names[at]] for at in chosen)
+                yield tuple(rows[names[column]] for column in chosen)
 
     return Table(columns, pieces, Hints(unit=unit))

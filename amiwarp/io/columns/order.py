@@ -96,7 +96,7 @@ def common_values(values: NDArray[Any]) -> list[Any]:
 
 def order_by_values(values: Sequence[NDArray[Any]], hints: Hints) -> tuple[str, ...]:
     """Return the order of four columns without names; x is taken to come before y."""
-    facts = [_Facts.of(each) for each in values]
+    facts = [_Facts.of(column_values) for column_values in values]
     if hints.order is not None and _fits_promise(facts, hints.order):
         return hints.order
     fitting = []
@@ -127,9 +127,9 @@ def _with_clearest_time(
     times = {order.index("t") for order in orders}
     if len(times) < 2:
         return orders
-    best = max(times, key=lambda at: (facts[at].fractions, facts[at].range))
+    best = max(times, key=lambda column: (facts[column].fractions, facts[column].range))
     others = times - {best}
-    if not all(_is_clearer(facts[best], facts[at]) for at in others):
+    if not all(_is_clearer(facts[best], facts[column]) for column in others):
         return orders
     return [order for order in orders if order.index("t") == best]
 

@@ -33,11 +33,12 @@ def find_layout(columns: Sequence[Column], given: GivenLayout, hints: Hints) -> 
     if is_openmv(columns) and given.columns is None and not hints.is_text:
         return openmv_layout()
     roles, assumptions = _find_roles(columns, given, hints)
-    chosen = {role: columns[at] for role, at in roles.items()}
+    chosen = {role: columns[number] for role, number in roles.items()}
     for role, column in chosen.items():
         if column.values.dtype.kind not in "iufb" or column.values.ndim != 1:
             raise AmiwarpError(
-                f"column {_shown(columns, roles[role])} for {role} is {column.values.dtype}; give numbers"
+                f"column {_shown(columns, roles[role])} for {role} is {column.values.dtype}; give numbers",
+                ErrorCode.FORMAT_UNKNOWN,
             )
 
     unit, why = find_unit(chosen["t"], given, hints)
@@ -62,13 +63,13 @@ def find_layout(columns: Sequence[Column], given: GivenLayout, hints: Hints) -> 
         assumptions=tuple(assumptions),
         unit_is_assumed=why is not None and unit == "us",
         is_promised=given == GivenLayout() and not assumptions and is_stated,
-        names={role: _shown(columns, at) for role, at in roles.items()},
+        names={role: _shown(columns, number) for role, number in roles.items()},
     )
 
 
-def _shown(columns: Sequence[Column], at: int) -> str:
+def _shown(columns: Sequence[Column], number: int) -> str:
     """Return the name of a column, or else its number from 1 on."""
-    return columns[at].name or f"column {at + 1}"
+    return columns[number].name or f"column {number + 1}"
 
 
 def _find_roles(
@@ -80,8 +81,8 @@ def _find_roles(
     if any(column.name for column in columns):
         roles = _named_columns(columns)
         guessed = []
-        for role, at in roles.items():
-            name = columns[at].name
+        for role, number in roles.items():
+            name = columns[number].name
             usual_role, _ = role_of(name or "")
             if usual_role is None:
                 guessed.append(f"{role} = {name}")
@@ -125,7 +126,8 @@ def _given_columns(columns: Sequence[Column], text: str) -> dict[str, int]:
             if not known:
                 known = f"the numbers 1 to {len(columns)}"
             raise AmiwarpError(
-                f"has no column {wanted!r}, which --columns gives for {role}; it has {known}"
+                f"has no column {wanted!r}, which --columns gives for {role}; it has {known}",
+                ErrorCode.CONTENT_MISSING,
             )
         (roles[role],) = matches
     return roles

@@ -191,11 +191,12 @@ def read_columns(
     """Yield pieces of the columns with these indices."""
     with _opened(path, kind) as (arrays, _):
         sources = sources_of(arrays, columns)
-        used = [sources[at] for at in chosen]
+        used = [sources[number] for number in chosen]
         counts = {source.count for source in used}
         if len(counts) != 1:
             raise AmiwarpError(
-                f"the columns have the lengths {sorted(counts)}; expected one length"
+                f"the columns have the lengths {sorted(counts)}; expected one length",
+                ErrorCode.FILE_DAMAGED,
             )
         count = counts.pop()
         notes["total"] = max(count, 1)

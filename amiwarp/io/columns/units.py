@@ -104,7 +104,7 @@ def _check_whole(t: NDArray[Any]) -> None:
             ErrorCode.AMBIGUOUS,
         )
     if t.size > MOST_PER_US * max(high - low, 1) + 1000:
-        raise AmiwarpError(_whole_doubt(t))
+        raise AmiwarpError(_whole_doubt(t), ErrorCode.AMBIGUOUS)
 
 
 def _whole_doubt(t: NDArray[Any]) -> str:
@@ -150,7 +150,7 @@ def _unit_of_whole(t: NDArray[Any]) -> tuple[str, str]:
     _check_whole(t)
     span = int(t.max()) - int(t.min())
     if span > LONGEST_S * 10**6:
-        raise AmiwarpError(_whole_doubt(t))
+        raise AmiwarpError(_whole_doubt(t), ErrorCode.AMBIGUOUS)
     why = f"times are whole numbers, and the first {t.size:,} events span {span * 1e-6:.3g} s then"
     return "us", why
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.file_access import read_at, write_at
 from amiwarp.io.hdf5.chunks import CHUNK
 from amiwarp.tasks import interrupts_later
@@ -86,7 +86,7 @@ class ChunkFile:
         with self._turns:
             self._turns.wait_for(lambda: self._turn == number or self._failed < number)
             if self._failed < number:
-                raise AmiwarpError("an earlier part could not be written")
+                raise AmiwarpError("an earlier part could not be written", ErrorCode.OUTPUT_FAILED)
             yield
             self._turn += 1
             self._turns.notify_all()
@@ -124,9 +124,9 @@ class ChunkFile:
                 if chunk.name not in self._datasets:
                     self._datasets[chunk.name] = dataset_of(chunk)
                 placed.append((self._place(chunk, rows[chunk.name]), chunk.parts))
-        for at, parts in placed:
-            if at is not None:
-                self.output.write_at(parts, at)
+        for offset, parts in placed:
+            if offset is not None:
+                self.output.write_at(parts, offset)
         self.check()
 
     def _place(self, chunk: EncodedChunk, rows: int) -> int | None:
@@ -139,10 +139,10 @@ class ChunkFile:
         if held < rows:
             dataset.id.set_extent((rows, *row))
         write = partial(dataset.id.write_direct_chunk, (chunk.start, *(0 for _ in row)))
-        at = self.output.place_of(sum(map(len, chunk.parts)), write)
-        if at is None:
+        offset = self.output.place_of(sum(map(len, chunk.parts)), write)
+        if offset is None:
             write(b"".join(chunk.parts))
-        return at
+        return offset
 
     def check(self) -> None:
         """Raise the error of the first write of HDF5 that failed, such as OSError for a full disk."""

@@ -32,6 +32,8 @@ CHECKSUM_ROW = 2048
 BLOCK_BYTES = 1 << 18
 """Size of the blocks that Blosc compresses [bytes]. It decodes these faster than its smaller default."""
 
+BLOSC_LEVEL = 1
+"""Level of Blosc. Higher levels are slower, and their files are hardly smaller."""
 GZIP_LEVEL = 1
 """Level of deflate: 1 is the fastest. Higher levels make event files only a few percent smaller."""
 
@@ -81,12 +83,11 @@ def encode_parts(column: NDArray[Any], codec: Codec = Codec.BLOSC) -> list[tuple
 
 def _compress(values: NDArray[Any]) -> bytes:
     """Compress the bytes of values as HDF5's Blosc filter does."""
-    level = 1
     compressed: bytes = _blosc().compress_ptr(
         values.ctypes.data,
         values.nbytes,
         values.itemsize,
-        level,
+        BLOSC_LEVEL,
         blosc_shuffle(values.dtype),
         "lz4",
     )
@@ -101,7 +102,10 @@ def _deflate(values: NDArray[Any]) -> bytes:
 
 
 def decode(stored: Sequence[bytes], out: NDArray[Any]) -> bool:
-    """Decode stored chunks, one after the other, into ``out``. Return whether all chunks are undamaged."""
+    """Decode chunks of Blosc, one after the other, into ``out``. Return whether all chunks are undamaged.
+
+    Checksums are computed by a kernel once :func:`compile_checksums` has been called.
+    """
     frames = []
     stored_sums = []
     for chunk in stored:
@@ -115,8 +119,8 @@ def decode(stored: Sequence[bytes], out: NDArray[Any]) -> bool:
 
 def _decompress(frame: memoryview, out: NDArray[Any]) -> bool:
     """Decompress a Blosc frame into ``out``. Return whether it has the right size and can be decoded."""
-    # After four bytes, the header of 16 bytes holds the sizes before and after compression. Blosc itself
-    # would trust them. A frame that is shorter than its header disagrees with them.
+    # The header of 16 bytes holds the size before compression at 4, the block size at 8 and the size after
+    # compression at 12. Blosc itself would trust them. A frame that is shorter than its header disagrees with them.
     decoded_size = int.from_bytes(frame[4:8], "little")
     encoded_size = int.from_bytes(frame[12:16], "little")
     if decoded_size != out.nbytes or encoded_size != len(frame):
@@ -141,6 +145,7 @@ def checksum(data: bytes | memoryview) -> int:
     table = words[:in_table].reshape(-1, CHECKSUM_ROW)
     rest = words[in_table:].astype(np.int64)
 
+    # uint32 holds the sums of up to 65,537 rows of words: 256 MiB, the largest chunk that is read.
     # Word i is counted once in the first sum, and count - i times in the second.
     columns = table.sum(axis=0, dtype=np.uint32)
     rows = table.sum(axis=1, dtype=np.uint32)
@@ -205,7 +210,9 @@ def make_dataset(
     options: dict[str, Any]
     if codec is Codec.BLOSC:
         shuffle = blosc_shuffle(np.dtype(dtype))
-        options = {"compression": hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=shuffle)}
+        options = {
+            "compression": hdf5plugin.Blosc(cname="lz4", clevel=BLOSC_LEVEL, shuffle=shuffle)
+        }
     else:
         options = {"compression": "gzip", "compression_opts": GZIP_LEVEL, "shuffle": True}
     # The checksum covers the compressed bytes. Its cost is too small to measure. LZ4 alone misses most damage.

@@ -213,7 +213,7 @@ class Column:
         reads them."""
         if self._stored is None:
             return None
-        return [self._stored.encoded(at // CHUNK) for at in range(start, stop, CHUNK)]
+        return [self._stored.encoded(row // CHUNK) for row in range(start, stop, CHUNK)]
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Return the elements with ``start <= index < stop``. Raises :class:`AmiwarpError` for damaged data."""
@@ -232,7 +232,7 @@ class Column:
         if values is not None and (start, stop) == (0, self._count):
             return self._rows(values.copy(), start, stop)
         rows = max(1, PIECE // max(1, math.prod(self.row)))
-        parts = [self._ask(at, min(at + rows, stop)) for at in range(start, stop, rows)]
+        parts = [self._ask(row, min(row + rows, stop)) for row in range(start, stop, rows)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _ask(self, start: int, stop: int) -> NDArray[Any]:

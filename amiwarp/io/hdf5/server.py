@@ -20,7 +20,7 @@ from amiwarp.io.hdf5.server_objects import Finder, all_values, attributes_of, gr
 from amiwarp.io.native.layout import FORMAT
 from amiwarp.io.reading_server import Reply, forget, keep, kept
 
-ATTRIBUTES = {
+ATTRIBUTES: dict[str, tuple[str, ...] | None] = {
     "/": ("format", "format_version", "width", "height"),
     "encoder": ("clock_offset_us",),
     "imu": ("to_camera",),
@@ -35,11 +35,11 @@ ATTRIBUTES = {
         "thickness",
         "tilt",
     ),
-    "truth": (),
+    "truth": None,
     "truth/world": ("name",),
-    "metadata": (),
+    "metadata": None,
 }
-"""Attributes that are read, by group; of ``truth`` and ``metadata`` all are read. Other attributes are ignored."""
+"""Attributes that are read, by group; None for all. Other attributes are ignored."""
 
 READ_ON_DEMAND = ("events/", "truth/x", "truth/y", "truth/events/", "ms_to_idx")
 """Prefixes of the datasets that are read repeatedly after a file was opened."""
@@ -59,19 +59,19 @@ def open_file(path: str, topic: str | None, again: bool) -> Reply:
     """
     file, unfinished = _open(path)
     keep("file", file)
-    find = Finder(file)
-    layout, group = find_layout(topic, find)
-    attributes = _all_attributes(find)
+    objects = Finder(file)
+    layout, group = find_layout(topic, objects)
+    attributes = _all_attributes(objects)
     names = _names_of_columns(layout, group, attributes)
     if layout == "m3ed":
-        attributes = m3ed_attributes(group, find)
+        attributes = m3ed_attributes(group, objects)
 
     columns: dict[str, Any] = {}
     keep("columns", columns)
     described = {}
     about = FileFacts(path, unfinished, _is_plain(file), os.path.getsize(path))
     for name, stored in names.items():
-        dataset = find(stored)
+        dataset = objects.find(stored)
         if dataset is not None:
             described[name] = describe(dataset, name, COLUMNS[name], about)
             columns[name] = dataset
@@ -105,10 +105,10 @@ def open_file(path: str, topic: str | None, again: bool) -> Reply:
     }, values
 
 
-def _all_attributes(find: Finder) -> dict[str, dict[str, Any]]:
+def _all_attributes(objects: Finder) -> dict[str, dict[str, Any]]:
     """Return the attributes of the native layout, by the name of the group, for the groups that exist."""
     # All groups come first: one that is no group is reported before an attribute.
-    groups = {name: group_of(find, name) for name in ATTRIBUTES}
+    groups = {name: group_of(objects, name) for name in ATTRIBUTES}
     return {
         name: attributes_of(group, name, ATTRIBUTES[name])
         for name, group in groups.items()

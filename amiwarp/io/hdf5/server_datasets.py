@@ -28,6 +28,7 @@ COLUMNS = {
     "encoder/index_t": "iu",
     "encoder/second_t": "iu",
     "encoder/second_angle": "f",
+    "encoder/second_index_t": "iu",
     "truth/x": "f",
     "truth/y": "f",
     **{
@@ -56,6 +57,15 @@ COLUMNS = {
 }
 """Datasets that are read, with the kinds of data types allowed for each, as in NumPy's ``dtype.kind``."""
 
+KIND_WORDS = {
+    "i": "signed integers",
+    "u": "unsigned integers",
+    "b": "truth values",
+    "f": "floats",
+    "S": "text",
+}
+"""Kinds of data types in words, for messages."""
+
 DIMENSIONS = {
     "t_offset": 0,
     **{f"truth/events/{name}": 1 + len(row) for name, (_, row) in EVENT_COLUMNS.items()},
@@ -79,6 +89,7 @@ READ_AT_ONCE = (
     "encoder/index_t",
     "encoder/second_t",
     "encoder/second_angle",
+    "encoder/second_index_t",
     "truth/frames/t",
     "truth/known/t",
     "truth/world/instances",
@@ -141,14 +152,17 @@ def describe(stored: Any, name: str, kinds: str, about: FileFacts) -> dict[str, 
     dataset = _opened(stored, name)
     if dataset.dtype.kind not in kinds or dataset.dtype.fields is not None:
         raise AmiwarpError(
-            f"dataset '{name}' is {dataset.dtype}; see docs/reference/recording-format.md"
+            f"dataset '{name}' is {dataset.dtype}; expected {_in_words(kinds)}, see "
+            "docs/reference/recording-format.md",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     row = dataset.shape[1:]
     has_whole_rows = dataset.chunks is None or dataset.chunks[1:] == row
     if row_bytes(dataset) > CHUNK_BYTES or not has_whole_rows:
         raise AmiwarpError(
             f"dataset '{name}' has rows of over {CHUNK_BYTES >> 20} MiB, or chunks of partial rows; "
-            "rewrite the file with chunks of whole rows"
+            "rewrite the file with chunks of whole rows",
+            ErrorCode.FORMAT_UNKNOWN,
         )
 
     places: list[tuple[int, int]] | None = None
@@ -179,6 +193,12 @@ def describe(stored: Any, name: str, kinds: str, about: FileFacts) -> dict[str, 
     }
 
 
+def _in_words(kinds: str) -> str:
+    """Return the kinds of data types of a dataset in words."""
+    *others, last = [KIND_WORDS[kind] for kind in kinds]
+    return f"{', '.join(others)} or {last}" if others else last
+
+
 def _opened(stored: Any, name: str) -> _Dataset:
     """Return a dataset with its properties, after checking its number of dimensions."""
     dimensions = DIMENSIONS.get(name, 1)
@@ -195,7 +215,7 @@ def _opened(stored: Any, name: str) -> _Dataset:
         shape=shape,
         dtype=stored.dtype,
         chunks=creation.get_chunk() if is_chunked else None,
-        filters=[creation.get_filter(at) for at in range(creation.get_nfilters())],
+        filters=[creation.get_filter(number) for number in range(creation.get_nfilters())],
     )
 
 
@@ -268,7 +288,8 @@ def bytes_of_chunk(dataset: Any, name: str) -> int:
     size = math.prod(dataset.chunks) * int(dataset.dtype.itemsize)
     if size > CHUNK_BYTES:
         raise AmiwarpError(
-            f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store it in smaller chunks"
+            f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store it in smaller chunks",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     return size
 
@@ -303,12 +324,16 @@ def _chunk_is_damaged(dataset: _Dataset, chunk: Any, raw: Any) -> bool:
         return bool(chunk.size != chunk_bytes + checksum_bytes)
     raw.seek(chunk.byte_offset)
     header = raw.read(16)
-    # After four bytes, Blosc's header holds the uncompressed and the compressed size, little-endian.
-    return (
-        len(header) < 16
-        or int.from_bytes(header[4:8], "little") != chunk_bytes
-        or chunk.filter_mask != 0
-    )
+    if len(header) < 16 or chunk.filter_mask != 0:
+        return True
+    # Blosc's header: versions and flags in 4 bytes, then uncompressed, block and compressed size, little-endian.
+    decoded_size = int.from_bytes(header[4:8], "little")
+    encoded_size = int.from_bytes(header[12:16], "little")
+    if codes[1:] not in ([], [FLETCHER32]):
+        # Filters behind Blosc changed the stored size, and only HDF5 can undo them.
+        return decoded_size != chunk_bytes
+    checksum_bytes = 4 if FLETCHER32 in codes else 0
+    return decoded_size != chunk_bytes or encoded_size != chunk.size - checksum_bytes
 
 
 def _stored_places(dataset: _Dataset, chunks: list[Any]) -> list[tuple[int, int]] | None:

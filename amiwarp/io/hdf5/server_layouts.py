@@ -15,12 +15,12 @@ SIDES = ("left", "right")
 """Cameras of M3ED and MVSEC."""
 
 
-def find_layout(topic: str | None, find: Finder) -> tuple[str, str]:
+def find_layout(topic: str | None, objects: Finder) -> tuple[str, str]:
     """Return the layout of a file, and the group of its events. ``topic`` chooses among several cameras."""
-    layouts = _layouts_by_group(find)
+    layouts = _layouts_by_group(objects)
     listed = ", ".join(layouts)
     if not layouts:
-        layouts = {"": _own_or_columns(find)}
+        layouts = {"": _own_or_columns(objects)}
         listed = "none, as it holds one stream of events"
     if topic is None:
         if len(layouts) > 1:
@@ -37,35 +37,35 @@ def find_layout(topic: str | None, find: Finder) -> tuple[str, str]:
     return layouts[topic], topic
 
 
-def _layouts_by_group(find: Finder) -> dict[str, str]:
+def _layouts_by_group(objects: Finder) -> dict[str, str]:
     """Return the groups of other programs' files that hold events, with their layouts."""
     layouts = {}
     for side in SIDES:
-        if find(f"prophesee/{side}/t") is not None:
+        if objects.find(f"prophesee/{side}/t") is not None:
             layouts[f"prophesee/{side}"] = "m3ed"
     for side in SIDES:
-        if find(f"davis/{side}/events") is not None:
+        if objects.find(f"davis/{side}/events") is not None:
             layouts[f"davis/{side}"] = "mvsec"
-    if find("CD/events") is not None:
+    if objects.find("CD/events") is not None:
         layouts["CD"] = "ecf"
     return layouts
 
 
-def _own_or_columns(find: Finder) -> str:
+def _own_or_columns(objects: Finder) -> str:
     """Return "native" for the layout of amiwarp and DSEC, or "columns" for any other."""
-    events = find("events")
+    events = objects.find("events")
     if not isinstance(events, h5py.h5g.GroupID):
         return "columns"
     names = list(h5py.Group(events))
-    own = set(ROLES) & set(names)
-    if not own:
+    role_names = set(ROLES) & set(names)
+    if not role_names:
         return "columns"
-    if h5py.h5a.exists(find(""), b"format"):
+    if h5py.h5a.exists(objects.find(""), b"format"):
         return "native"
     # Others give the same names to times in seconds, or have only some of the names by chance.
-    times = find("events/t")
+    times = objects.find("events/t")
     has_seconds = isinstance(times, h5py.h5d.DatasetID) and times.dtype.kind == "f"
-    has_other_names = len(own) < len(ROLES) and names_roles(names)
+    has_other_names = len(role_names) < len(ROLES) and names_roles(names)
     return "columns" if has_seconds or has_other_names else "native"
 
 
@@ -73,11 +73,11 @@ M3ED_COLUMNS = {**{f"events/{name}": name for name in "xytp"}, "ms_to_idx": "ms_
 """Names of M3ED's datasets, by the names in the native layout."""
 
 
-def m3ed_attributes(group: str, find: Finder) -> dict[str, dict[str, Any]]:
+def m3ed_attributes(group: str, objects: Finder) -> dict[str, dict[str, Any]]:
     """Return the camera of an M3ED file as attributes of the native layout; nothing if it is not stored."""
     values = {}
     for name, count in (("resolution", 2), ("intrinsics", 4), ("distortion_coeffs", 4)):
-        dataset = find(f"{group}/calib/{name}")
+        dataset = objects.find(f"{group}/calib/{name}")
         if (
             not isinstance(dataset, h5py.h5d.DatasetID)
             or dataset.shape != (count,)

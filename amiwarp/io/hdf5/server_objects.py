@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError, ErrorCode
-
-ATTRIBUTE_BYTES = 1 << 16
-"""Size of the largest attribute that is read [bytes]."""
+from amiwarp.io.native.layout import ATTRIBUTE_BYTES
 
 
 def all_values(stored: Any) -> NDArray[Any]:
@@ -25,16 +23,16 @@ def all_values(stored: Any) -> NDArray[Any]:
 
 
 class Finder:
-    """Function that finds a group or dataset of an open file, once each. All access to its objects goes through it.
+    """Groups and datasets of an open file, each of which is opened once. All access to its objects goes through it.
 
-    It raises :class:`AmiwarpError` for links, and for datasets whose values are in other files. It uses h5py's
+    Raises :class:`AmiwarpError` for links, and for datasets whose values are in other files. It uses h5py's
     low-level objects, which take less time.
     """
 
     def __init__(self, file: Any) -> None:
         self._found: dict[str, Any] = {"": h5py.h5g.open(file, b"/")}
 
-    def __call__(self, name: str) -> Any:
+    def find(self, name: str) -> Any:
         """Return the object of that name, or None."""
         if name not in self._found:
             self._found[name] = self._open(name)
@@ -42,27 +40,29 @@ class Finder:
 
     def _open(self, name: str) -> Any:
         folder, _, last = name.rpartition("/")
-        parent = self(folder)
+        parent = self.find(folder)
         key = last.encode()
         if not isinstance(parent, h5py.h5g.GroupID) or not parent.links.exists(key):
             return None
         if parent.links.get_info(key).type != h5py.h5l.TYPE_HARD:
             raise AmiwarpError(
-                f"'{name}' is a soft or external link; replace the link by a copy of the data"
+                f"'{name}' is a soft or external link; replace the link by a copy of the data",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         found = h5py.h5o.open(parent, key)
         if isinstance(found, h5py.h5d.DatasetID):
             creation = found.get_create_plist()
             if creation.get_layout() == h5py.h5d.VIRTUAL or creation.get_external_count():
                 raise AmiwarpError(
-                    f"dataset '{name}' takes its values from other files; copy the values into this file"
+                    f"dataset '{name}' takes its values from other files; copy the values into this file",
+                    ErrorCode.FORMAT_UNKNOWN,
                 )
         return found
 
 
 def member(file: h5py.File, name: str) -> Any:
     """Return a group or dataset of the file, or None, as :class:`Finder`."""
-    opened = Finder(file.id)(name)
+    opened = Finder(file.id).find(name)
     if isinstance(opened, h5py.h5d.DatasetID):
         return h5py.Dataset(opened)
     if isinstance(opened, h5py.h5g.GroupID):
@@ -70,20 +70,23 @@ def member(file: h5py.File, name: str) -> Any:
     return None
 
 
-def group_of(find: Finder, name: str) -> Any:
+def group_of(objects: Finder, name: str) -> Any:
     """Return the group of that name, or None. Raises :class:`AmiwarpError` for a dataset."""
-    item = find(name.strip("/"))
+    item = objects.find(name.strip("/"))
     if item is not None and not isinstance(item, h5py.h5g.GroupID):
-        raise AmiwarpError(f"'{name}' is not a group; see docs/reference/recording-format.md")
+        raise AmiwarpError(
+            f"'{name}' is a dataset; expected a group (docs/reference/recording-format.md)",
+            ErrorCode.FORMAT_UNKNOWN,
+        )
     return item
 
 
-def attributes_of(group: Any, name: str, wanted: Sequence[str]) -> dict[str, Any]:
-    """Return the ``wanted`` attributes of a group that exist; if none are wanted, all.
+def attributes_of(group: Any, name: str, wanted: Sequence[str] | None) -> dict[str, Any]:
+    """Return the ``wanted`` attributes of a group that exist; all if that is None.
 
     ``name``: name of the group, for messages.
     """
-    if not wanted:
+    if wanted is None:
         wanted = [_text(stored_name) for stored_name in h5py.Group(group).attrs]
     return {
         attribute: _value(group, name, attribute)
@@ -98,14 +101,25 @@ def _value(group: Any, name: str, attribute: str) -> Any:
     classes = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
     if stored.get_type().get_class() not in classes or stored.shape is None:
         raise AmiwarpError(
-            f"{name} attribute '{attribute}' is neither a number nor a string; remove it"
+            f"{name} attribute '{attribute}' is neither a number nor a string; remove it",
+            ErrorCode.FORMAT_UNKNOWN,
         )
-    if stored.get_storage_size() > ATTRIBUTE_BYTES:
+    # A text of variable length counts as 16 bytes here; its own length is checked once it is read.
+    stored_bytes = stored.get_storage_size()
+    _check_size(stored_bytes, name, attribute)
+    value = plain_value(all_values(stored)[()])
+    texts = value if isinstance(value, list) else [value]
+    text_bytes = sum(len(text.encode()) for text in texts if isinstance(text, str))
+    _check_size(text_bytes, name, attribute)
+    return value
+
+
+def _check_size(size_bytes: int, name: str, attribute: str) -> None:
+    if size_bytes > ATTRIBUTE_BYTES:
         raise AmiwarpError(
-            f"{name} attribute '{attribute}' has over {ATTRIBUTE_BYTES} bytes; the file is damaged",
+            f"{name} attribute '{attribute}' has {size_bytes:,} bytes, over {ATTRIBUTE_BYTES:,}; remove or shorten it",
             ErrorCode.FILE_DAMAGED,
         )
-    return plain_value(all_values(stored)[()])
 
 
 def plain_value(value: Any) -> Any:

@@ -85,7 +85,7 @@ def read_rows(notes: dict[str, int], path: str, name: str) -> Iterator[Columns]:
 def _filters(dataset: Any) -> list[int]:
     """Return the numbers of the filters of a dataset."""
     creation = dataset.id.get_create_plist()
-    return [creation.get_filter(at)[0] for at in range(creation.get_nfilters())]
+    return [creation.get_filter(number)[0] for number in range(creation.get_nfilters())]
 
 
 CODED_BYTES = 1 << 20
@@ -129,7 +129,8 @@ def _coded_chunk(dataset: Any, start: int) -> tuple[bytes, bool]:
     size = dataset.id.get_chunk_info_by_coord((start,)).size
     if size > ecf.MOST_BYTES:
         raise AmiwarpError(
-            f"dataset '{dataset.name}': a chunk has {size} bytes; expected at most {ecf.MOST_BYTES}"
+            f"dataset '{dataset.name}': a chunk has {size} bytes; expected at most {ecf.MOST_BYTES}",
+            ErrorCode.FILE_DAMAGED,
         )
     skipped_filters, data = dataset.id.read_direct_chunk((start,))
     is_plain = bool(skipped_filters & 1)
@@ -143,7 +144,8 @@ def _coded_chunk(dataset: Any, start: int) -> tuple[bytes, bool]:
 def _not_events(dataset: Any) -> AmiwarpError:
     """Return the error to raise for a dataset in Prophesee's codec that holds no events."""
     return AmiwarpError(
-        f"dataset '{dataset.name}' is {dataset.dtype}; the ECF codec holds rows of x, y, t, p"
+        f"dataset '{dataset.name}' is {dataset.dtype}; the ECF codec holds rows of x, y, t, p",
+        ErrorCode.FORMAT_UNKNOWN,
     )
 
 
@@ -165,7 +167,8 @@ def _check_rows(dataset: Any, name: str, path: str) -> None:
         is_good = has_columns and dataset.dtype.kind in "fiu"
     if not is_good:
         raise AmiwarpError(
-            f"dataset '{name}' is {dataset.dtype} of shape {dataset.shape}; expected rows of x, y, t, p"
+            f"dataset '{name}' is {dataset.dtype} of shape {dataset.shape}; expected rows of x, y, t, p",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     codes = _filters(dataset)
     if ECF in codes and codes != [ECF] and not h5py.h5z.filter_avail(ECF):

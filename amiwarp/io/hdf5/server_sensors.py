@@ -24,7 +24,8 @@ def read_imu(notes: dict[str, int], path: str, group: str) -> Iterator[tuple[NDA
         times, rows = _pair(file, path, f"{group}/imu")
         if rows.shape[1:] != (6,) or rows.dtype.kind not in "fiu":
             raise AmiwarpError(
-                f"dataset '{group}/imu' is {rows.dtype} of shape {rows.shape}; expected six columns"
+                f"dataset '{group}/imu' is {rows.dtype} of shape {rows.shape}; expected six columns",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         for start in range(0, len(times), PIECE):
             piece = slice(start, start + PIECE)
@@ -43,7 +44,8 @@ def read_heads(notes: dict[str, int], path: str, group: str) -> Iterator[tuple[N
         if not is_stack or images.dtype not in (np.uint8, np.uint16):
             raise AmiwarpError(
                 f"dataset '{group}/image_raw' is {images.dtype} of shape {images.shape}; expected uint8 or uint16 of "
-                "shape (frames, height, width)"
+                "shape (frames, height, width)",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         count, height, width = images.shape
         yield (
@@ -74,7 +76,8 @@ def _pair(file: Any, path: str, name: str) -> tuple[Any, Any]:
     _check_dataset(values, name, path)
     if times.shape != values.shape[:1] or times.dtype.kind not in "fiu":
         raise AmiwarpError(
-            f"dataset '{name}_ts' is {times.dtype} of shape {times.shape} for {values.shape[0]} rows"
+            f"dataset '{name}_ts' is {times.dtype} of shape {times.shape} for {values.shape[0]} rows",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     return times, values
 

@@ -65,25 +65,25 @@ class StoredColumn:
         out = self._decoded(first, last)
         return None if out is None else out[within]
 
-    def _chunk(self, at: int) -> NDArray[Any] | None:
+    def _chunk(self, chunk: int) -> NDArray[Any] | None:
         """Return a whole chunk, or None if it is damaged. The latest chunk is kept, for searches within it."""
         # Another thread may replace it meanwhile.
         latest = self._last
-        if latest is not None and latest[0] == at:
+        if latest is not None and latest[0] == chunk:
             return latest[1]
-        out = self._decoded(at, at)
+        out = self._decoded(chunk, chunk)
         if out is not None:
-            self._last = at, out
+            self._last = chunk, out
         return out
 
-    def encoded(self, at: int) -> bytes:
+    def encoded(self, chunk: int) -> bytes:
         """Return the stored bytes of chunk ``at``."""
-        offset, size = self._places[at]
+        offset, size = self._places[chunk]
         return os.pread(self._handle, size, offset)
 
     def _decoded(self, first: int, last: int) -> NDArray[Any] | None:
         """Return the elements of the chunks from ``first`` to ``last``, or None if one of the chunks is damaged."""
-        stored = [self.encoded(at) for at in range(first, last + 1)]
+        stored = [self.encoded(number) for number in range(first, last + 1)]
         count = min((last + 1) * CHUNK, self._count) - first * CHUNK
         out = np.empty((count, *self._row), self._dtype)
         # The last chunk of the column is padded, and does not fit into the result.

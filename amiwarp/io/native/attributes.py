@@ -75,7 +75,8 @@ def _read_distortion(attributes: Mapping[str, Any], where: str) -> Distortion | 
     if coefficients.ndim != 1 or len(coefficients) not in lengths:
         expected = " or ".join(map(str, lengths))
         raise AmiwarpError(
-            f"camera distortion is {shown(coefficients)}; expected {expected} numbers for {model}"
+            f"camera distortion is {shown(coefficients)}; expected {expected} numbers for {model}",
+            ErrorCode.FILE_DAMAGED,
         )
     return DISTORTIONS[model](*coefficients.tolist())
 
@@ -125,5 +126,8 @@ def _read_second_prism(attributes: Mapping[str, Any], where: str) -> Prism | Non
         return None
     prism = as_wedge(read_prism(second, f"{where} second prism"))
     if isinstance(prism, UnsizedPrism):
-        raise AmiwarpError(f"{where} has a second prism without 'second_apex'; add this attribute")
+        raise AmiwarpError(
+            f"{where} has a second prism without 'second_apex'; add this attribute",
+            ErrorCode.FILE_DAMAGED,
+        )
     return prism

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 
-from amiwarp.events import recording as checks
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Recording, inside_image
 from amiwarp.io.native.layout import FLAGS
 from amiwarp.io.native.writer import RecordingWriter
 from amiwarp.io.output_formats import Codec
@@ -25,7 +24,10 @@ def write_recording(
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a recording to a native file. ``size`` is the size of the image [px]."""
+    """Write a recording to a native file.
+
+    ``size`` is the size of the output's image [px], which a scale may have changed.
+    """
     truth = recording.truth
     with RecordingWriter(
         path,
@@ -41,7 +43,7 @@ def write_recording(
         truth_labels=None if truth is None else truth.labels,
     ) as writer:
         _copy_events(recording, writer, size, progress)
-        copy_records(recording, writer)
+        copy_sensors_and_truth(recording, writer)
         if recording.frames is not None:
             for index, t in enumerate(recording.frames.t.tolist()):
                 writer.append_image(t, recording.frames[index])
@@ -61,16 +63,19 @@ def _copy_events(
     for block in source.blocks():
         stop = start + len(block)
         truth_of_block = None if truth is None else truth.of_events(start, stop)
-        flags = {name: None if of is None else of(start, stop) for name, of in flags_of.items()}
+        flags = {
+            name: None if flags_between is None else flags_between(start, stop)
+            for name, flags_between in flags_of.items()
+        }
         if flags["inside"] is None and not block.whole_pixels:
-            flags["inside"] = checks.inside_image(block.x, block.y, *size)
+            flags["inside"] = inside_image(block.x, block.y, *size)
         writer.append(block, truth=truth_of_block, **flags)
         start = stop
         if progress is not None:
             progress("writing events", start / len(source))
 
 
-def copy_records(recording: Recording, writer: RecordingWriter) -> None:
+def copy_sensors_and_truth(recording: Recording, writer: RecordingWriter) -> None:
     """Append to a writer a recording's IMU samples, ground truth of instants, masks of known pixels, and poses."""
     truth = recording.truth
     if recording.imu is not None:

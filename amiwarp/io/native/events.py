@@ -64,7 +64,7 @@ class NativeEvents(EventSource):
         self._ends: list[int] = []
         """Times of the first and the last event [us]; empty without events."""
         if self._count:
-            self._ends = [int(self.slice(at, at + 1).t[0]) for at in (0, self._count - 1)]
+            self._ends = [int(self.slice(index, index + 1).t[0]) for index in (0, self._count - 1)]
         register_reader(self, self.path)
 
     def _stored_size(self) -> tuple[int, int] | None:
@@ -171,11 +171,11 @@ class NativeEvents(EventSource):
         if t > self.t_last:
             return self._count
         low, high = self._bracket(t)
-        at = low + int(np.searchsorted(self._times(low, high), t))
-        if 0 < at < self._count:
-            t_before, t_at = self._times(at - 1, at + 1)
+        index = low + int(np.searchsorted(self._times(low, high), t))
+        if 0 < index < self._count:
+            t_before, t_at = self._times(index - 1, index + 1)
             if t_before < t <= t_at:
-                return at
+                return index
         raise AmiwarpError(
             f"{self.path}: events/t is not sorted near {t} us, or ms_to_idx disagrees with it; the file is damaged",
             ErrorCode.FILE_DAMAGED,

@@ -28,5 +28,8 @@ POSE_TABLES = {
 }
 """Datasets of the names and of the values of what moves, and the length of a value."""
 
+ATTRIBUTE_BYTES = 1 << 16
+"""Size of the largest attribute that is written and read [bytes]."""
+
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """Arrays of a block of events, by the names of their datasets in the file."""

@@ -31,16 +31,11 @@ from amiwarp.io.file_access import allocate
 from amiwarp.io.hdf5.chunks import CHUNK, append_chunk, encode, make_dataset
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.native.copying import save_recording
+from amiwarp.io.native.header import check_sensor_size, write_header
 from amiwarp.io.native.layout import ENCODERS, EVENTS, FLAGS, Columns
-from amiwarp.io.native.parts import (
-    check_frame,
-    encoder_columns,
-    event_columns,
-    filled,
-    ms_entries,
-    write_header,
-)
+from amiwarp.io.native.ms_index import ms_entries
 from amiwarp.io.native.reader import open_hdf5
+from amiwarp.io.native.written_columns import copied_into_chunk, encoder_columns, event_columns
 from amiwarp.io.output_formats import check_native
 from amiwarp.io.outputs import NewFile, check_output, link_new, put_in_place
 from amiwarp.optics.camera import Camera
@@ -101,7 +96,7 @@ class LiveWriter:
         self.path = Path(path)
         self._overwrite = overwrite
         check_native(self.path)
-        check_frame(self.path, width, height, camera)
+        check_sensor_size(self.path, width, height, camera)
         self.part = self.path.resolve().with_name(f"{self.path.stem}.part.h5")
         self._size = (int(width), int(height))
         self._camera = camera
@@ -129,7 +124,8 @@ class LiveWriter:
         self._names = ENCODERS[:encoders]
         self._spans: dict[str, tuple[int, int]] = {}
         """Times of the first and the last sample of each encoder [us], by the beginning of its datasets' names."""
-        self._pulses = np.zeros(0, np.int64)  # index pulses later than the last encoder sample
+        self._early_pulses = dict.fromkeys(self._names, np.zeros(0, np.int64))
+        """Index pulses later than the last sample of each encoder [us], by the beginning of its datasets' names."""
         self._encoder: Encoder | None = None
 
     def __len__(self) -> int:
@@ -183,9 +179,13 @@ class LiveWriter:
             for name, dtype in dtypes.items()
         }
         file["t_offset"] = np.int64(0)
-        small: dict[str, Any] = {"ms_to_idx": np.int64, "encoder/index_t": np.int64}
+        small: dict[str, Any] = {"ms_to_idx": np.int64}
         for name in self._names:
-            small |= {f"{name}t": np.int64, f"{name}angle": np.float64}
+            small |= {
+                f"{name}t": np.int64,
+                f"{name}angle": np.float64,
+                f"{name}index_t": np.int64,
+            }
         for name, kind in small.items():
             dataset = file.create_dataset(
                 name, shape=(0,), maxshape=(None,), chunks=(SMALL_CHUNK,), dtype=kind
@@ -248,7 +248,7 @@ class LiveWriter:
             self._small["ms_to_idx"].add(entries)
             self._next_ms += entries.size
         new = {**columns, "events/t": t - self._t_offset}
-        self._pending = filled(self._pending, self._pending_count, new)
+        self._pending = copied_into_chunk(self._pending, self._pending_count, new)
         self._pending_count += t.size
         self._t_last = int(t[-1])
         if self._pending_count == CHUNK:
@@ -259,9 +259,8 @@ class LiveWriter:
     ) -> None:
         """Append encoder samples: times on the events' clock [us], unwrapped angles [rad], and index pulses [us].
 
-        ``second``: whether they are samples of the second encoder, whose index pulses are not stored. Pulses before the
-        first sample are dropped. Raises :class:`AmiwarpError` for samples that are not later than the samples before,
-        or not finite.
+        ``second``: whether they are samples of the second encoder. Pulses before the first sample are dropped. Raises
+        :class:`AmiwarpError` for samples that are not later than the samples before, or not finite.
         """
         self._check_open("append_encoder")
         name = self._names[1 if second else 0]
@@ -275,8 +274,8 @@ class LiveWriter:
             )
         if t.size:
             self._accept_samples(name, t, angles)
-        if not second and name in self._spans:
-            self._accept_pulses(as_times(index_t_us) + offset, self._spans[name])
+        if name in self._spans:
+            self._accept_pulses(name, as_times(index_t_us) + offset)
         if self._waiting_bytes() > MOST_WAITING:
             with errors_name(self.path, lambda: f"after {len(self)} events"):
                 self._flush()
@@ -295,12 +294,12 @@ class LiveWriter:
         self._small[f"{name}angle"].add(angles)
         self._spans[name] = first, int(t[-1])
 
-    def _accept_pulses(self, pulses: NDArray[np.int64], span: tuple[int, int]) -> None:
-        """Add index pulses within the ``span`` of the samples. Later pulses wait for their samples."""
-        first, last = span
-        pulses = np.append(self._pulses, pulses)
-        self._small["encoder/index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
-        self._pulses = pulses[pulses > last][-MOST_PULSES:]
+    def _accept_pulses(self, name: str, pulses: NDArray[np.int64]) -> None:
+        """Add index pulses [us] of an encoder within the time of its samples. Later pulses wait for their samples."""
+        first, last = self._spans[name]
+        pulses = np.append(self._early_pulses[name], pulses)
+        self._small[f"{name}index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
+        self._early_pulses[name] = pulses[pulses > last][-MOST_PULSES:]
 
     def set_encoder(self, encoder: Encoder) -> None:
         """Set the encoder data that the finished file holds instead of the appended encoder samples.
@@ -341,7 +340,7 @@ class LiveWriter:
                 f"{self.path}: compensated events need the flags inside, events from a sensor take no flags"
             )
         if self._compensated and extrapolated is None:
-            extrapolated = np.zeros(len(events))
+            extrapolated = np.zeros(len(events), np.uint8)
         return event_columns(events, EventTruth(), inside=inside, extrapolated=extrapolated)
 
     def _to_finish(self) -> int:
@@ -441,7 +440,8 @@ class LiveWriter:
         return of_events + sum(small.stored_bytes for small in self._small.values())
 
     def _replace_encoder(self, encoder: Encoder) -> None:
-        columns = {"encoder/index_t": np.zeros(0, np.int64), **encoder_columns(encoder)}
+        no_pulses = {f"{name}index_t": np.zeros(0, np.int64) for name in self._names}
+        columns = no_pulses | encoder_columns(encoder)
         self._reserve(2 * sum(values.nbytes for values in columns.values()))
         self._file["encoder"].attrs["clock_offset_us"] = float(encoder.clock_offset_us)
         for name, values in columns.items():

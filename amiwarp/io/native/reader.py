@@ -96,7 +96,8 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
         if (camera.width, camera.height) != events.size:
             raise AmiwarpError(
                 f"{path}: camera is {camera.width}x{camera.height}, events are {events.size}; both must have the same "
-                "size"
+                "size",
+                ErrorCode.FILE_DAMAGED,
             )
     if "encoder" in file.attributes:
         encoder = _read_encoder(path, file)
@@ -145,18 +146,15 @@ def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
         return None
     t, angle = samples
 
-    index_t = None
-    if "encoder/index_t" in file.columns:
-        pulses = file.columns["encoder/index_t"]
-        index_t = rounded_times(pulses.read(0, len(pulses)))
-        if file.unfinished:
-            index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])]
+    index_t = _read_pulses(file, ENCODERS[0], t)
 
     second = None
     if "encoder/second_t" in file.columns:
         samples_of_second = _read_samples(file, ENCODERS[1])
         if samples_of_second is not None:
-            second = Encoder(*samples_of_second)
+            second_t, second_angle = samples_of_second
+            second_index_t = _read_pulses(file, ENCODERS[1], second_t)
+            second = Encoder(second_t, second_angle, index_t=second_index_t)
 
     offset_us = attribute(
         file.attributes["encoder"], f"{path}: /encoder", "clock_offset_us", float, 0.0
@@ -181,6 +179,19 @@ def _read_samples(
     if t.size < 2 and (file.unfinished or t.size == angle.size == 0):
         return None
     return t, angle
+
+
+def _read_pulses(file: Hdf5File, name: str, t: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Return times of the index pulses [us] of the encoder with samples at ``t`` [us]; None without pulses."""
+    if f"{name}index_t" not in file.columns:
+        return None
+    pulses = file.columns[f"{name}index_t"]
+    index_t = rounded_times(pulses.read(0, len(pulses)))
+    if file.unfinished:
+        # The last samples may not be written yet.
+        index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])]
+    # A live recording has the dataset before it is known whether there are pulses.
+    return index_t if index_t.size else None
 
 
 def _read_imu(path: Path, file: Hdf5File) -> ImuSamples | None:
@@ -208,7 +219,8 @@ def _rotation_of_imu(file: Hdf5File) -> NDArray[np.float64] | None:
     rotation = as_numbers(rotation, "attribute 'to_camera'").astype(np.float64)
     if rotation.shape != (9,):
         raise AmiwarpError(
-            f"attribute 'to_camera' has shape {rotation.shape}; expected 9 numbers, row by row"
+            f"attribute 'to_camera' has shape {rotation.shape}; expected 9 numbers, row by row",
+            ErrorCode.FILE_DAMAGED,
         )
     return np.asarray(rotation.reshape(3, 3))
 
@@ -222,12 +234,13 @@ def _read_frames(path: Path, file: Hdf5File) -> StoredImages | None:
         image = dataset_of(file, "frames/image", len(times))
         if image.dtype not in (np.uint8, np.uint16) or not all(image.row):
             raise AmiwarpError(
-                f"frames are {image.dtype} of shape {image.row}; expected uint8 or uint16"
+                f"frames are {image.dtype} of shape {image.row}; expected uint8 or uint16",
+                ErrorCode.FILE_DAMAGED,
             )
         t = rounded_times(times.read(0, len(times)))
         if (t[1:] < t[:-1]).any():
             raise AmiwarpError("frames/t decreases; the file is damaged", ErrorCode.FILE_DAMAGED)
         height, width = image.row
         return StoredImages(
-            path, "frames", t, (width, height), lambda at: image.read(at, at + 1)[0], file
+            path, "frames", t, (width, height), lambda index: image.read(index, index + 1)[0], file
         )

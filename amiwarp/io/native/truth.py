@@ -140,17 +140,17 @@ def _frames(path: Path, file: Hdf5File, size: tuple[int, int]) -> StoredImages |
     if names:
         joints = dataset_of(file, "truth/frames/joints", count, (len(names), 3))
 
-    def read(at: int) -> FrameTruth:
+    def read(index: int) -> FrameTruth:
         values = {}
         for name, (dtype, _) in MAPS.items():
-            values[name] = _read_as(maps[name], dtype, at, at + 1)[0]
-        pose = _read_as(poses, np.float64, at, at + 1)[0]
+            values[name] = _read_as(maps[name], dtype, index, index + 1)[0]
+        pose = _read_as(poses, np.float64, index, index + 1)[0]
         joint_places = {}
         if joints is not None:
-            places = _read_as(joints, np.float64, at, at + 1)[0]
+            places = _read_as(joints, np.float64, index, index + 1)[0]
             joint_places = dict(zip(names, places, strict=True))
         return FrameTruth(
-            t_us=int(t[at]),
+            t_us=int(t[index]),
             **values,
             rotation=rotation_of(pose),
             position=pose[:3],
@@ -168,8 +168,8 @@ def _masks(path: Path, file: Hdf5File, size: tuple[int, int]) -> StoredImages | 
     width, height = size
     masks = dataset_of(file, "truth/known/mask", len(t), (height, width))
 
-    def read(at: int) -> NDArray[np.bool_]:
-        (mask,) = masks.read(at, at + 1)
+    def read(index: int) -> NDArray[np.bool_]:
+        (mask,) = masks.read(index, index + 1)
         return np.asarray(mask != 0)
 
     return StoredImages(path, "truth/known", t, size, read, file)

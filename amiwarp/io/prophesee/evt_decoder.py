@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.io.decoding import words_on
 from amiwarp.schema.calls import guarded
 from amiwarp.validation import one_of
@@ -59,7 +60,7 @@ class EvtDecoder:
     Raises
     ------
     AmiwarpError
-        If an argument is not usable.
+        If the version is unknown, or ``swapped`` is set for another version than 2.1.
 
     Notes
     -----
@@ -82,6 +83,11 @@ class EvtDecoder:
 
         start_once()
         self._version = one_of(version, WORD_TYPES, "version of EVT")
+        if swapped and self._version != "2.1":
+            raise AmiwarpError(
+                f"swapped is {swapped} for EVT {self._version}, but only words of EVT 2.1 have halves to swap; leave "
+                "swapped out"
+            )
         self._swapped = swapped
         self._device = wp.get_device("cpu" if device is None else device)
         self._state: wp.array | None = None
@@ -140,38 +146,46 @@ class EvtDecoder:
         )
         block_words = CPU_WORDS if device.is_cpu else CUDA_WORDS
         blocks = math.ceil(words.shape[0] / block_words)
+        inputs_of_words = [words, block_words]
         if self._version == "3.0":
             survey = evt3.survey_evt3
             decode = evt3.decode_evt3
-            layout = [words, block_words]
             clock_bits = 12
         else:
             survey = evt2.survey_evt2
             decode = evt2.decode_evt2
-            layout = [words, block_words, int(self._swapped)]
+            inputs_of_words.append(int(self._swapped))
             clock_bits = 28
 
         # First pass: what each block changes. So its state at the start and the place of its first event are known.
         changes = wp.empty(blocks, dtype=evt.Change, device=device)
-        launch(survey, blocks, layout, [changes], device=device, smallest=1)
+        launch(survey, blocks, inputs_of_words, [changes], device=device, smallest=1)
         links = self._link(changes, clock_bits)
         self._untimed += int(links.totals["untimed"])
         self._unknown += int(links.totals["unknown"])
 
         # Second pass: the events.
         events = new_event_arrays(int(links.totals["event"]), device)
-        edge_count = int(links.totals["trigger"])
-        edges = evt.TriggerArrays()
-        edges.channel = wp.empty(edge_count, dtype=wp.uint8, device=device)
-        edges.t = wp.empty(edge_count, dtype=wp.int64, device=device)
-        edges.rising = wp.empty(edge_count, dtype=wp.uint8, device=device)
-        inputs = [*layout, links.states, links.places]
+        edges = self._new_edges(int(links.totals["trigger"]))
+        inputs = [*inputs_of_words, links.states, links.places]
         launch(decode, blocks, inputs, [events, edges], device=device, smallest=1)
-        self._state = wp.clone(links.end)
+        self._state = wp.clone(links.end)  # the view would keep the states of all groups in memory
         triggers = Triggers(
             channel=edges.channel.numpy(), t=edges.t.numpy(), rising=edges.rising.numpy()
         )
         return DeviceEvents(events.x, events.y, events.t, events.p), triggers
+
+    def _new_edges(self, count: int) -> Any:
+        """Return arrays for the edges of external triggers on the device."""
+        import warp as wp
+
+        from amiwarp.kernels import evt
+
+        edges = evt.TriggerArrays()
+        edges.channel = wp.empty(count, dtype=wp.uint8, device=self._device)
+        edges.t = wp.empty(count, dtype=wp.int64, device=self._device)
+        edges.rising = wp.empty(count, dtype=wp.uint8, device=self._device)
+        return edges
 
     def _link(self, changes: Any, clock_bits: int) -> _Links:
         """Link blocks of words, in groups, so that many threads work.

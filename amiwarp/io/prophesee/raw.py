@@ -129,7 +129,8 @@ def stated_origin(path: Path, fields: dict[str, str]) -> int:
     origin = fields.get("t0", "0")
     if not re.fullmatch(r"[0-9]{1,19}", origin) or int(origin) > TIME_LIMIT:
         raise AmiwarpError(
-            f"{path}: t0 in the header is '{origin[:40]}'; expected a time of 0 to {TIME_LIMIT} us"
+            f"{path}: t0 in the header is '{origin[:40]}'; expected a time of 0 to {TIME_LIMIT} us",
+            ErrorCode.FILE_DAMAGED,
         )
     return int(origin)
 

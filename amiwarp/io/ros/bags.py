@@ -90,7 +90,8 @@ def _open_ros1(bag: Any, path: str) -> None:
             ) from error
         if str(error).startswith("Bag is not indexed"):
             raise AmiwarpError(
-                "has no index, because its recording was not ended; run rosbag reindex"
+                "has no index, because its recording was not ended; run rosbag reindex",
+                ErrorCode.FILE_DAMAGED,
             ) from error
         if not str(error).startswith("Bag index looks damaged"):
             raise
@@ -140,14 +141,19 @@ def note_unread(notes: dict[str, int]) -> None:
 
 def choose(bag: Any, topic: str | None, version: int) -> Any:
     """Return the connection of the topic with events. Raises :class:`AmiwarpError` if there are several or none."""
-    of_events = [each for each in bag.connections if each.msgtype in (*ARRAYS, *PACKETS)]
-    found = {each.topic: each for each in of_events if each.msgcount}
+    of_events = [
+        connection for connection in bag.connections if connection.msgtype in (*ARRAYS, *PACKETS)
+    ]
+    found = {connection.topic: connection for connection in of_events if connection.msgcount}
     if topic in found:
         return found[topic]
     if topic is None and len(found) == 1:
         return next(iter(found.values()))
     if found:
-        counts = [f"{name} ({each.msgcount} messages)" for name, each in sorted(found.items())[:20]]
+        counts = [
+            f"{name} ({connection.msgcount} messages)"
+            for name, connection in sorted(found.items())[:20]
+        ]
         listed = ", ".join(counts)
         if topic is None:
             raise AmiwarpError(
@@ -159,18 +165,22 @@ def choose(bag: Any, topic: str | None, version: int) -> Any:
             f"has no events in the topic '{topic}'; the topics with events are {listed}",
             ErrorCode.CONTENT_MISSING,
         )
-    empty = [each.topic for each in of_events if topic in (None, each.topic)]
+    empty = [connection.topic for connection in of_events if topic in (None, connection.topic)]
     if empty:
         raise AmiwarpError(
             f"holds no events: its topic {empty[0]} has no messages; give another recording",
             ErrorCode.CONTENT_MISSING,
         )
     others = sorted(
-        {f"{each.topic} ({each.msgtype.replace('/msg/', '/')})" for each in bag.connections}
+        {
+            f"{connection.topic} ({connection.msgtype.replace('/msg/', '/')})"
+            for connection in bag.connections
+        }
     )
     shown = ", ".join(others[:20]) or "none"
     raise AmiwarpError(
-        f"is a ROS {version} bag without event topics; its topics are {shown}; give a bag with events"
+        f"is a ROS {version} bag without event topics; its topics are {shown}; give a bag with events",
+        ErrorCode.CONTENT_MISSING,
     )
 
 
@@ -214,5 +224,6 @@ def _check_order(types: Any, name: str) -> None:
         if given != expected:
             shown = ", ".join(given) or "nothing"
             raise AmiwarpError(
-                f"defines {name} with the fields {shown}; expected {', '.join(expected)}"
+                f"defines {name} with the fields {shown}; expected {', '.join(expected)}",
+                ErrorCode.FORMAT_UNKNOWN,
             )

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.events.recording import Recording
-from amiwarp.io.event_packets import Packet
+from amiwarp.io.event_packets import Columns, Packet
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.io.file_sensors import sensors_of
 from amiwarp.io.inputs import errors_name
@@ -36,7 +36,7 @@ from amiwarp.io.ros.bags import (
     typestore,
 )
 from amiwarp.io.ros.events import edge_packets, event_packets, stamp_packets
-from amiwarp.io.ros.messages import Columns, decode_array, decode_packet, truncated_bytes
+from amiwarp.io.ros.messages import decode_array, decode_packet, truncated_bytes
 from amiwarp.io.ros.order import Placed, in_order, note_largest_gap, with_number
 from amiwarp.io.ros.packed import unpacked
 from amiwarp.io.ros.words import EVT, Layout, layout_of
@@ -165,7 +165,7 @@ def read_head(path: str, topic: str | None) -> Reply:
                 width, height, _ = decode_array(first_array.raw, ros1=ros1)
                 about["size"] = width, height
             return about, []
-        messages = (deserialised(connection, each.raw, ros1=ros1) for each in stored)
+        messages = (deserialised(connection, message.raw, ros1=ros1) for message in stored)
         first = next(messages, None)
         if first is not None:
             about["size"] = int(first.width), int(first.height)
@@ -296,11 +296,11 @@ def read_others(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[
         if not others:
             return
         index_of = {connection.id: index for index, connection in enumerate(others)}
-        for each in messages_of(bag, others, ros1=False):
-            index = index_of[each.connection.id]
+        for message in messages_of(bag, others, ros1=False):
+            index = index_of[message.connection.id]
             yield (
-                np.frombuffer(each.raw, np.uint8),
-                np.array([len(each.raw)], np.int64),
-                np.array([each.recorded], np.int64),
+                np.frombuffer(message.raw, np.uint8),
+                np.array([len(message.raw)], np.int64),
+                np.array([message.recorded], np.int64),
                 np.array([index], np.int64),
             )

@@ -70,13 +70,13 @@ class Unknown:
         # For each word, whether the words so far determine the time, the row and the base of vectors.
         always = np.ones(kind.size, np.bool_)
         known = dict.fromkeys((TIME_HIGH, TIME_LOW, ROW, VECTOR_BASE), always)
-        for each in self.kinds:
-            found = kind == each
-            if each == TIME_LOW:
+        for word_kind in self.kinds:
+            found = kind == word_kind
+            if word_kind == TIME_LOW:
                 # A TIME_LOW before the TIME_HIGH may belong to another TIME_HIGH.
                 found &= known[TIME_HIGH]
-            known[each] = np.logical_or.accumulate(found)
-        self.kinds = tuple(each for each in self.kinds if not known[each][-1:].any())
+            known[word_kind] = np.logical_or.accumulate(found)
+        self.kinds = tuple(word_kind for word_kind in self.kinds if not known[word_kind][-1:].any())
 
         is_vector = np.zeros(kind.size, np.bool_)
         is_single = kind <= 1

@@ -48,7 +48,8 @@ def read_heads(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[N
         if depth is None:
             known = ", ".join(DEPTHS)
             raise AmiwarpError(
-                f"the images have the encoding '{message.encoding[:40]}', not one of {known}"
+                f"the images have the encoding '{message.encoding[:40]}', not one of {known}",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         is_row_short = message.step < message.width * depth
         if is_row_short or message.data.size < message.height * message.step:
@@ -76,13 +77,13 @@ def read_images(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[
 def _sensor_messages(path: str, topic: str, kind: str) -> Iterator[Any]:
     """Yield the messages of the one topic with messages of a type, or of the topic next to the events' topic."""
     with opened_bag(path) as (bag, ros1):
-        of_events = next(each for each in bag.connections if each.topic == topic)
+        of_events = next(connection for connection in bag.connections if connection.topic == topic)
         if of_events.msgtype not in ARRAYS:
             raise AmiwarpError(
                 "the events have the time of their sensor, which these messages do not have"
             )
         chosen = _topic_near(bag, topic, kind)
-        connections = [each for each in bag.connections if each.topic == chosen]
+        connections = [connection for connection in bag.connections if connection.topic == chosen]
         for message in messages_of(bag, connections, ros1=ros1):
             yield deserialised(message.connection, message.raw, ros1=ros1)
 

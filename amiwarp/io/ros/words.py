@@ -110,7 +110,8 @@ def checked_words(message: Any, encoding: str) -> NDArray[Any]:
     if message.encoding != encoding:
         raise AmiwarpError(
             f"has packets of the encodings '{encoding}' and '{message.encoding[:40]}' in one topic; "
-            "filter the bag to one of them"
+            "filter the bag to one of them",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     check_byte_order(message)
     return words_of(message.events, EVT[encoding])

@@ -18,17 +18,18 @@ from numpy.typing import NDArray
 
 from amiwarp.events.recording import Events, regroup
 from amiwarp.io.output_formats import Bag, Outline
-from amiwarp.io.reading_process import packets, run
+from amiwarp.io.reading_process import packets as read_packets
+from amiwarp.io.reading_process import run
 from amiwarp.io.ros.packed import unpacked
 from amiwarp.io.ros.reader import event_topic, read_others, read_topics
 
 Messages: TypeAlias = Generator[tuple[int, Any, Any], None, None]
-"""Messages: time of the recording [ns], topic, bytes."""
+"""Messages: time of the recording [ns], connection of the library, which stands for a topic, and bytes."""
 
 AddTopic: TypeAlias = Callable[[Any, dict[str, Any]], Any]
 """Function that adds a topic, described by the second argument, to the writer, the first."""
 
-PACKET_US = 10_000
+LONGEST_PACKET_US = 10_000
 """Longest packet [us]."""
 
 
@@ -64,8 +65,8 @@ def write_messages(
             streams.append(_others(writer, bag, add_topic))
         for stream in streams:
             opened.enter_context(contextlib.closing(stream))
-        for recorded, topic, data in heapq.merge(*streams, key=itemgetter(0)):
-            writer.write(topic, recorded, data)
+        for recorded, merged_connection, data in heapq.merge(*streams, key=itemgetter(0)):
+            writer.write(merged_connection, recorded, data)
 
 
 class MessageClock:
@@ -89,8 +90,8 @@ class MessageClock:
         self._stamps = stamps
 
     def packets(self, block: Events) -> Iterator[Events]:
-        """Divide a block into packets, none longer than :data:`PACKET_US` or from several messages."""
-        for events in regroup([block], duration_us=PACKET_US):
+        """Divide a block into packets, none longer than :data:`LONGEST_PACKET_US` or from several messages."""
+        for events in regroup([block], duration_us=LONGEST_PACKET_US):
             message = np.searchsorted(self._t, events.t, "right")
             cuts = np.flatnonzero(np.diff(message)) + 1
             edges = [0, *cuts.tolist(), len(events)]
@@ -100,14 +101,15 @@ class MessageClock:
     def times(self, t: int) -> tuple[int, int]:
         """Return the time of the recording and the stamp of a message whose first event is at ``t`` [us], in ns."""
         following = int(np.searchsorted(self._t, t, "right"))
-        at = max(following - 1, 0)
-        later_us = t - int(self._t[at])
+        message = max(following - 1, 0)
+        # Negative for events before the first message.
+        later_us = t - int(self._t[message])
         later_ns = later_us * 1000
-        recorded = int(self._recorded[at]) + later_ns
-        if at + 1 < len(self._t):
+        recorded = int(self._recorded[message]) + later_ns
+        if message + 1 < len(self._t):
             # Packets stay in order.
-            recorded = min(recorded, int(self._recorded[at + 1]))
-        return recorded, int(self._stamps[at]) + later_ns
+            recorded = min(recorded, int(self._recorded[message + 1]))
+        return recorded, int(self._stamps[message]) + later_ns
 
 
 def _others(writer: Any, bag: Bag, add_topic: AddTopic) -> Messages:
@@ -115,7 +117,7 @@ def _others(writer: Any, bag: Bag, add_topic: AddTopic) -> Messages:
     topics = []
     for about in run(read_topics, bag.path, bag.topic):
         topics.append(add_topic(writer, about))
-    source = packets(read_others, bag.path, bag.topic, {})
+    source = read_packets(read_others, bag.path, bag.topic, {})
     for data, lengths, recorded, places in source:
         ends = np.cumsum(lengths)
         starts = ends - lengths

@@ -55,7 +55,7 @@ class TextForm:
     """Indices of the columns that are dates with times of day."""
     units: tuple[str | None, ...] = ()
     """Unit of time of each column in a line below the names; empty without such a line."""
-    own: TextSize | None = None
+    written_size: TextSize | None = None
     """What amiwarp wrote beside the text, or None."""
 
 
@@ -76,7 +76,8 @@ def find_form(path: Path, head: bytes) -> TextForm:
         if b"\r" in line.rstrip(b"\r\n"):
             raise AmiwarpError(
                 f"{path}: line {number + 1} holds a carriage return; lines must end with a newline; replace the "
-                "carriage returns by newlines"
+                "carriage returns by newlines",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         words = TextRow.of(line).words(line) if holds_values(line) else []
         may_be_size = len(words) == 2 and size is None and names is None
@@ -89,7 +90,9 @@ def find_form(path: Path, head: bytes) -> TextForm:
             if len(words) == 2:
                 shown = b" ".join(words)[:80].decode("ascii", "replace")
                 raise AmiwarpError(
-                    f"{path}: line {number + 1} '{shown}' is not a size in pixels; expected 'width height' or 't x y p'"
+                    f"{path}: line {number + 1} '{shown}' is not a size in pixels; "
+                    "expected 'width height' or 't x y p'",
+                    ErrorCode.FORMAT_UNKNOWN,
                 )
             rows = head[position:].split(b"\n", ROWS_OF_FORM)[:ROWS_OF_FORM]
             row = _form_of_rows(path, number + 1, rows)
@@ -115,7 +118,7 @@ def find_form(path: Path, head: bytes) -> TextForm:
     why = why_no_rows(head)
     if not why:
         why = f"line {number + 1} holds no numbers; expected 't x y p', or names of columns before them"
-    raise AmiwarpError(f"{path}: {why}")
+    raise AmiwarpError(f"{path}: {why}", ErrorCode.FORMAT_UNKNOWN)
 
 
 def _form_of_rows(path: Path, number: int, lines: Sequence[bytes]) -> TextRow:
@@ -173,8 +176,8 @@ def find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLayo
     rows, numbers = _rows_of_numbers(head, is_cut, form)
     names = _fitting_names(form, numbers, given)
     hints = Hints(is_text=True)
-    if form.own is not None:
-        hints = replace(hints, unit=form.own.unit, is_own=True)
+    if form.written_size is not None:
+        hints = replace(hints, unit=form.written_size.unit, is_own=True)
     if names is None:
         hints = replace(hints, order=ROLES, fractions="s")
     layout = find_layout(_columns_of(form, names, numbers), given, hints)
@@ -190,8 +193,8 @@ def find_text_layout(head: bytes, is_cut: bool, form: TextForm, given: GivenLayo
     if given.time_unit is None and names is None and are_seconds:
         layout = _in_seconds(layout, given)
 
-    if form.own is not None and form.own.compensated is not None:
-        return replace(layout, compensated=form.own.compensated)
+    if form.written_size is not None and form.written_size.compensated is not None:
+        return replace(layout, compensated=form.written_size.compensated)
     x_and_y = [layout.columns["x"], layout.columns["y"]]
     places = numbers[:, x_and_y]
     has_fraction = (places != np.floor(places)).any(axis=1)

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events, Recording
 from amiwarp.io.camera_files import read_calib
 from amiwarp.io.columns.layout import Layout
@@ -62,10 +62,10 @@ def open_text(path: Path, given: GivenLayout) -> Recording:
     with errors_name(path, lambda: "line 1"):
         head, is_cut = text_head(path, max(HEAD_BYTES, 2 * LONGEST_LINE))
         form = find_form(path, head)
-    own = read_size(path)
-    if own is not None:
+    written_size = read_size(path)
+    if written_size is not None:
         names = form.names or ROLES
-        form = replace(form, names=names, size=own.size, own=own)
+        form = replace(form, names=names, size=written_size.size, written_size=written_size)
     with errors_name(path, lambda: "finding the columns"):
         layout = find_text_layout(head, is_cut, form, given)
     events = FileEvents(
@@ -113,7 +113,8 @@ def _text_packets(
         whole, newline, rest = (rest + data).rpartition(b"\n")
         if len(rest) > LONGEST_LINE:
             raise AmiwarpError(
-                f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters"
+                f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters",
+                ErrorCode.FILE_DAMAGED,
             )
         if newline:
             yield parse(whole, line_number)
@@ -176,7 +177,9 @@ def _parse(path: Path, form: TextForm, layout: Layout, text: bytes, line_number:
         table = np.zeros((0, 0))
     if not _are_events(table, (len(kept), form.width), layout):
         bad = _first_bad_line(text.split(b"\n"), line_number, form, layout)
-        raise AmiwarpError(f"{path}: {bad}; expected {_expected(form, layout)}")
+        raise AmiwarpError(
+            f"{path}: {bad}; expected {_expected(form, layout)}", ErrorCode.FILE_DAMAGED
+        )
     if layout.unit == "ns":
         return _events(table, layout, _whole_times(kept, layout))
     return _events(table, layout)
@@ -184,7 +187,7 @@ def _parse(path: Path, form: TextForm, layout: Layout, text: bytes, line_number:
 
 def _whole_times(kept: list[bytes], layout: Layout) -> NDArray[np.int64] | None:
     """Return the times in some lines, which have more digits than float64; None if they are not whole numbers."""
-    at = layout.columns["t"]
+    time_column = layout.columns["t"]
     try:
         return np.loadtxt(
             kept,
@@ -192,7 +195,7 @@ def _whole_times(kept: list[bytes], layout: Layout) -> NDArray[np.int64] | None:
             ndmin=1,
             comments=None,
             encoding="ascii",
-            usecols=at,
+            usecols=time_column,
         )
     except ValueError:
         return None
@@ -280,7 +283,7 @@ def _expected(form: TextForm, layout: Layout) -> str:
 
 def _chosen(table: Vector, layout: Layout) -> list[Vector]:
     """Return the columns t, x, y, p."""
-    return [table[:, at] for at in layout.chosen]
+    return [table[:, column] for column in layout.chosen]
 
 
 def _plausible(columns: Sequence[Vector], layout: Layout) -> NDArray[np.bool_]:

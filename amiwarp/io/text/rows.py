@@ -134,7 +134,7 @@ class TextRow:
         """Return the indices of the columns of a line that are dates."""
         with_dates = replace(self, has_stamps=False, has_words=False)
         marked = STAMP.sub(b"date", with_dates.plain(line.removeprefix(BOM)))
-        return tuple(at for at, word in enumerate(marked.split()) if word == b"date")
+        return tuple(position for position, word in enumerate(marked.split()) if word == b"date")
 
     def names(self, line: bytes) -> tuple[str, ...]:
         """Return the names of columns in a line; an empty one for a column without a name."""
@@ -175,7 +175,9 @@ def doubtful_comma(lines: Iterable[bytes]) -> bytes | None:
 def _decimals_between_spaces(line: bytes) -> bool:
     """Return whether the commas of a line are decimal ones in columns between spaces or tabs."""
     fields = line.split()
-    return len(fields) >= 4 and all(b"," not in each or DECIMAL.fullmatch(each) for each in fields)
+    return len(fields) >= 4 and all(
+        b"," not in field or DECIMAL.fullmatch(field) for field in fields
+    )
 
 
 def number_of(word: bytes) -> float:

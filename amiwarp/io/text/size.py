@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.inputs import open_input
 from amiwarp.io.json_files import parse_json
 from amiwarp.optics.camera import LARGEST_SIZE
@@ -83,7 +83,8 @@ def may_replace_size(path: Path) -> bool:
     if beside.is_file() and _own_fields(beside, noted=False) is None:
         raise AmiwarpError(
             f"{beside}: was not written by amiwarp, which would put the sensor size of {path.name} there and never "
-            "replaces such a file; move it, or give the output another name"
+            "replaces such a file; move it, or give the output another name",
+            ErrorCode.OUTPUT_EXISTS,
         )
     return beside.is_file() and not path.exists()
 

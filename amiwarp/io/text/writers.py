@@ -135,12 +135,12 @@ def _digits(values: NDArray[np.integer], places: int = 0) -> Digits:
     characters = np.empty((width, len(values)), np.uint8)
     kept = np.ones((width, len(values)), np.bool_)
     last = width - 1
-    for at in range(last, -1, -1):
+    for position in range(last, -1, -1):
         # Without leading zeros, a digit is written if more than zero is left. The last digit is always written.
-        if not places and at < last:
-            np.greater(values, 0, out=kept[at])
+        if not places and position < last:
+            np.greater(values, 0, out=kept[position])
         rest = values // 10
-        characters[at] = values - rest * 10
+        characters[position] = values - rest * 10
         values = rest
     characters += ord("0")
     return characters, kept

@@ -199,7 +199,8 @@ def _exportable(
     head, items = recorded_dataset.read_manifest(folder / recorded_dataset.MANIFEST)
     if not items:
         raise AmiwarpError(
-            f"{folder}: has no recordings to export; make some with 'amiwarp dataset'"
+            f"{folder}: has no recordings to export; make some with 'amiwarp dataset'",
+            ErrorCode.CONTENT_MISSING,
         )
     tensors = [item for item in items if item.representation is not None]
     if tensors and chosen is ExportFormat.PARQUET:
@@ -292,8 +293,10 @@ def _files_of_earlier(out: Path, overwrite: bool) -> set[str]:
     ):
         files = dict(parse_json(file.read(recorded_dataset.MOST_BYTES))).get("files")
     # Only names that an export can have are removed, whatever the index says.
-    own = r"(data/)?[A-Za-z0-9_-]+[.](tar|parquet)|README[.]md"
-    return {name for name in files or () if isinstance(name, str) and re.fullmatch(own, name)}
+    exported_name = r"(data/)?[A-Za-z0-9_-]+[.](tar|parquet)|README[.]md"
+    return {
+        name for name in files or () if isinstance(name, str) and re.fullmatch(exported_name, name)
+    }
 
 
 def _names(items: Sequence[recorded_dataset.ManifestItem]) -> dict[str, str]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from amiwarp._version import __version__
-from amiwarp.errors import AmiwarpError, optional_module
+from amiwarp.errors import AmiwarpError, ErrorCode, optional_module
 from amiwarp.io.finished_work import append_line, create_journal, read_journal
 from amiwarp.io.output_formats import make_folder
 from amiwarp.io.outputs import NewFile, put_in_place, write_text
@@ -38,7 +38,10 @@ def check_folder(out: Path) -> None:
     if out.is_dir() and not (out / JOURNAL).exists():
         other = sorted(p.name for p in out.iterdir() if not p.name.startswith("."))
         if other:
-            raise AmiwarpError(f"{out}: holds other files, such as {other[0]}; give a new folder")
+            raise AmiwarpError(
+                f"{out}: holds other files, such as {other[0]}; give a new folder",
+                ErrorCode.OUTPUT_EXISTS,
+            )
 
 
 class Journal:
@@ -134,8 +137,8 @@ def write_manifest(
         "splits": dict(Counter(row["split"] for row in rows)),
         "licences": _licences(licences),
         "failed": [
-            {"file": by_key[f.key].file, "source": by_key[f.key].source, "error": f.error}
-            for f in failed
+            {"file": by_key[file.key].file, "source": by_key[file.key].source, "error": file.error}
+            for file in failed
         ],
         "not_in_specification": journal.others(items),
     }

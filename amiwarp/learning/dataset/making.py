@@ -279,7 +279,8 @@ def _local_workers(scheduler: str | None, workers: int | None, device: str) -> i
     if scheduler is not None:
         if workers is not None:
             raise AmiwarpError(
-                f"workers = {workers} applies to local processes; leave it out with a scheduler"
+                f"workers = {workers} applies to local processes; leave it out with a scheduler",
+                ErrorCode.OPTIONS,
             )
         return None
     known = quiet_start.start_quietly()

@@ -20,7 +20,7 @@ GROUP_EVENTS = 2_000_000
 GROUP_ROWS = 1000
 """Largest number of recordings in a row group."""
 MOST_EVENTS = 2**31 - 1
-"""Largest number of events of a recording in Parquet, whose lists have 32-bit offsets."""
+"""Largest number of events of a recording, and of a row group, in Parquet, whose lists have 32-bit offsets."""
 
 
 def _hub_name(split: str) -> str:
@@ -31,22 +31,25 @@ def _hub_name(split: str) -> str:
 def write_parquet(
     scratch: Path,
     splits: Sequence[str],
-    opened: Callable[[str], Iterator[tuple[recorded_dataset.ManifestItem, Any]]],
+    open_split: Callable[[str], Iterator[tuple[recorded_dataset.ManifestItem, Any]]],
     items: Sequence[recorded_dataset.ManifestItem],
-    limit: int,
+    file_bytes: int,
 ) -> list[str]:
-    """Write Parquet files of at least ``limit`` bytes before compression. Return their names."""
+    """Write Parquet files, which end once they hold ``file_bytes`` before compression. Return their names."""
     pa = require_pyarrow()
-    if len({_hub_name(split) for split in splits}) < len(splits):
-        raise AmiwarpError(
-            f"splits are {', '.join(splits)}; the same with '_' for '-', so give one another name"
-        )
+    counts = Counter(_hub_name(split) for split in splits)
+    for name, count in counts.items():
+        if count > 1:
+            alike = " and ".join(f"'{split}'" for split in splits if _hub_name(split) == name)
+            raise AmiwarpError(
+                f"splits {alike} are both '{name}' in Parquet, which has '_' for '-'; give one another name"
+            )
     rows = _rows(pa, flat_rows([item.entry for item in items]))
-    place = {item.file: k for k, item in enumerate(items)}
+    row_of_file = {item.file: row for row, item in enumerate(items)}
     (scratch / "data").mkdir()
     names = []
     for split in splits:
-        parts = list(_parquet_parts(pa, scratch, opened(split), rows, place, limit))
+        parts = _write_parts(pa, scratch, open_split(split), rows, row_of_file, file_bytes)
         for k, part in enumerate(parts):
             names.append(f"data/{_hub_name(split)}-{k:05}-of-{len(parts):05}.parquet")
             part.rename(scratch / names[-1])
@@ -68,59 +71,88 @@ def _rows(pa: Any, rows: Sequence[Mapping[str, Any]]) -> Any:
     return pa.table(columns)
 
 
-def _parquet_parts(
+class _PartWriter:
+    """Writer of the files of a split, each of which ends once it holds ``file_bytes`` before compression."""
+
+    def __init__(self, pa: Any, scratch: Path, file_bytes: int) -> None:
+        self.paths: list[Path] = []
+        """Files so far."""
+        self._pa = pa
+        self._scratch = scratch
+        self._file_bytes = file_bytes
+        self._writer: Any = None
+        self._written = 0  # bytes of the current file
+        self._waiting: list[Any] = []  # rows of the next row group
+        self._events = 0  # their events
+
+    def add(self, row: Any, events: int) -> None:
+        """Write the row of a recording with this number of events."""
+        if self._writer is None or self._written >= self._file_bytes:
+            self.close()
+            self._open(row.schema)
+        if self._events + events > MOST_EVENTS:
+            self._flush()
+        self._waiting.append(row)
+        self._events += events
+        self._written += row.nbytes
+        if self._events >= GROUP_EVENTS or len(self._waiting) >= GROUP_ROWS:
+            self._flush()
+
+    def close(self) -> None:
+        """Finish the current file, if there is one."""
+        if self._writer is not None:
+            self._flush()
+            self._writer.close()
+            self._writer = None
+
+    def discard(self) -> None:
+        """Close the current file, which stays incomplete."""
+        if self._writer is not None:
+            self._writer.close()
+
+    def _open(self, schema: Any) -> None:
+        parquet = importlib.import_module("pyarrow.parquet")
+        path = self._scratch / f"part-{len(self.paths)}.parquet"
+        # Of all columns, only the split repeats from row to row.
+        self._writer = parquet.ParquetWriter(
+            path, schema, compression="zstd", use_dictionary=["split"]
+        )
+        self.paths.append(path)
+        self._written = 0
+
+    def _flush(self) -> None:
+        """Write the waiting rows as a row group."""
+        if self._waiting:
+            self._writer.write_table(self._pa.concat_tables(self._waiting).combine_chunks())
+        self._waiting = []
+        self._events = 0
+
+
+def _write_parts(
     pa: Any,
     scratch: Path,
-    opened: Iterator[tuple[recorded_dataset.ManifestItem, Any]],
+    recordings: Iterator[tuple[recorded_dataset.ManifestItem, Any]],
     rows: Any,
-    place: Mapping[str, int],
-    limit: int,
-) -> Iterator[Path]:
-    """Write the recordings of a split. Yield the path of each file."""
-    parquet = importlib.import_module("pyarrow.parquet")
-    waiting: list[Any] = []
-    events = 0
-    written = 0
-    count = 0
-    writer: Any = None
-
-    def flush() -> None:
-        nonlocal waiting, events
-        if waiting:
-            writer.write_table(pa.concat_tables(waiting).combine_chunks())
-        waiting = []
-        events = 0
-
+    row_of_file: Mapping[str, int],
+    file_bytes: int,
+) -> list[Path]:
+    """Write the recordings of a split. Return the paths of the files."""
+    writer = _PartWriter(pa, scratch, file_bytes)
     try:
-        for item, recording in opened:
-            k = place[item.file]
-            table = rows.slice(k, 1)
+        for item, recording in recordings:
+            row = rows.slice(row_of_file[item.file], 1)
             for name, column in _columns(pa, item, recording).items():
-                if name in table.column_names:
-                    index = table.schema.get_field_index(name)
-                    table = table.set_column(index, name, column)
+                if name in row.column_names:
+                    # The width and height of the manifest give way to the file's own.
+                    index = row.schema.get_field_index(name)
+                    row = row.set_column(index, name, column)
                 else:
-                    table = table.append_column(name, column)
-            if writer is None or written >= limit:
-                if writer is not None:
-                    flush()
-                    writer.close()
-                path = scratch / f"part-{count}.parquet"
-                count = count + 1
-                written = 0
-                writer = parquet.ParquetWriter(
-                    path, table.schema, compression="zstd", use_dictionary=["split"]
-                )
-                yield path
-            waiting.append(table)
-            events += item.events
-            written += table.nbytes
-            if events >= GROUP_EVENTS or len(waiting) >= GROUP_ROWS:
-                flush()
-        flush()
+                    row = row.append_column(name, column)
+            writer.add(row, item.events)
+        writer.close()
     finally:
-        if writer is not None:
-            writer.close()
+        writer.discard()
+    return writer.paths
 
 
 def _columns(pa: Any, item: recorded_dataset.ManifestItem, recording: Any) -> dict[str, Any]:

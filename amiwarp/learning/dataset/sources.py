@@ -108,7 +108,8 @@ def _labels(
         row = rows.get(path.resolve())
         if row is None:
             raise AmiwarpError(
-                f"{table_path}: has no row for {path}; add it, or change the pattern of the source"
+                f"{table_path}: has no row for {path}; add it, or change the pattern of the source",
+                ErrorCode.CONTENT_MISSING,
             )
         labels |= row
     return labels
@@ -130,14 +131,16 @@ def _read_labels(path: Path) -> tuple[Path, dict[Path, dict[str, Any]]]:
         names = [name for name in reader.fieldnames or () if name != "file"]
         if "file" not in (reader.fieldnames or ()) or not names:
             raise AmiwarpError(
-                "has no column 'file' or no other column; write a header such as file,class"
+                "has no column 'file' or no other column; write a header such as file,class",
+                ErrorCode.CONTENT_MISSING,
             )
         _check_once(reader.fieldnames or (), "column", "give each label one column")
         rows = list(reader)
         for number, row in enumerate(rows, 1):
             if None in row or None in row.values():
                 raise AmiwarpError(
-                    f"row {number} has more or fewer cells than the header; correct it"
+                    f"row {number} has more or fewer cells than the header; correct it",
+                    ErrorCode.FILE_DAMAGED,
                 )
         columns = {name: _column([row[name] for row in rows]) for name in names}
         files = [(path.parent / row["file"]).resolve() for row in rows]

@@ -83,26 +83,26 @@ def _sensors(value: Any, name: str) -> dict[str, SensorModel]:
         raise AmiwarpError(
             f"{name} is {shown(value)}; expected a list of at least one entry", ErrorCode.FIELD
         )
-    known = tuple(f.name for f in fields(SensorModel))
+    known = tuple(field.name for field in fields(SensorModel))
     sensors: dict[str, SensorModel] = {}
     for k, entry in enumerate(value):
         where = f"sensors[{k}]"
         table = {"name": entry, "preset": entry} if isinstance(entry, str) else entry
         given = dict(fields_of(table, where, "name", optional=("preset", *known)))
-        own = given.pop("name")
+        world_name = given.pop("name")
         preset = given.pop("preset", "default")
-        for key, text in (("name", own), ("preset", preset)):
+        for key, text in (("name", world_name), ("preset", preset)):
             if not isinstance(text, str) or not text:
                 raise AmiwarpError(
                     f"field {where}.{key} is {shown(text)}; expected text", ErrorCode.FIELD
                 )
-        if own in sensors:
+        if world_name in sensors:
             raise AmiwarpError(
-                f"field {where} has the name {own!r} of another sensor; give it its own name",
+                f"field {where} has the name {world_name!r} of another sensor; give it its own name",
                 ErrorCode.FIELD,
             )
         base = at_field(where, partial(_sensor, preset))
-        sensors[own] = with_fields(base, given, where)
+        sensors[world_name] = with_fields(base, given, where)
     return sensors
 
 

@@ -277,8 +277,10 @@ def _of_video(item: Item, source: str, entry: spec.CameraEntry, **settings: Any)
 def _world(item: Item, source: str) -> WorldScene:
     """Return the world of a recording. The seed of a named world is the specification's."""
     recipe = item.recipe
-    way = recipe["trajectory"]
-    if way is not None and way.lower().endswith(POSE_FILES):
-        way = os.fspath(item.folder / way)
+    trajectory = recipe["trajectory"]
+    if trajectory is not None and trajectory.lower().endswith(POSE_FILES):
+        trajectory = os.fspath(item.folder / trajectory)
     name = item.source if item.kind == "worlds" else source
-    return WorldScene(*open_world(name, way, seed=recipe["seed"], duration_s=recipe["duration_s"]))
+    return WorldScene(
+        *open_world(name, trajectory, seed=recipe["seed"], duration_s=recipe["duration_s"])
+    )

@@ -109,10 +109,13 @@ class AdaptiveOptions:
         if model.ANGLES > 1:
             raise AmiwarpError(
                 f"--adaptive sets the speed of one prism, the calibration belongs to a {model.TEXT}; "
-                "leave --adaptive out"
+                "leave --adaptive out",
+                ErrorCode.OPTIONS,
             )
         if link is None:
-            raise AmiwarpError("--adaptive sets the motor's speed; give the controller's --port")
+            raise AmiwarpError(
+                "--adaptive sets the motor's speed; give the controller's --port", ErrorCode.OPTIONS
+            )
         rpm = min(max(START_RPM, self.least_rpm), self.limit_rpm)
         controller = SpeedController(
             prism_orbit(model),
@@ -187,7 +190,8 @@ class OutputOptions:
             given = "--to" if self.to == "-" else "--raw-to"
             raise AmiwarpError(
                 f"--json and {given} - both write to standard output; remove --json, or give {given} "
-                "tcp: or unix:"
+                "tcp: or unix:",
+                ErrorCode.OPTIONS,
             )
 
 

@@ -286,7 +286,9 @@ def _described(link: Link, messages: list[str]) -> dict[str, Any]:
         details = "; ".join(
             [*messages, "docs/reference/link-protocol.md describes the messages it must send"]
         )
-        raise AmiwarpError(f"{link.name}: no status in {WAIT_S:g} s; {details}")
+        raise AmiwarpError(
+            f"{link.name}: no status in {WAIT_S:g} s; {details}", ErrorCode.UNREACHABLE
+        )
     state = f"unknown ({status.state})"
     if status.state < len(STATES):
         state = STATES[status.state]

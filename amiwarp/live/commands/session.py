@@ -256,7 +256,9 @@ def check_whole(source: Source, status: SessionStatus) -> None:
     waits = "; --wait-for-source S waits for it to return"
     hint = waits if can_return(source.name) and not hasattr(source, "returns") else ""
     kept = f"the {status.events:,} events received until then are kept"
-    raise AmiwarpError(f"{source.name}: the stream broke off: {problem}; {kept}{hint}")
+    raise AmiwarpError(
+        f"{source.name}: the stream broke off: {problem}; {kept}{hint}", ErrorCode.UNREACHABLE
+    )
 
 
 def session_summary(status: SessionStatus, source: Source) -> dict[str, Any]:

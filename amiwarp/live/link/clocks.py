@@ -69,8 +69,10 @@ class ClockMap:
 
     def __call__(self, own_us: ArrayLike) -> NDArray[np.int64]:
         """Return the other clock's times for times ``own_us`` of the own clock [us], rounded, same shape."""
-        own = np.asarray(own_us, np.int64)
-        return own + np.rint(self.offset_us + self.drift * (own - self.at_us)).astype(np.int64)
+        own_pulses = np.asarray(own_us, np.int64)
+        return own_pulses + np.rint(self.offset_us + self.drift * (own_pulses - self.at_us)).astype(
+            np.int64
+        )
 
     def inverse(self, other_us: float) -> float:
         """Return the own clock's time for a time of the other clock [us]."""
@@ -84,12 +86,12 @@ def fit_to_pulses(own_us: ArrayLike, other_us: ArrayLike, sigma_us: float = 1.0)
     deviation of a time stamp. The fit is a least-squares line without pairs beyond :data:`OUTLIER_STD`. Raises
     :class:`AmiwarpError` for fewer than three pairs, or different lengths.
     """
-    own = np.asarray(own_us, np.int64)
+    own_pulses = np.asarray(own_us, np.int64)
     other = np.asarray(other_us, np.int64)
-    if own.shape != other.shape or own.ndim != 1 or len(own) < FEWEST_PAIRS:
+    if own_pulses.shape != other.shape or own_pulses.ndim != 1 or len(own_pulses) < FEWEST_PAIRS:
         expected = f"give the times of the same pulses on both clocks, at least {FEWEST_PAIRS}"
-        raise AmiwarpError(f"clock map: {own.size} and {other.size} pulses; {expected}")
-    return _fit_line(own, other, np.full(len(own), sigma_us))
+        raise AmiwarpError(f"clock map: {own_pulses.size} and {other.size} pulses; {expected}")
+    return _fit_line(own_pulses, other, np.full(len(own_pulses), sigma_us))
 
 
 def fit_to_round_trips(sent_us: ArrayLike, other_us: ArrayLike, received_us: ArrayLike) -> ClockMap:
@@ -117,16 +119,18 @@ def fit_to_round_trips(sent_us: ArrayLike, other_us: ArrayLike, received_us: Arr
 
 
 def _fit_line(
-    own: NDArray[np.int64], other: NDArray[np.int64], sigma: NDArray[np.float64]
+    own_pulses: NDArray[np.int64], other: NDArray[np.int64], sigma: NDArray[np.float64]
 ) -> ClockMap:
     """Fit a line to pairs of times, weighted by ``sigma`` [us], and reject outliers iteratively."""
-    difference = (other - own).astype(np.float64)
-    kept = np.ones(len(own), np.bool_)
+    difference = (other - own_pulses).astype(np.float64)
+    kept = np.ones(len(own_pulses), np.bool_)
     for rounds in range(MOST_ROUNDS):
         # A weighted least-squares line about the mean time; about a median, so that float64 keeps microseconds.
         weight = sigma[kept] ** -2.0
-        at = int(np.rint(np.average(own[kept] - own[0], weights=weight))) + int(own[0])
-        x = (own - at).astype(np.float64)
+        shift = int(np.rint(np.average(own_pulses[kept] - own_pulses[0], weights=weight))) + int(
+            own_pulses[0]
+        )
+        x = (own_pulses - shift).astype(np.float64)
         base = float(np.median(difference[kept]))
         offset = float(np.average(difference[kept] - base, weights=weight))
         rest = difference[kept] - base - offset
@@ -145,7 +149,7 @@ def _fit_line(
     std = scale / math.sqrt(float(np.sum(weight)))
     drift_std = scale / math.sqrt(max(slope_weight, 1e-300))
     return ClockMap(
-        at_us=at,
+        at_us=shift,
         offset_us=base + offset,
         drift=drift,
         offset_std_us=std,

@@ -98,9 +98,9 @@ def check_speed(talk: Conversation) -> Iterator[Check]:
 def check_ramp(talk: Conversation, start: int, arrived: bool) -> Check:
     """Check the speed during the ramp, by the samples from number ``start`` on."""
     t, count = talk.counts_since(start)
-    at = np.arange(t[0], t[-1], SLICE_S * 1e6) if len(t) else np.zeros(0)
+    slice_starts = np.arange(t[0], t[-1], SLICE_S * 1e6) if len(t) else np.zeros(0)
     factor = 60.0 / (SLICE_S * max(talk.status.counts_per_turn, 1) * talk.rpm)
-    speed = np.diff(np.interp(at, t, count)) * factor  # of the target
+    speed = np.diff(np.interp(slice_starts, t, count)) * factor  # of the target
     # A comparison with NaN fails: too few samples fail the check.
     highest = float(speed.max()) if len(speed) else math.nan
     lowest = float(speed.min()) if len(speed) else math.nan
@@ -207,8 +207,10 @@ def check_steep_ramp(talk: Conversation) -> Check:
     talk.run(STOP_S, until=lambda: talk.status.state == 0)
     per_us = abs(rpm) / 60e6 * max(talk.status.counts_per_turn, 1)
     slice_us = max(STEEP_SLICE_S * 1e6, STEEP_COUNTS / per_us)
-    at = np.arange(t[0], t[-1], slice_us) if len(t) else np.zeros(0)
-    speed = np.diff(np.interp(at, t, count)) / (slice_us * per_us) * math.copysign(1.0, rpm)
+    slice_starts = np.arange(t[0], t[-1], slice_us) if len(t) else np.zeros(0)
+    speed = (
+        np.diff(np.interp(slice_starts, t, count)) / (slice_us * per_us) * math.copysign(1.0, rpm)
+    )
     highest = float(speed.max()) if len(speed) else math.nan
     what = f"answer {reason(refused)}, at most {100 * highest:.0f} % of {rpm:g} rpm"
     remedy = "limit the ramp to one that the motor can follow, or tune the control loop"
@@ -234,7 +236,7 @@ def check_lost_host(talk: Conversation) -> Check:
     talk.run(LOST_HOST_S + STOP_S, until=lambda: talk.status.target_rpm == 0, pings=False)
     after = (talk.wire.now_us() - silent) * 1e-6
     stopped = talk.run(STOP_S, until=lambda: talk.status.state == 0, pings=False)
-    said = bool(talk.status.faults & LOST_HOST_STOP)
+    is_reported = bool(talk.status.faults & LOST_HOST_STOP)
     end = talk.ask(protocol.Condition)
 
     # A new command clears the fault. The setting cannot change while the prism turns.
@@ -254,11 +256,18 @@ def check_lost_host(talk: Conversation) -> Check:
         and end.host_timeout_s == LOST_HOST_S
     )
     on_time = LOST_HOST_S - PING_S <= after <= LOST_HOST_S + CHANGE_S
-    good = taken == restored == again == 0 and not kept and stopped and said and counted and cleared
+    good = (
+        taken == restored == again == 0
+        and not kept
+        and stopped
+        and is_reported
+        and counted
+        and cleared
+    )
     what = (
         f"told {LOST_HOST_S} s, {'' if stopped else 'not '}stopped after {after:.1f} s of silence"
     )
-    what += f"{'' if counted else ', not counted'}{'' if said else ', not said'}"
+    what += f"{'' if counted else ', not counted'}{'' if is_reported else ', not said'}"
     remedy = "brake when no frame came for the setting host-timeout; count it; set fault bit 10 until a new command"
     return Check(name, good and on_time and while_turning == 3, what, remedy)
 

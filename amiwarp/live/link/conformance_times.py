@@ -27,14 +27,14 @@ def check_latch(talk: Conversation) -> Check:
     """Check that time and count of index pulses fit the samples."""
     name = "latches time and count together"
     t, count = talk.counts_since(0)
-    inside = [(at, c) for at, c in talk.index if len(t) and t[0] < at < t[-1]]
+    inside = [(pulse_us, c) for pulse_us, c in talk.index if len(t) and t[0] < pulse_us < t[-1]]
     if len(inside) < 2:
         return Check(name, None, "too few index pulses", "")
-    at, latched = np.array(inside, np.int64).T
-    off = latched - np.interp(at, t, count)
+    pulse_us, latched = np.array(inside, np.int64).T
+    off = latched - np.interp(pulse_us, t, count)
     off -= (1 << 32) * np.rint(off / (1 << 32))
     # Pulses of the ramps, too: at a perfectly constant speed all of them are whole milliseconds apart.
-    resolution = math.gcd(*np.diff(at).tolist())
+    resolution = math.gcd(*np.diff(pulse_us).tolist())
     rate = abs(talk.rpm) / 60e6 * talk.status.counts_per_turn
     what = f"index pulses within {np.abs(off).max():.1f} counts of the samples, clock in steps of {resolution} us"
     good = (
@@ -111,9 +111,12 @@ def check_pong_times(talk: Conversation) -> Check:
     remedy = "put the clock of the samples into each pong and status as it is sent"
     if len(talk.trips) < FEWEST_PAIRS:
         return Check(name, None, "too few pongs", remedy)
-    sent, at, received = np.array(talk.trips, np.int64).T
+    sent, answered, received = np.array(talk.trips, np.int64).T
     middle = sent + (received - sent) // 2
-    outside = np.abs(at - fit_to_round_trips(sent, at, received)(middle)) - (received - sent) / 2
+    outside = (
+        np.abs(answered - fit_to_round_trips(sent, answered, received)(middle))
+        - (received - sent) / 2
+    )
     worst = max(float(outside.max()), 0.0)
     what = f"{worst / 1000:.1f} ms outside the round trip, {talk.apart} times apart, {talk.stray} not asked for"
     return Check(name, worst <= STALE_US and talk.apart + talk.stray == 0, what, remedy)

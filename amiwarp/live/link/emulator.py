@@ -98,7 +98,9 @@ class Controller:
         self._batch_size = min(max(int(BATCH_US / self._sample_us), 1), protocol.MOST_SAMPLES)
         self._rng = random.Random(seed)
         self._pulse_rng = random.Random(seed)
-        edges = [(at, fault, on) for fault in faults for at, on in fault_edges(fault, start_us)]
+        edges = [
+            (edge_us, fault, on) for fault in faults for edge_us, on in fault_edges(fault, start_us)
+        ]
         self._fault_edges = sorted(edges, key=itemgetter(0))
         self._active_faults: list[str] = []
         self._decoder = protocol.FrameDecoder(lines=False)
@@ -206,14 +208,14 @@ class Controller:
         if len(time_us):
             self._before = time_us[-1], angle[-1]
         while self._next_pulse_us <= last:
-            at = self._next_pulse_us
-            self.pulses.append((self._pulse_number, round(self._boot_us + at / self._rate)))
-            due.append((at, protocol.Sync(self._t(at), self._pulse_number % WRAP)))
+            pulse_us = self._next_pulse_us
+            self.pulses.append((self._pulse_number, round(self._boot_us + pulse_us / self._rate)))
+            due.append((pulse_us, protocol.Sync(self._t(pulse_us), self._pulse_number % WRAP)))
             self._pulse_number += 1
             self._next_pulse_us += self._pulse_interval_us()
-        for at, what in sorted(due, key=itemgetter(0)):
+        for pulse_us, what in sorted(due, key=itemgetter(0)):
             if isinstance(what, int):
-                self._batch.append((self._t(at), _int32(self._count(what))))
+                self._batch.append((self._t(pulse_us), _int32(self._count(what))))
                 if len(self._batch) >= self._batch_size:
                     self._flush()
             else:
@@ -433,16 +435,16 @@ class Controller:
         for name in self._active_faults:
             if name not in ("garbage", "truncate", "crc", "drop") or self._rng.random() >= 0.5:
                 continue
-            at = self._rng.randrange(1, len(frame))
+            byte = self._rng.randrange(1, len(frame))
             if name == "garbage":
                 length = self._rng.randrange(1, 40)
                 frame = bytearray(self._rng.randbytes(length)) + frame
             elif name == "truncate":
-                del frame[at:]
+                del frame[byte:]
             elif name == "crc":
-                frame[at] ^= 1 << self._rng.randrange(8)
+                frame[byte] ^= 1 << self._rng.randrange(8)
             else:
-                del frame[at]
+                del frame[byte]
         return frame
 
 

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.live.link import protocol
 from amiwarp.live.link.clocks import ClockMap, monotonic_us
 from amiwarp.live.link.follower import Follower
@@ -223,7 +223,8 @@ class Link(BackgroundLoop):
             refused = self._answers.pop(sequence)
         if refused is None:
             raise AmiwarpError(
-                f"{self.name}: {what}: no answer in {ANSWER_S:g} s; check the controller by 'amiwarp motor status'"
+                f"{self.name}: {what}: no answer in {ANSWER_S:g} s; check the controller by 'amiwarp motor status'",
+                ErrorCode.UNREACHABLE,
             )
         if refused:
             raise AmiwarpError(

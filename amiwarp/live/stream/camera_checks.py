@@ -32,12 +32,12 @@ def refuse_others(
 
     ``elsewhere``: for some settings, how to reach them with another driver.
     """
-    for each in INSTEAD:
+    for setting in INSTEAD:
         # trigger=off is equal to 0 here: a trigger input that the driver does not switch on is off
-        if each not in can and getattr(settings, each) not in (None, {}, (), 0):
-            remedy = "; or ".join(filter(None, (elsewhere.get(each), INSTEAD[each])))
+        if setting not in can and getattr(settings, setting) not in (None, {}, (), 0):
+            remedy = "; or ".join(filter(None, (elsewhere.get(setting), INSTEAD[setting])))
             raise AmiwarpError(
-                f"{name}: {model} has no {NAMES.get(each, each)} through this driver; {remedy}"
+                f"{name}: {model} has no {NAMES.get(setting, setting)} through this driver; {remedy}"
             )
 
 
@@ -75,7 +75,7 @@ def check_bias_names(
     """Raise :class:`AmiwarpError` for a bias that is not among the ``known`` ones, with their present values."""
     for bias in settings.biases:
         if bias not in known:
-            listed = ", ".join(f"{each} ({value})" for each, value in known.items())
+            listed = ", ".join(f"{known_bias} ({value})" for known_bias, value in known.items())
             raise AmiwarpError(
                 f"{name}: {model} has no bias {bias!r}; its biases, with their values, are {listed}"
             )
@@ -101,12 +101,12 @@ def check_band(name: str, band: tuple[int, int], low: int, high: int) -> None:
 def difference(settings: CameraSettings, applied: CameraSettings) -> str:
     """Return which given settings the camera has otherwise than given; empty if none."""
     changes = []
-    for each in fields(settings):
-        given = getattr(settings, each.name)
-        got = getattr(applied, each.name)
-        if each.name != "biases" and given not in (None, (), 0) and given != got:
-            one = CameraSettings(**{each.name: got})
-            changes.append(str(one) or f"no {each.name}")
+    for field in fields(settings):
+        given = getattr(settings, field.name)
+        got = getattr(applied, field.name)
+        if field.name != "biases" and given not in (None, (), 0) and given != got:
+            one = CameraSettings(**{field.name: got})
+            changes.append(str(one) or f"no {field.name}")
     changes += [
         f"{bias}={applied.biases.get(bias)}"
         for bias, value in settings.biases.items()

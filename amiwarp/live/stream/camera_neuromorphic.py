@@ -76,9 +76,9 @@ def _find_camera(which: str) -> Any:
     """Return the camera with the serial number ``which``, or the only one whose model's name contains it."""
     cameras = list_cameras()
     found = [
-        each
-        for each in cameras
-        if which == each.serial or _squeezed(which) in _squeezed(each.name.value)
+        device
+        for device in cameras
+        if which == device.serial or _squeezed(which) in _squeezed(device.name.value)
     ]
     name = f"camera:{which}"
     if not cameras:
@@ -87,10 +87,10 @@ def _find_camera(which: str) -> Any:
         )
     if len(found) != 1:
         listed = ", ".join(
-            f"camera:{each.serial} ({each.name.value})"
-            if each.serial
-            else f"{each.name.value} ({each.error})"
-            for each in found or cameras
+            f"camera:{device.serial} ({device.name.value})"
+            if device.serial
+            else f"{device.name.value} ({device.error})"
+            for device in found or cameras
         )
         raise Unreachable(
             f"{name}: {len(found)} such cameras are connected; choose one of these: {listed}"
@@ -122,6 +122,7 @@ class NeuromorphicSource(CameraSource):
         packet_us: int = 1000,
     ) -> None:
         super().__init__(request, say, packet_us=packet_us)
+        self.lost = 0
         found = _find_camera(request.which)
         drivers = import_module("neuromorphic_drivers")
         model = found.name.value
@@ -191,6 +192,7 @@ class NeuromorphicSource(CameraSource):
             )
 
     def _count_lost(self, ring: Any) -> None:
+        """Note how many USB packets are lost so far, and say when the first ones are."""
         lost = self.lost if ring is None else int(ring.dropped_packets)
         if lost and not self.lost:
             self._say(f"{self.name}: this computer is too slow: USB packets with events are lost")
@@ -270,9 +272,9 @@ def _configuration(name: str, model: Any, drivers: Any, settings: CameraSettings
 
 def _biases(name: str, model: str, kind: Any, settings: CameraSettings) -> Any:
     """Return the biases of a camera model, with the biases of the settings instead of their defaults."""
-    known: dict[str, Any] = {each.name: each for each in dataclasses.fields(kind)}
+    known: dict[str, Any] = {field.name: field for field in dataclasses.fields(kind)}
     check_bias_names(
-        name, model, settings, {bias: int(each.default) for bias, each in known.items()}
+        name, model, settings, {bias: int(field.default) for bias, field in known.items()}
     )
     for bias, value in settings.biases.items():
         # Of the type's NumPy and Python names; none for a switch

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io import open_recording
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.schema.calls import guarded
@@ -106,7 +106,8 @@ class CameraSettings:
         object.__setattr__(self, "counts_per_turn", counts)
         if counts and self.trigger is False:
             raise AmiwarpError(
-                "counts_per_turn counts edges at the trigger input; leave it out, or set the trigger on"
+                "counts_per_turn counts edges at the trigger input; leave it out, or set the trigger on",
+                ErrorCode.OPTIONS,
             )
 
     def __str__(self) -> str:
@@ -181,7 +182,7 @@ def _parse_settings(parts: Sequence[str]) -> CameraSettings:
         name, _, value = part.partition("=")
         if name == "settings":
             saved = saved_settings(value)
-            values |= {each.name: getattr(saved, each.name) for each in fields(saved)}
+            values |= {field.name: getattr(saved, field.name) for field in fields(saved)}
             biases |= saved.biases
             continue
         field_name, read, form = FORMS.get(
@@ -203,7 +204,8 @@ def saved_settings(path: str) -> CameraSettings:
     text = open_recording(path).metadata.get(SAVED)
     if not isinstance(text, str):
         raise AmiwarpError(
-            f"{path}: stores no settings of a camera; give a recording that 'amiwarp record' made of one"
+            f"{path}: stores no settings of a camera; give a recording that 'amiwarp record' made of one",
+            ErrorCode.CONTENT_MISSING,
         )
     return _parse_settings(text.split(",") if text else ())
 

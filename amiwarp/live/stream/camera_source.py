@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events, MetadataValue
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.camera_checks import difference
@@ -55,8 +55,8 @@ class CameraSource:
         """What a recording shall store about the camera."""
         self.problem: str | None = None
         """Why the camera stopped, in one line; None while it runs."""
-        self.lost = 0
-        """Number of USB packets that were lost, because the computer was too slow."""
+        self.lost: int | None = None
+        """Number of USB packets that were lost, because the computer was too slow; None if the library tells none."""
         self._count = 0
         """Number of rising edges at the trigger input so far, if they are counts of an encoder."""
 
@@ -115,7 +115,8 @@ def library(name: str, camera: str, remedy: str) -> Any:
         return import_module(name)
     except ImportError as error:
         raise AmiwarpError(
-            f"{camera}: needs the library {name.partition('.')[0]} ({error}); {remedy}"
+            f"{camera}: needs the library {name.partition('.')[0]} ({error}); {remedy}",
+            ErrorCode.PACKAGE_MISSING,
         ) from error
 
 

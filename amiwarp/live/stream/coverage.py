@@ -246,8 +246,8 @@ class CoverageMeter:
         image = self._image(x, y)
 
         # An edge gives events in proportion to the way that it moves across itself.
-        way = np.abs(np.diff(across, axis=0)).sum(axis=0)
-        amount = step * _edge_directions(image) / np.maximum(way, TEXTURE_TRAVEL)
+        path_length = np.abs(np.diff(across, axis=0)).sum(axis=0)
+        amount = step * _edge_directions(image) / np.maximum(path_length, TEXTURE_TRAVEL)
         moved = np.ptp(across, axis=0) >= TEXTURE_TRAVEL
         old = np.where(np.isfinite(self._texture), self._texture, amount)
         share = 1.0 - math.exp(-seconds / TEXTURE_S)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Recording
 from amiwarp.live.link.emulator import Controller
 from amiwarp.live.link.rotors import Played
@@ -44,7 +44,8 @@ class EmulatedCamera(BackgroundLoop):
         events = recording.events
         if encoder is None or not len(events):
             raise AmiwarpError(
-                f"{recording.name}: has no {'events' if encoder else 'encoder'}; give a recording with both"
+                f"{recording.name}: has no {'events' if encoder else 'encoder'}; give a recording with both",
+                ErrorCode.CONTENT_MISSING,
             )
         self._events = events
         self._rotor = rotor

@@ -210,12 +210,12 @@ def event_encoder(
     :class:`AmiwarpError` for a calibration without an encoder.
     """
     # A source's own samples are already shifted by its file's clock offset; the calibrated offset is more accurate.
-    own = clock_offset(source, link)
+    own_offset = clock_offset(source, link)
     if calibration is not None:
         check_made_with_encoder(calibration)
     known = {} if calibration is None else calibration.parameters
     harmonics = None if calibration is None else calibration.harmonics
-    offset = known.get("clock_offset", own) - own
+    offset = known.get("clock_offset", own_offset) - own_offset
     second: EncoderStream | float | None = second_ratio
     if second is None and encoder_count(source, link) == 2:
         second = EncoderStream(offset)

@@ -26,11 +26,12 @@ def read_fields(payload: bytes | bytearray) -> dict[str, Any]:
         fields = json.loads(payload, parse_constant=_refuse)
     except RecursionError as error:
         raise AmiwarpError(
-            "its hello message is nested too deeply; send one JSON object with 'camera' and 'prism' in it"
+            "its hello message is nested too deeply; send one JSON object with 'camera' and 'prism' in it",
+            ErrorCode.FILE_DAMAGED,
         ) from error
     except ValueError as error:
         raise AmiwarpError(
-            f"its hello message is not JSON: {error}; send one JSON object"
+            f"its hello message is not JSON: {error}; send one JSON object", ErrorCode.FILE_DAMAGED
         ) from error
     _check_object("its hello", fields)
     _check_size("its hello", fields)
@@ -70,7 +71,9 @@ def _check_prism(where: str, fields: Any) -> None:
 
 def _check_object(where: str, fields: Any) -> None:
     if not isinstance(fields, dict):
-        raise AmiwarpError(f"{where} is {_shown(fields)}; expected an object of attributes")
+        raise AmiwarpError(
+            f"{where} is {_shown(fields)}; expected an object of attributes", ErrorCode.FILE_DAMAGED
+        )
 
 
 def _check_size(where: str, fields: dict[str, Any]) -> None:
@@ -82,7 +85,8 @@ def _check_size(where: str, fields: dict[str, Any]) -> None:
     if not (1 <= width <= LARGEST_SIZE and 1 <= height <= LARGEST_SIZE):
         size = f"{_shown(width)}x{_shown(height)}"
         raise AmiwarpError(
-            f"{where} has a size of {size}; expected 1 .. {LARGEST_SIZE} pixels each way"
+            f"{where} has a size of {size}; expected 1 .. {LARGEST_SIZE} pixels each way",
+            ErrorCode.FILE_DAMAGED,
         )
 
 
@@ -113,7 +117,10 @@ def _raise_wrong(where: str, name: str, value: Any, expected: str) -> NoReturn:
             f"{where} has no attribute '{name}'; add this attribute: {expected}",
             ErrorCode.CONTENT_MISSING,
         )
-    raise AmiwarpError(f"{where} attribute '{name}' is {_shown(value)}; expected {expected}")
+    raise AmiwarpError(
+        f"{where} attribute '{name}' is {_shown(value)}; expected {expected}",
+        ErrorCode.FILE_DAMAGED,
+    )
 
 
 def _shown(value: Any) -> str:

@@ -7,7 +7,7 @@ import queue
 from collections.abc import Iterator
 from pathlib import Path
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.reconstruction.film_files import check_film
 from amiwarp.reconstruction.phase_camera import LivePicture
 from amiwarp.reconstruction.picture import Picture
@@ -64,5 +64,6 @@ class PictureFilm(BackgroundLoop):
                 last = live.picture
         if last is None:
             raise AmiwarpError(
-                f"{self._path}: there is no picture: the stream ended before the prism had made a whole turn"
+                f"{self._path}: there is no picture: the stream ended before the prism had made a whole turn",
+                ErrorCode.CONTENT_MISSING,
             )

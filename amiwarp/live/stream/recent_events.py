@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_speed import rpm_between
 from amiwarp.events.encoder_stream import starts_of_runs
@@ -305,7 +305,10 @@ class LiveSource:
         """
         first = recent.recording()
         if first is None:
-            raise AmiwarpError("the stream has delivered less than one full turn; wait for one")
+            raise AmiwarpError(
+                "the stream has delivered less than one full turn; wait for one",
+                ErrorCode.CONTENT_MISSING,
+            )
         self._recent = recent
         self._messages = messages
         self._last = first
@@ -484,7 +487,10 @@ def followed(
                 how = f"in {FIRST_S:g} s" if thread.is_alive() else "before the stream ended"
                 problem = getattr(source, "problem", None)
                 why = "" if problem is None else f": it broke off, {problem}"
-                raise AmiwarpError(f"{source.name}: delivered less than one full turn {how}{why}")
+                raise AmiwarpError(
+                    f"{source.name}: delivered less than one full turn {how}{why}",
+                    ErrorCode.CONTENT_MISSING,
+                )
             time.sleep(0.05)
         yield
     finally:

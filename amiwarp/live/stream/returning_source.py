@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.camera_source import CameraSource
@@ -59,7 +59,8 @@ class ReturningSource:
             what = "give camera:, dv, prophesee, tcp:, unix:, tcp-listen: or unix-listen:, or omit the option"
             raise AmiwarpError(
                 f"{spec}: --wait-for-source applies to sockets and cameras only, because other sources cannot be "
-                f"reopened; {what}"
+                f"reopened; {what}",
+                ErrorCode.OPTIONS,
             )
         self._wait_s = wait_s
         self._say = say
@@ -76,8 +77,8 @@ class ReturningSource:
         self.prism = source.prism
         self.encoders = source.encoders
         self.metadata = getattr(source, "metadata", {})
-        self.lost = 0
-        """Number of USB packets that were lost, see :attr:`CameraSource.lost`."""
+        self.lost: int | None = getattr(source, "lost", 0)
+        """Number of USB packets that were lost, see :attr:`CameraSource.lost`; 0 for sockets."""
         self.problem: str | None = None
         """How the stream ended, in one line; None if it ended with its end message."""
         self.returns = 0
@@ -121,7 +122,9 @@ class ReturningSource:
         unchecked = fresh
         lost_before = self.lost
         for packet in self._source.packets():
-            self.lost = lost_before + getattr(self._source, "lost", 0)
+            if isinstance(self._source, CameraSource):
+                lost = self._source.lost
+                self.lost = None if lost is None or lost_before is None else lost_before + lost
             if self._restarts:
                 packet = self._shifted(packet, unchecked)
                 unchecked = unchecked and packet.empty

@@ -16,12 +16,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.live.stream.sockets import IDLE_S, close_listener, listen, ready
-from amiwarp.live.stream.stream_format import encode_end
+from amiwarp.live.stream.stream_format import encode_end, packet_count
 
 MOST_BYTES = 1 << 24
-"""Memory of the packets that may wait for a client; a client that is slower loses packets [bytes]."""
+"""Memory of the packets that may wait for one client [bytes]. A slower client loses packets."""
 PACKET_OVERHEAD = 256
 """Memory of a waiting packet beyond its data, for its Python objects [bytes]."""
 MOST_CLIENTS = 32
@@ -123,11 +123,13 @@ class SocketSink:
     def send(self, data: bytes) -> None:
         """Send complete packets, encoded by the ``encode_...`` functions, to all clients."""
         self._accept()
-        for client in self._clients:
-            if data and client.waiting_bytes + len(data) > self._most_bytes and client.waiting:
-                self.lost += 1
-            elif data:
-                client.put(data)
+        if data:
+            for client in self._clients:
+                is_full = client.waiting_bytes + len(data) > self._most_bytes
+                if client.waiting and is_full:
+                    self.lost += packet_count(data)
+                else:
+                    client.put(data)
         self._push()
 
     def tick(self) -> None:
@@ -214,8 +216,15 @@ class PipeSink:
     """Its name, see :func:`open_sink`."""
 
     def __init__(
-        self, hello: bytes, file: Any = None, *, stop: threading.Event | None = None
+        self,
+        hello: bytes,
+        file: Any = None,
+        *,
+        stop: threading.Event | None = None,
+        name: str = "standard output",
     ) -> None:
+        """Write ``hello`` to an open binary ``file``, called ``name`` in messages."""
+        self._name = name
         self._file = sys.stdout.buffer if file is None else file
         self._stop = stop or threading.Event()
         self._may_block_long = _may_block(self._file)
@@ -227,6 +236,7 @@ class PipeSink:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        # After an error the stream is incomplete, and gets no end.
         if kind is None:
             self.close()
 
@@ -241,8 +251,11 @@ class PipeSink:
                 self._file.flush()
         except OSError as error:
             raise AmiwarpError(
-                f"standard output: {error.strerror}; start the program that reads it again"
+                f"{self._name}: {error.strerror}; start the program that reads it again",
+                ErrorCode.OUTPUT_FAILED,
             ) from error
+        except ValueError as error:  # Python's error for a closed file
+            raise AmiwarpError(f"{self._name}: the file is closed; open it again") from error
 
     def _wait_for_reader(self) -> None:
         """Wait until the pipe's reader accepts data."""
@@ -252,8 +265,9 @@ class PipeSink:
                 until = min(until, time.monotonic() + DRAIN_S)
             if time.monotonic() > until:
                 raise AmiwarpError(
-                    "standard output: its reader accepts no more data, so the end of the stream is lost; check the "
-                    "program that reads it"
+                    f"{self._name}: its reader accepts no more data, so the end of the stream is lost; check the "
+                    "program that reads it",
+                    ErrorCode.OUTPUT_FAILED,
                 )
 
     def tick(self) -> None:

@@ -100,7 +100,8 @@ def listen(address: str) -> tuple[socket.socket, str]:
     except OSError as error:
         why = error.strerror or error
         raise AmiwarpError(
-            f"{address}: cannot listen at this address: {why}; choose another address"
+            f"{address}: cannot listen at this address: {why}; choose another address",
+            ErrorCode.UNREACHABLE,
         ) from error
     if isinstance(target, str):
         return server, address

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.compensation.streams import Compensated
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events
 from amiwarp.io.native.attributes import (
     camera_attributes,
@@ -145,6 +145,17 @@ def _pack(kind: int, count: int, payload: bytes) -> bytes:
     return HEADER.pack(MAGIC, VERSION, kind, 0, count, len(payload), zlib.crc32(payload)) + payload
 
 
+def packet_count(data: bytes) -> int:
+    """Return the number of packets in encoded data, which ends with a complete packet."""
+    count = 0
+    start = 0
+    while start < len(data):
+        *_, payload_bytes, _ = HEADER.unpack_from(data, start)
+        start += HEADER.size + payload_bytes
+        count += 1
+    return count
+
+
 def _row_bytes(kind: int) -> int:
     """Return the size of a row of a packet [bytes]; 0 for a kind without rows."""
     return sum(np.dtype(column).itemsize for column in COLUMNS.get(kind, ()))
@@ -271,5 +282,6 @@ class PacketDecoder:
 
     def _error(self, what: str) -> AmiwarpError:
         return AmiwarpError(
-            f"{self._where}: packet at byte {self._offset}: {what}; see docs/reference/stream-format.md"
+            f"{self._where}: packet at byte {self._offset}: {what}; see docs/reference/stream-format.md",
+            ErrorCode.FILE_DAMAGED,
         )

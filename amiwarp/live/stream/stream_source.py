@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.compensation.streams import Compensated
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import LARGEST_ANGLE
 from amiwarp.events.recording import Events
 from amiwarp.io import open_recording
@@ -85,7 +85,8 @@ class FileSource:
         encoder = recording.encoder
         if len(self._events) and self._events.slice(0, 1).x.dtype != np.uint16:
             raise AmiwarpError(
-                f"{path}: is compensated already; give a recording with the sensor's events"
+                f"{path}: is compensated already; give a recording with the sensor's events",
+                ErrorCode.CONTENT_MISSING,
             )
         self.size = self._events.size
         self.camera = recording.camera
@@ -176,7 +177,8 @@ class StreamSource:
             if isinstance(message, Hello) and message != self._first_hello:
                 raise AmiwarpError(
                     f"{self.name}: a second hello message describes another camera; correct the program that sends the "
-                    "stream"
+                    "stream",
+                    ErrorCode.FILE_DAMAGED,
                 )
             if message is not None and not isinstance(message, (Hello, End)):
                 yield self._packet(message)
@@ -198,7 +200,8 @@ class StreamSource:
                 return message
             if message is not None:
                 raise AmiwarpError(
-                    f"{self.name}: begins without a hello message; see docs/reference/stream-format.md"
+                    f"{self.name}: begins without a hello message; see docs/reference/stream-format.md",
+                    ErrorCode.FILE_DAMAGED,
                 )
         raise Unreachable(
             f"{self.name}: {self.problem or 'sent no hello'}; see docs/reference/stream-format.md"
@@ -234,29 +237,40 @@ class StreamSource:
         now = monotonic_us()
         if isinstance(message, Compensated):
             raise AmiwarpError(
-                f"{self.name}: sends compensated events; give the stream of a sensor"
+                f"{self.name}: sends compensated events; give the stream of a sensor",
+                ErrorCode.CONTENT_MISSING,
             )
         if len(message.t) and not (
             message.t.min() >= -LARGEST_US and message.t.max() <= LARGEST_US
         ):
             what = f"times of {message.t.min()} .. {message.t.max()} us, not in +-{LARGEST_US}"
-            raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
+            raise AmiwarpError(
+                f"{self.name}: {what}; correct the program that sends it", ErrorCode.FILE_DAMAGED
+            )
         if isinstance(message, Triggers):
             return make_packet(now, triggers=message.t)
         if isinstance(message, EncoderSamples):
             if not (np.abs(message.angle) <= LARGEST_ANGLE).all():
                 what = f"an encoder sample is not finite or beyond {LARGEST_ANGLE:g} rad"
-                raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
+                raise AmiwarpError(
+                    f"{self.name}: {what}; correct the program that sends it",
+                    ErrorCode.FILE_DAMAGED,
+                )
             if not message.second:
                 return make_packet(now, encoder_t=message.t, encoder_angle=message.angle)
             if self.encoders < 2:
                 what = "samples of a second encoder come without 'encoders': 2 in its hello message"
-                raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
+                raise AmiwarpError(
+                    f"{self.name}: {what}; correct the program that sends it",
+                    ErrorCode.FILE_DAMAGED,
+                )
             return make_packet(now, second_t=message.t, second_angle=message.angle)
         width, height = self.size
         if len(message) and (
             message.x.max() >= width or message.y.max() >= height or message.p.max() > 1
         ):
             what = f"an event outside the {width}x{height} frame, or with a polarity that is neither 0 nor 1"
-            raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
+            raise AmiwarpError(
+                f"{self.name}: {what}; correct the program that sends it", ErrorCode.FILE_DAMAGED
+            )
         return make_packet(now, message)

@@ -202,7 +202,7 @@ class Model:
             return 0.0, 2.0 * value
         if name in phases:
             return -PHASE.half_range, PHASE.half_range
-        parameter = next(each for each in cls.PARAMETERS if each.name == name)
+        parameter = next(known for known in cls.PARAMETERS if known.name == name)
         half_range = parameter.half_range
         if parameter.period:
             half_range = BEYOND_TURNS * math.tau

@@ -111,8 +111,8 @@ class MirrorModel(Model):
 
     @classmethod
     def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
-        own = {name: value for name, value in values.items() if name in cls.FREE}
-        return cls(camera, **own)
+        own_values = {name: value for name, value in values.items() if name in cls.FREE}
+        return cls(camera, **own_values)
 
     @classmethod
     def start_values(cls, prism: Prism | Plate) -> dict[str, float]:

@@ -196,9 +196,9 @@ def write(
     cli.report(common, data, [_line(data)])
 
 
-def _line(d: dict[str, Any]) -> str:
-    rate = d["events"] / max(d["seconds"], 1e-9) / 1e6
+def _line(data: dict[str, Any]) -> str:
+    rate = data["events"] / max(data["seconds"], 1e-9) / 1e6
     return (
-        f"{d['file']}: {d['events']:,} events, {d['duration_s']:.6g} s simulated in {d['seconds']:.2f} s "
-        f"({d['times_real_time']:.3g} x real time, {rate:.3g} Mev/s on {d['device']})"
+        f"{data['file']}: {data['events']:,} events, {data['duration_s']:.6g} s simulated in {data['seconds']:.2f} s "
+        f"({data['times_real_time']:.3g} x real time, {rate:.3g} Mev/s on {data['device']})"
     )

@@ -105,20 +105,20 @@ def blocked(world: World, instant: int, origin: wp.vec3, direction: wp.vec3, far
 
 
 @wp.func
-def meet_triangle(o: wp.vec3, d: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec3:
+def meet_triangle(o: wp.vec3, direction: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec3:
     """Return where a ray from ``o`` along ``d`` hits the triangle with the corners 0, ``u`` and ``v``.
 
     The result is the distance and the barycentric weights of the first two corners. If the ray does not hit the
     triangle, the distance is FAR. Uses Cramer's rule.
     """
     missed = wp.vec3(FAR, 0.0, 0.0)
-    p = wp.cross(d, v)
+    p = wp.cross(direction, v)
     q = wp.cross(o, u)
     det = wp.dot(u, p)
     if det == 0.0:
         return missed
     a = wp.dot(o, p) / det
-    b = wp.dot(d, q) / det
+    b = wp.dot(direction, q) / det
     distance = wp.dot(v, q) / det
     if a < -EDGE or b < -EDGE or a + b > 1.0 + EDGE or distance <= 0.0:
         return missed

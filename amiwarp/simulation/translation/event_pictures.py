@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.choices import CONTRAST
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events, EventSource
 from amiwarp.simulation.picture_light import DARK
 from amiwarp.simulation.pictures import Pictures
@@ -62,7 +62,8 @@ class EventPictures(KnownPictures):
         if not len(events) or events.t_last < start_us or events.t_first > end_us:
             raise AmiwarpError(
                 f"no events between {start_us} and {end_us:.0f} us, the times of the "
-                "pictures; give times.csv with times on the clock of the events"
+                "pictures; give times.csv with times on the clock of the events",
+                ErrorCode.CONTENT_MISSING,
             )
         self._pictures = pictures
         self._events = events

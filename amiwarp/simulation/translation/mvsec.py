@@ -67,7 +67,8 @@ def open_mvsec(path: Path) -> MvsecPictures:
             times: Any = file.get(f"{MVSEC_PICTURES}_ts")
             if pictures is None or times is None:
                 raise AmiwarpError(
-                    f"it has no {MVSEC_PICTURES}; without a data set's name, its events are translated"
+                    f"it has no {MVSEC_PICTURES}; without a data set's name, its events are translated",
+                    ErrorCode.CONTENT_MISSING,
                 )
             seconds = np.asarray(times, np.float64)
             shape = pictures.shape
@@ -75,7 +76,8 @@ def open_mvsec(path: Path) -> MvsecPictures:
         if len(shape) != 3 or dtype != np.uint8 or len(seconds) != shape[0] or shape[0] < 2:
             given = f"{MVSEC_PICTURES} has shape {shape}, type {dtype} and {len(seconds)} times"
             raise AmiwarpError(
-                f"{given}; expected (n, height, width), uint8, and n times, n at least 2"
+                f"{given}; expected (n, height, width), uint8, and n times, n at least 2",
+                ErrorCode.FORMAT_UNKNOWN,
             )
         if not (np.isfinite(seconds).all() and np.abs(seconds).max() < 1e12):
             raise AmiwarpError(

@@ -71,7 +71,8 @@ def translator_input(
     ):
         if events is not None:
             raise AmiwarpError(
-                f"{source} is a recording, and events are given too; give one of them, or pictures"
+                f"{source} is a recording, and events are given too; give one of them, or pictures",
+                ErrorCode.OPTIONS,
             )
         _check_unused("a recording, which has no pictures", fps=fps, interpolation=interpolation)
         return _from_events(_recording(source), dataset, device, progress)
@@ -101,7 +102,9 @@ def _check_unused(what: str, **settings: object) -> None:
     """Raise :class:`AmiwarpError` for a setting that is given, but does not apply to ``what``."""
     for name, value in settings.items():
         if value is not None and value is not Interpolation.AUTO:
-            raise AmiwarpError(f"{name} is given, but does not apply to {what}; leave it out")
+            raise AmiwarpError(
+                f"{name} is given, but does not apply to {what}; leave it out", ErrorCode.OPTIONS
+            )
 
 
 def _is_recording(path: Path) -> bool:
@@ -182,7 +185,7 @@ def _from_events(
 def _saccade_windows(start_us: int, camera: Camera) -> list[Window]:
     """Return one window for each saccade."""
     rates = saccade_rates(camera)
-    return [Window(start_us + k * SACCADE_US, SACCADE_US, each) for k, each in enumerate(rates)]
+    return [Window(start_us + k * SACCADE_US, SACCADE_US, rate) for k, rate in enumerate(rates)]
 
 
 def _from_picture(path: Path) -> TranslatorInput:

@@ -112,7 +112,8 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
         parts = [_received(about, arrays) for about in answer["parts"]]
     if not parts:
         raise AmiwarpError(
-            f"{path}: holds no faces; give a file with triangles, not points or lines alone"
+            f"{path}: holds no faces; give a file with triangles, not points or lines alone",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     return parts
 

@@ -31,6 +31,8 @@ MOST_POSES = 500_000
 """Largest number of poses of a trajectory: 8 minutes at 1 kHz. Its splines take 1.7 kB for each pose."""
 COLUMNS = 8
 """Number of columns of a table of poses: t, x, y, z, qx, qy, qz, qw."""
+FARTHEST_M = 1e9
+"""Largest coordinate of a camera that looks at a point, and of that point [m]."""
 
 
 @guarded
@@ -75,18 +77,27 @@ class Trajectory:
                 f"trajectory has times {t.shape}, positions {position.shape}, orientations {rotation.shape}; "
                 "give shapes (n,), (n, 3) and (n, 4)"
             )
-        if not all(np.isfinite(values).all() for values in (t, position, rotation)):
-            raise AmiwarpError("trajectory holds values that are not finite; remove these poses")
-        if not (np.diff(t) > 0).all():
+        is_finite = np.isfinite(np.column_stack([t, position, rotation])).all(axis=1)
+        if not is_finite.all():
+            first = int(np.argmin(is_finite))
             raise AmiwarpError(
-                "trajectory's times do not increase; sort the poses and remove duplicates"
+                f"trajectory holds values that are not finite, first in pose {first}; remove such poses"
+            )
+        increases = np.diff(t) > 0
+        if not increases.all():
+            later = int(np.argmin(increases)) + 1
+            raise AmiwarpError(
+                f"trajectory's times do not increase: pose {later} at {t[later]:.6g} s follows {t[later - 1]:.6g} s; "
+                "sort the poses and remove duplicates"
             )
         with np.errstate(over="ignore"):  # the length of huge values is infinite
             length = np.linalg.norm(rotation, axis=1, keepdims=True)
-        off = np.abs(length - 1.0)
-        if not (off < 0.01).all():
+        deviation = np.abs(length - 1.0)
+        if not (deviation < 0.01).all():
+            worst = int(np.argmax(deviation))
             raise AmiwarpError(
-                f"trajectory has a quaternion of length {float(length[np.argmax(off), 0]):.3g}; give unit quaternions"
+                f"trajectory has a quaternion of length {float(length[worst, 0]):.3g} in pose {worst}; give unit "
+                "quaternions"
             )
         object.__setattr__(self, "t", t)
         object.__setattr__(self, "position", position)
@@ -95,15 +106,13 @@ class Trajectory:
 
     def _check_jumps(self) -> None:
         """Raise :class:`AmiwarpError` if the camera or body moves or turns too fast between two poses."""
-        from scipy.spatial.transform import Rotation
-
         t, position = self._table()
         if t.size < 2:
             return
         step = np.diff(t)
         with np.errstate(over="ignore"):
             speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
-        orientation: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
+        orientation = self._orientation
         rate = (orientation[:-1].inv() * orientation[1:]).magnitude() / step
         self._check_speed("moves", speed, LARGEST_SPEED, "m/s")
         self._check_speed("turns", rate, LARGEST_TURN_RATE, "rad/s")
@@ -112,9 +121,10 @@ class Trajectory:
         """Raise :class:`AmiwarpError` if any speed between two poses is above a limit."""
         if speeds.max() > limit:
             t, _ = self._table()
-            at = float(t[int(np.argmax(speeds))])
+            fastest_s = float(t[int(np.argmax(speeds))])
             raise AmiwarpError(
-                f"trajectory {what} at {speeds.max():.3g} {unit} after {at:.6g} s, faster than {limit:g} {unit}; "
+                f"trajectory {what} at {speeds.max():.3g} {unit} after {fastest_s:.6g} s, "
+                f"faster than {limit:g} {unit}; "
                 "check the units of the times (s) and positions (m), or split the trajectory at the jump"
             )
 
@@ -130,14 +140,20 @@ class Trajectory:
         return bool((position != position[0]).any() or (rotation != rotation[0]).any())
 
     @cached_property
+    def _orientation(self) -> Any:
+        """Orientations of all poses, as one ``Rotation``."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_quat(np.asarray(self.rotation, np.float64))
+
+    @cached_property
     def _splines(self) -> tuple[Any, Any]:
         """Splines of the orientation and of the position over time [s]."""
         from scipy.interpolate import CubicSpline
-        from scipy.spatial.transform import Rotation, RotationSpline
+        from scipy.spatial.transform import RotationSpline
 
-        at, position = self._table()
-        orientation: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
-        return RotationSpline(at, orientation), CubicSpline(at, position)
+        times, position = self._table()
+        return RotationSpline(times, self._orientation), CubicSpline(times, position)
 
     def poses(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the orientations and positions at given times.
@@ -159,23 +175,22 @@ class Trajectory:
         AmiwarpError
             If the times are no one-dimensional array of numbers, or hold NaN.
         """
-        from scipy.spatial.transform import Rotation, Slerp
+        from scipy.spatial.transform import Slerp
 
-        at, position = self._table()
-        orientation: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
+        times, position = self._table()
         given = np.atleast_1d(np.asarray(array(t, "t"), np.float64))
         if given.ndim != 1 or np.isnan(given).any():
             what = "holds NaN" if given.ndim == 1 else f"has shape {given.shape}"
             raise AmiwarpError(f"t {what}; give times in seconds, shape (k,)")
-        inside = np.clip(given, at[0], at[-1])
-        if at.size == 1:
-            turns = np.repeat(orientation.as_matrix(), inside.size, axis=0)
+        inside = np.clip(given, times[0], times[-1])
+        if times.size == 1:
+            turns = np.repeat(self._orientation.as_matrix(), inside.size, axis=0)
             places = np.repeat(position, inside.size, axis=0)
             return turns, places
-        if at.size == 2:
-            share = (inside - at[0]) / (at[1] - at[0])
+        if times.size == 2:
+            share = (inside - times[0]) / (times[1] - times[0])
             between = position[0] + share[:, None] * (position[1] - position[0])
-            return Slerp(at, orientation)(inside).as_matrix(), between
+            return Slerp(times, self._orientation)(inside).as_matrix(), between
         turn, place = self._splines
         return turn(inside).as_matrix(), np.asarray(place(inside))
 
@@ -234,7 +249,7 @@ class Trajectory:
         position: ArrayLike,
         *,
         look_at: ArrayLike | None = None,
-        rotation: ArrayLike = (0, 0, 0, 1),
+        rotation: ArrayLike | None = None,
     ) -> Trajectory:
         """Return a trajectory that never moves.
 
@@ -243,16 +258,28 @@ class Trajectory:
         position : array_like
             Position [m], shape ``(3,)``.
         look_at : array_like, optional
-            Point in the world that the camera looks at [m], shape ``(3,)``. With it, ``rotation`` is ignored.
-        rotation : array_like
-            Orientation as a unit quaternion (x, y, z, w), from the frame of the camera or body to the world's frame.
+            Point in the world that the camera looks at [m], shape ``(3,)``.
+        rotation : array_like, optional
+            Orientation as a unit quaternion (x, y, z, w), from the frame of the camera or body to the world's frame; by
+            default the world's own.
 
         Returns
         -------
         Trajectory
             Trajectory with one pose for all times.
+
+        Raises
+        ------
+        AmiwarpError
+            If both ``look_at`` and ``rotation`` are given, or one of the arguments is not usable.
         """
-        quaternion = rotation if look_at is None else looking_at(position, look_at).as_quat()
+        if look_at is not None and rotation is not None:
+            raise AmiwarpError(
+                "look_at and rotation are both given; give one of them", ErrorCode.OPTIONS
+            )
+        quaternion: ArrayLike = (0, 0, 0, 1) if rotation is None else rotation
+        if look_at is not None:
+            quaternion = looking_at(position, look_at).as_quat()
         return cls([0.0], array(position, "position")[None], array(quaternion, "rotation")[None])
 
     @classmethod
@@ -279,6 +306,11 @@ class Trajectory:
         -------
         Trajectory
             The sampled trajectory.
+
+        Raises
+        ------
+        AmiwarpError
+            If the function returns something else, or the trajectory has too many poses.
         """
         duration_s = real(duration_s, "duration_s", 1e-6, 1e6, " s")
         count = max(2, round(duration_s * real(rate_hz, "rate_hz", 1e-3, 1e6)) + 1)
@@ -287,10 +319,11 @@ class Trajectory:
                 f"trajectory has {count} poses; give at most {MOST_POSES}, by a smaller rate_hz"
             )
         t = np.linspace(0.0, duration_s, count)
-        poses = [pose(float(moment)) for moment in t]
-        places = np.stack([np.asarray(place, np.float64) for _, place in poses])
-        turns = np.stack([turn.as_quat() for turn, _ in poses])
-        return cls(t, places, turns)
+        positions = np.empty((count, 3))
+        rotations = np.empty((count, 4))
+        for k, moment in enumerate(t.tolist()):
+            positions[k], rotations[k] = _position_and_quaternion(pose(moment), moment)
+        return cls(t, positions, rotations)
 
     @classmethod
     def from_file(cls, path: str | Path) -> Trajectory:
@@ -300,7 +333,7 @@ class Trajectory:
         ----------
         path : str or Path
             Text file with the columns t [s], x, y, z [m], qx, qy, qz, qw, separated by spaces (TUM) or commas (CSV).
-            The file may begin with a header line, and contain comments after ``#``.
+            The file may begin with a header line, in which no word is a number, and contain comments after ``#``.
 
         Returns
         -------
@@ -314,19 +347,25 @@ class Trajectory:
         """
         path = Path(path)
         values = plain_array("d")
+        has_header = False
         for number, line in text_lines(path):
             words = line.split("#")[0].replace(",", " ").split()
-            if not words or (not values and words[0].lower() in ("t", "time", "timestamp", "t_s")):
+            if not words:
+                continue
+            if not values and not has_header and not any(map(_is_number, words)):
+                has_header = True
                 continue
             try:
                 row = [float(word) for word in words]
             except ValueError as error:
                 raise AmiwarpError(
-                    f"{path}: line {number} is {line[:60]!r}; expected 8 numbers t x y z qx qy qz qw"
+                    f"{path}: line {number} is {line[:60]!r}; expected 8 numbers t x y z qx qy qz qw",
+                    ErrorCode.FILE_DAMAGED,
                 ) from error
             if len(row) != COLUMNS:
                 raise AmiwarpError(
-                    f"{path}: line {number} has {len(row)} numbers; expected 8: t x y z qx qy qz qw"
+                    f"{path}: line {number} has {len(row)} numbers; expected 8: t x y z qx qy qz qw",
+                    ErrorCode.FILE_DAMAGED,
                 )
             if len(values) == COLUMNS * MOST_POSES:
                 raise AmiwarpError(
@@ -348,6 +387,8 @@ class Trajectory:
 
     def save_tum(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the poses to a TUM file: lines of t x y z qx qy qz qw, separated by spaces.
+
+        Times are written as they are; :meth:`from_file` counts them from the first pose.
 
         Parameters
         ----------
@@ -372,16 +413,17 @@ def looking_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0
     """
     from scipy.spatial.transform import Rotation
 
-    for point in (array(position, "position"), array(target, "look_at")):
-        if point.shape != (3,) or not (np.abs(point) <= 1e9).all():
+    for name, given in (("position", position), ("look_at", target)):
+        point = array(given, name)
+        if point.shape != (3,) or not (np.abs(point) <= FARTHEST_M).all():
             raise AmiwarpError(
-                f"a point of a camera that looks at a place is {shown(point)}; give 3 numbers in m"
+                f"{name} is {shown(given)}; give 3 numbers in m, up to {FARTHEST_M:g}"
             )
     forward = np.asarray(target, np.float64) - np.asarray(position, np.float64)
     distance = float(np.linalg.norm(forward))
     if not distance > 0.0:
         raise AmiwarpError(
-            "the camera looks at its own position; give a target at another position"
+            f"look_at is the position {shown(position)} itself; give a target at another place"
         )
     forward /= distance
     right: Any = np.cross(forward, np.asarray(up, np.float64))
@@ -392,3 +434,26 @@ def looking_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0
     right /= np.linalg.norm(right)
     down = np.cross(forward, right)
     return Rotation.from_matrix(np.column_stack([right, down, forward]))
+
+
+def _position_and_quaternion(result: Any, moment_s: float) -> tuple[Any, Any]:
+    """Return the position [m] and the quaternion that a function of time returned for a moment [s]."""
+    try:
+        rotation, position = result
+        numbers = np.asarray(position, np.float64)
+        quaternion = np.asarray(rotation.as_quat(), np.float64)
+    except (TypeError, ValueError, AttributeError):
+        numbers = quaternion = np.zeros(0)
+    if numbers.shape != (3,) or quaternion.shape != (4,):
+        raise AmiwarpError(
+            f"pose returns {shown(result)} at {moment_s:g} s; return a scipy Rotation and a position of 3 numbers in m"
+        )
+    return numbers, quaternion
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +14,6 @@ from amiwarp.simulation.worlds.bodies import Body
 from amiwarp.simulation.worlds.lights import Lamp, Sky, Sun
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.validation import instance, real
-
-if TYPE_CHECKING:
-    pass
 
 MOST_INSTANCES = 65535
 """Largest number of instances of a world. Instance numbers are stored as uint16, and number 0 is the sky."""
@@ -47,6 +43,7 @@ class World:
     """Trajectories of named points, such as the joints of a figure."""
 
     def __post_init__(self) -> None:
+        instance(self.name, str, "world's name")
         object.__setattr__(self, "bodies", tuple(self.bodies))
         object.__setattr__(self, "lamps", tuple(self.lamps))
         object.__setattr__(self, "ambient", real(self.ambient, "world ambient", 0.0, 1e6))
@@ -62,11 +59,11 @@ class World:
 
     def _check_names(self) -> None:
         """Raise :class:`AmiwarpError` if two bodies have the same name, the first such name in alphabetical order."""
-        numbers = Counter(body.name for body in self.bodies)
-        doubles = sorted(name for name, number in numbers.items() if number > 1)
-        if doubles:
+        counts = Counter(body.name for body in self.bodies)
+        duplicates = sorted(name for name, count in counts.items() if count > 1)
+        if duplicates:
             raise AmiwarpError(
-                f"world {self.name!r} has several bodies named {doubles[0]!r}; give unique names"
+                f"world {self.name!r} has several bodies named {duplicates[0]!r}; give unique names"
             )
 
     @property

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from amiwarp.errors import AmiwarpError, ErrorCode
-from amiwarp.simulation.worlds.named.catalogue import named_world
+from amiwarp.simulation.worlds.named.camera_paths import TRAJECTORIES
+from amiwarp.simulation.worlds.named.catalogue import WORLDS, named_world
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world import World
 from amiwarp.simulation.worlds.world_files import load_world
-
-if TYPE_CHECKING:
-    pass
 
 WORLD_FILES = (".toml", ".json")
 """File suffixes of world files."""
@@ -32,18 +29,31 @@ def open_world(
     is_file = trajectory is not None and trajectory.lower().endswith(POSE_FILES)
     poses = Trajectory.from_file(str(trajectory)) if is_file else None
     if not name.lower().endswith(WORLD_FILES):
+        _check_is_name("world", name, WORLDS, WORLD_FILES)
+        if trajectory is not None and poses is None:
+            _check_is_name("trajectory", trajectory, TRAJECTORIES, POSE_FILES)
         kind = "still" if poses is not None else trajectory or "handheld"
-        world, own = named_world(name, kind, seed=seed, duration_s=duration_s)
-        return world, poses or own
+        world, named_trajectory = named_world(name, kind, seed=seed, duration_s=duration_s)
+        return world, poses or named_trajectory
     world, stored = load_world(Path(name))
     if trajectory is not None and poses is None:
         raise AmiwarpError(
-            f"trajectory {trajectory} applies only to named worlds; give a file of poses for {name}"
+            f"trajectory {trajectory} applies only to named worlds; give a file of poses for {name}",
+            ErrorCode.OPTIONS,
         )
     chosen = poses or stored
     if chosen is None:
         raise AmiwarpError(
-            f"{name}: has no camera trajectory; give a file of poses (.txt, .csv) as trajectory",
+            f"{name}: has no camera trajectory; give a file of poses ({', '.join(POSE_FILES)}) as trajectory",
             ErrorCode.CONTENT_MISSING,
         )
     return world, chosen
+
+
+def _check_is_name(what: str, name: str, names: tuple[str, ...], suffixes: tuple[str, ...]) -> None:
+    """Raise :class:`AmiwarpError` if a name means a file, of a kind that is not read."""
+    if Path(name).suffix:
+        raise AmiwarpError(
+            f"{what} is '{name}'; give a file of the kind {' or '.join(suffixes)}, or one of {', '.join(names)}",
+            ErrorCode.FORMAT_UNKNOWN,
+        )

@@ -130,7 +130,8 @@ def _read(path: Path) -> dict[str, Any]:
         data = read_toml(path, "a world")
     else:
         raise AmiwarpError(
-            f"{path}: has the suffix {path.suffix!r}; a world file ends in .toml or .json"
+            f"{path}: has the suffix {path.suffix!r}; a world file ends in .toml or .json",
+            ErrorCode.FORMAT_UNKNOWN,
         )
     return data
 
@@ -209,11 +210,13 @@ class _Reader:
             texture = at_field(f"{where}.material.texture", lambda: self._picture(picture_name))
         bodies = []
         for name, part in zip(_part_names(entry.name, parts), parts, strict=True):
-            own = at_field(f"{where}.material", partial(_material, part, material, texture, where))
+            own_material = at_field(
+                f"{where}.material", partial(_material, part, material, texture, where)
+            )
             body = Body(
                 name=name,
                 mesh=part.mesh,
-                material=own,
+                material=own_material,
                 trajectory=trajectory,
                 category=entry.category,
                 instance=entry.instance or entry.name,
@@ -295,15 +298,15 @@ def _material(part: LoadedMesh, entry: MaterialEntry, texture: Any, where: str) 
 
     ``texture``: picture that the world file gives, or None.
     """
-    own = part.material
+    part_material = part.material
     if texture is not None and part.mesh.uv is None:
         raise AmiwarpError(
             f"field {where}.material.texture needs texture coordinates, but the mesh has none; remove it",
             ErrorCode.FIELD,
         )
-    reflectance = own.reflectance if texture is None else 1.0
+    reflectance = part_material.reflectance if texture is None else 1.0
     return Material(
         reflectance if entry.reflectance is None else entry.reflectance,
-        own.texture if texture is None else texture,
-        own.emission if entry.emission is None else entry.emission,
+        part_material.texture if texture is None else texture,
+        part_material.emission if entry.emission is None else entry.emission,
     )

@@ -289,8 +289,8 @@ def _image_rows(
         return sample.error(places, Vote.BILINEAR), image_error
 
     measured = []
-    own = timed[: len(all_settings)]
-    for result, setting in zip(own, all_settings, strict=True):
+    timed_settings = timed[: len(all_settings)]
+    for result, setting in zip(timed_settings, all_settings, strict=True):
         measured.append(measured_row(result, failed, partial(error, result, setting)))
     of_libraries = timed[len(all_settings) :]
     for result, task in zip(of_libraries, library_tasks, strict=True):

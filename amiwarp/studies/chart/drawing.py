@@ -231,9 +231,9 @@ class ChartPanel:
             return outside, letters, drawn
 
         def crosses(spot: Any) -> bool:
-            way = place + np.linspace(0.05, 0.95, 19)[:, None] * (spot - place)
+            line = place + np.linspace(0.05, 0.95, 19)[:, None] * (spot - place)
             other_points = [point for point in self.points if not point.contains(*place)]
-            return any(one.count_contains(way) for one in [*self.letters, *other_points])
+            return any(one.count_contains(line) for one in [*self.letters, *other_points])
 
         # Of the spots that cover least, the nearest to which the label's line crosses nothing
         spots = []
@@ -243,7 +243,7 @@ class ChartPanel:
         costs = [covered(spot) for spot in spots]
         least = min(costs)
         best = [spot for spot, cost in zip(spots, costs, strict=True) if cost == least]
-        spot = next((each for each in best if not crosses(each)), best[0])
+        spot = next((candidate for candidate in best if not crosses(candidate)), best[0])
         label.xyann = (spot - place) / self.unit
         self.letters.append(box(spot))
         self.lines.append(Bbox([np.minimum(place, spot), np.maximum(place, spot)]))
@@ -266,7 +266,7 @@ def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
     lists = _numbered(rows, lines)
     keys = _keys(rows, lines)
 
-    listed = LINE * max(len(each) for each in lists)
+    listed = LINE * max(len(list_of_labels) for list_of_labels in lists)
     # The panels of compensation have titles of their own.
     titles = TITLE * (1 if rows[0].chart == "calibration" else 1.75)
     legend = KEY * math.ceil(len(keys) / COLUMNS)

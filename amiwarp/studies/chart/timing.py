@@ -47,7 +47,7 @@ class Timed:
 
     def row(self, error_px: float, **more: Any) -> Row:
         """Return the row of the measured setting, with its error and further fields."""
-        usual = [took / slow for took, slow in zip(self.times, self.slowness, strict=True)]
+        usual = [seconds / slow for seconds, slow in zip(self.times, self.slowness, strict=True)]
         median = statistics.median(usual)
         spread = (max(self.times) - min(self.times)) / median
         return Row(
@@ -111,11 +111,11 @@ def measure(
             try:
                 start = time.perf_counter()
                 result = task.run()
-                took = time.perf_counter() - start
+                seconds = time.perf_counter() - start
                 if turn == first_timed:
                     results[number] = task.keep(result)
                 if turn >= first_timed:
-                    times[number].append(took)
+                    times[number].append(seconds)
             except Exception as error:
                 failed[number] = failure_text(error)
             progress(what, (turn * len(tasks) + done + 1) / (rounds * len(tasks)))
@@ -126,14 +126,14 @@ def _timed(
     tasks: Sequence[Task], times: list[list[float]], results: list[Any], failed: Mapping[int, str]
 ) -> list[Timed]:
     """Return the tasks together with their times and results, or with their failures, by the number of the task."""
-    slow = slowness([took for number, took in enumerate(times) if number not in failed])
+    slow = slowness([seconds for number, seconds in enumerate(times) if number not in failed])
     timed = []
     for number, task in enumerate(tasks):
         if number in failed:
             timed.append(Timed(task, (), (), None, failed[number]))
         else:
-            took = times[number]
-            timed.append(Timed(task, tuple(took), slow[: len(took)], results[number]))
+            seconds = times[number]
+            timed.append(Timed(task, tuple(seconds), slow[: len(seconds)], results[number]))
     return timed
 
 
@@ -146,7 +146,7 @@ def slowness(times: Sequence[Sequence[float]]) -> tuple[float, ...]:
     rounds = max(map(len, times), default=0)
     if rounds == 0:
         return ()
-    whole = np.array([took for took in times if len(took) == rounds])
+    whole = np.array([seconds for seconds in times if len(seconds) == rounds])
     relative = whole / np.median(whole, axis=1, keepdims=True)
     return tuple(np.median(relative, axis=0).tolist())
 

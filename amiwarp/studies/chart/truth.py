@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.metrics import truth_model
@@ -49,16 +49,20 @@ class KnownRecording:
         encoder = recording.encoder
         if truth is None or not set(NEEDED) <= set(truth.parameters):
             raise AmiwarpError(
-                f"{recording.name}: has no ground truth (apex, index, phase); create a recording with: amiwarp simulate"
+                f"{recording.name}: has no ground truth (apex, index, phase); "
+                "create a recording with: amiwarp simulate",
+                ErrorCode.CONTENT_MISSING,
             )
         if camera is None or encoder is None or recording.prism is None:
             raise AmiwarpError(
-                f"{recording.name}: lacks camera, encoder or prism; create a recording with: amiwarp simulate"
+                f"{recording.name}: lacks camera, encoder or prism; create a recording with: amiwarp simulate",
+                ErrorCode.CONTENT_MISSING,
             )
         events = recording.events.slice(0, MOST_EVENTS)
         if not len(events) or events.x.dtype != np.uint16:
             raise AmiwarpError(
-                f"{recording.name}: has no sensor events (uint16); give a recording that is not compensated"
+                f"{recording.name}: has no sensor events (uint16); give a recording that is not compensated",
+                ErrorCode.CONTENT_MISSING,
             )
         held = Recording(
             MemoryEvents(events, *recording.events.size),

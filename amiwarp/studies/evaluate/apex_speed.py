@@ -217,11 +217,14 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     turn = _TurnEvents(streams)
     blur = {delay: turn.blur(delay) for delay in DELAYS_US[::COARSE].tolist()}
     for name in ("all", "bright", "dark"):
-        rough = min(blur, key=lambda d: blur[d][name])
+        rough = min(blur, key=lambda deflection: blur[deflection][name])
         for delay in DELAYS_US[np.abs(DELAYS_US - rough) < 100 * COARSE].tolist():
             if delay not in blur:
                 blur[delay] = turn.blur(delay)
-    best = {name: min(blur, key=lambda d: blur[d][name]) for name in ("all", "bright", "dark")}
+    best = {
+        name: min(blur, key=lambda deflection: blur[deflection][name])
+        for name in ("all", "bright", "dark")
+    }
     delay = best["all"]
 
     condition = streams.condition

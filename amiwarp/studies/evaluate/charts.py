@@ -137,9 +137,9 @@ def _ticks(ax: Axes, chart: Chart, rows: list[dict[str, Value]]) -> None:
     """Label the values of the horizontal axis themselves if they are few."""
     from matplotlib.ticker import NullFormatter, NullLocator
 
-    at = sorted({float(row[chart.x]) for row in rows})  # type: ignore[arg-type]
-    if len(at) <= FEW_TICKS:
-        ax.set_xticks(at, [f"{x:g}" for x in at])
+    ticks = sorted({float(row[chart.x]) for row in rows})  # type: ignore[arg-type]
+    if len(ticks) <= FEW_TICKS:
+        ax.set_xticks(ticks, [f"{x:g}" for x in ticks])
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.xaxis.set_minor_locator(NullLocator())
 
@@ -165,13 +165,13 @@ def _bars(ax: Axes, chart: Chart, rows_of_series: dict[Value, list[dict[str, Val
     width = 0.8 / max(1, count)
     for number, (name, rows) in enumerate(rows_of_series.items()):
         shift = (number - (count - 1) / 2) * width
-        at = [groups.index(row[chart.x]) + shift for row in rows]
+        places = [groups.index(row[chart.x]) + shift for row in rows]
         y: Any = [row[chart.y] for row in rows]
         std: Any = None
         if chart.spread is not None:
             std = [row[chart.spread] or 0.0 for row in rows]
         ax.bar(
-            at,
+            places,
             y,
             0.9 * width,
             yerr=std,

@@ -207,14 +207,14 @@ def judge(
         case: Interval.of(list(of_case.values())) for case, of_case in values.items() if of_case
     }
     for other in (Verdict.REPRODUCED, Verdict.NOT_REPRODUCED):
-        cases = [case for case, own in intervals.items() if own.verdict(above, below) is other]
+        cases = [case for case, mean in intervals.items() if mean.verdict(above, below) is other]
         if cases and verdict is not other:
             ours += f"; {other} in {' and '.join(cases)}"
 
     incomplete = sum(len(of_seed) < len(intervals) for of_seed in by_seed.values())
     if incomplete:
         ours += f"; seeds that lack a case: {incomplete}"
-    texts = {case: own.text(unit) for case, own in intervals.items()}
+    texts = {case: mean.text(unit) for case, mean in intervals.items()}
     return Claim(number, text, ours, verdict, rule, texts if len(texts) > 1 else {})
 
 

@@ -14,16 +14,8 @@ from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.studies.evaluate.charts import CHANCE
 from amiwarp.studies.evaluate.claims import Claim, differences, judge, ranges, untestable
 from amiwarp.studies.evaluate.conditions import FEATURES_APEX, Condition, Settings
-from amiwarp.studies.evaluate.corner_tracks import (
-    GAP_US,
-    LIMITS_PX,
-    Tracks,
-    link_corners,
-    quality_curve,
-    seen_places,
-    track_frames,
-    true_paths,
-)
+from amiwarp.studies.evaluate.corner_tracks import GAP_US, Tracks, link_corners
+from amiwarp.studies.evaluate.frame_tracks import track_frames
 from amiwarp.studies.evaluate.results import (
     Amount,
     CellResult,
@@ -36,6 +28,8 @@ from amiwarp.studies.evaluate.results import (
     where,
 )
 from amiwarp.studies.evaluate.streams import Frames, Stream, Streams
+from amiwarp.studies.evaluate.track_quality import LIMITS_PX, quality_curve
+from amiwarp.studies.evaluate.track_truth import seen_places, true_paths
 
 TITLE = "Corners"
 PROTOCOL = (
@@ -279,7 +273,7 @@ def _curve(
     rows = []
     for quality in quality_curve(tracks, truth, LIMITS_PX):
         values = (
-            float(quality.number),
+            float(quality.tracks),
             quality.total_s / span_s,
             1e3 * quality.lifetime_s,
             quality.error_px,
@@ -431,7 +425,7 @@ def _claims_of_paper(moving: Sequence[dict[str, Any]]) -> list[Claim]:
 def _error_checks(rows: Sequence[dict[str, Any]], moving: Sequence[dict[str, Any]]) -> list[Claim]:
     """Check the error at the usual limit: against the S-EV's, and over the camera's motions."""
     efast = where(moving, detector=CornerMethod.EFAST)
-    room = where(rows, detector=CornerMethod.EFAST, scene="room")
+    rows_of_room = where(rows, detector=CornerMethod.EFAST, scene="room")
     return [
         judge(
             None,
@@ -445,7 +439,7 @@ def _error_checks(rows: Sequence[dict[str, Any]], moving: Sequence[dict[str, Any
         judge(
             None,
             f"The error does not depend on the camera's motion, within {SAME_PX:g} px (room, {TRACKS_END}).",
-            differences(ranges(room, "error_px"), "error_px", AMI, by=("scene",)),
+            differences(ranges(rows_of_room, "error_px"), "error_px", AMI, by=("scene",)),
             f"the range of the error of '{Stream.CALIBRATED}' over the camera's motions, with rest,",
             below=SAME_PX,
             unit="px",

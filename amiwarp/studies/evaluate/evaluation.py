@@ -161,8 +161,8 @@ def evaluate(
                 sections.append(section(name, cells))
         with contextlib.ExitStack() as stack:
             if continued:
-                for own in (folder, folder / "tables", folder / "figures"):
-                    stack.enter_context(own_folder(own))
+                for output_folder in (folder, folder / "tables", folder / "figures"):
+                    stack.enter_context(own_folder(output_folder))
             files = write(folder, sections, settings, processor_s)
 
     failures = {

@@ -81,12 +81,12 @@ class Values(TypedDict):
 
 def conditions(settings: Settings) -> list[Condition]:
     """Return the room with a moving camera; in full also the ball, whose body is left out, and fast motion."""
-    room = settings.conditions(world="room", trajectory="handheld")
+    room_conditions = settings.conditions(world="room", trajectory="handheld")
     if settings.quick:
-        return room
+        return room_conditions
     wide = wide_focal(settings)
     return [
-        *room,
+        *room_conditions,
         *settings.conditions(world="room", trajectory="fast", focal_px=FOCAL_PX),
         *settings.conditions(world="desk", trajectory="handheld", focal_px=FOCAL_PX),
         *settings.conditions(world="ball", trajectory="handheld", focal_px=wide),

@@ -6,7 +6,7 @@ from typing import Any, Literal, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.studies.evaluate.claims import Claim, untestable
 from amiwarp.studies.evaluate.conditions import Condition, Settings, wide_focal
@@ -127,7 +127,8 @@ def image_joints(streams: Streams, t_us: int) -> dict[str, NDArray[np.float64]]:
     camera = streams.camera
     if not isinstance(scene, WorldScene) or not scene.world.joints:
         raise AmiwarpError(
-            "the world has no joints, so a pose cannot be judged; use the world 'person'"
+            "the world has no joints, so a pose cannot be judged; use the world 'person'",
+            ErrorCode.CONTENT_MISSING,
         )
     t = [t_us * 1e-6]
     rotations, positions = scene.trajectory.poses(t)

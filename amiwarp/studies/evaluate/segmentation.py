@@ -161,11 +161,11 @@ def _event_scores(
         instance = streams.event_truth(stream, start_us, end_us).instance
         assert instance is not None
         truth = np.isin(instance, moving_instances(streams))
-        own = _scores(events, truth, bodies, streams.camera, choices)
-        rows += [row | {"stream": stream.value, "budget": OWN} for row in own]
+        own_scores = _scores(events, truth, bodies, streams.camera, choices)
+        rows += [row | {"stream": stream.value, "budget": OWN} for row in own_scores]
         if stream is Stream.SAME_COUNT:
             continue
-        equal = own[:1]
+        equal = own_scores[:1]
         if len(events) > fewest:
             thinned = np.arange(fewest) * len(events) // max(fewest, 1)
             equal = _scores(events[thinned], truth[thinned], bodies, streams.camera, [STANDARD])
@@ -257,7 +257,7 @@ def _curves(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the scores of the standard settings, and those over the least gain."""
     rows = rows_of(results, "rows")
-    own = [r for r in rows if r["budget"] == OWN and r["stream"] in set(Stream)]
+    own_rows = [r for r in rows if r["budget"] == OWN and r["stream"] in set(Stream)]
     names = ("scene", "camera", "stream")
     scores = ["object_iou", "iou", "precision", "recall"]
     columns = (
@@ -284,7 +284,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
             "segmentation_settings",
             "Segmentation over its settings",
             ("setting", *names, "value of the setting", *columns),
-            grouped(_curves(own), ("setting", *names, "value of the setting"), scores),
+            grouped(_curves(own_rows), ("setting", *names, "value of the setting"), scores),
             "Gain: the gain in agreement of what stays blurred. The other settings belong to the clustering.",
             Chart("value of the setting", "IoU per object", "stream", "std", panels=("setting",)),
         ),
@@ -296,7 +296,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
     the prism, and better than by a standard camera."""
     rows = [r for r in rows_of(results, "rows") if _values(STANDARD).items() <= r.items()]
     measures = (("object_iou", "per object"), ("iou", "per event"))
-    own = [r for r in rows if r["budget"] == OWN]
+    own_rows = [r for r in rows if r["budget"] == OWN]
     return [
         *(
             judge(
@@ -324,7 +324,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
                     None,
                     f"With the {name} it is segmented better than with a standard camera of {rate} frames/s (per "
                     "object).",
-                    differences(own, "object_iou", {"stream": stream}, {"stream": frames}),
+                    differences(own_rows, "object_iou", {"stream": stream}, {"stream": frames}),
                     f"the IoU per object of '{stream}' less the IoU of '{frames}'",
                     above=0.0,
                 )

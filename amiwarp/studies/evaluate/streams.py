@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.calib.settings import Settings as CalibrationSettings
-from amiwarp.compensation.blocks import compensate_events
+from amiwarp.compensation.in_memory import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, Recording
 from amiwarp.events.truth import EventTruth, FrameTruth
@@ -323,11 +323,11 @@ class Streams(RecordedStreams):
             return source.truth.of_events(0, 0)
         # The truth is read in one piece; then the rows are picked that the window has.
         truth = source.truth.of_events(int(rows[0]), int(rows[-1]) + 1)
-        at = rows - rows[0]
+        offsets = rows - rows[0]
         picked = {}
         for name in ("points", "cause", "instance", "depth", "place"):
             value = getattr(truth, name)
-            picked[name] = None if value is None else value[at]
+            picked[name] = None if value is None else value[offsets]
         return EventTruth(**picked)
 
     def _source(self, stream: Stream) -> Recording:

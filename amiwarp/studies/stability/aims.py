@@ -166,7 +166,7 @@ def aims_of(cells: Iterable[Stored], default: str | None, worse: Sequence[WorseT
             here.append(result.outcome)
     successes = Rate(inside.count(Outcome.SUCCESS), len(inside))
     silent_failures = Rate(outside.count(Outcome.SILENT), len(outside))
-    clearest_first = sorted(worse, key=lambda each: each.p_value)
+    clearest_first = sorted(worse, key=lambda comparison: comparison.p_value)
     return Aims(successes, silent_failures, tuple(clearest_first))
 
 

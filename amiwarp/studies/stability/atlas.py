@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.studies.stability.aims import (
     DEFAULT,
     WORKS,
@@ -157,7 +157,8 @@ def aggregate(
             worse += worse_than_paper(axis, value, here, identities)
     if not spots:
         raise AmiwarpError(
-            "found no results of single runs (cells) for these axes and methods; run without --redraw first"
+            "found no results of single runs (cells) for these axes and methods; run without --redraw first",
+            ErrorCode.CONTENT_MISSING,
         )
     default = identities.get(DEFAULT)
     combinations = {

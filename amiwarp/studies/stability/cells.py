@@ -104,7 +104,7 @@ class Store(CellStore):
             if data["format"] != FORMAT:
                 return None
             values = instance(data["condition"], dict, "field condition")
-            known_fields = {f.name for f in fields(Condition)}
+            known_fields = {field.name for field in fields(Condition)}
             if not values.keys() <= known_fields:
                 return None  # a version with other fields wrote it
             condition = build(Condition, values, "condition")

@@ -259,7 +259,7 @@ def stability_lines(
         "",
     ]
     if atlas.stated:
-        shown += [cli.table([d.row() for d in atlas.stated], *STATED_HEADINGS), ""]
+        shown += [cli.table([deviation.row() for deviation in atlas.stated], *STATED_HEADINGS), ""]
     listed = ("overview", "pages", "summary", "data", "table")
     shown += [f"{name}: {files[name]}" for name in listed]
     failed = {}

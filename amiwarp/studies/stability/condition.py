@@ -367,7 +367,7 @@ def troubles_of(c: Condition) -> list[str]:
         low, high = OPTIC_ALWAYS.get(name, (default, default))
         return name == "optic" or value == default or low <= value <= high
 
-    return [f.name for f in fields(Condition) if not harmless(f.name, f.default)]
+    return [field.name for field in fields(Condition) if not harmless(field.name, field.default)]
 
 
 @dataclass(frozen=True)

@@ -190,8 +190,8 @@ def _strips(
     ax.xaxis.tick_top()
     ax.tick_params(axis="x", length=0, pad=1.0)
     names = [value_label(axis, v) for v in values]
-    room = 72.0 * ax.get_position().width * SHEET / len(names)
-    size = min(SMALL, *(room / (0.6 * len(name)) for name in names))
+    points_per_name = 72.0 * ax.get_position().width * SHEET / len(names)
+    size = min(SMALL, *(points_per_name / (0.6 * len(name)) for name in names))
     ax.set_xticks(range(len(values)), names, fontsize=size)
 
 

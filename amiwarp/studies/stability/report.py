@@ -35,8 +35,8 @@ def atlas_json(atlas: Atlas) -> str:
         **atlas.about,
         "cells": atlas.cells,
         "aims": atlas.aims.to_json(),
-        "stated_deviations": [d.to_json() for d in atlas.stated],
-        "failures": [asdict(f) for f in atlas.failures],
+        "stated_deviations": [deviation.to_json() for deviation in atlas.stated],
+        "failures": [asdict(failure) for failure in atlas.failures],
     }
     head = json.dumps(data, indent=1, allow_nan=False).removesuffix("\n}")
     lines = []
@@ -95,10 +95,10 @@ def markdown(atlas: Atlas) -> str:
     refused = _failing(atlas, Outcome.REFUSAL)
     failures = [failure.row() for failure in atlas.failures]
     worse = []
-    for each in atlas.aims.worse:
-        value = value_label(each.axis, each.value)
-        rates = (str(each.default), str(each.paper))
-        worse.append((each.axis.name, value, *rates, f"{each.p_value:.2g}"))
+    for comparison in atlas.aims.worse:
+        value = value_label(comparison.axis, comparison.value)
+        rates = (str(comparison.default), str(comparison.paper))
+        worse.append((comparison.axis.name, value, *rates, f"{comparison.p_value:.2g}"))
     made = [str(atlas.about[name]) for name in ("machine", "date") if name in atlas.about]
     parts = [
         "# Atlas of failures",

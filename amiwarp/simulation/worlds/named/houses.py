@@ -81,8 +81,8 @@ def _trim(x: float, y: float, away: float, width: float, storeys: int) -> list[M
         sill_z = floor_z + 0.85
         lintel_z = floor_z + 0.95 + WINDOW[1] + 0.05
         cornice_z = floor_z + STOREY - 0.05
-        for at in windows:
-            centre = left + at
+        for window in windows:
+            centre = left + window
             # On the ground floor, the place of a sill may be the door.
             if storey > 0:
                 meshes.append(shapes.box(sill_size, (centre, y, sill_z), tile_m=0.8))

@@ -10,8 +10,15 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.compensation.gpu_pieces import GpuPieces
-from amiwarp.events import device_events
-from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
+from amiwarp.events.device_events import (
+    DeviceEvents,
+    check_order,
+    check_sensor,
+    device_for,
+    limits,
+    time_span,
+    wait,
+)
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_stream import check_prisms
 from amiwarp.events.recording import Events
@@ -53,27 +60,27 @@ class BlockCompensator:
         all_cores: bool = False,
     ) -> tuple[Events, NDArray[np.uint8]]:
         """Return compensated events (NaN without coordinates), and 1 for each inside the image, shape ``(n,)``."""
-        device_events.check_sensor(events)
+        check_sensor(events)
         if not len(events):
-            nowhere = np.zeros(0, np.float32)
-            return Events(nowhere, nowhere, events.t, events.p), np.zeros(0, np.uint8)
+            no_positions = np.zeros(0, np.float32)
+            return Events(no_positions, no_positions, events.t, events.p), np.zeros(0, np.uint8)
         if self._pieces is None:
-            x, y, inside = self._compensate(events, all_cores)
+            x, y, inside = self._on_cpu(events, all_cores)
         else:
             x, y, inside = self._pieces(events)
         return Events(x, y, events.t, events.p), inside
 
     def on_device(self, events: DeviceEvents) -> tuple[wp.array, wp.array]:
         """Return compensated x and y of at least one event, as Warp arrays of shape ``(n,)``."""
-        device_events.check_sensor(events)
-        _, _, max_x, max_y, _, _ = limits(events)
+        check_sensor(events)
+        extremes = limits(events)
         one_thread = self._pieces.one_thread if self._pieces else contextlib.nullcontext()
         with one_thread:
             columns = self._plan.device_columns(events)
-            results = self._plan.run(columns, self._encoder, max_x, max_y)
+            results = self._plan.run(columns, self._encoder, extremes.right, extremes.bottom)
         return results.out_x[: len(events)], results.out_y[: len(events)]
 
-    def _compensate(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
+    def _on_cpu(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
         """Return compensated x and y [px] and 1 for each event inside the image, on a CPU."""
         count = len(events)
         padded = self._plan.padded(count)
@@ -147,22 +154,18 @@ def compensate_events(
     (2, 2)
     """
     device = device_for(events, device)
-    device_events.check_order(events)
+    check_order(events)
     if isinstance(events, DeviceEvents):
         return _compensate_on_device(events, model, encoder)
-    if len(events):
-        first = int(events.t.min())
-        last = int(events.t.max())
-    else:
-        first, last = encoder.coverage
-    compensator = BlockCompensator(model, encoder, first, last, device)
+    t_first, t_last = time_span(events) if len(events) else encoder.coverage
+    compensator = BlockCompensator(model, encoder, t_first, t_last, device)
     compensated, _ = compensator(events, all_cores=True)
     return np.stack([compensated.x, compensated.y], axis=1)
 
 
 def _compensate_on_device(events: DeviceEvents, model: Model, encoder: Encoder) -> wp.array:
     """Return finished coordinates without the prism [px], shape (n, 2)."""
-    device_events.check_sensor(events)
+    check_sensor(events)
     device = events.device
     count = len(events)
     xy = wp.empty((count, 2), dtype=float, device=device)

@@ -4,7 +4,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-HALF = wp.constant(wp.int64(1 << 31))
+HALF_WRAP = wp.constant(wp.int64(1 << 31))
 """Half the range of a time of 32 bits. A larger step is a wrap."""
 OUTSIDE = wp.constant(wp.int64(-(1 << 62)))
 """Stands for a number that lies outside of what is read."""
@@ -15,16 +15,17 @@ class Span:
     """A part of the memory."""
 
     address: wp.uint64
+    """Address of the first byte."""
     size: wp.int64
     """Number of bytes."""
 
 
 @wp.func
-def wraps_between(last: wp.int64, now: wp.int64) -> int:
+def wrap_between(last: wp.int64, now: wp.int64) -> int:
     """Return 1 if the time wraps between two records, -1 if it wraps backwards, else 0."""
-    if last - now > HALF:
+    if last - now > HALF_WRAP:
         return 1
-    if now - last > HALF:
+    if now - last > HALF_WRAP:
         return -1
     return 0
 
@@ -36,9 +37,10 @@ def wraps_between(last: wp.int64, now: wp.int64) -> int:
     // Byte by byte: a GPU reads no number across its borders, and its compiler takes memcpy() for one such read.
     for (int k = 0; k < width; ++k) part |= (uint32_t)from[k] << (8 * k);
 #else
-    if (width == 2) { uint16_t half; memcpy(&half, from, 2); return half; }
-    memcpy(&part, from, 4);
+    if (width == 2) { uint16_t half; memcpy(&half, from, 2); part = half; }
+    else memcpy(&part, from, 4);
 #endif
+    if (width == 2) return is_signed ? (int64_t)(int16_t)part : (int64_t)part;
     return is_signed ? (int64_t)(int32_t)part : (int64_t)part;
 """)
 def load_number(address: wp.uint64, at: wp.int64, width: int, is_signed: int) -> wp.int64:
