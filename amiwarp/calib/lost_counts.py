@@ -176,8 +176,8 @@ def steps_in_samples(encoder: Encoder) -> list[Step]:
 def _fit_steps(encoder: Encoder, sample: NDArray[np.int64]) -> Vector:
     """Return what the samples around some intervals tell of a step in each, shape (3, n).
 
-    ``sample``: indices of the samples before the intervals, shape (n,). The rows are the size of the step [rad], the part
-    of it that comes in the interval [rad], and the sum of the squares that a smooth path leaves of a step of 1.
+    ``sample``: indices of the samples before the intervals, shape (n,). The rows are the size of the step [rad], the
+    part of it that comes in the interval [rad], and the sum of the squares that a smooth path leaves of a step of 1.
     """
     around = sample[:, None] + np.arange(1 - AROUND, AROUND + 1)
     angle = encoder.angle[around] - encoder.angle[sample][:, None]
