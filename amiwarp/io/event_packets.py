@@ -21,7 +21,7 @@ class Surveyed:
 
     events: Events
     surveys: NDArray[Any] | None
-    """What each block holds, see :class:`amiwarp.kernels.event_order.Survey`; None if the events have been changed."""
+    """What each block holds, see :class:`amiwarp.kernels.event_survey.Survey`; None if the events have been changed."""
 
     @property
     def is_in_order(self) -> bool:
