@@ -28,7 +28,7 @@ class Surveyed:
         """Whether no event is earlier than the one before it."""
         if self.surveys is None:
             return not bool((self.events.t[1:] < self.events.t[:-1]).any())
-        if self.surveys["falls"].any():
+        if self.surveys["decreases"].any():
             return False
         first = self.surveys["first"]
         latest = self.surveys["latest"]
