@@ -38,13 +38,16 @@ class EventColumns(NamedTuple):
 def decode_chunk(data: bytes) -> EventColumns:
     """Return the events in a chunk. Raises :class:`AmiwarpError` if it is damaged."""
     if len(data) < HEAD.size:
-        raise AmiwarpError("a chunk of the ECF codec lacks its head; the file is damaged")
+        raise AmiwarpError(
+            f"a chunk of the ECF codec has {len(data)} bytes; expected {HEAD.size} of its head or more; the file is "
+            "damaged, copy it again"
+        )
     head, origin = HEAD.unpack_from(data)
     count = head >> 2
     if count > MOST_EVENTS or len(data) > MOST_BYTES:
         raise AmiwarpError(
             f"a chunk of the ECF codec has {count} events in {len(data)} bytes; expected at most {MOST_EVENTS} in "
-            f"{MOST_BYTES}; the file is damaged"
+            f"{MOST_BYTES}; the file is damaged, copy it again"
         )
     rest = np.frombuffer(data, np.uint8)[HEAD.size :]
     t, rest = _times(rest, origin, count)
@@ -64,7 +67,7 @@ def decode_chunk(data: bytes) -> EventColumns:
 
 def _damaged(what: str) -> AmiwarpError:
     return AmiwarpError(
-        f"a chunk of the ECF codec holds other {what} than events; the file is damaged"
+        f"the {what} of a chunk of the ECF codec, number 1 of 1, are damaged; copy the file again"
     )
 
 

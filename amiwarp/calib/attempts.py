@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from amiwarp.calib import checks
-from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
+from amiwarp.calib.bad_pixels import MaskedEventSource, find_bad_pixels, searched_part
 from amiwarp.calib.calibrator import Attempt, Calibrator, with_warnings
 from amiwarp.calib.camera_attempts import with_gyroscope, with_rotation, without_rotation
 from amiwarp.calib.encoder_attempts import (
@@ -246,7 +246,7 @@ def without_bad_pixels(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrat
     source = calibrator.recording.events
     encoder = calibrator.recording.encoder
     assert encoder is not None
-    mask, summary = strange_pixels(stretch(source, encoder), encoder, source.size)
+    mask, summary = find_bad_pixels(searched_part(source, encoder), encoder, source.size)
     if summary.share < LEAST_BAD_SHARE:
         return calibrator, tried
     checks.check_light(mask, summary, calibrator.recording.name)

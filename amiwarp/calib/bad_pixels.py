@@ -22,6 +22,8 @@ LEAST_TURNS = 2
 """Smallest number of turns that are searched, however many events they have."""
 MOST_EVENTS = 2_500_000
 """Number of events above which fewer than :data:`MOST_TURNS` turns are searched."""
+TURNS_BEYOND = 0.05
+"""Part of a turn that is searched beyond whole turns, so that every angle occurs in each of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,21 +56,24 @@ class BadPixelSummary:
         return f"{' and '.join(kinds)} left out, {100.0 * self.share:.0f} % of the events"
 
 
-def stretch(source: EventSource, encoder: Encoder) -> Events:
-    """Return all events of some whole turns in the middle of a recording. Thinned events would not repeat by turn."""
-    first = source.t_first
-    whole = source.t_last + 1 - source.t_first
-    turn = 60e6 / max(abs(encoder.rpm), 1e-6)
-    affordable = MOST_EVENTS * whole / (len(source) * turn)
-    turns = min(max(affordable, LEAST_TURNS), MOST_TURNS)
-    # two turns may hold more than MOST_EVENTS, but turns of a very slow prism must not load a whole file
-    most = min(whole, 4.0 * MOST_EVENTS * whole / len(source))
-    length = math.ceil(min((math.floor(turns) + 0.05) * turn, most))
-    start = first + (whole - length) // 2
-    return source.between(start, start + length)
+def searched_part(source: EventSource, encoder: Encoder) -> Events:
+    """Return all events of some whole turns in the middle of a recording; of a very slow prism, of less than a turn.
+
+    Thinned events would not repeat by turn.
+    """
+    first_us = source.t_first
+    whole_us = source.t_last + 1 - source.t_first
+    turn_us = 60e6 / max(abs(encoder.rpm), 1e-6)
+    affordable_turns = MOST_EVENTS * whole_us / (len(source) * turn_us)
+    turns = min(max(affordable_turns, LEAST_TURNS), MOST_TURNS)
+    # Two turns may hold more than MOST_EVENTS, but turns of a very slow prism must not load a whole file.
+    most_us = min(whole_us, 4.0 * MOST_EVENTS * whole_us / len(source))
+    length_us = math.ceil(min((math.floor(turns) + TURNS_BEYOND) * turn_us, most_us))
+    start_us = first_us + (whole_us - length_us) // 2
+    return source.between(start_us, start_us + length_us)
 
 
-def strange_pixels(
+def find_bad_pixels(
     events: Events, encoder: Encoder, size: tuple[int, int]
 ) -> tuple[NDArray[np.bool_], BadPixelSummary]:
     """Find hot pixels and pixels that see a flickering lamp.
@@ -79,8 +84,8 @@ def strange_pixels(
     Parameters
     ----------
     events : Events
-        A sensor's events (uint16) in the order of time. Use all events of some turns, see :func:`stretch`; thinned
-        events reveal less.
+        A sensor's events (uint16) in the order of time. Use all events of some turns, see :func:`searched_part`;
+        thinned events reveal less.
     encoder : Encoder
         Encoder that covers the events.
     size : (int, int)

@@ -5,8 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.camera_rates import ANGLE_RANGES
-from amiwarp.calib.first_guess import BIN_US, LONGEST_US, count_signed
+from amiwarp.calib.first_guess import ANGLE_RANGES, BIN_US, LONGEST_US, count_signed
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.calib.first_guess import ANGLE_RANGES
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
 from amiwarp.optics.camera import Camera
@@ -18,11 +19,9 @@ from amiwarp.optics.camera import Camera
 Vector = NDArray[np.float64]
 Rates = tuple[float, float, float]
 
-ANGLE_RANGES = 24
-"""Number of ranges of prism angles per turn."""
 LEAST_TURNED = 1.25 * math.tau
 """Smallest angle of the prism from which the angular velocity is estimated [rad]."""
-CELL_PX = 2.0
+CELL_PX = 2
 """Side of the cells in which events are counted, and of the cells of the correlations [px]."""
 PATCHES = (6, 5)
 """Number of image patches along x and y."""
@@ -30,12 +29,13 @@ SMOOTHING_PX = 2.0
 """Standard deviation of the Gaussian that smooths the correlations [px]."""
 PEAKS = 3
 """Number of correlation peaks examined per image patch."""
-BESIDE = np.arange(-4, 5)
+PEAK_NEIGHBOURS = np.arange(-4, 5)
 """Distances from a peak within which there is no other one [cells]."""
 STARTS = 12
 """Number of candidate angular velocities from which the estimate is refined."""
 ROLLS = tuple(range(-60, 61, 12))
-"""Rotations about the optical axis that are combined with each correlation peak [1/focal length per turn]."""
+"""Rotations about the optical axis that are combined with each correlation peak, as the displacement at one focal
+length from the image's middle [px per turn]."""
 
 
 def estimate_rates(events: Events, encoder: Encoder, camera: Camera) -> Rates:
@@ -57,14 +57,14 @@ def estimate_rates(events: Events, encoder: Encoder, camera: Camera) -> Rates:
 
     # How the image of each patch moves from the first to the second turn.
     within_turn = turned % math.tau
-    ranges = (within_turn * (ANGLE_RANGES / math.tau)).astype(np.int64)
-    turn = (turned / math.tau).astype(np.int64)
-    turn = np.minimum(turn, 2)
-    centres, surfaces = correlations(events, ranges, turn, camera)
+    range_of_event = (within_turn * (ANGLE_RANGES / math.tau)).astype(np.int64)
+    turn_of_event = (turned / math.tau).astype(np.int64)
+    turn_of_event = np.minimum(turn_of_event, 2)  # 2: after two turns, not used
+    centres, surfaces = _correlations(events, range_of_event, turn_of_event, camera)
     agreement = _agreement_with(centres, surfaces, camera, turn_s)
 
     unit = 1.0 / (camera.fx * turn_s)  # moves the image by about one pixel per turn
-    candidates = np.array(hypotheses(surfaces, unit))
+    candidates = np.array(_candidate_rates(surfaces, unit))
     worst_first = np.argsort(agreement(candidates), kind="stable")
     starts = candidates[worst_first[-STARTS:]]
     return _refined(agreement, starts, unit)
@@ -110,7 +110,7 @@ def _agreement_with(
     rays = np.asarray(camera.pixels_to_rays(centres.astype(np.float32)), np.float64)
     farthest = max(surfaces.shape[1:]) / 2
 
-    def moved(rates: Vector) -> Vector:
+    def centres_after_turn(rates: Vector) -> Vector:
         """Return where the centres are after a turn [px], shape (n, patches, 2)."""
         # a static point moves against the camera's rotation
         rotations = Rotation.from_rotvec(-rates * turn_s).as_matrix()
@@ -120,7 +120,7 @@ def _agreement_with(
         return pixels.reshape(len(rates), len(centres), 2)
 
     def agreement(rates: Vector) -> Vector:
-        cells = (moved(rates) - centres) / CELL_PX
+        cells = (centres_after_turn(rates) - centres) / CELL_PX
         # A rotation that moves a patch beyond the correlations agrees with nothing.
         is_near = np.abs(cells) <= farthest
         inside = is_near.all(axis=(1, 2))
@@ -135,7 +135,7 @@ def _agreement_with(
     return agreement
 
 
-def hypotheses(surfaces: Vector, unit: float) -> list[Rates]:
+def _candidate_rates(surfaces: Vector, unit: float) -> list[Rates]:
     """Return candidate angular velocities [rad/s]: each patch's correlation peaks, combined with several rolls."""
     found: list[Rates] = []
     for surface in [surfaces.sum(axis=0), *surfaces]:
@@ -149,8 +149,8 @@ def hypotheses(surfaces: Vector, unit: float) -> list[Rates]:
                 found.append((y * unit, -x * unit, roll * unit))
 
             # The next peak is not beside this one.
-            near_rows = (row + BESIDE) % rows
-            near_columns = (column + BESIDE) % columns
+            near_rows = (row + PEAK_NEIGHBOURS) % rows
+            near_columns = (column + PEAK_NEIGHBOURS) % columns
             surface = surface.copy()
             surface[np.ix_(near_rows, near_columns)] = 0.0
     return found
@@ -160,25 +160,25 @@ def _displacement(cell: int, cells: int) -> float:
     """Return the displacement [px] of a cell of a correlation with periodic borders: the far half is negative."""
     if cell > cells / 2:
         cell -= cells
-    return CELL_PX * cell
+    return float(CELL_PX * cell)
 
 
-def correlations(
+def _correlations(
     events: Events,
-    ranges: NDArray[np.int64],
-    turn: NDArray[np.int64],
+    range_of_event: NDArray[np.int64],
+    turn_of_event: NDArray[np.int64],
     camera: Camera,
 ) -> tuple[Vector, Vector]:
     """Return the centres of the patches [px] and the cross-correlation of successive turns in each patch.
 
-    ``ranges`` holds the range of prism angles of each event, and ``turn`` its turn: only 0 and 1 are used.
-    The centres have shape (patches, 2). The correlations have shape (patches, rows, columns), cells of 2 px of
-    displacement, periodic borders and values from 0 to 1.
+    ``range_of_event`` holds the range of prism angles of each event, and ``turn_of_event`` its turn: only 0 and 1 are
+    used. The centres have shape (patches, 2). The correlations have shape (patches, rows, columns), cells of
+    :data:`CELL_PX` of displacement, periodic borders and values from 0 to 1.
     """
     from scipy.ndimage import gaussian_filter
 
-    rows = camera.height // 2
-    columns = camera.width // 2
+    rows = camera.height // CELL_PX
+    columns = camera.width // CELL_PX
     padded_rows = _padded(rows)
     padded_columns = _padded(columns)
     size = (padded_rows, padded_columns)
@@ -187,9 +187,9 @@ def correlations(
 
     spectra = np.zeros((patches, padded_rows, padded_columns // 2 + 1), np.complex128)
     for range_index in range(ANGLE_RANGES):
-        in_range = ranges == range_index
-        first_turn = np.flatnonzero(in_range & (turn == 0))
-        second_turn = np.flatnonzero(in_range & (turn == 1))
+        in_range = range_of_event == range_index
+        first_turn = np.flatnonzero(in_range & (turn_of_event == 0))
+        second_turn = np.flatnonzero(in_range & (turn_of_event == 1))
         before = _signed_counts_in_cells(events[first_turn], rows, columns)
         after = _signed_counts_in_cells(events[second_turn], rows, columns)
         after_spectrum = np.fft.rfft2(after, size)
@@ -204,7 +204,9 @@ def correlations(
         gaussian_filter(correlation, smoothing, output=surface, mode="wrap")
     highest = surfaces.max(axis=(1, 2), keepdims=True)
     positive = np.maximum(surfaces, 0.0)
-    return CELL_PX * centres + 0.5, positive / np.maximum(highest, 1e-12)
+    # Cell c holds the pixels 2c and 2c + 1, whose middle is 2c + 0.5.
+    middle_of_cell = 0.5 * (CELL_PX - 1)
+    return CELL_PX * centres + middle_of_cell, positive / np.maximum(highest, 1e-12)
 
 
 def _padded(cells: int) -> int:
@@ -214,7 +216,10 @@ def _padded(cells: int) -> int:
 
 
 def _patches(rows: int, columns: int) -> tuple[Vector, list[Vector]]:
-    """Return the centres of the patches [cells], shape (n, 2), and a Gaussian window about each, (rows, columns)."""
+    """Return the centres of the patches [cells], shape (n, 2), and a Gaussian window about each, (rows, columns).
+
+    Both are half a cell right of and below the patches' middles, which changes nothing, because they agree.
+    """
     across, down = PATCHES
     spread_x = columns / across * 0.5
     spread_y = rows / down * 0.5
@@ -233,9 +238,9 @@ def _patches(rows: int, columns: int) -> tuple[Vector, list[Vector]]:
 
 
 def _signed_counts_in_cells(events: Events, rows: int, columns: int) -> Vector:
-    """Return the number of ON minus OFF events in cells of 2 × 2 px, shape (rows, columns)."""
-    row = np.minimum(events.y // 2, rows - 1).astype(np.int64)
-    column = np.minimum(events.x // 2, columns - 1)
+    """Return the number of ON minus OFF events in cells of :data:`CELL_PX`, shape (rows, columns)."""
+    row = np.minimum(events.y // CELL_PX, rows - 1).astype(np.int64)
+    column = np.minimum(events.x // CELL_PX, columns - 1)
     cell = row * columns + column
     sign = 2.0 * events.p - 1.0
     counts = np.bincount(cell, weights=sign, minlength=rows * columns)

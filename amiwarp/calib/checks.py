@@ -11,7 +11,7 @@ from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.canvas import Image
-from amiwarp.imaging.sharpness import edge_coherence
+from amiwarp.imaging.edge_coherence import edge_coherence
 from amiwarp.io.assumptions import ASSUMED_SIZE
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.models.registry import MODELS

@@ -47,17 +47,19 @@ turns may no longer be whole at the corrected speed."""
 MORE_CORRECTIONS = 2
 """Largest number of times that a correction of the encoder's angles is corrected again, if an error of them is left."""
 QUADRATURE = (0.25, 0.5, 2.0, 4.0)
+"""Scales of a quadrature encoder of which other edges are counted than stated."""
 NEAR_QUADRATURE = 0.03
-"""Scales of a quadrature encoder of which other edges are counted than stated, and how near a found one must be."""
+"""Largest relative difference of a found scale from one of :data:`QUADRATURE` that is taken for it."""
 DOUBTFUL_PATH_RATIO = 0.9
 """Ratio of the costs with and without a path between pulses up to which the path is taken if the pulses confirm it, or
 else the speed between them is said to vary. It was 0.85 where a speed that hunted by 3 % left 0.16 px; much noise makes
 both costs high."""
-DOUBTFUL_PATH = (
+VARYING_SPEED_TEXT = (
     "the encoder gives pulses only, and the speed between them varies or cannot be told from the events: the "
     "result may be off by a tenth of a pixel or more; let the motor turn more steadily, hold the camera still, or use "
     "an encoder with more samples a turn"
 )
+"""Warning about pulses between which the speed varies, or may vary."""
 BETWEEN_PULSES = "a speed that varies between pulses"
 """Words of what could hide in the angle between pulses."""
 LEAST_BETWEEN_PX = 0.01
@@ -68,7 +70,8 @@ of 0.024 px, with 16 it left 0.002 px. The paths of a pair have as many each, bu
 GRADUAL_US = 5000
 """Duration of a step of an encoder's angle above which the events must tell how it came about [us]."""
 LEAST_SCALE_ERROR = 0.003
-"""Smallest relative error of an encoder's scale that is reported. Three turns measure the scale to about 0.001."""
+"""Smallest relative error of an encoder's scale that is tried and reported. Three turns measure the scale to about
+0.001."""
 
 
 def with_mended_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, Attempt]:
@@ -102,17 +105,30 @@ def _explains_more(again: Attempt, tried: Attempt, encoder: Encoder) -> bool:
 
     ``encoder`` is the one of the recording, with whose angles ``tried`` was made.
     """
-    still = not (again.unexplained or again.camera_turned)
-    examined = again.accepted
-    most_cost = tried.cost
+    if again.calibration is None:
+        return False
+    if again.cost <= limits.LARGEST_COST_RATIO * tried.cost:
+        return True
     if any(map(lost_counts, each_encoder(encoder))):
-        # no prism makes such steps: they need no lower cost, and what else is wrong is looked for next
-        most_cost *= LARGEST_STRAIGHT_COST_RATIO
-        still |= tried.unexplained or tried.camera_turned
-        examined |= again.photometric is not None and bool(again.photometric.harmonics)
-    holds = examined and again.cost < most_cost and still
-    much_better = again.cost <= limits.LARGEST_COST_RATIO * tried.cost
-    return again.calibration is not None and (holds or much_better)
+        return _repairs_steps(again, tried)
+    return again.accepted and again.cost < tried.cost and not _something_moves(again)
+
+
+def _repairs_steps(again: Attempt, tried: Attempt) -> bool:
+    """Return whether an attempt without the encoder's steps is good enough to replace the attempt with them.
+
+    No prism makes such steps: the attempt needs no lower cost, and what else is wrong is looked for next.
+    """
+    has_harmonics = again.photometric is not None and bool(again.photometric.harmonics)
+    may_be_judged = again.accepted or has_harmonics
+    explains_as_much = _something_moves(tried) or not _something_moves(again)
+    is_as_low = again.cost < LARGEST_STRAIGHT_COST_RATIO * tried.cost
+    return may_be_judged and explains_as_much and is_as_low
+
+
+def _something_moves(attempt: Attempt) -> bool:
+    """Return whether an attempt leaves events unexplained, or explains them by a camera that turns."""
+    return bool(attempt.unexplained or attempt.camera_turned)
 
 
 def _with_path_between_pulses(
@@ -124,7 +140,7 @@ def _with_path_between_pulses(
     """
     encoder = calibrator.recording.encoder
     assert encoder is not None
-    doubtful = replace(calibrator, mended_words=DOUBTFUL_PATH)
+    doubtful = replace(calibrator, mended_words=VARYING_SPEED_TEXT)
     try:
         between = between_pulses(calibrator, tried, search)
     except AmiwarpError:  # the events do not determine the path
@@ -133,7 +149,8 @@ def _with_path_between_pulses(
     # A path that was found in place of a turning camera's motion tells nothing of the pulses.
     untold_px = BOUND * between.std_px
     if not (tried.unexplained or tried.camera_turned):
-        scatter = min(between.std_px, between.deviation_px)  # is a part of the deviation
+        # The fit's own scatter is a part of the deviation, and is stated apart.
+        scatter = min(between.std_px, between.deviation_px)
         left_px = math.sqrt(between.deviation_px**2 - scatter**2)
         bound_px = left_px + untold_px
         calibrator = replace(calibrator, hidden_px={BETWEEN_PULSES: bound_px})
@@ -174,14 +191,14 @@ def _with_all_counts(calibrator: Calibrator, tried: Attempt) -> Calibrator | Non
     encoder = recording.encoder
     assert encoder is not None
     names = angle_names(MODELS[calibrator.settings.model])
-    mended = [*each_encoder(encoder)]
+    encoders = [*each_encoder(encoder)]
     gradual: list[int] = []
     said: list[str] = []
     for angle, each in enumerate(each_encoder(encoder)):
         steps, shown = _steps_of(each, recording, tried)
         if not steps:
             continue
-        mended[angle] = without_steps(each, steps)
+        encoders[angle] = without_steps(each, steps)
         if any(step.last_us - step.first_us > GRADUAL_US for step in steps):
             gradual.append(angle)
         begin_us = recording.events.t_first + round(encoder.clock_offset_us)
@@ -189,7 +206,7 @@ def _with_all_counts(calibrator: Calibrator, tried: Attempt) -> Calibrator | Non
     if not said:
         return None
 
-    without = together(mended)
+    without = together(encoders)
     if gradual:
         without = _fitted_encoder(_on_angles(calibrator, without), gradual)
     words = (
@@ -404,7 +421,7 @@ def with_other_encoder(calibrator: Calibrator, tried: Attempt) -> WrongEncoder |
 
 
 def _other_scales(calibrator: Calibrator) -> list[float]:
-    """Return the turns that the encoder may show for one turn of the prism, the likeliest first; -1 is backwards.
+    """Return the turns that the encoder may show for one turn of the prism. -1 is backwards, which is tried first.
 
     The events of a still scene repeat every turn of the prism. If they repeat at another encoder angle, the
     encoder's scale may be wrong.

@@ -13,6 +13,8 @@ from amiwarp.events.recording import Recording
 
 CELL = 8
 """Side of the cells in which events are counted [px]."""
+ANGLE_RANGES = 24
+"""Number of ranges of prism angles per turn in which events of successive turns are compared."""
 BIN_US = 1000
 """Length of the time bins in which events are counted, unless another one is given [us]."""
 LONGEST_US = 3_000_000
@@ -26,8 +28,9 @@ LEAST_CORRELATION = 0.1
 UNLIKE = 0.2
 """Correlation below which the events of two angles are not alike."""
 ANGLE_BINS = 96
+"""Number of angle bins per turn for the check of an encoder's scale."""
 MOST_TURNS = 24
-"""Angle bins per turn and largest number of turns for the check of an encoder's scale."""
+"""Largest number of turns for the check of an encoder's scale."""
 
 
 def estimate_rpm(recording: Recording, bin_us: int = BIN_US, mover: str = "prism") -> float:

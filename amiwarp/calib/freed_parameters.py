@@ -97,8 +97,8 @@ def _judge(trial: Trial, group: str) -> FreedParameter:
         return _undetermined(group, std, f"{how}, {share:.1g} of the largest curvature")
 
     # Whether held-out turns are sharper with it.
-    held = trial.test.each(space, trial.sharpest([0, 1]))
-    freed = trial.test.each(space, trial.sharpest(which))
+    held = trial.test.of_parts(space, trial.sharpest([0, 1]))
+    freed = trial.test.of_parts(space, trial.sharpest(which))
     _, _, gain = trial.as_motion(freed - held)
     moved = float(np.linalg.norm(quadratic.step_to_maximum()[2:]))
     wins = gain[0] > 0.0 and moved > trial.budget_px

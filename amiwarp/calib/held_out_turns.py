@@ -83,11 +83,11 @@ class HalfSharpness:
         self._meter = SharpnessMeter(
             canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=device
         )
-        self.fastest: dict[str, float] = {}
+        self.fastest_s: dict[str, float] = {}
         """Shortest measured time for one event's angle, displacement and vote [s], by name of the model."""
 
-    def each(self, space: ParameterSpace, values: Mapping[str, float]) -> Vector:
-        """Return the sharpness of each part, shape (PARTS,)."""
+    def of_parts(self, space: ParameterSpace, values: Mapping[str, float]) -> Vector:
+        """Return the sharpness of each part, shape (PARTS,), and note the time in :attr:`fastest_s`."""
         model = space.build(values)
         device = self._meter.device
         self._votes.clear()
@@ -100,8 +100,9 @@ class HalfSharpness:
             camera_rotation=space.camera_rotation(values),
         )
         wp.synchronize_device(device)
-        took = (time.perf_counter() - began) / max(self._events.count, 1)
-        self.fastest[space.model] = min(took, self.fastest.get(space.model, math.inf))
+        seconds_per_event = (time.perf_counter() - began) / max(self._events.count, 1)
+        fastest_s = self.fastest_s.get(space.model, math.inf)
+        self.fastest_s[space.model] = min(seconds_per_event, fastest_s)
         self._votes.read(self._meter.image)
         self._meter.launch()
         return np.array(self._meter.results())
@@ -111,15 +112,15 @@ def gradient(half: HalfSharpness, space: ParameterSpace, v: Vector) -> Vector:
     """Return the gradient of the mean sharpness at a search vector [1/px]."""
     rise = []
     for step in STEP_PX * np.eye(len(v)):
-        ahead = half.each(space, space.to_values(v + step))
-        behind = half.each(space, space.to_values(v - step))
+        ahead = half.of_parts(space, space.to_values(v + step))
+        behind = half.of_parts(space, space.to_values(v - step))
         rise.append(ahead - behind)
     return np.asarray(np.mean(rise, axis=1) / (2.0 * STEP_PX))
 
 
 @dataclass(frozen=True)
-class Quadratic:
-    """Quadratic approximation of sharpness about a point along n directions."""
+class QuadraticSharpness:
+    """QuadraticSharpness approximation of sharpness about a point along n directions."""
 
     slopes: Vector
     """Gradient of the sharpness of each part of the events [1/px], shape ``(n, parts)``."""
@@ -129,29 +130,34 @@ class Quadratic:
     @classmethod
     def about(
         cls, half: HalfSharpness, space: ParameterSpace, v: Vector, directions: Vector
-    ) -> Quadratic:
+    ) -> QuadraticSharpness:
         """Return the approximation about a search vector.
 
         Each row of ``directions`` is a vector that moves events by one pixel, shape (n, entries of the vector).
         """
-        each = partial(half.each, space)
-        slopes, hessian = finite_differences(each, space, v, directions)
+        of_parts = partial(half.of_parts, space)
+        slopes, hessian = finite_differences(of_parts, space, v, directions)
         return cls(slopes, hessian)
 
-    def restricted_to(self, which: list[int]) -> Quadratic:
+    def restricted_to(self, which: list[int]) -> QuadraticSharpness:
         """Return the approximation along the directions whose numbers are in ``which``."""
-        return Quadratic(self.slopes[which], self.hessian[np.ix_(which, which)])
+        return QuadraticSharpness(self.slopes[which], self.hessian[np.ix_(which, which)])
 
-    def step_to_maximum(self, gradient: Vector | None = None) -> Vector:
+    def _curvatures(self) -> tuple[Vector, Vector, float]:
+        """Return the curvatures [1/px²], the directions in which they are, and the smallest one that counts."""
+        values, vectors = np.linalg.eigh(-self.hessian)
+        floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
+        return values, vectors, floor
+
+    def step_to_maximum(self, other_gradient: Vector | None = None) -> Vector:
         """Return the step to the sharpest point [px]: 0 along flat directions, at most :data:`LONGEST_STEP_PX` long.
 
-        ``gradient`` [1/px] replaces the approximation's own gradient, for another model with about the same Hessian.
+        ``other_gradient`` [1/px] replaces the approximation's own gradient, for another model with about the same
+        Hessian.
         """
-        values, vectors = np.linalg.eigh(-self.hessian)
-        if gradient is None:
-            gradient = self.slopes.mean(axis=1)
-        along = vectors.T @ gradient
-        floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
+        values, vectors, floor = self._curvatures()
+        own_gradient = self.slopes.mean(axis=1)
+        along = vectors.T @ (own_gradient if other_gradient is None else other_gradient)
         to_maximum = along / np.maximum(values, floor)
         step = vectors @ np.where(values > floor, to_maximum, 0.0)
         length = max(float(np.linalg.norm(step)), 1e-12)
@@ -164,8 +170,8 @@ class Quadratic:
 
     def deviations(self) -> Vector:
         """Return the standard deviation of the maximum along each direction [px], by the sandwich estimate."""
-        values, vectors = np.linalg.eigh(-self.hessian)
-        floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
+        values, vectors, floor = self._curvatures()
+        # Flat directions count with the smallest curvature, so that their deviation is large but finite.
         inverse_values = np.diag(1.0 / np.maximum(values, floor))
         inverse = vectors @ inverse_values @ vectors.T
         parts = self.slopes.shape[1]

@@ -194,7 +194,7 @@ def _refined(trial: Trial, name: str) -> Vector:
     space, values = trial.fitted(name, trial.answer)
     v = space.to_vector(values)
     step = trial.quadratic.restricted_to([0, 1]).step_to_maximum(gradient(trial.train, space, v))
-    return trial.test.each(space, space.to_values(v + step))
+    return trial.test.of_parts(space, space.to_values(v + step))
 
 
 def _candidate(
@@ -208,7 +208,7 @@ def _candidate(
     if held_out is not None:
         sharpness = float(held_out.mean())
         mean, std, seen = trial.as_motion(trial.reference - held_out)
-        cost = 1e9 * min(half.fastest[name] for half in (trial.train, trial.test))
+        cost = 1e9 * min(half.fastest_s[name] for half in (trial.train, trial.test))
     chosen = (
         predicted <= trial.budget_px
         and not found

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.first_guess import CELL
+from amiwarp.calib.first_guess import ANGLE_RANGES, CELL
 from amiwarp.calib.lost_counts import (
     FEWEST_PULSES,
     Step,
@@ -20,7 +20,7 @@ from amiwarp.calib.lost_counts import (
     steps_in_samples,
 )
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 
 Vector = NDArray[np.float64]
 Spectrum = NDArray[np.complex128]
@@ -28,8 +28,9 @@ Spectrum = NDArray[np.complex128]
 SAME_STEP = math.radians(0.5)
 """Largest difference of a step in the samples from the same one in the events [rad]."""
 ANGLE_BINS = 96
+"""Number of bins of the angle in a turn in which events are counted."""
 FINE_BINS = 8192
-"""Number of bins of the angle in a turn in which events are counted, and in which the angle of a turn is found."""
+"""Number of bins of the angle in a turn in which the angle of a turn is found."""
 LEAST_CORRELATION = 0.3
 """Smallest correlation of the events of a turn with the events of the turns before it for the events to repeat. It was
 0.5 for a still scene, and more with more events in a cell."""
@@ -149,3 +150,24 @@ def _best_shift(total: Spectrum, spectrum: Spectrum) -> tuple[float, float]:
     size = math.sqrt(energy * energy_of_turn)
     correlation = 0.5 * FINE_BINS * float(likeness[best]) / max(size, 1e-30)
     return shift, correlation
+
+
+def counts_of(turn: Events, encoder: Encoder, size: tuple[int, int]) -> Vector:
+    """Return the events of a turn, ON minus OFF, by cell of the image and range of prism angles, flattened."""
+    width, height = size
+    columns = math.ceil(width / CELL)
+    rows = math.ceil(height / CELL)
+    ranges = np.floor(encoder.angle_at(turn.t) * (ANGLE_RANGES / math.tau))
+    angle = ranges.astype(np.int64) % ANGLE_RANGES
+    row = (turn.y // CELL).astype(np.int64)
+    cell = row * columns + turn.x // CELL
+    signs = 2.0 * turn.p - 1.0
+    bins = rows * columns * ANGLE_RANGES
+    counts = np.bincount(cell * ANGLE_RANGES + angle, weights=signs, minlength=bins)
+    return np.asarray(counts, np.float64)
+
+
+def repetition(before: Vector, counts: Vector) -> float:
+    """Return the correlation of the events of a turn with the turn before."""
+    energy = math.sqrt(float(counts @ counts) * float(before @ before))
+    return float(counts @ before) / max(energy, 1e-30)

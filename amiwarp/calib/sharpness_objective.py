@@ -139,7 +139,7 @@ class Objective:
         """Return the sharpness at a search vector [px]."""
         return self.values(self.space.to_values(v))
 
-    def each(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+    def of_parts(self, values: Mapping[str, float]) -> NDArray[np.float64]:
         """Return the sharpness of each part at parameter values, shape (parts,)."""
         return np.array(self.measure(values))
 

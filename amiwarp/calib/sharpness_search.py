@@ -372,14 +372,14 @@ class Search:
         measured here.
         """
         parts = self._objective_by_parts(Sharpness.VARIANCE)
-        here = parts.each(self.best)
+        here = parts.of_parts(self.best)
         space = self.space
         if space.moving:
             at_rest = dict.fromkeys((name for name in MOTION if name in self.best), 0.0)
             others_best = {name: other.best[name] for name in other.space.names}
-            there = parts.each({**self.best, **others_best, **at_rest})
+            there = parts.of_parts({**self.best, **others_best, **at_rest})
         else:
-            there = other._objective_by_parts(Sharpness.VARIANCE).each(other.best)
+            there = other._objective_by_parts(Sharpness.VARIANCE).of_parts(other.best)
         return checks.significance(here, there)
 
     def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
@@ -394,7 +394,7 @@ class Search:
             variance = parts if plain else self._objective_by_parts(Sharpness.VARIANCE)
             kind = MODELS[space.model]
             points = (best, kind.turned_values(best, math.pi), kind.still_values(best))
-            sharp, opposite, still = (variance.each(values) for values in points)
+            sharp, opposite, still = (variance.of_parts(values) for values in points)
             if "photometric" in self.settings.stages:
                 size = space.size_name
                 nearly_inside = best[size] + LEAST_INSIDE_PX / space.pixels[size]
@@ -496,7 +496,7 @@ def estimate_covariance(
     The sandwich estimate H⁻¹ cov(g) H⁻¹ / n from n disjoint parts of the events: g is a part's gradient at the optimum
     of all events, and H the mean Hessian of the parts.
     """
-    slopes, hessian = finite_differences(parts.each, parts.space, v, np.eye(len(v)))
+    slopes, hessian = finite_differences(parts.of_parts, parts.space, v, np.eye(len(v)))
     gradients = slopes.T
     values, vectors = np.linalg.eigh(-hessian)
     largest = max(float(values.max()), 1e-12)

@@ -30,15 +30,18 @@ LEAST_RATIO = 10
 """Smallest ratio of the number of events at the first time stamp to the number at any later one that is compared.
 Where many events share each time stamp because a clock is coarse, the first one has no more than the others."""
 COMPARED = 4
+"""Number of later events that are compared, as a multiple of the events at the first time stamp."""
 MOST_COMPARED = 1 << 20
-"""Number of later events that are compared, as a multiple of the events at the first time stamp, and its limit."""
+"""Largest number of later events that are compared."""
 WINDOWS_US = (20, 200, 2000)
 """Lengths of a burst that is spread over several time stamps, or that falls on a tick of a coarse clock [us]."""
 FEWEST_IN_WINDOW = 1000
+"""Smallest number of events of a burst that is spread over several time stamps."""
 LEAST_WINDOW_RATIO = 2.0
+"""Smallest ratio of the events of such a burst to the number in any later window of that length. The rate of a still
+scene changes by less, and slowly."""
 FEWEST_WINDOWS = 50
-"""Smallest number of events of such a burst, smallest ratio of it to the number in any later window of that length, and
-smallest number of later windows with events. The rate of a still scene changes by less, and slowly."""
+"""Smallest number of later windows with events to which such a burst is compared."""
 LARGEST_TAIL = 0.2
 """Largest share of what such a burst has beyond the usual number of events in a window that the next window has. A
 burst ends. Pixels that begin at their references give many events at first too, which grow fewer slowly."""
@@ -57,10 +60,10 @@ def without_start_burst(recording: Recording) -> tuple[Recording, tuple[str, ...
     if isinstance(source, MemoryEvents):
         later = MemoryEvents(later[:], *source.size)
     last = int(source.slice(count - 1, count).t[0])
-    stamps = f"carry the first time stamp ({source.t_first} us), far more than any later one"
+    clause = f"carry the first time stamp ({source.t_first} us), far more than any later one"
     if last > source.t_first:
-        stamps = f"came in the first {last - source.t_first} us (from {source.t_first} us on), far more than later"
-    warning = f"{count:,} events {stamps}, as cameras emit when they start: they were left out of the calibration"
+        clause = f"came in the first {last - source.t_first} us (from {source.t_first} us on), far more than later"
+    warning = f"{count:,} events {clause}, as cameras emit when they start: they were left out of the calibration"
     # The ground truth has a value for each event of the whole recording. Calibration does not use it.
     return replace(recording, events=later, truth=None), (warning,)
 
@@ -88,7 +91,7 @@ def _size_within(source: EventSource, window_us: int) -> int:
     if count < FEWEST_IN_WINDOW:
         return 0
     t = source.slice(count, count + MOST_COMPARED).t
-    # the last window may not be whole, which makes it smaller
+    # Windows without events do not count. The last window may not be whole, which makes it smaller.
     later = _runs((t - first) // window_us)
     if len(later) < FEWEST_WINDOWS or count < LEAST_WINDOW_RATIO * int(later.max()):
         return 0

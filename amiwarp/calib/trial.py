@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.calibration_events import CalibrationEvents
 from amiwarp.calib.groundwork import CIRCLES, TILT, Groundwork, accepted_photometric, lay_groundwork
-from amiwarp.calib.held_out_turns import HalfSharpness, Quadratic, split_turns
+from amiwarp.calib.held_out_turns import HalfSharpness, QuadraticSharpness, split_turns
 from amiwarp.calib.model_fit import BUDGET_SHARE, ellipse_error, fit_models
 from amiwarp.calib.settings import Settings
 from amiwarp.calib.thinning import thin_events
@@ -84,15 +84,15 @@ class Trial(Groundwork):
         return self._halves[1]
 
     @cached_property
-    def quadratic(self) -> Quadratic:
+    def quadratic(self) -> QuadraticSharpness:
         """Quadratic approximation of the exact model's sharpness on the training turns, along all tested directions."""
         rows = [self.space.names.index(n) for n in self.tested]
-        return Quadratic.about(self.train, self.space, self.start, self.directions[rows])
+        return QuadraticSharpness.about(self.train, self.space, self.start, self.directions[rows])
 
     @cached_property
     def reference(self) -> Vector:
         """Sharpness of the exact model on the held-out turns, with the parameters sharpest on the training turns."""
-        return self.test.each(self.space, self.sharpest([0, 1]))
+        return self.test.of_parts(self.space, self.sharpest([0, 1]))
 
     @property
     def rejection_px(self) -> float:

@@ -20,6 +20,8 @@ BAD_INPUT = 1
 """Exit code for input that cannot be used."""
 USAGE = 2
 """Exit code for a command line that is wrong."""
+REPEAT_S = 0.05
+"""Delay of a repeated interrupt [s], by when the finaliser that caught it has ended."""
 
 _UsageError: Any = typer.BadParameter.__base__
 """Class ``UsageError`` of click, taken from Typer, because newer versions of Typer contain their own copy of click."""
@@ -28,7 +30,7 @@ _UsageError: Any = typer.BadParameter.__base__
 class Command(NamedTuple):
     """Entry of the list of commands. Its texts are here so that ``amiwarp --help`` need not load the command."""
 
-    room: str
+    package: str
     """Package whose module ``commands`` has the function ``run_NAME``, with ``_`` for a hyphen."""
     summary: str
     """First sentence of the help."""
@@ -189,7 +191,7 @@ COMMANDS = {
 
 def function_of(name: str) -> Callable[..., None]:
     """Load the module of a command and return the command's function."""
-    module = importlib.import_module(f"amiwarp.{COMMANDS[name].room}.commands")
+    module = importlib.import_module(f"amiwarp.{COMMANDS[name].package}.commands")
     function: Callable[..., None] = getattr(module, f"run_{name.replace('-', '_')}")
     return function
 
@@ -214,9 +216,9 @@ def _loaded(name: str) -> Any:
     """Load the module of a command and return the command."""
     from amiwarp.cli.common import command  # NumPy is loaded with it
 
-    alone = typer.Typer(rich_markup_mode="rich", add_completion=False)
-    command(alone, function_of(name), name=name, example=COMMANDS[name].example)
-    return typer.main.get_command(alone)
+    parent = typer.Typer(rich_markup_mode="rich", add_completion=False)
+    command(parent, function_of(name), name=name, example=COMMANDS[name].example)
+    return typer.main.get_command(parent)
 
 
 class _Group(TyperGroup):
@@ -231,6 +233,7 @@ class _Group(TyperGroup):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help with the summaries, without loading the commands."""
+        # TyperGroup takes the help of each command from here.
         self.commands = {
             name: TyperCommand(name, help=command.summary) for name, command in COMMANDS.items()
         }
@@ -240,7 +243,7 @@ class _Group(TyperGroup):
             self.commands = _LoadedCommands()
 
     def main(self, *args: Any, **extra: Any) -> Any:
-        extra["standalone_mode"] = False
+        extra["standalone_mode"] = False  # click would print errors and exit by itself
         try:
             code = super().main(*args, **extra)
         except _UsageError as error:
@@ -292,7 +295,7 @@ def _repeat_dropped_interrupt(unraisable: Any) -> None:
     if not issubclass(unraisable.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
         return
-    timer = threading.Timer(0.05, _interrupt)
+    timer = threading.Timer(REPEAT_S, _interrupt)
     timer.daemon = True
     timer.start()
 

@@ -12,7 +12,8 @@ from amiwarp.choices import Sharpness
 from amiwarp.events.recording import Events
 from amiwarp.imaging.canvas import CanvasShape
 from amiwarp.imaging.export import PERCENTILE
-from amiwarp.imaging.sharpness import SharpnessMeter, random_variance, relative_variance
+from amiwarp.imaging.relative_variance import random_variance, relative_variance
+from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.uploaded_events import UploadedEvents
 from amiwarp.imaging.votes import Votes
 from amiwarp.optics.models.base import Model
@@ -77,8 +78,8 @@ class RegionSharpness:
         """Return variance and sharpness of the smoothed region.
 
         The variance over mean, as :attr:`amiwarp.Sharpness.VARIANCE`, grows with the number of events. The sharpness,
-        see :func:`amiwarp.imaging.sharpness.relative_variance`, does not depend on it. ``offset_us`` is added to the
-        encoder's clock offset [us].
+        see :func:`amiwarp.imaging.relative_variance.relative_variance`, does not depend on it. ``offset_us`` is added
+        to the encoder's clock offset [us].
         """
         self._votes.add_events(model, events, drift=offset_us)
         left, top, right, bottom = region

@@ -1,14 +1,11 @@
-"""Sharpness of an image of warped events: five measures with one signature, for all of which higher is sharper.
-
-The last function measures how much the image's edges run in one direction.
-"""
+"""Sharpness of an image of warped events: five measures with one signature, for all of which higher is sharper."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -18,7 +15,6 @@ from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_columns import cast, import_array
 from amiwarp.imaging.canvas import CanvasShape, Image
-from amiwarp.kernels.edge_directions import SEGMENT, find_largest, sum_directions
 from amiwarp.kernels.launch import BLOCK_DIM, launch
 from amiwarp.kernels.lowest import lowest_value
 from amiwarp.kernels.page_locked_memory import page_locked
@@ -37,8 +33,22 @@ from amiwarp.kernels.smoothing import (
 from amiwarp.schema.calls import guarded
 from amiwarp.validation import array, choice, on_gpu, real
 
-_Step = tuple[Any, int, list[Any], Any, int]
-"""Kernel with its number of threads, its inputs, its output, and the fewest threads of a CPU slice."""
+
+class Step(NamedTuple):
+    """Launch of a kernel whose last input is its first thread."""
+
+    kernel: Any
+    threads: int
+    inputs: list[Any]
+    output: Any
+    smallest: int
+    """Fewest threads of a CPU slice."""
+
+
+SMALLEST_SLICE_BLOCKS = 512
+"""Fewest threads of a CPU slice, if each smooths a block of pixels."""
+SMALLEST_SLICE_STRIPS = 64
+"""Fewest threads of a CPU slice, if each sums over a strip of the image: these take longer."""
 PAPER_ETA = 1.0
 """Parameter η of the paper's sharpness cost J [events]; He et al. do not state the value that they used."""
 LARGEST_SMOOTHING = 1000.0
@@ -78,16 +88,18 @@ class SharpnessMeter:
             strips = math.ceil(rows * columns / BLOCK_DIM)
         else:
             strips = math.ceil(rows / int(STRIP)) * self.image.frame.blocks
-        self._sums = wp.empty((layers, strips), dtype=wp.vec2d, device=device)
-        self._host = self._sums
+        self._strip_sums = wp.empty((layers, strips), dtype=wp.vec2d, device=device)
+        self._host_sums = self._strip_sums
         if self.device.is_cuda:
-            self._host = page_locked(self, (layers,), wp.vec2d, self.device)
+            self._host_sums = page_locked(self, (layers,), wp.vec2d, self.device)
             # the same memory, into which a kernel writes: a copy would take longer
-            address = self._host.ptr
-            self._sum = wp.array(ptr=address, dtype=wp.vec2d, shape=layers, device=self.device)
+            address = self._host_sums.ptr
+            self._layer_sums = wp.array(
+                ptr=address, dtype=wp.vec2d, shape=layers, device=self.device
+            )
             if len(weights) > 1:
                 _ = self._smoothed  # a captured graph must not allocate it
-        self._sums_on_host = self._host.numpy().reshape(canvas.parts, -1, 2)
+        self._sums_by_part = self._host_sums.numpy().reshape(canvas.parts, -1, 2)
 
     def launch(self, votes: Any = None) -> None:
         """Measure :attr:`image` on the device without waiting for the result.
@@ -103,14 +115,14 @@ class SharpnessMeter:
             launch(kernel, n, inputs, [out], device=self.device)
         wp.launch(
             gather_sums,
-            self._sum.size * BLOCK_DIM,
-            [self._sums],
-            [self._sum],
+            self._layer_sums.size * BLOCK_DIM,
+            [self._strip_sums],
+            [self._layer_sums],
             device=self.device,
             block_dim=BLOCK_DIM,
         )
 
-    def _fused_steps(self, votes: Any) -> Iterator[_Step]:
+    def _fused_steps(self, votes: Any) -> Iterator[Step]:
         """Yield what :meth:`_steps` does, in fewer kernels: for the variance on CUDA."""
         taps = len(self._weights)
         frame = self.image.frame
@@ -118,33 +130,35 @@ class SharpnessMeter:
         smoothed = self._smoothed[0]
         if votes is None:
             inputs = [self.image.pixels, self._weights, 1, frame]
-            yield smooth_few(taps), blocks, inputs, smoothed, 512
+            yield Step(smooth_few(taps), blocks, inputs, smoothed, SMALLEST_SLICE_BLOCKS)
         else:
             inputs = [votes, self._weights, frame]
-            yield smooth_votes(taps), blocks, inputs, smoothed, 512
-        _, strips = self._sums.shape
+            yield Step(smooth_votes(taps), blocks, inputs, smoothed, SMALLEST_SLICE_BLOCKS)
+        _, strips = self._strip_sums.shape
         inputs = [smoothed, self._weights, frame, strips * BLOCK_DIM]
-        threads = self._sums.size * BLOCK_DIM
-        yield smooth_and_add(taps), threads, inputs, self._sums.flatten(), 512
+        threads = self._strip_sums.size * BLOCK_DIM
+        sums = self._strip_sums.flatten()
+        yield Step(smooth_and_add(taps), threads, inputs, sums, SMALLEST_SLICE_BLOCKS)
 
-    def _steps(self) -> Iterator[_Step]:
+    def _steps(self) -> Iterator[Step]:
         """Yield each kernel with its number of threads, inputs, output, and the fewest threads of a CPU slice."""
         pixels = self.image.pixels
         frame = self.image.frame
         taps = len(self._weights)
-        threads = self._sums.size
-        sums = self._sums.flatten()
+        threads = self._strip_sums.size
+        sums = self._strip_sums.flatten()
         is_variance = self.kind is Sharpness.VARIANCE
         if self.device.is_cpu and is_variance and 1 < taps <= MOST_UNROLLED:
             inputs = [pixels, self._weights, frame]
-            yield smooth_and_sum(taps), threads, inputs, sums, 64
+            yield Step(smooth_and_sum(taps), threads, inputs, sums, SMALLEST_SLICE_STRIPS)
             return
         if taps > 1:
             yield from smoothing_steps(self.image, self._weights, self._smoothed)
             pixels = self._smoothed[-1]
         number = list(Sharpness).index(self.kind)
         inputs = [pixels, frame, PAPER_ETA]
-        yield sum_terms(self.image.width, number), threads, inputs, sums, 64
+        kernel = sum_terms(self.image.width, number)
+        yield Step(kernel, threads, inputs, sums, SMALLEST_SLICE_STRIPS)
 
     @cached_property
     def _smoothed(self) -> list[Any]:
@@ -166,7 +180,7 @@ class SharpnessMeter:
         """Wait, and return the sharpness of each part of the last measured image."""
         if self.device.is_cuda:
             wp.synchronize_stream(self.device)
-        sums = self._sums_on_host
+        sums = self._sums_by_part
         # NumPy takes microseconds even for sums of one
         few = sums[:, 0] if sums.shape[1] == 1 else sums.sum(axis=1)
         return [self._score(total, terms) for total, terms in few.tolist()]
@@ -174,7 +188,7 @@ class SharpnessMeter:
     @property
     def finite(self) -> bool:
         """Whether all values of the last measured image were finite."""
-        return bool(np.isfinite(self._sums_on_host[..., 0]).all())
+        return bool(np.isfinite(self._sums_by_part[..., 0]).all())
 
     def measure(self) -> float:
         """Return the sharpness of :attr:`image`, which has one part."""
@@ -182,7 +196,11 @@ class SharpnessMeter:
         return self.results()[0]
 
     def _score(self, total: float, terms: float) -> float:
-        """Return the sharpness from the sum of the image's pixels and the sum of the measure's terms."""
+        """Return the sharpness from the sum of the image's pixels and the sum of the measure's terms.
+
+        Of n pixels x with the gradient g and the Laplacian l, these are: VARIANCE: Σx²/Σx - Σx/n; GRADIENT: Σg²/Σx;
+        LAPLACIAN: Σl²/Σx; ENTROPY: Σ x ln x / Σx - ln Σx; PAPER_J: -Σ 1/(1 + exp(x/η)) over pixels above 0.
+        """
         if total <= 0.0:
             return 0.0
         if self.kind is Sharpness.VARIANCE:
@@ -194,7 +212,7 @@ class SharpnessMeter:
         return terms / total
 
 
-def smoothing_steps(image: Image, weights: wp.array, out: list[wp.array]) -> Iterator[_Step]:
+def smoothing_steps(image: Image, weights: wp.array, out: list[wp.array]) -> Iterator[Step]:
     """Yield the two steps that smooth an image along its rows and columns, as :meth:`SharpnessMeter._steps` does.
 
     ``out``: buffers of the layout of the image for the result of each step.
@@ -203,7 +221,8 @@ def smoothing_steps(image: Image, weights: wp.array, out: list[wp.array]) -> Ite
     kernel = smooth_few(len(weights)) if unrolled else smooth(image.width)
     smoothed = image.pixels
     for step, result in zip((1, image.frame.stride), out, strict=True):
-        yield kernel, image.blocks, [smoothed, weights, step, image.frame], result, 512
+        inputs = [smoothed, weights, step, image.frame]
+        yield Step(kernel, image.blocks, inputs, result, SMALLEST_SLICE_BLOCKS)
         smoothed = result
 
 
@@ -219,42 +238,6 @@ def gaussian(sigma: float) -> NDArray[np.float32]:
     weights = np.exp(-0.5 * (places / sigma) ** 2)
     total = weights[0] + 2.0 * weights[1:].sum()
     return (weights / total).astype(np.float32)
-
-
-def random_variance(smoothing: float) -> float:
-    """Return the variance over mean of an image of random events: bilinear votes at dithered places, then smoothed.
-
-    ``smoothing``: standard deviation of the Gaussian [px].
-    """
-    weights = gaussian(smoothing).astype(np.float64)
-    both_sides = np.concatenate([weights[:0:-1], weights])
-    square = float(both_sides @ both_sides)
-    of_neighbours = float(both_sides[1:] @ both_sides[:-1])
-    # Bilinear votes share an event by 1 - u and u, with u from 0 to 1: 2/3 is the mean of (1 - u)² + u².
-    along_an_axis = (2.0 * square + of_neighbours) / 3.0
-    return along_an_axis**2
-
-
-def relative_variance(variance: float, mean: float, smoothing: float) -> float:
-    """Return the variance of the density of events over the square of its mean, which more events do not change.
-
-    It is 0 for events at random places, whatever their number: the variance that counting gives them is subtracted.
-
-    Parameters
-    ----------
-    variance : float
-        Variance over mean of an image of bilinear votes of dithered events, from :class:`SharpnessMeter`.
-    mean : float
-        Mean of that image [events per pixel], above 0.
-    smoothing : float
-        Standard deviation of the Gaussian that smoothed the image [px].
-
-    Returns
-    -------
-    float
-        The relative variance. It is negative only by noise.
-    """
-    return (variance - random_variance(smoothing)) / mean
 
 
 @guarded
@@ -326,42 +309,3 @@ def sharpness(
             "one image for each polarity, shape (2, height, width)"
         )
     return value
-
-
-EDGE_SMOOTHING_PX = 1.5
-"""Standard deviation of the Gaussian that smooths an image before its gradients are computed [px]."""
-STRONG = 0.1
-"""Share of the largest squared gradient above which a gradient counts."""
-FEW_SEGMENTS = 512
-"""Smallest number of segments for which a second CPU thread is used."""
-
-
-def edge_coherence(image: Image, inset: int) -> float:
-    """Return the coherence of an image's edge directions, |Σ g² e^{2iφ}| / Σ g² over gradients (g, φ), 0 to 1.
-
-    It is 1 if all edges are parallel. The gradients are taken of the sum of all layers. Noise has no direction and
-    lowers the coherence, so weak gradients are left out, and so are pixels within ``inset`` of the image's border.
-    """
-    device = image.device
-    layers, rows, columns = image.shape
-    weights = wp.array(gaussian(EDGE_SMOOTHING_PX), dtype=float, device=device)
-    along_rows = wp.zeros_like(image.pixels)
-    smoothed = wp.zeros_like(image.pixels)
-    for kernel, n, inputs, out, smallest in smoothing_steps(image, weights, [along_rows, smoothed]):
-        launch(kernel, n, inputs, [out], device=device, smallest=smallest)
-
-    inner_rows = max(0, rows - 2 * inset)
-    inner_columns = max(0, columns - 2 * inset)
-    segments = inner_rows * math.ceil(inner_columns / int(SEGMENT))
-    largest: Any = wp.zeros(max(1, segments), dtype=float, device=device)
-    inputs = [smoothed, image.frame, layers, inset]
-    launch(find_largest, segments, inputs, [largest], device=device, smallest=FEW_SEGMENTS)
-
-    limit = STRONG * float(largest.numpy().max())
-    sums: Any = wp.zeros(max(1, segments), dtype=wp.vec3d, device=device)
-    inputs.append(limit)
-    launch(sum_directions, segments, inputs, [sums], device=device, smallest=FEW_SEGMENTS)
-    total, x, y = sums.numpy().sum(axis=0).tolist()
-    if not total > 0.0:
-        return 0.0
-    return math.hypot(x, y) / total

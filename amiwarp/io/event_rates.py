@@ -19,6 +19,9 @@ MOST_BINS = 1 << 19
 MOST_EXACT = 1_000_000
 """Largest number of events that are read to count them in finer bins."""
 
+LEAST_BINS = 4.0
+"""Number of the recording's bins in a bin of a curve below which events are read and counted anew."""
+
 
 class EventRates:
     """Counts of a recording's events over time. Call :meth:`fill` until it returns True, in one thread.
@@ -32,27 +35,27 @@ class EventRates:
         self._stop = source.t_last + 1
         duration_us = self._stop - self._first
         bins = min(MOST_BINS, duration_us)
-        share = np.arange(bins + 1, dtype=np.float64) / bins
-        elapsed = np.rint(share * duration_us)
+        fraction_at_edge = np.arange(bins + 1, dtype=np.float64) / bins
+        elapsed = np.rint(fraction_at_edge * duration_us)
         self._edges = self._first + elapsed.astype(np.int64)
         self._counts = np.zeros((2, bins), np.int64)
         self._blocks: Iterator[Events] = iter(source.blocks())
         nothing = np.zeros((2, bins + 1), np.int64)
-        self._read = (nothing, self._first)
+        self._progress = (nothing, self._first)
         """Number of OFF and ON events before each edge, and the time up to which events are read [us]. They are one
         value, because another thread reads them."""
 
     @property
     def share(self) -> float:
         """Share of the recording's duration that is counted, 0 to 1."""
-        _, read_us = self._read
+        _, read_us = self._progress
         duration_us = self._stop - self._first
         return (read_us - self._first) / duration_us
 
     def fill(self, seconds: float) -> bool:
         """Count events for about ``seconds`` [s], at least one block. Return whether all events are counted."""
         until = time.perf_counter() + seconds
-        _, read_us = self._read
+        _, read_us = self._progress
         for block in self._blocks:
             if len(block):
                 self._count(block)
@@ -63,7 +66,7 @@ class EventRates:
             read_us = self._stop
         sums = np.zeros((2, len(self._edges)), np.int64)
         np.cumsum(self._counts, axis=1, out=sums[:, 1:])
-        self._read = sums, read_us
+        self._progress = sums, read_us
         return read_us == self._stop
 
     def _count(self, block: Events) -> None:
@@ -71,7 +74,7 @@ class EventRates:
         ends = [block.t[0], block.t[-1]]
         first_bin, last_bin = np.searchsorted(self._edges, ends, side="right") - 1
         edges = self._edges[first_bin : last_bin + 2]
-        self._counts[:, first_bin : last_bin + 1] += counted(block, edges)
+        self._counts[:, first_bin : last_bin + 1] += counts_by_polarity(block, edges)
 
     def curve(
         self,
@@ -83,8 +86,9 @@ class EventRates:
 
         Returns edges of the bins on the events' clock [us], shape ``(n + 1,)``, and rates [1/s], shape ``(2, n)``, NaN
         where the recording is not read yet.
-        Bins finer than the bins of the whole recording are counted if the time between holds few events. Otherwise, the
-        curve has fewer bins. Times outside the recording have rate 0.
+        Bins finer than the bins of the whole recording are counted if the time between holds few events: up to
+        :data:`MOST_EXACT` are then read from the source. Otherwise, the curve has fewer bins. Times outside the
+        recording have rate 0.
         """
         start_us = int(start_us)
         end_us = max(int(end_us), start_us + 1)
@@ -94,13 +98,13 @@ class EventRates:
 
         finest_us = (self._stop - self._first) / (len(self._edges) - 1)
         bin_us = edges[1] - edges[0]
-        is_fine = bin_us < 4.0 * finest_us and finest_us > 1.0
+        is_fine = bin_us < LEAST_BINS * finest_us and finest_us > 1.0
         if is_fine:
-            counts = self._exact(edges)
+            counts = self._counts_from_source(edges)
             if counts is not None:
                 return edges, counts / np.diff(edges) * 1e6
             edges = self._edges_within(start_us, end_us, bins)
-        return edges, self._from_sums(edges) / np.diff(edges) * 1e6
+        return edges, self._counts_from_sums(edges) / np.diff(edges) * 1e6
 
     def _edges_within(self, start_us: int, end_us: int, bins: int) -> Integers:
         """Return edges of about ``bins`` bins that are edges of the whole recording's bins, except the two ends."""
@@ -111,9 +115,9 @@ class EventRates:
         kept = [*range(0, last, step), last]
         return edges[np.unique(kept)]
 
-    def _from_sums(self, edges: Integers) -> NDArray[np.float64]:
+    def _counts_from_sums(self, edges: Integers) -> NDArray[np.float64]:
         """Return the numbers of OFF and ON events in bins, from what was counted; NaN where nothing was read."""
-        sums, read_us = self._read
+        sums, read_us = self._progress
         # A bin of the recording belongs to where it begins.
         before = np.searchsorted(self._edges, edges)
         last = sums.shape[1] - 1
@@ -124,7 +128,7 @@ class EventRates:
             counts[:, unread] = np.nan
         return counts
 
-    def _exact(self, edges: Integers) -> Integers | None:
+    def _counts_from_source(self, edges: Integers) -> Integers | None:
         """Return the numbers of OFF and ON events in bins, read from the source; None if there are too many."""
         # Such a file would be read from its start.
         if isinstance(self._source, FileEvents):
@@ -134,10 +138,10 @@ class EventRates:
         if stop - first > MOST_EXACT:
             return None
         events = self._source.slice(first, stop)
-        return counted(events, edges)
+        return counts_by_polarity(events, edges)
 
 
-def counted(events: Events, edges: Integers) -> Integers:
+def counts_by_polarity(events: Events, edges: Integers) -> Integers:
     """Return the numbers of OFF and ON events in time bins, shape ``(2, n)``."""
     event_at_edge = np.searchsorted(events.t, edges)
     on_until = np.cumsum(events.p, dtype=np.int64)

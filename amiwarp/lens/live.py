@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.camera_rates import ANGLE_RANGES
+from amiwarp.calib.first_guess import ANGLE_RANGES
+from amiwarp.calib.repeated_turns import counts_of, repetition
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_stream import starts_of_runs
@@ -29,9 +30,10 @@ from amiwarp.tasks import Progress, silent
 SETTLED_TURNS = 5
 """Length at which a still span is used before it ends [turns]: three, and one to settle on either side."""
 MOST_BYTES = 1 << 27
+"""Largest memory of a turn's events [bytes], about ten millions. Without a full turn within it, what waits is
+dropped."""
 MOST_SAMPLES = 1 << 14
-"""Limits of a turn: the memory of its events [bytes], about ten millions, and its number of encoder samples. Without a
-full turn within them, what waits is dropped."""
+"""Largest number of encoder samples of a turn. Without a full turn within it, what waits is dropped."""
 SAME_PX = 5.0
 """A pose whose corners are all nearer than this to the corners of an earlier pose tells nothing new [px]."""
 
@@ -160,8 +162,8 @@ class StillSpans:
             self._before = None
             return
         encoder = Encoder(self._t, self._angle)
-        counts = poses.counts_of(turn, encoder, self._size)
-        if self._before is None or poses.repetition(self._before, counts) < poses.LEAST_REPETITION:
+        counts = counts_of(turn, encoder, self._size)
+        if self._before is None or repetition(self._before, counts) < poses.LEAST_REPETITION:
             self._end_span()
             self._edges = [start]
             self._span = []
@@ -260,7 +262,7 @@ class LiveLens:
     def calibrate(self, progress: Progress) -> LensCalibration:
         """Calibrate from the poses. Raises :class:`AmiwarpError` as :func:`~amiwarp.calibrate_lens` does."""
         if not self._spans:
-            raise AmiwarpError(poses.MOVES)
+            raise AmiwarpError(poses.MOVES_TEXT)
         work = LensWork(
             self._board,
             self._camera,

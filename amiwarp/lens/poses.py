@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,26 +11,28 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.camera_rates import ANGLE_RANGES
-from amiwarp.calib.first_guess import CELL
+from amiwarp.calib.repeated_turns import counts_of, repetition
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import Events, MemoryEvents, Recording
+from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.tasks import in_order
 
 Vector = NDArray[np.float64]
 
 LEAST_TURNS = 1.5
+"""Length of the shortest still span that is used [turns]."""
 MOST_TURNS = 3.0
-"""Shortest still span, and the longest part of one that is used, from its middle [turns]."""
+"""Length of the longest part of a still span that is used, in its middle [turns]."""
 LEAST_REPETITION = 0.75
 """Smallest correlation of the events of two successive turns while nothing moves. A still board's was 0.96 to 0.98,
 a board that moved by 1.8 px in a turn had 0.82, and by 3.7 px 0.52."""
-WITHOUT_PRISM = "because without it a still board gives no events"
-MOVES = (
+WITHOUT_PRISM_TEXT = "because without it a still board gives no events"
+"""End of the messages that ask for a turning prism."""
+MOVES_TEXT = (
     "no turn of the prism repeats the one before: hold the board and the camera still for two turns; without a prism, "
     "a still board gives no events"
 )
+"""Message about a recording in which something moves all the time."""
 MOST_POSES = 40
 """Largest number of poses that are used. More would lengthen the work, and hardly improve the lens."""
 
@@ -49,12 +50,13 @@ class Pose:
 def still_poses(recordings: Sequence[Recording]) -> tuple[list[Pose], dict[str, str]]:
     """Return the still spans of all recordings, and the reason by name of each recording that has none.
 
-    Raises :class:`AmiwarpError`, with the reason of the first recording, if none has any.
+    Of more than :data:`MOST_POSES` spans, some are left out, evenly: a recording of which all are left out is in
+    neither. Raises :class:`AmiwarpError`, with the reason of the first recording, if none has any.
     """
     recordings = _named_apart(recordings)
     spans: list[tuple[Recording, tuple[int, int]]] = []
     reasons: dict[str, str] = {}
-    jobs = (partial(_spans_of, recording) for recording in recordings)
+    jobs = (partial(_spans_or_reason, recording) for recording in recordings)
     for recording, found in zip(recordings, in_order(jobs), strict=True):
         if isinstance(found, AmiwarpError):
             reasons[recording.name] = str(found)
@@ -100,20 +102,22 @@ def _pose(recording: Recording, start: int, stop: int, *, several: bool) -> Pose
     return Pose(name, replace(recording, events=events))
 
 
-def _spans_of(recording: Recording) -> list[tuple[int, int]] | AmiwarpError:
+def _spans_or_reason(recording: Recording) -> list[tuple[int, int]] | AmiwarpError:
     """Return start and end of every still span [us], each at most :data:`MOST_TURNS` long, or why there is none."""
+    # Raised in another thread, an error would end the work on the other recordings too.
     try:
-        return _found_spans(recording)
+        return _still_spans(recording)
     except AmiwarpError as error:
         return error
 
 
-def _found_spans(recording: Recording) -> list[tuple[int, int]]:
+def _still_spans(recording: Recording) -> list[tuple[int, int]]:
+    """Return start and end of every still span [us]. Raises :class:`AmiwarpError` if there is none."""
     encoder = recording.encoder
     source = recording.events
     if encoder is None:
         raise AmiwarpError(
-            f"has no encoder; record the angle of a turning prism, {WITHOUT_PRISM}",
+            f"has no encoder; record the angle of a turning prism, {WITHOUT_PRISM_TEXT}",
             ErrorCode.CONTENT_MISSING,
         )
     if not len(source):
@@ -137,7 +141,7 @@ def _found_spans(recording: Recording) -> list[tuple[int, int]]:
         stop = int(edges[last_edge])
         found.append(used_part(start, stop, turn))
     if not found:
-        raise AmiwarpError(MOVES)
+        raise AmiwarpError(MOVES_TEXT)
     return found
 
 
@@ -145,7 +149,7 @@ def too_few_turns(turns: float) -> str:
     """Return the reason for an error: the prism makes too few turns for a pose."""
     return (
         f"the prism makes {max(turns, 0.0):.2g} turns; a pose needs {LEAST_TURNS:g} turns of the prism in front of a "
-        f"board that stands still, {WITHOUT_PRISM}"
+        f"board that stands still, {WITHOUT_PRISM_TEXT}"
     )
 
 
@@ -168,27 +172,6 @@ def _repetition(recording: Recording, encoder: Encoder, edges: NDArray[np.int64]
             found.append(repetition(before, counts))
         before = counts
     return np.array(found)
-
-
-def counts_of(turn: Events, encoder: Encoder, size: tuple[int, int]) -> Vector:
-    """Return the events of a turn, ON minus OFF, by cell of the image and range of prism angles, flattened."""
-    width, height = size
-    columns = math.ceil(width / CELL)
-    rows = math.ceil(height / CELL)
-    ranges = np.floor(encoder.angle_at(turn.t) * (ANGLE_RANGES / math.tau))
-    angle = ranges.astype(np.int64) % ANGLE_RANGES
-    row = (turn.y // CELL).astype(np.int64)
-    cell = row * columns + turn.x // CELL
-    signs = 2.0 * turn.p - 1.0
-    bins = rows * columns * ANGLE_RANGES
-    counts = np.bincount(cell * ANGLE_RANGES + angle, weights=signs, minlength=bins)
-    return np.asarray(counts, np.float64)
-
-
-def repetition(before: Vector, counts: Vector) -> float:
-    """Return the correlation of the events of a turn with the turn before, see :data:`LEAST_REPETITION`."""
-    energy = math.sqrt(float(counts @ counts) * float(before @ before))
-    return float(counts @ before) / max(energy, 1e-30)
 
 
 def _runs(still: NDArray[np.bool_]) -> list[tuple[int, int]]:

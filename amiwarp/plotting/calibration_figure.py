@@ -18,15 +18,20 @@ from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.palette import BLACK, BLUE, ORANGE, VERMILION
 from amiwarp.optics.models.registry import MODELS
 from amiwarp.plotting.figures import blank, save
-from amiwarp.results.calibration import Calibration, cost_surface
+from amiwarp.results.calibration import Calibration, PhotometricSummary, cost_surface
 
 EVENTS = 2_000_000
 """Largest number of events in the image of a figure; more events are thinned evenly."""
 FOUND = VERMILION
+"""Colour of the calibrated parameters."""
 TRUTH = BLACK
+"""Colour of the true parameters."""
 LOCAL = ORANGE
+"""Colour of the samples of the local search."""
 SHARPEST = BLUE
-"""Colours of the calibrated parameters, of the true parameters, of the local search, and of the sharpest parameters."""
+"""Colour of the sharpest parameters."""
+FEWEST_SAMPLES = 10
+"""Smallest number of samples of which a map is drawn."""
 LEGEND = "#dddddd"
 """Background of the legend, on which white and orange marks can be seen."""
 HATCHES = "#999999"
@@ -102,23 +107,9 @@ def draw_cost(
     of_global_search = np.array([stage.name == "global" for stage in calibration.stages], bool)
     coarse = of_global_search[stages.astype(int)]
 
-    # The map of the global search, if its samples span an area.
-    if coarse.sum() >= 10 and np.ptp(x[coarse]) > 0 and np.ptp(y[coarse]) > 0:
-        surface = ax.tricontourf(x[coarse], y[coarse], costs[coarse], levels=24, cmap="cividis")
-        label = f"sharpness ({calibration.sharpness_name}, coarse image)"
-        if any(stage.algorithm == PHASE for stage in calibration.stages):
-            label = "minus the unexplained share of the sums in phase"
-        figure.colorbar(surface, ax=ax, label=label, shrink=0.85)
-        dots = {
-            "color": "white",
-            "markersize": 4.0,
-            "markeredgecolor": "black",
-            "markeredgewidth": 0.7,
-        }
-        ax.plot(x[coarse], y[coarse], "o", label="global search", **dots)
-        _hatch_the_unsampled(ax)
-
-    # The samples of the local search, and what it has found.
+    # A map needs samples that span an area.
+    if coarse.sum() >= FEWEST_SAMPLES and np.ptp(x[coarse]) > 0 and np.ptp(y[coarse]) > 0:
+        _draw_map(figure, ax, (x[coarse], y[coarse]), costs[coarse], calibration)
     ax.plot(
         x[~coarse],
         y[~coarse],
@@ -129,7 +120,10 @@ def draw_cost(
         label="local search",
     )
     found = _polar(calibration.parameters[size], calibration.parameters["phase"])
-    moved = _draw_sharpest(ax, calibration, size)
+    moved = ""
+    stage = calibration.photometric
+    if stage is not None and _draw_sharpest(ax, stage, size):
+        moved = f"\nphotometric stage moved it by {stage.moved_px:.2g} px"
     ax.plot(
         *found,
         "o",
@@ -157,6 +151,29 @@ def draw_cost(
     )
 
 
+def _draw_map(
+    figure: Any,
+    ax: Any,
+    places: tuple[NDArray[np.float64], NDArray[np.float64]],
+    costs: NDArray[np.float64],
+    calibration: Calibration,
+) -> None:
+    """Draw the map of the global search's costs, with its samples at ``places``, columns and rows [deg]."""
+    surface = ax.tricontourf(*places, costs, levels=24, cmap="cividis")
+    label = f"sharpness ({calibration.sharpness_name}, coarse image)"
+    if any(stage.algorithm == PHASE for stage in calibration.stages):
+        label = "minus the unexplained share of the sums in phase"
+    figure.colorbar(surface, ax=ax, label=label, shrink=0.85)
+    dots = {
+        "color": "white",
+        "markersize": 4.0,
+        "markeredgecolor": "black",
+        "markeredgewidth": 0.7,
+    }
+    ax.plot(*places, "o", label="global search", **dots)
+    _hatch_the_unsampled(ax)
+
+
 def _hatch_the_unsampled(ax: Any) -> None:
     """Hatch the background of a map, which shows where nothing was sampled, and name it in the legend."""
     how = {"facecolor": "white", "edgecolor": HATCHES, "hatch": "////", "linewidth": 0.0}
@@ -164,17 +181,11 @@ def _hatch_the_unsampled(ax: Any) -> None:
     ax.fill((), (), label="not sampled", **how)  # draws nothing but the legend's entry
 
 
-def _draw_sharpest(ax: Any, calibration: Calibration, size: str) -> str:
-    """Mark the sharpest parameters if the photometric stage has moved the result from them.
-
-    Returns a line of the title that says so; empty if nothing moved it.
-    """
-    stage = calibration.photometric
-    if stage is None or not stage.accepted:
-        return ""
+def _draw_sharpest(ax: Any, stage: PhotometricSummary, size: str) -> bool:
+    """Mark the sharpest parameters if the photometric stage has moved the result from them; return whether it has."""
     parameters = stage.sharpness_parameters
-    if size not in parameters or "phase" not in parameters:
-        return ""
+    if not stage.accepted or size not in parameters or "phase" not in parameters:
+        return False
     sharpest = _polar(parameters[size], parameters["phase"])
     ax.plot(
         *sharpest,
@@ -185,7 +196,7 @@ def _draw_sharpest(ax: Any, calibration: Calibration, size: str) -> str:
         markeredgewidth=1.6,
         label="sharpest",
     )
-    return f"\nphotometric stage moved it by {stage.moved_px:.2g} px"
+    return True
 
 
 def _polar(size: float, phase: float) -> tuple[float, float]:

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 
-HALF = (0.4, 0.5, 0.5)
+HALF_BOX = (0.4, 0.5, 0.5)
 """Half width of the box about the origin in which the points lie: along x, y and angle."""
-
-__all__ = ["HALF", "Cloud", "draw_cloud"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,8 +19,8 @@ class Cloud:
     """Points of one event cloud."""
 
     xyz: NDArray[np.float32]
-    """Coordinates of the points: x, y (up) and prism angle, within :data:`HALF` of the origin for points in the region,
-    shape ``(n, 3)``."""
+    """Coordinates of the points: x, y (up) and prism angle, within :data:`HALF_BOX` of the origin for points in the
+    region, shape ``(n, 3)``."""
     on: NDArray[np.bool_]
     """Whether each point is an ON event, shape ``(n,)``."""
 
@@ -34,8 +32,8 @@ def draw_cloud(axes: Any, cloud: Cloud) -> None:
     # Colours by their names would be slow.
     colours = to_rgba_array([OFF_COLOUR, ON_COLOUR])[cloud.on.astype(int)]
     axes.scatter(*cloud.xyz.T, s=1.6, c=colours, linewidths=0, alpha=0.7, depthshade=False)
-    axes.set_box_aspect(HALF, zoom=1.1)
-    x, y, z = HALF
+    axes.set_box_aspect(HALF_BOX, zoom=1.1)
+    x, y, z = HALF_BOX
     axes.set(xlim=(-x, x), ylim=(-y, y), zlim=(-z, z))
     axes.view_init(elev=22, azim=-45)
     axes.set(xlabel="x", ylabel="y", xticks=(), yticks=(), zticks=())

@@ -19,9 +19,11 @@ TIMELINE = "sensor_time"
 
 def rerun_module() -> Any:
     """Import Rerun. Raises :class:`AmiwarpError` if it is missing."""
-    for name in ("rerun.chunk", "rerun"):
-        module = optional_module(name, "rerun", "Rerun needs its library")
-    return module
+    reason = "Rerun needs its library"
+    optional_module(
+        "rerun.chunk", "rerun", reason
+    )  # is not imported with rerun; older versions lack it
+    return optional_module("rerun", "rerun", reason)
 
 
 def rerun_chunks(window: Window) -> Iterator[Any]:
@@ -29,8 +31,8 @@ def rerun_chunks(window: Window) -> Iterator[Any]:
     rerun = rerun_module()
 
     def chunk(entity: str, t: Any, columns: Any) -> Any:
-        time = rerun.TimeColumn(TIMELINE, duration=np.asarray(t, "timedelta64[us]"))
-        return rerun.chunk.Chunk.from_columns(entity, [time], columns)
+        times = rerun.TimeColumn(TIMELINE, duration=np.asarray(t, "timedelta64[us]"))
+        return rerun.chunk.Chunk.from_columns(entity, [times], columns)
 
     for name, frame in window.frames.items():
         image = rerun.EncodedImage.columns(blob=[frame.png], media_type=["image/png"])
@@ -65,5 +67,6 @@ def write_rerun(part: Path, content: Iterable[Window], about: Outline) -> None:
         if failed:
             raise failed[0] from error
         raise AmiwarpError(
-            f"Rerun cannot write it: {error}; choose another place", ErrorCode.OUTPUT_FAILED
+            f"{about.path}: Rerun cannot write it: {error}; choose a place with room that you may write to",
+            ErrorCode.OUTPUT_FAILED,
         ) from error

@@ -38,7 +38,7 @@ from amiwarp.reconstruction.smoothness import (
     CHOICE_STEPS,
     SMOOTHNESS,
     choice_square,
-    start_lowest_weight,
+    start_weight_choice,
 )
 from amiwarp.reconstruction.windows import map_tile, window_count, window_span
 from amiwarp.results.calibration import Calibration
@@ -421,7 +421,7 @@ class Reconstruction:
             solver.solve(*SCALES[:2], steps=CHOICE_STEPS)
             return solver.residuals.start_mean_cost(SCALES[0], held=True)
 
-        return start_lowest_weight(start_cost)
+        return start_weight_choice(start_cost)
 
     def _tile(self, start_us: int, length_us: int) -> tuple[int, int, Tiles]:
         """Return the map's margin left of and above the image (columns, rows), and the map of a window."""

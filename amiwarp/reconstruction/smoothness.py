@@ -14,7 +14,7 @@ TIE = 1.05
 CHOICE_STEPS = 12
 """Number of conjugate-gradient steps in each round with which the weights are compared. In 28 windows of 12 recordings,
 8, 12, 16 and 24 steps chose the same."""
-CHOICE_SQUARES = (64, 96)
+CHOICE_SIDES_PX = (64, 96)
 """Sides of the square of pixels in which the smoothness is chosen [px]."""
 CHOICE_EVENTS = 24_000
 """Number of events that suffices for the choice in the smaller square."""
@@ -23,11 +23,12 @@ CHOICE_EVENTS = 24_000
 def choice_square(count: NDArray[np.int32]) -> tuple[int, int, int]:
     """Return first column, first row and side of the square of pixels in which the smoothness is chosen.
 
-    It is the square with the most events, of the smallest side with enough events. ``count``: events per pixel, shape
+    It is the square with the most events, of the smallest side with enough events. It may reach beyond the image,
+    right and below. ``count``: events per pixel, shape
     ``(height, width)``.
     """
     height, width = count.shape
-    for side in CHOICE_SQUARES:
+    for side in CHOICE_SIDES_PX:
         rows = [
             count[top : top + side].sum(axis=0, dtype=count.dtype) for top in range(0, height, side)
         ]
@@ -38,7 +39,7 @@ def choice_square(count: NDArray[np.int32]) -> tuple[int, int, int]:
     return int(column) * side, int(row) * side, side
 
 
-def start_lowest_weight(start_cost: Callable[[float], Callable[[], float]]) -> Callable[[], float]:
+def start_weight_choice(start_cost: Callable[[float], Callable[[], float]]) -> Callable[[], float]:
     """Start to find the largest weight of :data:`SMOOTHNESS` whose cost is nearly the lowest; see :data:`TIE`.
 
     ``start_cost`` starts to compute the cost of a weight and returns a function that waits for it. Return a function

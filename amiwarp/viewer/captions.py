@@ -8,7 +8,7 @@ import numpy as np
 
 from amiwarp.choices import Axis
 from amiwarp.imaging.regions import SMOOTHING_PX
-from amiwarp.imaging.sharpness import random_variance
+from amiwarp.imaging.relative_variance import random_variance
 from amiwarp.viewer.filters import rate_text
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.shown_window import DisplayedWindow

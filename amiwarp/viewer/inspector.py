@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.bad_pixels import strange_pixels, stretch
+from amiwarp.calib.bad_pixels import find_bad_pixels, searched_part
 from amiwarp.calib.plate import LARGEST_INVERSE
 from amiwarp.choices import Sharpness, Vote
 from amiwarp.compensation.in_memory import compensate_events
@@ -407,9 +407,9 @@ class Inspector:
         """Hot pixels as a mask and as a list, found in the middle of the recording."""
         source = self.recording.events
         encoder = self.encoder
-        events = stretch(source, encoder)
+        events = searched_part(source, encoder)
         if math.isfinite(self.turn_us):
-            hot, _ = strange_pixels(events, encoder, source.size)
+            hot, _ = find_bad_pixels(events, encoder, source.size)
         else:
             hot = find_hot_pixels(events, source.size)
         return hot, list_hot_pixels(events, hot)

@@ -122,7 +122,7 @@ class MessageFilter:
         )
 
 
-def finite(given: str) -> float:
+def finite_number(given: str) -> float:
     """Return the typed text as a number, clipped to ±:data:`LARGEST`. Raises :class:`ValueError` for other text."""
     value = float(given or 0.0)
     if math.isnan(value):

@@ -50,7 +50,7 @@ from amiwarp.viewer.knobs import Knobs
 from amiwarp.viewer.library import Library
 from amiwarp.viewer.look import Look
 from amiwarp.viewer.page_files import use_page
-from amiwarp.viewer.page_messages import finite
+from amiwarp.viewer.page_messages import finite_number
 from amiwarp.viewer.shown_window import DisplayedWindow
 from amiwarp.viewer.sliders import FIELD_LIMITS, GIVEN, SLIDERS, UNITS
 from amiwarp.viewer.view_state import History, ViewState
@@ -98,6 +98,8 @@ class Panel(Actions):
         self._library = library
         self.buffers_lock = asyncio.Lock()
         """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
+        # Locks, in the order in which they are taken: device_lock, for CUDA; then buffers_lock, for the inspector's own
+        # buffers. Slow updates, calibrations and films work on a snapshot or a copy, and take the first only.
         self.device_lock: Any = contextlib.nullcontext()
         if "cuda" in str(inspector.device):
             self.device_lock = _CUDA_LOCK
@@ -116,7 +118,7 @@ class Panel(Actions):
         """Whether the playback runs; after a stop it runs until it notices the stop."""
         self._picked = -1
         """Index of the drawn event that is described; -1 for none."""
-        self._has_card = False
+        self._has_graphics_card = False
         """Whether the browser draws with a graphics card."""
         self._lasting = False
         """Whether a change lasts, such as a drag: meanwhile the brightness of images does not follow it."""
@@ -130,7 +132,9 @@ class Panel(Actions):
         """Window and selection for which each slow part of the page was made, by its name."""
         # Successive changes of one name are undone together, until a release.
         self._change = ""
+        """Name of the change that lasts, with the number of the drag; empty for none."""
         self._drags = 0
+        """Number of releases so far."""
         self._rates: list[EventRates] = []
         """Counted events of the recording, and of the recordings on its time axis."""
         self._rates_first_us = 0
@@ -155,7 +159,7 @@ class Panel(Actions):
         self.history_steps = ()
         self._rates = []  # the next count has not begun
         self._made_for.clear()
-        self.use_card(self._has_card)
+        self.use_card(self._has_graphics_card)
         inspector.renew()  # a live stream may have gone on since the inspector was made
         files: list[list[str]] = []
         folder = ""
@@ -261,7 +265,7 @@ class Panel(Actions):
         )
 
     def request(self, *what: Request, change: str = "") -> None:
-        """Request quick updates.
+        """Request quick updates of :data:`QUICK`; "newest" is for a live stream.
 
         ``change``: name of a change that lasts, such as a drag; it is undone in one step.
         """
@@ -387,9 +391,8 @@ class Panel(Actions):
 
     def released(self) -> None:
         """Update the slow parts of the page after a change, and end what is undone in one step."""
-        if (
-            self._lasting
-        ):  # the images get the scale of what is shown now, as part of the same change
+        # The images get the scale of what is shown now, as part of the same change.
+        if self._lasting:
             change = self._change
             self.request("knobs")
             self._change = change
@@ -408,7 +411,7 @@ class Panel(Actions):
         if name not in (*FIELD_LIMITS, *layout.FILTER_FIELDS, *times):
             return
         try:
-            value = finite(text)
+            value = finite_number(text)
         except ValueError:
             self.say(f"{text!r} is not a number; give a number such as 1.5", "error")
             return
@@ -431,14 +434,19 @@ class Panel(Actions):
 
     def _set_filter(self, name: str, value: float) -> None:
         """Set a field of a filter, or the decay time of images."""
-        label, unit, (low, high) = layout.FILTER_FIELDS[name]
-        if not low <= value <= high:
-            self.say(
-                f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error"
-            )
+        label, unit, limits = layout.FILTER_FIELDS[name]
+        if self._is_refused(label, value, unit, limits):
             return
         self.state[name] = round(value) if name == "every" else value
         self.request("knobs" if name == "decay_ms" else "window")
+
+    def _is_refused(self, label: str, value: float, unit: str, limits: tuple[float, float]) -> bool:
+        """Return whether a value is outside its limits, and say so."""
+        low, high = limits
+        if low <= value <= high:
+            return False
+        self.say(f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error")
+        return True
 
     def step(self, count: int) -> None:
         """Move the time window, as :meth:`Actions.step` does. To count events takes long, and is done in a thread."""
@@ -470,12 +478,8 @@ class Panel(Actions):
         """Set a parameter of the prism or the camera, in the unit of its slider or field."""
         if name not in FIELD_LIMITS:
             return
-        low, high = FIELD_LIMITS[name]
-        label, unit, _ = SLIDERS[name] if name in SLIDERS else GIVEN[name]
-        if not low <= value <= high:
-            self.say(
-                f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error"
-            )
+        field = SLIDERS[name] if name in SLIDERS else GIVEN[name]
+        if self._is_refused(field.label, value, field.unit, FIELD_LIMITS[name]):
             return
         self._wanted[name] = round(value, 4)
         if name in SLIDERS:
@@ -485,7 +489,7 @@ class Panel(Actions):
 
     def use_card(self, has_card: bool) -> None:
         """Show more points if the browser has a graphics card to draw them."""
-        self._has_card = has_card
+        self._has_graphics_card = has_card
         if has_card and self.inspector.most_points < WINDOW_POINTS:
             self.inspector.most_points = WINDOW_POINTS
             self.request("window")
@@ -494,7 +498,7 @@ class Panel(Actions):
         """Do nothing: the page asks only whether the server answers."""
 
     def toggle(self, name: str) -> None:
-        """Invert a state variable that is true or false."""
+        """Invert a state variable that is true or false. The page cannot call this, only press keys that do."""
         self.state[name] = not self.state[name]
 
     def look_from(self, view: str) -> None:
@@ -883,33 +887,25 @@ class Panel(Actions):
 
     async def _write_export(self, what: str) -> None:
         """Write a file that is no film, and give it to the browser."""
+        async with self.device_lock, self.buffers_lock:
+            await self._download(what, partial(WRITERS[what], self))
+
+    def write_figure(self, path: Path) -> None:
+        """Write what the page shows as a figure."""
         from amiwarp.viewer.publish import Page, save_figure
 
-        inspector = self.inspector
-        figure = partial(
-            save_figure,
-            inspector,
+        save_figure(
+            self.inspector,
+            path,
             page=Page(),
             view=self.view,
             look=self.look,
             against=self.against,
         )
-        write: dict[str, Callable[[Path], object]] = {
-            **dict.fromkeys(("pdf", "svg"), figure),
-            "values": lambda path: save_values(path, self._make_images().after),
-            **dict.fromkeys(("csv", "npz"), partial(downloads.write_table, inspector)),
-            "events": partial(downloads.write_events, inspector, compensated=False),
-            "compensated": partial(downloads.write_events, inspector, compensated=True),
-            "calibration": lambda path: inspector.as_calibration().save(path),
-            "vtp": partial(
-                downloads.write_cloud, inspector, axis=self.look.axis, compensated=False
-            ),
-            "vtp_after": partial(
-                downloads.write_cloud, inspector, axis=self.look.axis, compensated=True
-            ),
-        }
-        async with self.device_lock, self.buffers_lock:
-            await self._download(what, write[what])
+
+    def write_values(self, path: Path) -> None:
+        """Write the values of the second image."""
+        save_values(path, self._make_images().after)
 
     async def _write_film(self, what: str) -> None:
         """Make a film in a thread, with its progress on the page, and give it to the browser."""
@@ -1017,7 +1013,7 @@ class Panel(Actions):
     # Updates of what the page shows
 
     async def update_quickly(self, todo: set[str]) -> None:
-        """Make quick updates: "newest", "suggestion", "window", "knobs", "look" and "state"."""
+        """Make quick updates of :data:`QUICK`."""
         if "newest" in todo:  # here, because no other update uses the events that it replaces
             await self._take_newest()
             todo = {*todo, "window"}
@@ -1128,7 +1124,9 @@ class Panel(Actions):
         state = self.state
         inspector = self.inspector
         if not float(state.length_ms) > 0.0:
-            raise AmiwarpError(f"a window of {state.length_ms:g} ms; give a length above 0")
+            raise AmiwarpError(
+                f"the window's length is {state.length_ms:g} ms; give a length above 0"
+            )
         start_us, length_us = self.time_window
         length_us = min(length_us, self.whole_us)
         known_count = inspector.fixed_count
@@ -1278,15 +1276,15 @@ class Panel(Actions):
         x: list[float] = (values / UNITS[name]).tolist()
         if not x:
             return
-        label, unit, *_ = SLIDERS[name]
+        slider = SLIDERS[name]
         best = int(np.argmax(scores))
         peak = f"{x[best]:.4g}"
         if best in (0, len(x) - 1):
             peak = f"at the edge {peak}"
         now = sliders.knob_values(self.inspector)[name]
         state.curve = {
-            "name": label,
-            "title": f"{label} ({unit})",
+            "name": slider.label,
+            "title": f"{slider.label} ({slider.unit})",
             "text": f"peak {peak}, now {now:.4g}",
             "x": x,
             "y": scores.tolist(),
@@ -1310,3 +1308,24 @@ def _result_or_error(
         return str(error)
     finally:
         inspector = None  # this frame may be kept alive, too
+
+
+WRITERS: dict[str, Callable[[Panel, Path], object]] = {
+    "pdf": Panel.write_figure,
+    "svg": Panel.write_figure,
+    "values": Panel.write_values,
+    "csv": lambda panel, path: downloads.write_table(panel.inspector, path),
+    "npz": lambda panel, path: downloads.write_table(panel.inspector, path),
+    "events": lambda panel, path: downloads.write_events(panel.inspector, path, compensated=False),
+    "compensated": lambda panel, path: downloads.write_events(
+        panel.inspector, path, compensated=True
+    ),
+    "calibration": lambda panel, path: panel.inspector.as_calibration().save(path),
+    "vtp": lambda panel, path: downloads.write_cloud(
+        panel.inspector, path, axis=panel.look.axis, compensated=False
+    ),
+    "vtp_after": lambda panel, path: downloads.write_cloud(
+        panel.inspector, path, axis=panel.look.axis, compensated=True
+    ),
+}
+"""Functions that write the downloads that are no films, by the names in :data:`amiwarp.viewer.layout.EXPORTS`."""

@@ -4,11 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from amiwarp.optics.models.registry import MODELS, size_names
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.knobs import OTHERS, SLIDING, Source, size_name
+from amiwarp.viewer.knobs import OTHERS, SLIDING, Knobs, Source, size_name
+
+
+class Slider(NamedTuple):
+    """Slider of a parameter, in the page's units."""
+
+    label: str
+    unit: str
+    """Unit, with angles in degrees; empty for a number."""
+    ends: tuple[float, float, float]
+    """Smallest value, largest value and step."""
+
+
+class GivenField(NamedTuple):
+    """Field of a property of camera or prism that a recording may lack."""
+
+    label: str
+    unit: str
+    limits: tuple[float, float]
+    """Smallest and largest value."""
+
 
 LIMITS = {
     "apex": (0.0, 29.9),
@@ -27,53 +47,61 @@ UNITS = {
 }
 """Conversion from the units of page and address (angles in degrees) to the parameters' units (radians): factors."""
 GIVEN = {
-    "fov_deg": ("field of view", "°", (1.0, 170.0)),
-    "prism_index": ("refractive index", "", (1.01, 3.5)),
+    "fov_deg": GivenField("field of view", "°", (1.0, 170.0)),
+    "prism_index": GivenField("refractive index", "", (1.01, 3.5)),
 }
-"""Properties of camera and prism that a recording may lack: label, unit, and smallest and largest value."""
-_OF_MODELS = {
-    name: (p.label, {"rad": "°", "1": ""}.get(p.unit, p.unit), p.slider)
+"""Properties of camera and prism that a recording may lack."""
+_SLIDERS_OF_MODELS = {
+    name: Slider(p.label, {"rad": "°", "1": ""}.get(p.unit, p.unit), p.slider)
     for name, p in SLIDING.items()
 }
-SLIDERS: dict[str, tuple[str, str, tuple[float, float, float]]] = {
-    "apex": ("apex angle", "°", (0.0, 3.0, 0.005)),
-    **{name: slider for name, slider in _OF_MODELS.items() if name in size_names()},
-    "phase": ("phase", "°", (-180.0, 180.0, 0.25)),
-    "clock_offset": ("clock offset", "µs", (-20000.0, 20000.0, 10.0)),
-    "rpm": ("speed of the prism", "rpm", (-3000.0, 3000.0, 0.5)),
-    **{name: slider for name, slider in _OF_MODELS.items() if name not in size_names()},
+# The sizes first, behind the apex; other parameters last.
+SLIDERS = {
+    "apex": Slider("apex angle", "°", (0.0, 3.0, 0.005)),
+    **{name: slider for name, slider in _SLIDERS_OF_MODELS.items() if name in size_names()},
+    "phase": Slider("phase", "°", (-180.0, 180.0, 0.25)),
+    "clock_offset": Slider("clock offset", "µs", (-20000.0, 20000.0, 10.0)),
+    "rpm": Slider("speed of the prism", "rpm", (-3000.0, 3000.0, 0.5)),
+    **{name: slider for name, slider in _SLIDERS_OF_MODELS.items() if name not in size_names()},
 }
-"""Sliders by parameter, in their order: label, unit, and (minimum, maximum, step). The apex's may be longer."""
+"""Sliders by parameter, in their order on the page. The apex's may be longer."""
 FIELD_LIMITS = {
     **{name: LIMITS[name] for name in SLIDERS},
-    **{name: ends for name, (_, _, ends) in GIVEN.items()},
+    **{name: field.limits for name, field in GIVEN.items()},
 }
 """Smallest and largest value of the fields of the prism and the camera, in the page's units."""
 
 
 def knob_values(inspector: Inspector) -> dict[str, float]:
     """Return the prism's parameters in the page's units, rounded as the page shows them."""
-    return {name: round((inspector.knobs.value(name) or 0.0) / UNITS[name], 4) for name in SLIDERS}
+    return {name: _in_page_units(name, inspector.knobs) for name in SLIDERS}
+
+
+def _in_page_units(name: str, knobs: Knobs) -> float:
+    """Return a parameter as the page shows it; 0 if the model has none."""
+    return round((knobs.value(name) or 0.0) / UNITS[name], 4)
 
 
 def sliders(inspector: Inspector) -> list[dict[str, Any]]:
     """Return the sliders of the model's parameters: label, unit, ends, step, limits, value, true value and source."""
     values = knob_values(inspector)
     known = truths(inspector)
+    # Of the sizes, only the ones of the shown model's orbits.
     shown = {*MODELS[inspector.knobs.model].FREE} - size_names()
     shown |= {*inspector.orbit_names, "clock_offset" if inspector.has_encoder else "rpm"}
     out = []
-    for name, (label, unit, (least, most, step)) in SLIDERS.items():
+    for name, slider in SLIDERS.items():
         if name not in shown:
             continue
+        least, most, step = slider.ends
         if name == "apex":
             most = max(most, round(2.0 * math.degrees(inspector.nominal_apex), 1))
         low, high = FIELD_LIMITS[name]
         out.append(
             {
                 "name": name,
-                "label": label,
-                "unit": unit,
+                "label": slider.label,
+                "unit": slider.unit,
                 "least": least,
                 "most": most,
                 "step": step,
@@ -98,12 +126,13 @@ def given_fields(inspector: Inspector) -> list[dict[str, Any]]:
 
     fields = []
     for name, value in values.items():
-        label, unit, (low, high) = GIVEN[name]
+        field = GIVEN[name]
+        low, high = field.limits
         fields.append(
             {
                 "name": name,
-                "label": label,
-                "unit": unit,
+                "label": field.label,
+                "unit": field.unit,
                 "value": round(value, 4),
                 "low": low,
                 "high": high,
@@ -117,12 +146,12 @@ def truths(inspector: Inspector) -> dict[str, float | None]:
     known = inspector.truth
     if known is None:
         return dict.fromkeys(SLIDERS)
-    return {name: round((known.value(name) or 0.0) / UNITS[name], 4) for name in SLIDERS}
+    return {name: _in_page_units(name, known) for name in SLIDERS}
 
 
 def with_unit(name: str, value: float, digits: int = 4) -> str:
     """Return a value of a slider, in its unit, as text."""
-    _, unit, _ = SLIDERS[name]
+    unit = SLIDERS[name].unit
     space = "" if unit in {"°", ""} else " "
     return f"{value:.{digits}g}{space}{unit}"
 

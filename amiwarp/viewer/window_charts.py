@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,15 +24,26 @@ ORBIT_CURVES = ((ON_COLOUR, 2.0, "in x"), (OFF_COLOUR, 2.0, "in y"))
 INTERVAL_CURVES = ((OFF_COLOUR, 2.0, "intervals"), (ON_COLOUR, 2.0, "median"))
 """Colour, width and name of the histogram of intervals, and of the line at their median."""
 LEGEND_EM = 1.5
+"""Height of the legend above the curves, in sizes of the font."""
 MARK_EM = 1.2
-"""Height of the legend above the curves, and length of the line before a name, in sizes of the font."""
+"""Length of the line before a name in the legend, in sizes of the font."""
+MARK_GAP_EM = 0.4
+"""Gap between the line and the name, in sizes of the font."""
+NAME_GAP_EM = 1.2
+"""Gap between a name and the next line, in sizes of the font."""
 MARK_TEXT = 3 * "m"
-"""Text that is wider than the line before a name, and the gap behind it."""
+"""Text that is wider than the line before a name, and the gaps beside it."""
 NUMBERS_EM = 3.6
 """Width of the numbers left of a chart, in sizes of the font."""
+TITLE_LINES = 1.2
+"""Height of the title above a chart, in lines of text."""
+RIGHT_EM = 1.3
+"""Space right of a chart, into which its last number may reach, in sizes of the font."""
+TICK_EM = 0.3
+"""Length of the tick at a number of an axis, in sizes of the font."""
 FULL_TURN = 360.0
-"""Range of prism angles, whose numbers are divisors of a turn [deg]."""
-ROOM = 0.06
+"""Upper end of an axis of prism angles [deg]; its numbers are at quarters of a turn."""
+MARGIN_SHARE = 0.06
 """Space above and below the curves, as a share of their height."""
 
 
@@ -71,7 +83,7 @@ class Chart:
         if len(values):
             low = float(values.min())
             high = float(values.max())
-        margin = ROOM * max(high - low, least)
+        margin = MARGIN_SHARE * max(high - low, least)
         self.x_range = x_range
         self.y_range = (low - margin, max(high, low + least) + margin)
 
@@ -79,7 +91,7 @@ class Chart:
         """Return the part of the chart's place in which the curves are."""
         line = LINE * font_px
         return rect.inset(
-            NUMBERS_EM * font_px, 1.2 * line, 1.3 * font_px, line + LEGEND_EM * font_px
+            NUMBERS_EM * font_px, TITLE_LINES * line, RIGHT_EM * font_px, line + LEGEND_EM * font_px
         )
 
     def draw(self, paper: Paper, rect: Rect) -> None:
@@ -94,16 +106,16 @@ class Chart:
         self._draw_axes(paper, inner)
         for curve in self.curves:
             if len(curve.x):
-                columns = self._column(inner, curve.x)
-                rows = np.clip(self._row(inner, curve.y), inner.low, inner.top)
+                columns = self._x_px(inner, curve.x)
+                rows = np.clip(self._y_px(inner, curve.y), inner.low, inner.top)
                 paper.line(np.column_stack([columns, rows]), curve.colour, curve.width)
 
-    def _column(self, inner: Rect, x: Any) -> Any:
+    def _x_px(self, inner: Rect, x: Any) -> Any:
         """Return the columns of the window at which values of x are."""
         low, high = self.x_range
         return inner.left + (x - low) / (high - low) * inner.width
 
-    def _row(self, inner: Rect, y: Any) -> Any:
+    def _y_px(self, inner: Rect, y: Any) -> Any:
         """Return the rows of the window, from its lower side, at which values of y are."""
         low, high = self.y_range
         return inner.low + (y - low) / (high - low) * inner.height
@@ -113,21 +125,16 @@ class Chart:
         em = paper.font_px
         line = [(inner.left, inner.top), (inner.left, inner.low), (inner.right, inner.low), GAP]
 
-        low, high = self.x_range
-        least = 4 if high == FULL_TURN else 3
-        most = int(min(max(inner.width / (5.0 * em), least), 5))
-        values = ticks(low, high, most)
-        for text, value in zip(tick_texts(values.tolist()), values, strict=True):
-            column = self._column(inner, value)
-            line += [(column, inner.low), (column, inner.low - 0.3 * em), GAP]
+        _, high = self.x_range
+        fewest = 4 if high == FULL_TURN else 3  # three numbers of a turn would be no quarters
+        for text, value in _numbers(self.x_range, inner.width / (5.0 * em), fewest):
+            column = self._x_px(inner, value)
+            line += [(column, inner.low), (column, inner.low - TICK_EM * em), GAP]
             paper.text(text, column, inner.low - 0.4 * em, across="center", up="top")
 
-        low, high = self.y_range
-        most = int(min(max(inner.height / (2.0 * em), 3), 5))
-        values = ticks(low, high, most)
-        for text, value in zip(tick_texts(values.tolist()), values, strict=True):
-            row = self._row(inner, value)
-            line += [(inner.left, row), (inner.left - 0.3 * em, row), GAP]
+        for text, value in _numbers(self.y_range, inner.height / (2.0 * em), 3):
+            row = self._y_px(inner, value)
+            line += [(inner.left, row), (inner.left - TICK_EM * em, row), GAP]
             paper.text(text, inner.left - 0.5 * em, row, across="right")
         paper.line(line)
 
@@ -140,8 +147,15 @@ class Chart:
         middle = inner.top + 0.5 * LEGEND_EM * paper.font_px
         for curve in shown:
             paper.line([(x, middle), (x + MARK_EM * em, middle)], curve.colour, curve.width)
-            paper.text(curve.label, x + (MARK_EM + 0.4) * em, middle, font_px=em)
-            x += (MARK_EM + 1.6) * em + text_width(curve.label, em)
+            paper.text(curve.label, x + (MARK_EM + MARK_GAP_EM) * em, middle, font_px=em)
+            x += (MARK_EM + MARK_GAP_EM + NAME_GAP_EM) * em + text_width(curve.label, em)
+
+
+def _numbers(ends: tuple[float, float], room: float, fewest: int) -> Iterator[tuple[str, float]]:
+    """Yield the numbers of an axis as text and value. ``room``: how many fit; at most five are shown."""
+    low, high = ends
+    values = ticks(low, high, int(min(max(room, fewest), 5)))
+    yield from zip(tick_texts(values.tolist()), values.tolist(), strict=True)
 
 
 def chart_places(rect: Rect) -> tuple[Rect, Rect, Rect]:

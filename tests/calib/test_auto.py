@@ -384,7 +384,7 @@ def test_every_device_judges_alike(found: Calibration, wide: Recording, device: 
     trial = trial_for(wide, found.exact, SHARPNESS, (), device=device)
     values = trial.sharpest([0, 1])
     assert (
-        trial.test.each(trial.space, values).mean()
-        > trial.test.each(trial.space, {**values, "apex": 0.0}).mean()
+        trial.test.of_parts(trial.space, values).mean()
+        > trial.test.of_parts(trial.space, {**values, "apex": 0.0}).mean()
     )
     assert np.abs(trial.start - trial.space.to_vector(values)).max() < 0.3  # px

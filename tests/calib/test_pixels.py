@@ -26,7 +26,7 @@ from amiwarp import (
     simulate,
     truth_model,
 )
-from amiwarp.calib.bad_pixels import BadPixelSummary, strange_pixels, stretch, without_pixels
+from amiwarp.calib.bad_pixels import BadPixelSummary, find_bad_pixels, searched_part, without_pixels
 from amiwarp.calib.checks import check_light
 from amiwarp.calib.hot_pixels import bin_times, outliers, unrepeated_counts
 from amiwarp.simulation import linear_luminance
@@ -79,7 +79,9 @@ def events_of(recording: Recording) -> Events:
 def strange(recording: Recording, every: int = 1) -> tuple[NDArray[np.bool_], BadPixelSummary]:
     assert recording.encoder is not None
     events = events_of(recording)
-    return strange_pixels(events[np.arange(len(events)) // 8 % every == 0], recording.encoder, SIZE)
+    return find_bad_pixels(
+        events[np.arange(len(events)) // 8 % every == 0], recording.encoder, SIZE
+    )
 
 
 def hot_pixels(fraction: float) -> NDArray[np.bool_]:
@@ -239,7 +241,7 @@ def test_two_estimates_for_a_lamp_are_one_lamp(
 
     columns = np.concatenate([lit(16, first_hz, 1.0), lit(96, second_hz, depth)], axis=1)
     events = Events.from_arrays(*columns[:, np.argsort(columns[2], kind="stable")])
-    _, summary = strange_pixels(events, Encoder.constant_speed(720.0, 0, 1_000_000), (144, 64))
+    _, summary = find_bad_pixels(events, Encoder.constant_speed(720.0, 0, 1_000_000), (144, 64))
     assert summary.flickering > 2000, "both patches"
     assert summary.lamps_hz == (pytest.approx(first_hz, abs=0.1),)
 
@@ -277,13 +279,13 @@ def test_a_stretch_of_a_long_recording(monkeypatch: pytest.MonkeyPatch) -> None:
     encoder = Encoder.constant_speed(-600.0, 0, 2_400_000)  # 1000 events a turn
     for most, turns in ((10**6, 8), (5_200, 5), (600, 2)):
         monkeypatch.setattr("amiwarp.calib.bad_pixels.MOST_EVENTS", most)
-        found = stretch(source, encoder)
+        found = searched_part(source, encoder)
         assert len(found) == pytest.approx(1000 * turns + 50, abs=1)
         assert found.t[0] + found.t[-1] == pytest.approx(2_400_000, abs=200)
     slow = Encoder.constant_speed(20.0, 0, 2_400_000)
-    assert len(stretch(source, slow)) == pytest.approx(2400, abs=1)
+    assert len(searched_part(source, slow)) == pytest.approx(2400, abs=1)
     monkeypatch.undo()
-    assert len(stretch(source, slow)) == len(t)
+    assert len(searched_part(source, slow)) == len(t)
 
 
 def test_keep() -> None:
@@ -297,7 +299,7 @@ def test_keep() -> None:
 def test_nothing_to_look_at() -> None:
     samples = Encoder.constant_speed(720.0, 0, 2000)
     for events in (Events.empty(), Events.from_arrays([1], [1], [500], [1])):
-        mask, summary = strange_pixels(events, samples, (4, 3))
+        mask, summary = find_bad_pixels(events, samples, (4, 3))
         assert mask.shape == (3, 4)
         assert not mask.any()
         assert str(summary) == ""

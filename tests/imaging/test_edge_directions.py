@@ -5,7 +5,12 @@ import pytest
 from scipy import ndimage
 
 from amiwarp.imaging import CanvasShape, Image
-from amiwarp.imaging.sharpness import EDGE_SMOOTHING_PX, LEAST_PADDING, STRONG, edge_coherence
+from amiwarp.imaging.edge_coherence import (
+    EDGE_SMOOTHING_PX,
+    LEAST_GRADIENT_SHARE,
+    edge_coherence,
+)
+from amiwarp.imaging.sharpness import LEAST_PADDING
 
 INSET = 8
 
@@ -25,7 +30,7 @@ def reference(image: np.ndarray) -> float:
     gy, gx = (slope[INSET:-INSET, INSET:-INSET] for slope in np.gradient(smooth))
     energy = gx**2 + gy**2
     angle = np.arctan2(gy, gx)
-    strong = energy > STRONG * energy.max()
+    strong = energy > LEAST_GRADIENT_SHARE * energy.max()
     return float(abs((energy * np.exp(2j * angle))[strong].sum()) / energy[strong].sum())
 
 

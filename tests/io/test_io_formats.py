@@ -628,10 +628,11 @@ def test_prophesee_hdf5_that_is_damaged(tmp_path):
     for mode in ("packed", "rows", "masks"):
         whole = ecf_chunk(events, mode)
         for chunk, message in (
-            (whole[:-3], "holds other .* than events"), (whole[:5], "lacks its head"),
+            (whole[:-3], "of a chunk of the ECF codec, number 1 of 1, are damaged"),
+            (whole[:5], "dataset 'CD/events': a chunk .* has 5 bytes; expected 12 of its head"),
             (struct.pack("<I", 1 << 31) + whole[4:], r"has 536870912 events in \d+ bytes; expected at most 65535"),
             (ecf_chunk(events[:700], mode), "a chunk has 700 events; expected 800"),
-            (whole[:12] + b"\xf1" * 20 + whole[12:], "holds other times than events"),
+            (whole[:12] + b"\xf1" * 20 + whole[12:], "the times of a chunk"),
         ):  # fmt: skip
             write_ecf(path, [chunk], 800, 800)
             with pytest.raises(AmiwarpError, match=rf"a\.hdf5: .*{message}"):
@@ -929,7 +930,9 @@ def test_a_damaged_header_of_aedat4_is_named(tmp_path, old, new):
     path.write_bytes(
         whole[:start] + struct.pack("<I", len(header)) + header + whole[start + 4 + size :]
     )
-    with pytest.raises(AmiwarpError, match=r"b\.aedat4: the header is damaged"):
+    with pytest.raises(
+        AmiwarpError, match=r"b\.aedat4: bytes .* the header is damaged: .*; copy the file again"
+    ):
         open_recording(path)
 
 

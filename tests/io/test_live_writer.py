@@ -630,3 +630,14 @@ def test_a_damaged_part_is_refused_at_once(tmp_path):
         outcomes["read" if said is None else "refused"] += 1
         assert time.monotonic() - began < 60.0
     assert min(outcomes.values()) > 5
+
+
+@pytest.mark.parametrize("flags", [[0, 256], [1, -1], [0.5, 1.0], [0.0, np.nan], ["a", "b"]])
+def test_flags_are_zero_or_one(tmp_path, flags):
+    x = np.array([1.5, 2.5], np.float32)
+    events = Events.from_arrays(x, x, [1, 2], [0, 1])
+    with live(tmp_path / "a.h5", compensated=True) as writer:
+        with pytest.raises(AmiwarpError, match=r"flag inside is .*; give booleans, or numbers 0"):
+            writer.append(events, inside=flags)
+        writer.append(events, inside=[True, False])
+    assert len(open_recording(tmp_path / "a.h5").events) == 2

@@ -18,6 +18,7 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from amiwarp import (
     AmiwarpError,
+    ErrorCode,
     Events,
     MemoryEvents,
     Recording,
@@ -640,9 +641,23 @@ def test_an_array_with_another_number_of_events_than_it_states_is_refused(
     assert ros1 or len(decode_array(bytes(raw) + bytes(3), ros1=ros1)[2][2]) == 100
     raw[at : at + 4] = struct.pack("<I", stated)
     with pytest.raises(
-        AmiwarpError, match=f"declares {stated} events, but has .* bytes instead of"
+        AmiwarpError, match=f"declares {stated} events, but has .* bytes; expected "
     ):
         decode_array(bytes(raw), ros1=ros1)
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_an_array_that_ends_in_its_header_is_refused(ros1: bool) -> None:
+    store = typestore(ros1)
+    made = array_message(store, EVENTS[:5], ros1=ros1)
+    raw = bytes((store.serialize_ros1 if ros1 else store.serialize_cdr)(made, made.__msgtype__))
+    for length in (7, 15, 22):
+        with pytest.raises(AmiwarpError, match=r"bytes, whose header alone needs .*copy") as caught:
+            decode_array(raw[:length], ros1=ros1)
+        assert caught.value.code is ErrorCode.FILE_DAMAGED
+    with pytest.raises(AmiwarpError, match=r"encapsulation 0000; .* ros2 bag convert") as caught:
+        decode_array(b"\0\0" + raw[2:], ros1=False)
+    assert caught.value.code is ErrorCode.FORMAT_UNKNOWN
 
 
 @pytest.mark.parametrize("encoding", ["evt3", "evt2"])

@@ -111,6 +111,21 @@ def coins() -> NDArray[np.float64]:
     return np.asarray(library("skimage.data").coins(), np.float64)
 
 
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ((100, 100, 3), r"shape \(100, 100, 3\); expected \(height, width\); give a grey picture"),
+        ((95, 400), "picture is 400 x 95 px; NIQE needs blocks of 96 px; give at least 96 x 96 px"),
+        ((100, 191), "picture is 191 x 100 px; NIQE needs two blocks of 96 px; give at least 192"),
+    ],
+)
+def test_niqe_says_which_picture_it_needs(shape: tuple[int, ...], message: str) -> None:
+    picture = np.random.default_rng(0).uniform(0.0, 255.0, shape)
+    known = naturalness.NaturalPictures(np.zeros(36), np.eye(36))
+    with pytest.raises(AmiwarpError, match=message):
+        naturalness.niqe(picture, known)
+
+
 def test_niqe_rises_with_blur_and_noise(coins: NDArray[np.float64]) -> None:
     noise = np.random.default_rng(3).normal(size=coins.shape)
     blurred = [naturalness.niqe(ndimage.gaussian_filter(coins, s)) for s in (0.0, 1.0, 2.0, 4.0)]

@@ -550,7 +550,7 @@ def test_bad_values_are_said_and_good_ones_make_the_page_go_on(
     page: Any, recording: Recording
 ) -> None:
     for name, bad, good, words in (
-        ("length_ms", "0", "40", "a window of 0 ms; give a length above 0"),
+        ("length_ms", "0", "40", "the window's length is 0 ms; give a length above 0"),
         ("start_ms", "99999", "100", "no events from 99999.000 ms on for 40.000 ms"),
         ("start_ms", "-1e300", "50", "no events from"),
     ):

@@ -40,7 +40,7 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.imaging import CanvasShape, Votes, regions
 from amiwarp.imaging.export import save_values
 from amiwarp.imaging.regions import suggest_region
-from amiwarp.imaging.sharpness import random_variance, relative_variance
+from amiwarp.imaging.relative_variance import random_variance, relative_variance
 from amiwarp.io import event_rates, spans
 from amiwarp.io.event_rates import EventRates
 from amiwarp.optics import MODELS

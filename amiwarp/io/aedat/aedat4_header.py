@@ -18,6 +18,9 @@ MAGIC = b"#!AER-DAT4.0\r\n"
 HEADER_BYTES = 1 << 24
 """Longest header that is read [bytes]."""
 
+NUMBER = re.compile(r"[0-9]{1,9}")
+"""Number of up to nine digits, which fits into 32 bits."""
+
 
 @dataclass(frozen=True, slots=True)
 class Stream:
@@ -62,12 +65,14 @@ def read_header(path: Path) -> Aedat4File:
         start = len(head) + size
         if start > file_bytes:
             raise AmiwarpError(
-                f"{path}: byte {len(head)}: the header ends beyond the file, which is truncated",
+                f"{path}: the header ends at byte {start:,}, the file at byte {file_bytes:,}; it is cut off, copy it "
+                "again",
                 ErrorCode.FILE_DAMAGED,
             )
         if size > HEADER_BYTES:
             raise AmiwarpError(
-                f"{path}: byte {len(head)}: the header has {size} bytes, more than {HEADER_BYTES}; the file is damaged",
+                f"{path}: byte {len(head)}: the header has {size} bytes, more than {HEADER_BYTES}; the file is "
+                "damaged, copy it again",
                 ErrorCode.FILE_DAMAGED,
             )
         header = file.read(size)
@@ -86,7 +91,8 @@ def read_header(path: Path) -> Aedat4File:
             streams = dict(_streams(ElementTree.fromstring(description)))
         except (*DAMAGE, ElementTree.ParseError) as error:
             raise AmiwarpError(
-                f"{path}: the header is damaged: {error}", ErrorCode.FILE_DAMAGED
+                f"{path}: bytes {len(head)} to {start}: the header is damaged: {error}; copy the file again",
+                ErrorCode.FILE_DAMAGED,
             ) from error
         end = file_bytes
         if start <= table < file_bytes and _is_table(file, table, file_bytes - table, compression):
@@ -107,10 +113,10 @@ def _streams(description: ElementTree.Element) -> Iterator[tuple[int, Stream]]:
     """Yield number and description of each stream in the XML text of a header."""
     for node in description.iterfind("node[@name='outInfo']/node"):
         name = node.get("name", "")
-        if re.fullmatch(r"[0-9]{1,9}", name):
+        if NUMBER.fullmatch(name):
             width = node.findtext("node[@name='info']/attr[@key='sizeX']", "")
             height = node.findtext("node[@name='info']/attr[@key='sizeY']", "")
             size = None
-            if re.fullmatch(r"[0-9]{1,9}", width) and re.fullmatch(r"[0-9]{1,9}", height):
+            if NUMBER.fullmatch(width) and NUMBER.fullmatch(height):
                 size = (int(width), int(height))
             yield int(name), Stream(node.findtext("attr[@key='typeIdentifier']", ""), size)

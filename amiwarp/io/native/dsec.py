@@ -17,11 +17,12 @@ from amiwarp.io.hdf5.chunk_file import ChunkFile
 from amiwarp.io.hdf5.chunks import CHUNK
 from amiwarp.io.hdf5.datasets import append_values, make_dataset
 from amiwarp.io.native.layout import EVENTS
-from amiwarp.io.native.parts import ms_entries
+from amiwarp.io.native.ms_index import ms_entries
 from amiwarp.io.output_formats import Outline
 
 DSEC = EVENTS | {"t": np.uint32}
-"""Types of DSEC's datasets."""
+"""Types of DSEC's datasets. Times count from ``t_offset``; the limits of :mod:`amiwarp.io.output_formats` refuse
+recordings over 2**32 us, which would wrap."""
 
 
 def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:

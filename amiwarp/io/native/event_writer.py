@@ -28,8 +28,9 @@ from amiwarp.io.hdf5.chunk_file import ChunkFile, EncodedChunk
 from amiwarp.io.hdf5.chunks import CHUNK, encode_parts
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.native.layout import EVENTS, Columns
-from amiwarp.io.native.parts import event_columns, filled, ms_entries
+from amiwarp.io.native.ms_index import ms_entries
 from amiwarp.io.native.records import Datasets
+from amiwarp.io.native.written_columns import copied_into_chunk, event_columns
 from amiwarp.io.output_formats import Codec
 from amiwarp.tasks import Result, in_order
 from amiwarp.validation import shown
@@ -265,7 +266,7 @@ class EventWriter:
             chunk = {name: column[start:stop] for name, column in columns.items()}
             # A whole chunk of new events is written without a copy.
             if stop - start < CHUNK:
-                self._pending = filled(self._pending, self._pending_count, chunk)
+                self._pending = copied_into_chunk(self._pending, self._pending_count, chunk)
                 chunk = self._pending
             self._pending_count = (self._pending_count + stop - start) % CHUNK
             if self._pending_count == 0:

@@ -32,16 +32,11 @@ from amiwarp.io.hdf5.chunks import CHUNK, encode
 from amiwarp.io.hdf5.datasets import append_chunk, make_dataset
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.native.copying import save_recording
+from amiwarp.io.native.header import check_sensor_size, write_header
 from amiwarp.io.native.layout import ENCODERS, EVENTS, FLAGS, Columns
-from amiwarp.io.native.parts import (
-    check_frame,
-    encoder_columns,
-    event_columns,
-    filled,
-    ms_entries,
-    write_header,
-)
+from amiwarp.io.native.ms_index import ms_entries
 from amiwarp.io.native.reader import open_hdf5
+from amiwarp.io.native.written_columns import copied_into_chunk, encoder_columns, event_columns
 from amiwarp.io.output_formats import check_native
 from amiwarp.io.outputs import NewFile, check_output, link_new, put_in_place
 from amiwarp.optics.camera import Camera
@@ -102,7 +97,7 @@ class LiveWriter:
         self.path = Path(path)
         self._overwrite = overwrite
         check_native(self.path)
-        check_frame(self.path, width, height, camera)
+        check_sensor_size(self.path, width, height, camera)
         self.part = self.path.resolve().with_name(f"{self.path.stem}.part.h5")
         self._size = (int(width), int(height))
         self._camera = camera
@@ -254,7 +249,7 @@ class LiveWriter:
             self._small["ms_to_idx"].add(entries)
             self._next_ms += entries.size
         new = {**columns, "events/t": t - self._t_offset}
-        self._pending = filled(self._pending, self._pending_count, new)
+        self._pending = copied_into_chunk(self._pending, self._pending_count, new)
         self._pending_count += t.size
         self._t_last = int(t[-1])
         if self._pending_count == CHUNK:
@@ -346,7 +341,7 @@ class LiveWriter:
                 f"{self.path}: compensated events need the flags inside, events from a sensor take no flags"
             )
         if self._compensated and extrapolated is None:
-            extrapolated = np.zeros(len(events))
+            extrapolated = np.zeros(len(events), np.uint8)
         return event_columns(events, EventTruth(), inside=inside, extrapolated=extrapolated)
 
     def _to_finish(self) -> int:

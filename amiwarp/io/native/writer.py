@@ -22,9 +22,10 @@ from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, WorldLabels
 from amiwarp.io.hdf5.chunk_file import ChunkFile
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.native.event_writer import EventWriter, FlaggedEvents
+from amiwarp.io.native.header import check_sensor_size, write_header
 from amiwarp.io.native.layout import POSE_TABLES, Columns
-from amiwarp.io.native.parts import check_frame, encoder_columns, write_header
 from amiwarp.io.native.records import Datasets, Records
+from amiwarp.io.native.written_columns import encoder_columns
 from amiwarp.io.output_formats import Codec, check_native
 from amiwarp.io.outputs import NewFile
 from amiwarp.optics.camera import Camera
@@ -97,7 +98,7 @@ class RecordingWriter:
         self._overwrite = overwrite
         check_native(self.path)
         self._codec = choice(Codec, codec, f"{self.path}: codec")
-        check_frame(self.path, width, height, camera)
+        check_sensor_size(self.path, width, height, camera)
         self._size = (int(width), int(height))
         self._camera = camera
         self._prism = prism

@@ -33,7 +33,7 @@ HEAD = struct.Struct("<Iq")
 PLAIN = np.dtype([("x", "<i8"), ("y", "<i8"), ("t", "<i8"), ("p", "<i8")])
 """An event of a chunk that is stored without the codec, as the reading process sends it."""
 DAMAGE = ("", "times", "runs", "columns", "packed numbers")
-"""What a chunk holds other than events, by the numbers of :mod:`amiwarp.kernels.ecf`."""
+"""Part of a chunk that is damaged, by the numbers of :mod:`amiwarp.kernels.ecf`."""
 
 
 def event_packets(server: str, path: Path, name: str, notes: dict[str, int]) -> Iterator[Packet]:
@@ -51,7 +51,10 @@ def event_packets(server: str, path: Path, name: str, notes: dict[str, int]) -> 
             if is_plain[first]:
                 yield _plain_columns(part, sizes[chunks], expected, name)
             else:
-                on_device, counts = decode_chunks(part, sizes[chunks])
+                try:
+                    on_device, counts = decode_chunks(part, sizes[chunks])
+                except AmiwarpError as error:
+                    raise AmiwarpError(f"dataset '{name}': {error}") from error
                 events = on_device.to_host()
                 wanted = _wanted(counts, expected, name)
                 yield events if wanted.all() else events[wanted]
@@ -75,7 +78,8 @@ def _wanted(counts: Integers, rows: Integers, name: str) -> NDArray[np.bool_]:
     if few.size:
         first = few[0]
         raise AmiwarpError(
-            f"dataset '{name}': a chunk has {counts[first]} events; expected {rows[first]}; the file is damaged",
+            f"dataset '{name}': a chunk has {counts[first]} events; expected {rows[first]}; the file is damaged, "
+            "copy it again",
             ErrorCode.FILE_DAMAGED,
         )
     chunk = np.repeat(np.arange(counts.size), counts)
@@ -125,7 +129,8 @@ def decode_chunks(
         first = np.flatnonzero(damage)[0]
         what = DAMAGE[damage[first]]
         raise AmiwarpError(
-            f"a chunk of the ECF codec holds other {what} than events; the file is damaged",
+            f"the {what} of a chunk of the ECF codec, number {first + 1} of {len(sizes)}, are damaged; copy the file "
+            "again",
             ErrorCode.FILE_DAMAGED,
         )
     arrays = new_event_arrays(int(counts.sum()), device)
@@ -138,14 +143,16 @@ def _read_head(chunk: NDArray[np.uint8]) -> tuple[int, int]:
     """Return number of events with packing, and first time [us], of a chunk."""
     if chunk.size < HEAD.size:
         raise AmiwarpError(
-            "a chunk of the ECF codec lacks its head; the file is damaged", ErrorCode.FILE_DAMAGED
+            f"a chunk of the ECF codec has {chunk.size} bytes; expected {HEAD.size} of its head or more; the file is "
+            "damaged, copy it again",
+            ErrorCode.FILE_DAMAGED,
         )
     head, origin = HEAD.unpack_from(chunk.data)
     count = head >> 2
     if count > MOST_EVENTS or chunk.size > MOST_BYTES:
         raise AmiwarpError(
             f"a chunk of the ECF codec has {count} events in {chunk.size} bytes; expected at most {MOST_EVENTS} in "
-            f"{MOST_BYTES}; the file is damaged",
+            f"{MOST_BYTES}; the file is damaged, copy it again",
             ErrorCode.FILE_DAMAGED,
         )
     return head, origin

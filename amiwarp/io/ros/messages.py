@@ -7,22 +7,52 @@ slow. Words of Prophesee's sensors are in :mod:`amiwarp.io.ros.words`.
 
 import math
 import struct
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.io.event_packets import Columns
 from amiwarp.io.ros.words import EVT, check_byte_order
-
-Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
-"""Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
 
 WORD_BYTES = {"mono": 8, "trigger": 8, "libcaer": 8, "libcaer_cmp": 2}
 """Encodings without EVT words, and the bytes of an event, or of a word of the compressed one."""
 
 NOTHING: Columns = (np.zeros(0, np.int64),) * 4
 """No events."""
+
+
+# Types of libcaer's compressed words, in their upper four bits.
+TIME_HIGH = 0
+"""Upper 12 bits of the time."""
+TIME_LOW = 1
+"""Lower 12 bits of the time."""
+COLUMN = 2
+"""Column of the events that follow."""
+SINGLE = 3
+"""Row and polarity of one event."""
+FIRST_ROW = 4
+"""First row of the next vectors, and their polarity."""
+VECTOR = 5
+"""One bit for each of eight rows."""
+
+PACKED = np.dtype([("x", "<u2"), ("y", "<u2"), ("sec", "<u4"), ("nsec", "<u4"), ("p", "u1")])
+"""Event of ROS 1, without padding."""
+
+ALIGNED = np.dtype(
+    {
+        "names": ["x", "y", "sec", "nsec", "p"],
+        "formats": ["<u2", "<u2", "<i4", "<u4", "u1"],
+        "offsets": [0, 2, 6, 10, 14],
+        "itemsize": 16,
+    }
+)
+"""Event of ROS 2 that begins 2 bytes after a multiple of 4, as all do except a first one at a multiple of 4: the first
+begins at 0 and has its times at 4, the second begins at 14 and has them at 20."""
+
+ALIGNMENT = 4
+"""Number of bytes to a multiple of which a message of ROS 2 may be padded."""
 
 
 def decode_packet(message: Any) -> tuple[Columns, Columns]:
@@ -53,7 +83,7 @@ def decode_packet(message: Any) -> tuple[Columns, Columns]:
 
 
 def truncated_bytes(message: Any) -> int:
-    """Return the number of bytes at the end of a message that are no whole word."""
+    """Return the number of bytes at the end of a message that are no whole word, after :func:`decode_packet`."""
     return len(message.events) % WORD_BYTES[message.encoding]
 
 
@@ -83,18 +113,6 @@ def _libcaer(base: int, data: NDArray[np.uint8]) -> Columns:
     y = word >> 2 & 0x7FFF
     p = word >> 1 & 1
     return x, y, t, p
-
-
-# Types of libcaer's compressed words, in their upper four bits.
-TIME_HIGH = 0
-TIME_LOW = 1
-COLUMN = 2
-SINGLE = 3
-"""Row and polarity of one event."""
-FIRST_ROW = 4
-"""First row of the next vectors, and their polarity."""
-VECTOR = 5
-"""One bit for each of eight rows."""
 
 
 def _libcaer_cmp(base: int, data: NDArray[np.uint8]) -> Columns:
@@ -137,52 +155,46 @@ def _libcaer_cmp(base: int, data: NDArray[np.uint8]) -> Columns:
 
 
 def decode_array(raw: bytes | memoryview, *, ros1: bool) -> tuple[int, int, Columns]:
-    """Return width, height and the events of a message of the types :data:`ARRAYS`."""
+    """Return width, height and the events of a message of the types :data:`amiwarp.io.ros.bags.ARRAYS`."""
     if not ros1:
         encapsulation = bytes(raw[:2])
         if encapsulation != b"\0\1":
             raise AmiwarpError(
-                f"has messages of the encapsulation {encapsulation.hex()}; expected little-endian CDR",
+                f"has messages of the encapsulation {encapsulation.hex()}; expected little-endian CDR; convert the bag "
+                "with ros2 bag convert",
                 ErrorCode.FORMAT_UNKNOWN,
             )
         raw = raw[4:]
     # The header: in ROS 1 a sequence number, then in both the time and a string. In ROS 2, numbers are aligned.
     offset = 12 if ros1 else 8
+    _need(raw, offset + 4)
     (length,) = struct.unpack_from("<I", raw, offset)
     offset += 4 + length
     if not ros1:
         offset = math.ceil(offset / ALIGNMENT) * ALIGNMENT
-    height, width, count = struct.unpack_from("<III", raw, offset)
     start = offset + 12
+    _need(raw, start)
+    height, width, count = struct.unpack_from("<III", raw, offset)
     if ros1:
         return width, height, _packed(raw, start, count)
     return width, height, _aligned(raw, start, count)
 
 
-PACKED = np.dtype([("x", "<u2"), ("y", "<u2"), ("sec", "<u4"), ("nsec", "<u4"), ("p", "u1")])
-"""Event of ROS 1, without padding."""
-
-ALIGNED = np.dtype(
-    {
-        "names": ["x", "y", "sec", "nsec", "p"],
-        "formats": ["<u2", "<u2", "<i4", "<u4", "u1"],
-        "offsets": [0, 2, 6, 10, 14],
-        "itemsize": 16,
-    }
-)
-"""Event of ROS 2 that begins 2 bytes after a multiple of 4, as all do except a first one at a multiple of 4."""
-
-
-ALIGNMENT = 4
-"""Number of bytes to a multiple of which a message of ROS 2 may be padded."""
+def _need(raw: bytes | memoryview, stop: int) -> None:
+    """Raise :class:`AmiwarpError` if a message ends before byte ``stop`` of its header."""
+    if len(raw) < stop:
+        raise AmiwarpError(
+            f"has a message of {len(raw)} bytes, whose header alone needs {stop}; the bag is damaged, copy it again",
+            ErrorCode.FILE_DAMAGED,
+        )
 
 
 def _check_length(raw: bytes | memoryview, end: int, count: int, padding: int) -> None:
     """Raise :class:`AmiwarpError` if a message does not end behind its events, or up to ``padding`` bytes later."""
     if not end <= len(raw) <= end + padding:
         raise AmiwarpError(
-            f"has a message that declares {count} events, but has {len(raw)} bytes instead of {end}; "
-            "the bag is damaged",
+            f"has a message that declares {count} events, but has {len(raw)} bytes; expected {end}; the bag is "
+            "damaged, copy it again",
             ErrorCode.FILE_DAMAGED,
         )
 

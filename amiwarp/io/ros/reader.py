@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.events.recording import Recording
-from amiwarp.io.event_packets import Packet
+from amiwarp.io.event_packets import Columns, Packet
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.io.file_sensors import sensors_of
 from amiwarp.io.inputs import errors_name
@@ -36,7 +36,7 @@ from amiwarp.io.ros.bags import (
     typestore,
 )
 from amiwarp.io.ros.events import edge_packets, event_packets, stamp_packets
-from amiwarp.io.ros.messages import Columns, decode_array, decode_packet, truncated_bytes
+from amiwarp.io.ros.messages import decode_array, decode_packet, truncated_bytes
 from amiwarp.io.ros.order import Placed, in_order, note_largest_gap, with_number
 from amiwarp.io.ros.packed import unpacked
 from amiwarp.io.ros.words import EVT, Layout, layout_of

@@ -11,7 +11,7 @@ from amiwarp.live.stream.stream_format import encode_encoder, encode_events
 
 
 class Forward:
-    """Sends events and encoder samples to a sink. It has the methods of a :class:`LiveWriter`."""
+    """A :class:`~amiwarp.live.stream.consumers.RawConsumer` that sends events and encoder samples to a sink."""
 
     def __init__(self, sink: SocketSink | PipeSink) -> None:
         self._sink = sink

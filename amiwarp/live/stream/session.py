@@ -181,7 +181,7 @@ class Session:
             self._phase_check.close(self._drain_left)
         if self._keeper is not None and not self._hasty:
             self._keeper.close()
-        self._consumers.end()
+        self._consumers.join()
 
     def _abandon(self) -> None:
         """Drop the data that wait for the consumers, so that the caller can close their files at once."""
@@ -304,4 +304,4 @@ class Session:
             self._poll_encoder()
         if self._compensator is not None:
             self._give(self._compensator.flush())
-        self._consumers.finish(self._drain_left)
+        self._consumers.drain(self._drain_left)

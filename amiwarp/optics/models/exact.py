@@ -22,6 +22,7 @@ from amiwarp.validation import instance
 
 UPRIGHT_ROWS = np.eye(3)
 """Rotation of a prism axis without tilt: the identity matrix."""
+UPRIGHT_ROWS.setflags(write=False)
 UPRIGHT = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 """The same for kernels."""
 PAIRS = ("tilt", "cylinder", "wobble")
@@ -29,16 +30,20 @@ PAIRS = ("tilt", "cylinder", "wobble")
 
 
 def _pair(
-    name: str, half_range: float, limit: float, slider: tuple[float, float]
+    name: str, half_range_rad: float, limit_deg: float, slider_deg: tuple[float, float]
 ) -> tuple[Parameter, ...]:
-    """Return two parameters, x and y, of one pair of angles; ``slider``: its largest value and step [deg]."""
-    largest, step = slider
+    """Return two parameters, x and y, of one pair of angles.
+
+    A search looks within ``half_range_rad`` of the start value [rad]; ``limit_deg`` is the largest value in an address
+    [deg], and ``slider_deg`` the largest value and the step of the slider [deg].
+    """
+    largest, step = slider_deg
     return tuple(
         Parameter(
             f"{name}_{axis}",
             "rad",
-            half_range,
-            limits=(-limit, limit),
+            half_range_rad,
+            limits=(-limit_deg, limit_deg),
             label=f"{name} in {axis}",
             slider=(-largest, largest, step),
         )
@@ -105,6 +110,7 @@ class ExactModel(Model):
         for name in PAIRS:
             angles = getattr(self, name)
             default = getattr(ExactModel, name)
+            # A default is good already; models are made in each step of a search.
             if angles is not default:
                 object.__setattr__(self, name, check_angles(angles, name))
 
@@ -121,6 +127,7 @@ class ExactModel(Model):
 
     @classmethod
     def still_values(cls, values: Mapping[str, float]) -> dict[str, float]:
+        # Without an apex, both faces are parallel however the prism is tipped, but a cylinder would still bend rays.
         flat = dict(values)
         for name in ("cylinder_x", "cylinder_y"):
             if name in flat:
@@ -129,10 +136,12 @@ class ExactModel(Model):
 
     def params(self, device: Any) -> Any:
         *numbers, axis = self.kernel_values()
+        # The same object: :meth:`kernel_values` returns it without a tilt.
         matrix = UPRIGHT if axis is UPRIGHT_ROWS else wp.mat33(*axis.ravel().tolist())
         return struct_of(ExactParams, [*numbers, matrix])
 
     def kernel_values(self) -> tuple[Any, ...]:
+        # The fields of ExactParams, in their order; the axis as an array.
         tilted = any(self.tilt)
         uneven = any((*self.cylinder, *self.wobble))
         wobble_along, wobble_across = self.wobble

@@ -86,33 +86,33 @@ def run_translate(
 
     device = cli.choose_device(common.device)
     name = None if dataset is None else choice(DataSet, dataset, "--dataset")
-    interpolation_kind = choice(Interpolation, interpolation, "--interpolation")
-    plain: Path | Recording = source
-    between: Path | Recording | None = events
+    kind = choice(Interpolation, interpolation, "--interpolation")
+    pictures: Path | Recording = source
+    events_between: Path | Recording | None = events
     if layout.given():
         opened = open_recording(source if events is None else events, **layout.given())
-        plain, between = (opened, None) if events is None else (source, opened)
+        pictures, events_between = (opened, None) if events is None else (source, opened)
     with cli.progress("reading") as advance:
-        given = translator_input(
-            plain,
-            events=between,
+        read = translator_input(
+            pictures,
+            events=events_between,
             dataset=name,
-            interpolation=interpolation_kind,
+            interpolation=kind,
             fps=fps,
             device=device,
             progress=advance,
         )
-    if duration is None and not given.duration_us:
+    if duration is None and not read.duration_us:
         raise AmiwarpError(
             f"{source}: does not state its duration; give --duration", ErrorCode.CONTENT_MISSING
         )
-    chosen = rig.size is None and rig.fov_deg is None and rig.camera is None
+    has_camera = rig.size is not None or rig.fov_deg is not None or rig.camera is not None
     simulation = translation(
-        given,
+        read,
         rig.build_prism(),
         fov=None if picture_fov_deg is None else cli.fov_from(picture_fov_deg, "--picture-fov-deg"),
         blur=blur_px,
-        camera=None if chosen else rig.build_camera(given.frames.size),
+        camera=rig.build_camera(read.frames.size) if has_camera else None,
         duration_s=duration,
         motion=rig.build_motion(),
         sensor=sensor.build(),

@@ -28,7 +28,7 @@ from amiwarp.tasks import Progress
 
 JOB = "calibration"
 """Name of the job to which all rows of the calibration chart belong."""
-SHARP = STAGES[:1]
+SHARPNESS_ONLY = STAGES[:1]
 """Stages of a calibration that uses sharpness alone."""
 EVENTS = (100_000, 300_000, 1_000_000, 10**9)
 """Numbers of events with which the calibration is measured; the last one means all events."""
@@ -36,8 +36,8 @@ FOLDS = (1024, 512, 256)
 """Numbers of prism angles per turn to which the events are folded."""
 PAIRS = (150_000, 300_000, 600_000, 1_200_000)
 """Numbers of event pairs with which the photometric stage is measured."""
-GUESS = math.radians(10.0)
-"""Phase error [rad] of the start phase that is given to a search without a global stage."""
+GUESS_ERROR_RAD = math.radians(10.0)
+"""Error of the start phase that is given to a search without a global stage [rad]."""
 PAIRS_OF_ALGORITHMS = (
     ("GN_DIRECT_L", "LN_SBPLX"),
     ("GN_DIRECT_L", "LN_COBYLA"),
@@ -62,12 +62,12 @@ class CalibrationSetting:
     comparable: bool = True
     """False if the calibration needs a guess of the phase, so that it cannot be compared with the others."""
 
-    def fields(self, device: str) -> dict[str, Any]:
+    def row_fields(self, device: str) -> dict[str, Any]:
         """Return the fields of the setting's row that do not depend on the measurement."""
         both = "both stages" if self.settings.stages == STAGES else "sharpness alone"
         plain = settings_to(self.settings)
         return {
-            "chart": "calibration",
+            "chart": JOB,
             "job": JOB,
             "label": self.label,
             "family": self.family,
@@ -84,28 +84,32 @@ def calibration_settings(known: KnownRecording, *, quick: bool) -> list[Calibrat
         few = Settings(events=50_000, global_evaluations=60)
         return [
             CalibrationSetting("default", "default", Settings()),
-            CalibrationSetting("50 k events, sharpness", "events", replace(few, stages=SHARP)),
+            CalibrationSetting(
+                "50 k events, sharpness", "events", replace(few, stages=SHARPNESS_ONLY)
+            ),
             CalibrationSetting(
                 "circle, 50 k events, sharpness",
                 "model",
-                replace(few, model="circle", stages=SHARP),
+                replace(few, model="circle", stages=SHARPNESS_ONLY),
             ),
         ]
-    return [*_stages(known), *_events(), *_folds(), *_algorithms(), *_photometric(), *_mixed()]
+    return [*_models(known), *_events(), *_folds(), *_algorithms(), *_photometric(), *_mixed()]
 
 
 def _both(label: str, family: str, settings: Settings) -> Iterator[CalibrationSetting]:
     """Yield a setting with both stages of the calibration, and the same setting with sharpness alone."""
     yield CalibrationSetting(label, family, settings)
-    yield CalibrationSetting(f"{label}, sharpness", family, replace(settings, stages=SHARP))
+    yield CalibrationSetting(
+        f"{label}, sharpness", family, replace(settings, stages=SHARPNESS_ONLY)
+    )
 
 
-def _stages(known: KnownRecording) -> Iterator[CalibrationSetting]:
+def _models(known: KnownRecording) -> Iterator[CalibrationSetting]:
     """Yield the default setting, every model, and the local search that starts from a guess."""
     yield from _both("default", "default", Settings())
     for model in rungs():
         yield from _both(model, "model", Settings(model=model))
-    guess = Settings(global_algorithm=None, start={"phase": known.model.phase + GUESS})
+    guess = Settings(global_algorithm=None, start={"phase": known.model.phase + GUESS_ERROR_RAD})
     for setting in _both("local search from a guess", "algorithms", guess):
         yield replace(setting, comparable=False)
 
@@ -118,7 +122,7 @@ def _events() -> Iterator[CalibrationSetting]:
             yield from _both(f"{name} events", "events", Settings(events=count))
     # The photometric stage selects its own pairs, so more events would only delay its start
     yield CalibrationSetting(
-        "all events, sharpness", "events", Settings(events=EVENTS[-1], stages=SHARP)
+        "all events, sharpness", "events", Settings(events=EVENTS[-1], stages=SHARPNESS_ONLY)
     )
 
 
@@ -130,12 +134,12 @@ def _folds() -> Iterator[CalibrationSetting]:
     for bins in (0, *FOLDS):
         if bins != Settings().fold:
             yield CalibrationSetting(
-                f"{_folded(bins)}, sharpness", "folding", Settings(fold=bins, stages=SHARP)
+                f"{_folded(bins)}, sharpness", "folding", Settings(fold=bins, stages=SHARPNESS_ONLY)
             )
     if FOLDS[-1] != Settings().fold:
         yield CalibrationSetting(_folded(FOLDS[-1]), "folding", Settings(fold=FOLDS[-1]))
     for bins in FOLDS:
-        settings = Settings(events=EVENTS[-1], fold=bins, stages=SHARP)
+        settings = Settings(events=EVENTS[-1], fold=bins, stages=SHARPNESS_ONLY)
         yield CalibrationSetting(f"all events, {_folded(bins)}, sharpness", "folding", settings)
 
 
@@ -147,7 +151,7 @@ def _folded(bins: int) -> str:
 def _algorithms() -> Iterator[CalibrationSetting]:
     """Yield settings with other search algorithms and numbers of search steps."""
     for first, second in PAIRS_OF_ALGORITHMS:
-        settings = Settings(global_algorithm=first, local_algorithm=second, stages=SHARP)
+        settings = Settings(global_algorithm=first, local_algorithm=second, stages=SHARPNESS_ONLY)
         # NLopt's names begin with GN_ or LN_.
         label = f"{first[3:]} + {second[3:]}, sharpness"
         yield CalibrationSetting(label, "algorithms", settings)
@@ -155,7 +159,7 @@ def _algorithms() -> Iterator[CalibrationSetting]:
         yield CalibrationSetting(
             f"{budget} global steps, sharpness",
             "algorithms",
-            Settings(global_evaluations=budget, stages=SHARP),
+            Settings(global_evaluations=budget, stages=SHARPNESS_ONLY),
         )
 
 
@@ -201,6 +205,7 @@ def calibration_rows(
         try:
             return calibrate(known.recording, replace(settings, seed=seed), device=device)
         except AmiwarpError as error:
+            # A refusal is a result: its time is measured, and it is noted, not failed.
             return error
 
     def row(timed: Timed) -> Row | None:
@@ -223,7 +228,7 @@ def calibration_rows(
     tasks = []
     for setting in all_settings:
         tasks.append(
-            Task(partial(run, setting.settings), len(known.events), setting.fields(device))
+            Task(partial(run, setting.settings), len(known.events), setting.row_fields(device))
         )
     timed = measure(
         tasks,
@@ -232,6 +237,7 @@ def calibration_rows(
         "calibrating",
         warm_up=False,
         release=True,
+        # Only settings near the best of all are measured again.
         again=lambda once: near_front([row(timed_setting) for timed_setting in once]),
     )
 
@@ -277,7 +283,7 @@ def _kinds(all_settings: list[CalibrationSetting]) -> list[Settings]:
 
 
 def _shortened(settings: Settings) -> Settings:
-    """Return a setting with few events and steps, for a short run."""
+    """Return a setting with just enough events and steps to compile what it uses."""
     return replace(
         settings,
         events=20_000,

@@ -18,7 +18,7 @@ from amiwarp.io.inputs import read_text
 from amiwarp.io.output_formats import make_folder
 from amiwarp.io.outputs import check_output, write_csv, write_text
 from amiwarp.simulation.sensor_model import SensorModel
-from amiwarp.studies.chart.calibration_rows import GUESS, calibration_rows
+from amiwarp.studies.chart.calibration_rows import GUESS_ERROR_RAD, calibration_rows
 from amiwarp.studies.chart.compensation_rows import FILE, Libraries, compensation_rows
 from amiwarp.studies.chart.drawing import draw
 from amiwarp.studies.chart.rows import Row, beaten_by, fastest_within, fronts, most_accurate_within
@@ -277,7 +277,7 @@ def _share_note(rows: Sequence[Row]) -> str:
 def _guess_note(rows: Sequence[Row]) -> str:
     """Return the note that is printed below the calibration chart."""
     text = "Model error: rms over image and turn, without the constant lag."
-    guess = round(math.degrees(GUESS))
+    guess = round(math.degrees(GUESS_ERROR_RAD))
     if any(not r.comparable for r in rows):
         text += f" With a guess: the phase is known to {guess}°, so these points are not part of the front."
     return text

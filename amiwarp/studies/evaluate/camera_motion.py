@@ -1,7 +1,7 @@
 """Rotation of the camera by contrast maximisation: the rotation whose compensation makes the image of events sharpest.
 
 Source: G. Gallego, H. Rebecq and D. Scaramuzza, "A Unifying Contrast Maximization Framework for Event Cameras", CVPR
-2018. Coordinates may be a sensor's, or compensated.
+2018. The events may be a sensor's or compensated.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class _RotationSearch:
         self._events = events
         self._camera = camera
         self._middle_us = (first_us + last_us) // 2
-        # Moves the image by about one pixel [rad/s]
+        # Angular velocity that moves the image by about one pixel during the events [rad/s]
         span_us = max(last_us - first_us, 1)
         self._unit = 1.0 / (camera.fx * span_us * 1e-6)
         self._votes = Votes(CanvasShape(camera.width, camera.height), "cpu")
@@ -114,7 +114,7 @@ class _RotationSearch:
         options: Any = {
             "initial_simplex": simplex,
             "xatol": 0.02 * self._unit * sigma,
-            "fatol": np.inf,
+            "fatol": np.inf,  # the simplex's size alone decides: a cost that is a median jumps
             "maxiter": 60,
         }
         optimum = minimize(cost, rate, method="Nelder-Mead", options=options)

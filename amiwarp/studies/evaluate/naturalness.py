@@ -22,7 +22,7 @@ BLOCK = 96
 """Side of a block of pixels [px]."""
 SCALES = 2
 """Number of scales; the second has half the resolution."""
-FEATURES = 36
+FEATURES = 18 * SCALES
 """Number of features of a block: 18 per scale."""
 WINDOW_SIGMA = 7.0 / 6.0
 """Standard deviation of the local mean's window of 7 x 7 px [px]."""
@@ -56,7 +56,8 @@ def niqe(picture: NDArray[Any], natural: NaturalPictures | None = None) -> float
     features, _ = block_features(picture)
     if len(features) < 2:
         raise AmiwarpError(
-            f"picture has shape {picture.shape}; NIQE needs two blocks of {BLOCK} x {BLOCK} px"
+            f"picture is {_size_text(picture)}; NIQE needs two blocks of {BLOCK} px; give at least {2 * BLOCK} x "
+            f"{BLOCK} px"
         )
     distance = features.mean(axis=0) - natural.mean
     pooled = (np.cov(features, rowvar=False) + natural.covariance) / 2.0
@@ -97,10 +98,14 @@ def shipped_pictures() -> NaturalPictures:
 
 def block_features(picture: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the features of each block, shape (n, 36), and the blocks' mean local deviation, shape (n,)."""
+    if picture.ndim != 2:
+        raise AmiwarpError(
+            f"picture has shape {picture.shape}; expected (height, width); give a grey picture"
+        )
     rows, columns = (side // BLOCK for side in picture.shape)
     if not rows or not columns:
         raise AmiwarpError(
-            f"picture has shape {picture.shape}; NIQE needs blocks of {BLOCK} x {BLOCK} px"
+            f"picture is {_size_text(picture)}; NIQE needs blocks of {BLOCK} px; give at least {BLOCK} x {BLOCK} px"
         )
     image = picture[: rows * BLOCK, : columns * BLOCK].astype(np.float64)
     features_by_scale: list[NDArray[np.float64]] = []
@@ -117,6 +122,11 @@ def block_features(picture: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[
         if scale == 0:
             sharpness = np.array([block.mean() for block in _blocks(deviation, side)])
     return np.concatenate(features_by_scale, axis=1), sharpness
+
+
+def _size_text(picture: NDArray[Any]) -> str:
+    height, width = picture.shape
+    return f"{width} x {height} px"
 
 
 def locally_normalised(

@@ -13,6 +13,10 @@ LAMP_HZ = 100.0
 """Frequency of the flickering lamp [Hz]."""
 FRAME_US = 1000
 """Interval between two pictures [us]."""
+LEAVES = 600
+"""Number of leaves in the texture of a passing disc."""
+DISC_STREAM = 0x0B1
+"""Second seed of the disc's texture, which shall not be the texture of the scene with the same seed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +60,7 @@ class Lamp(_ChangingStill):
         columns = slice(round((0.5 - half) * width), round((0.5 + half) * width))
         for t in range(0, self.duration_us + FRAME_US, FRAME_US):
             picture = self.light.copy()
+            # The square of a sine has twice its frequency: one dip in each period of the lamp.
             wave = math.sin(math.pi * LAMP_HZ * t * 1e-6)
             picture[rows, columns] *= 1.0 - self.depth * wave**2
             yield t, picture
@@ -80,7 +85,7 @@ class PassingObject(_ChangingStill):
         radius = math.sqrt(self.share * width * height / math.pi)
         middle = math.ceil(radius)
         side = 2 * middle + 1
-        texture = leaves(np.random.default_rng([self.seed, 0x0B1]), side, side, 600)
+        texture = leaves(np.random.default_rng([self.seed, DISC_STREAM]), side, side, LEAVES)
         rows, columns = np.mgrid[:side, :side]
         in_disc = (rows - middle) ** 2 + (columns - middle) ** 2 <= radius**2
         top = height // 2 - middle
