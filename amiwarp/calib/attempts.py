@@ -222,7 +222,7 @@ def at_found_speed(calibrator: Calibrator, tried: Attempt) -> Attempt:
         return tried
     held: dict[str, float] = {}
     if not calibrator.settings.free:
-        held = causes.doubtful_harmonic(found.parameters, found.uncertainty)
+        held = causes.without_doubtful_harmonic(found.parameters, found.uncertainty)
     known = {name: value for name, value in found.parameters.items() if name != "rpm"}
     free = tuple(name for name in found.free if name != "rpm" and name not in held)
     settings = replace(

@@ -348,7 +348,7 @@ class BatchPipeline:
         return views
 
     def _copy(self, target: Any, source: Any, names: Iterable[str], start: int, end: int) -> None:
-        """Copy the events ``at`` to ``end`` of columns between the device and the host."""
+        """Copy the events ``start`` to ``end`` of columns between the device and the host."""
         for name in names:
             target_column = getattr(target, name)
             source_column = getattr(source, name)

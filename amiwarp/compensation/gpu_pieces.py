@@ -30,7 +30,7 @@ class PieceBuffers:
     """Page-locked memory and memory on a GPU for one piece of events."""
 
     def __init__(self, capacity: int, plan: LaunchPlan, encoder: Any, device: Any) -> None:
-        """Allocate memory for ``room`` events."""
+        """Allocate memory for ``capacity`` events."""
         self.room = capacity
         self._plan = plan
         self._encoder = encoder

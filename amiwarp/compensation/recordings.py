@@ -21,7 +21,7 @@ from amiwarp.events.recording import Events, EventSource, Recording
 from amiwarp.io import RecordingWriter
 from amiwarp.io.conversion import bag_of, left_out, subtracted_us
 from amiwarp.io.export import export
-from amiwarp.io.hdf5.chunks import compile_checksums
+from amiwarp.io.hdf5.fletcher32 import compile_checksums
 from amiwarp.io.native.copying import copy_sensors_and_truth
 from amiwarp.io.native.event_writer import FlaggedEvents
 from amiwarp.io.native.events import NativeEvents

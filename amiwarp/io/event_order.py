@@ -27,10 +27,10 @@ SORT_EVENTS = 1 << 25
 
 
 def surveys_of(events: Events) -> NDArray[Any]:
-    """Return what blocks of some events hold, see :class:`amiwarp.kernels.event_order.Survey`."""
+    """Return what blocks of some events hold, see :class:`amiwarp.kernels.event_survey.Survey`."""
     import warp as wp
 
-    from amiwarp.kernels.event_order import Survey, survey_events
+    from amiwarp.kernels.event_survey import Survey, survey_events
     from amiwarp.kernels.launch import launch
     from amiwarp.kernels.quiet_start import start_once
 
@@ -54,7 +54,7 @@ def raise_late_times(events: Events, before: int) -> tuple[int, int]:
     """
     import warp as wp
 
-    from amiwarp.kernels.event_order import raise_times
+    from amiwarp.kernels.event_survey import raise_times
     from amiwarp.kernels.launch import launch
 
     # The largest time before each block.

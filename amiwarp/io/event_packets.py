@@ -21,14 +21,14 @@ class Surveyed:
 
     events: Events
     surveys: NDArray[Any] | None
-    """What each block holds, see :class:`amiwarp.kernels.event_order.Survey`; None if the events have been changed."""
+    """What each block holds, see :class:`amiwarp.kernels.event_survey.Survey`; None if the events have been changed."""
 
     @property
     def is_in_order(self) -> bool:
         """Whether no event is earlier than the one before it."""
         if self.surveys is None:
             return not bool((self.events.t[1:] < self.events.t[:-1]).any())
-        if self.surveys["falls"].any():
+        if self.surveys["decreases"].any():
             return False
         first = self.surveys["first"]
         latest = self.surveys["latest"]

@@ -325,7 +325,7 @@ class FileEvents(EventSource):
 
         before = counts.t_last if counts.count else int(surveys["first"][0])
         floors = np.maximum.accumulate(np.concatenate([[before], surveys["latest"][:-1]]))
-        if surveys["falls"].any() or (surveys["first"] < floors).any():
+        if surveys["decreases"].any() or (surveys["first"] < floors).any():
             late, late_us = raise_late_times(events, before)
             counts.late += late
             counts.late_us = max(counts.late_us, late_us)

@@ -8,7 +8,7 @@ writes the events and notes what they are. One thread reads one packet, or a par
 import warp as wp
 
 from amiwarp.kernels.event_arrays import EventArrays
-from amiwarp.kernels.event_order import Survey, count_falls, largest_coordinate, latest_time
+from amiwarp.kernels.event_survey import Survey, count_decreases, largest_coordinate, latest_time
 from amiwarp.kernels.native_code import load_int64
 from amiwarp.kernels.raw_numbers import OUTSIDE, Span, number_at, span_of
 
@@ -143,7 +143,7 @@ def unpack_events(
     survey = Survey()
     survey.first = load_int64(events.t, first)
     survey.latest = latest_time(events.t, first, stop)
-    survey.falls = count_falls(events.t, first, stop)
+    survey.decreases = count_decreases(events.t, first, stop)
     survey.right = largest_coordinate(events.x, first, stop)
     survey.bottom = largest_coordinate(events.y, first, stop)
     surveys[index] = survey

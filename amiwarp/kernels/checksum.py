@@ -46,7 +46,7 @@ ROWS = 16
 #endif
 """)
 def fletcher32(address: wp.uint64, size: wp.uint64) -> wp.uint64:
-    """Return the checksum of ``size`` bytes in memory, as :func:`amiwarp.io.hdf5.chunks.checksum`. Only for CPUs.
+    """Return the checksum of ``size`` bytes in memory, as :func:`amiwarp.io.hdf5.fletcher32.checksum`. Only for CPUs.
 
     Words are added to 16 pairs of sums, in rows of 16. A sum of up to 360 rows, and the sum of these sums, fit 32 bits.
     """
@@ -67,7 +67,7 @@ class Checksums:
         self._idle: list[tuple[RecordedLaunch, NDArray[np.uint64]]] = [_recorded()]
 
     def __call__(self, parts: Sequence[bytes | memoryview]) -> list[int]:
-        """Return the checksum of each block, as :func:`amiwarp.io.hdf5.chunks.checksum`."""
+        """Return the checksum of each block, as :func:`amiwarp.io.hdf5.fletcher32.checksum`."""
         try:
             launch, table = self._idle.pop()
         except IndexError:

@@ -108,9 +108,8 @@ def open_camera(
     """
     kind, colon, _ = name.partition(":")
     if kind not in CAMERAS:
-        raise AmiwarpError(
-            f"name is {name!r}; give a camera: {', '.join(f'{prefix}:' for prefix in CAMERAS)}"
-        )
+        cameras = ", ".join(f"{prefix}:" for prefix in CAMERAS)
+        raise AmiwarpError(f"name is {name!r}; give a camera: {cameras}")
     wait_s = real(wait_for_source_s, "wait_for_source_s", 0.0, 1e9, " s")
     text = "" if settings is None else str(settings)
     spec = ",".join(part for part in (name if colon else f"{name}:", text) if part)

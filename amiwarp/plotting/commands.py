@@ -112,9 +112,8 @@ def run_render(
     events = recording.events
     window = None
     if frames.window is not None:
-        window = cli.span(
-            frames.window, *((events.t_first, events.t_last) if len(events) else (0, 0))
-        )
+        ends = (events.t_first, events.t_last) if len(events) else (0, 0)
+        window = cli.span(frames.window, *ends)
     with cli.progress("rendering") as advance:
         summary = render(
             recording,
@@ -141,14 +140,15 @@ def run_render(
         "seconds": seconds,
     }
     data["assumptions"] = assumed_texts(recording.metadata)
-    cli.report(common, data, [_line(data), *cli.assumption_lines(data["assumptions"])])
+    cli.report(common, data, [_summary_line(data), *cli.assumption_lines(data["assumptions"])])
 
 
-def _line(data: dict[str, Any]) -> str:
-    pace = "" if data["speed"] is None else f" at {data['speed']:.4g} of real time"
+def _summary_line(data: dict[str, Any]) -> str:
+    """Return size, length and speed of a film, and how fast it was made, in a line."""
+    speed_text = "" if data["speed"] is None else f" at {data['speed']:.4g} of real time"
     film = (
         f"{data['frames']:,} frames of {data['width']} x {data['height']} px, "
-        f"{data['frames'] / data['fps']:.4g} s{pace}"
+        f"{data['frames'] / data['fps']:.4g} s{speed_text}"
     )
     rate = data["events"] / max(data["seconds"], 1e-9) / 1e6
     work = f"{data['frames'] / max(data['seconds'], 1e-9):.3g} frames/s, {rate:.3g} Mev/s on {data['device']}"

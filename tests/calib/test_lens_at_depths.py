@@ -12,7 +12,7 @@ DEVIATION = 0.001
 
 
 def state(
-    found: float, *likely: causes.Cause, rotation_gain: float = 0.0, cost: float = 0.1
+    found: float, *likely: causes.SuspectedError, rotation_gain: float = 0.0, cost: float = 0.1
 ) -> Any:
     """Return a state whose check finds a change of k1, and names likely causes."""
     check = SimpleNamespace(

@@ -16,7 +16,9 @@ import pytest
 
 from amiwarp import AmiwarpError, Encoder, Events, Poses, RecordingWriter
 from amiwarp.io.hdf5.chunk_file import ChunkFile, EncodedChunk
-from amiwarp.io.hdf5.chunks import CHUNK, checksum, decode, encode, encode_parts, make_dataset
+from amiwarp.io.hdf5.chunks import CHUNK, decode, encode, encode_parts
+from amiwarp.io.hdf5.datasets import make_dataset
+from amiwarp.io.hdf5.fletcher32 import checksum
 
 assert hdf5plugin.FILTERS  # its import registers the filter
 
@@ -235,7 +237,7 @@ FAILING = """
 import errno, os, sys
 import numpy as np
 from amiwarp.io.hdf5.chunk_file import ChunkFile
-from amiwarp.io.hdf5.chunks import make_dataset
+from amiwarp.io.hdf5.datasets import make_dataset
 written = os.pwritev
 calls = 0
 def failing(*arguments):

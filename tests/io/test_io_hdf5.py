@@ -26,7 +26,8 @@ from amiwarp import (
 from amiwarp.io import reading_process, reading_server
 from amiwarp.io.hdf5 import chunks
 from amiwarp.io.hdf5 import file as hdf5_file
-from amiwarp.io.hdf5.chunks import CHUNK, checksum, decode
+from amiwarp.io.hdf5.chunks import CHUNK, decode
+from amiwarp.io.hdf5.fletcher32 import checksum
 from amiwarp.io.reading_process import borrow, give_back, run
 from amiwarp.io.reading_server import Reply
 from reference.io_samples import make_events, refusal, to_faery, write_dsec, write_native

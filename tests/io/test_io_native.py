@@ -34,7 +34,8 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.io.hdf5.chunks import CHUNK, checksum, decode, encode
+from amiwarp.io.hdf5.chunks import CHUNK, decode, encode
+from amiwarp.io.hdf5.fletcher32 import checksum
 from amiwarp.io.hdf5.stored_column import StoredColumn
 from amiwarp.io.native.attributes import camera_attributes, read_camera
 from amiwarp.kernels.checksum import Checksums

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import amiwarp
 from amiwarp.calib.photometric import consistency
-from amiwarp.calib.photometric.causes import THIRD, Cause, doubtful_harmonic
+from amiwarp.calib.photometric.causes import THIRD, SuspectedError, without_doubtful_harmonic
 from amiwarp.results import make_space
 from reference import optics as reference
 from tests.command_line import app
@@ -260,7 +260,7 @@ def test_it_is_calibrated_without_start_values(calibrated: amiwarp.Calibration) 
 def test_a_third_harmonic_is_looked_for_unless_it_is_given() -> None:
     camera = amiwarp.Camera.from_fov(128, 96, 1.0)
 
-    def causes_with(free: tuple[str, ...] | None = None, **start: float) -> list[Cause]:
+    def causes_with(free: tuple[str, ...] | None = None, **start: float) -> list[SuspectedError]:
         space = make_space("vibration", camera, NO_PRISM, free=free, start=start, bounds={}, rad_per_us=1e-3,
                            duration_us=1e5)  # fmt: skip
         return consistency.testable(space)
@@ -273,12 +273,12 @@ def test_a_third_harmonic_is_looked_for_unless_it_is_given() -> None:
 def test_a_harmonic_that_may_be_none_is_left_out() -> None:
     values = {"amplitude": 0.01, "third_x": 8e-5, "third_y": 2e-5}
     certain = {"amplitude": 1e-5, "third_x": 2e-5, "third_y": 2e-5}
-    assert doubtful_harmonic(values, certain) == {}
-    assert doubtful_harmonic(values, {**certain, "third_x": 3e-5}) == {
+    assert without_doubtful_harmonic(values, certain) == {}
+    assert without_doubtful_harmonic(values, {**certain, "third_x": 3e-5}) == {
         "third_x": 0.0,
         "third_y": 0.0,
     }
-    assert doubtful_harmonic(values, {"amplitude": 1e-5}) == {}
+    assert without_doubtful_harmonic(values, {"amplitude": 1e-5}) == {}
 
 
 @pytest.mark.slow

@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.nlopt_solver import maximise
 from amiwarp.calib.photometric import limits
-from amiwarp.calib.photometric.causes import SIDE, Cause, turned, with_cause
+from amiwarp.calib.photometric.causes import (
+    SIDE,
+    SuspectedError,
+    values_with_other_side,
+    with_cause,
+)
 from amiwarp.calib.photometric.cost import Cost, size_and_phase_directions
 from amiwarp.calib.photometric.descent import iterate
 from amiwarp.calib.photometric.findings import Optimum
@@ -101,10 +106,12 @@ class AnswerSearch:
         """Return the search in another space, on the same map."""
         return replace(self, cost=self.cost.in_space(space))
 
-    def with_cause(self, cause: Cause, v: Vector) -> AnswerSearch:
+    def with_cause(self, cause: SuspectedError, v: Vector) -> AnswerSearch:
         """Return the search with a cause corrected or free, on the same map; ``v`` is the present answer [px]."""
         space, _ = with_cause(self.space, cause, self.space.to_values(v))
-        sharpest = turned(self.space, self.sharpest) if cause == SIDE else self.sharpest
+        sharpest = (
+            values_with_other_side(self.space, self.sharpest) if cause == SIDE else self.sharpest
+        )
         return replace(self.in_space(space), sharpest=sharpest)
 
     def search(self, start: Vector) -> Answer:

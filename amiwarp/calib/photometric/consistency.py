@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.photometric.causes import (
     ASPECT,
-    CAUSES,
     CENTER,
     DISTORTION,
     FACES,
     FLAT_SIDE,
     FOCAL_LENGTH,
-    GATED,
     INDEX,
+    LOOKED_AT_FIRST,
     SCREENED,
     SEAT,
-    SHAPES,
     SIDE,
+    SUSPECTS,
     THIRD,
-    Cause,
+    UNEVEN,
+    SuspectedError,
     other_side,
-    turned,
+    values_with_other_side,
     with_cause,
 )
 from amiwarp.calib.photometric.cost import size_and_phase_directions
@@ -98,7 +98,7 @@ TELLING = 3.0
 class LikelyCause:
     """A cause for which the answer does not hold everywhere."""
 
-    cause: Cause
+    cause: SuspectedError
     moved_px: float
     """Change of the model over the image and a turn if the cause is corrected, constant lag removed [px rms]."""
     gain: float
@@ -210,20 +210,20 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
 
 
 def _screened_columns(
-    cost: Cost, best: Vector, screened: Sequence[Cause], least_gain: float
+    cost: Cost, best: Vector, screened: Sequence[SuspectedError], least_gain: float
 ) -> dict[str, Any]:
     """Return the derivatives of the residuals that every answer is examined with."""
     columns = by_parts_of_pairs(cost, best)
     for cause in screened:
-        if cause not in GATED:
+        if cause not in LOOKED_AT_FIRST:
             columns |= by_cause(cost, best, cause)
     # wobble and index look like cylinder power: where the first look finds none of that, it finds none of them
-    alike: list[Cause] = []
+    alike: list[SuspectedError] = []
     if FACES in screened:
         alike = [cause for cause in screened if cause in (INDEX, SEAT)]
     gated = [by_rotation(cost, best)]
     for cause in screened:
-        if cause in GATED and cause not in alike:
+        if cause in LOOKED_AT_FIRST and cause not in alike:
             gated.append(by_cause(cost, best, cause))
     for group in telling(cost, gated, least_gain):
         columns |= group
@@ -280,7 +280,7 @@ def _untold(space: ParameterSpace, best: Vector, fit: LinearFit) -> float:
     if std * TELLING <= 1.0:
         return 0.0
     values = space.to_values(best)
-    other = other_side(space).build(turned(space, values))
+    other = other_side(space).build(values_with_other_side(space, values))
     away = distance(other, space.build(values))
     return away if away >= LEAST_MOVE_PX else 0.0
 
@@ -290,7 +290,7 @@ def _shake(space: ParameterSpace, fit: LinearFit) -> float:
     if not set(SHAKE).issubset(fit.names):
         return 0.0
     causes: list[str] = []
-    for cause in CAUSES:
+    for cause in SUSPECTS:
         for name in cause.names:
             if name in fit.names and name not in space.names:
                 causes.append(name)
@@ -340,7 +340,7 @@ def _distortion(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[fl
     return float(estimate.change[-1]) / px_per_unit, std / px_per_unit
 
 
-def testable(space: ParameterSpace) -> list[Cause]:
+def testable(space: ParameterSpace) -> list[SuspectedError]:
     """Return the causes that can be tested: of what the model has, and what is neither free nor found before."""
     kind = MODELS[space.model]
     if kind.SIMPLIFIES is not None or not space.cartesian:
@@ -350,7 +350,7 @@ def testable(space: ParameterSpace) -> list[Cause]:
         adjustable.add(FLAT_SIDE)
     free = set(space.names)
     causes = []
-    for cause in CAUSES:
+    for cause in SUSPECTS:
         names = {*cause.names}
         # only the size of orbits tells the focal length, and the depth of each pixel makes up for that
         if cause == FOCAL_LENGTH and space.depths is not None:
@@ -360,14 +360,14 @@ def testable(space: ParameterSpace) -> list[Cause]:
         if names <= adjustable and not names & free and not known:
             causes.append(cause)
     # a prism whose other side is flat looks nearly like one with cylinder power
-    shaped = any(set(cause.names) & free for cause in SHAPES)
+    shaped = any(set(cause.names) & free for cause in UNEVEN)
     if shaped:
         causes = [cause for cause in causes if cause != SIDE]
     return causes
 
 
 def _likely(
-    cost: Cost, best: Vector, fit: LinearFit, causes: Sequence[Cause], least_gain: float
+    cost: Cost, best: Vector, fit: LinearFit, causes: Sequence[SuspectedError], least_gain: float
 ) -> list[LikelyCause]:
     """Return the significant causes, ordered by the share of the residual that their correction removes."""
     found = []
@@ -386,7 +386,7 @@ def _likely(
 def _corrected(
     cost: Cost,
     best: Vector,
-    cause: Cause,
+    cause: SuspectedError,
     change: Vector,
 ) -> tuple[float, Vector]:
     """Return how far the correction of a cause changes the model [px rms], and the corrected search vector."""

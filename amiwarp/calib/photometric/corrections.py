@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.photometric import limits
 from amiwarp.calib.photometric.answers import Answer, AnswerSearch, is_accepted, join_runs
-from amiwarp.calib.photometric.causes import FLAT_SIDE, SHAPES, Cause
+from amiwarp.calib.photometric.causes import FLAT_SIDE, UNEVEN, SuspectedError
 from amiwarp.calib.photometric.consistency import Consistency, LikelyCause, check_consistency
 from amiwarp.calib.photometric.distances import distance, stated_px
 from amiwarp.calib.photometric.findings import (
@@ -73,7 +73,7 @@ LARGEST_LAST_STEP_PX = 0.01
 class Corrected:
     """Answer after the correction of a cause."""
 
-    cause: Cause
+    cause: SuspectedError
     search: AnswerSearch
     """Search in the corrected space, on the map that all explanations share."""
     answer: Answer
@@ -198,7 +198,7 @@ def _best_correction(state: Refinement) -> Corrected | None:
         least = min(each.cost for each in among)
         return least + share * (here - least)
 
-    of_given = [each for each in tried if each.cause not in SHAPES]
+    of_given = [each for each in tried if each.cause not in UNEVEN]
     if of_given and min(each.cost for each in of_given) <= near_best(tried, GIVEN_SHARE):
         tried = of_given
     good = [each for each in tried if each.cost <= near_best(tried, TIE_SHARE)]

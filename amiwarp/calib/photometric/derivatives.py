@@ -13,7 +13,14 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.calib.photometric.causes import FLAT_SIDE, SIDE, Cause, other_side, turned, with_cause
+from amiwarp.calib.photometric.causes import (
+    FLAT_SIDE,
+    SIDE,
+    SuspectedError,
+    other_side,
+    values_with_other_side,
+    with_cause,
+)
 from amiwarp.calib.photometric.cost import place_arguments
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.launch import launch
@@ -199,13 +206,13 @@ def by_wave_of_angle(cost: Cost, best: Vector, wave: Vector) -> Any:
     return shifted(cost, best, shift)
 
 
-def by_cause(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
+def by_cause(cost: Cost, best: Vector, cause: SuspectedError) -> dict[str, Any]:
     """Return the derivatives of the residuals by the parameters of a cause, by name."""
     space = cost.space
     values = space.to_values(best)
     try:
         if cause == SIDE:
-            other = place_arguments(other_side(space), turned(space, values))
+            other = place_arguments(other_side(space), values_with_other_side(space, values))
             here = place_arguments(space, values)
             by_side = partial(cost.brightness.find_slope, other, here, 1.0)
             return {FLAT_SIDE: cost.column(FLAT_SIDE, by_side)}

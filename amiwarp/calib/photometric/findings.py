@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from amiwarp.brightness.sensor_timing import SensorTiming
-from amiwarp.calib.photometric.causes import Cause
+from amiwarp.calib.photometric.causes import SuspectedError
 from amiwarp.optics.prism import FlatSide
 
 
@@ -177,9 +177,9 @@ class ParameterCorrected(Finding):
 class RivalCauses(Finding):
     """Two causes explain the events equally well."""
 
-    taken: Cause
+    taken: SuspectedError
     """The cause that was corrected."""
-    rival: Cause
+    rival: SuspectedError
     apart_px: float
     """Distance of their models [px rms]."""
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.photometric.causes import SIDE, Cause, with_cause
+from amiwarp.calib.photometric.causes import SIDE, SuspectedError, with_cause
 from amiwarp.calib.photometric.distances import FOLLOW_PX
 from amiwarp.calib.photometric.linear_fit import LinearFit
 from amiwarp.errors import AmiwarpError
@@ -131,7 +131,7 @@ def hidden_px(
     space: ParameterSpace,
     v: Vector,
     fit: LinearFit,
-    causes: Iterable[Cause],
+    causes: Iterable[SuspectedError],
 ) -> dict[str, float]:
     """Return by how much the motion may be wrong for each cause that was looked for [px rms], by its words.
 

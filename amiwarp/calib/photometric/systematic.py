@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib.photometric.causes import FLAT_SIDE, Cause
+from amiwarp.calib.photometric.causes import FLAT_SIDE, SuspectedError
 from amiwarp.calib.photometric.cost import size_and_phase_directions
 from amiwarp.calib.photometric.derivatives import orbit_of, path_of
 from amiwarp.calib.photometric.distances import FOLLOW_PX, displacements
@@ -170,7 +170,7 @@ def _moves(space: ParameterSpace, best: Vector, names: Sequence[str]) -> tuple[V
 def errors_of_a_wrong_lens(
     space: ParameterSpace,
     fit: LinearFit,
-    causes: Sequence[Cause],
+    causes: Sequence[SuspectedError],
 ) -> Vector:
     """Return the covariance of the answer [px²] if everything else about a lens that was given wrongly is doubtful."""
     others: list[str] = []

@@ -10,7 +10,7 @@ import numpy as np
 
 from amiwarp.brightness.sensor_timing import SensorTiming
 from amiwarp.calib.photometric import limits
-from amiwarp.calib.photometric.causes import FLAT_SIDE, Cause
+from amiwarp.calib.photometric.causes import FLAT_SIDE, SuspectedError
 from amiwarp.calib.photometric.consistency import CLOCK, Consistency
 from amiwarp.calib.photometric.findings import (
     AngleError,
@@ -399,7 +399,7 @@ def rivals_in_words(found: RivalCauses) -> str:
     )
 
 
-def _freed(cause: Cause) -> str:
+def _freed(cause: SuspectedError) -> str:
     return ",".join(n for n in cause.names if n != FLAT_SIDE)
 
 

@@ -24,7 +24,7 @@ class PacketEvents(NamedTuple):
     counts: NDArray[np.int64]
     """Number of events of each packet; -1 if it is damaged."""
     surveys: NDArray[Any]
-    """What blocks of the events hold, see :class:`amiwarp.kernels.event_order.Survey`."""
+    """What blocks of the events hold, see :class:`amiwarp.kernels.event_survey.Survey`."""
     earliest: NDArray[np.int64]
     """Least time of each block [us]."""
 
@@ -66,7 +66,7 @@ def decode_packets(packets: NDArray[Any], device: Any) -> PacketEvents:
     from amiwarp.events.device_events import DeviceEvents
     from amiwarp.kernels import aedat4
     from amiwarp.kernels.event_arrays import new_event_arrays
-    from amiwarp.kernels.event_order import Survey
+    from amiwarp.kernels.event_survey import Survey
     from amiwarp.kernels.launch import launch
 
     device = wp.get_device(device)

@@ -172,6 +172,7 @@ def describe(stored: Any, name: str, kinds: str, about: FileFacts) -> dict[str, 
         chunks = _chunks(dataset, name, about)
         count = _chunked_length(dataset, name, chunks, about.unfinished)
         if about.plain:
+            # Only datasets with chunks of the native layout have places.
             used = -(-count // CHUNK)
             places = _stored_places(dataset, chunks[:used])
         if places is None:
@@ -202,29 +203,39 @@ def _in_words(kinds: str) -> str:
 def _opened(stored: Any, name: str) -> _Dataset:
     """Return a dataset with its properties, after checking its number of dimensions."""
     dimensions = DIMENSIONS.get(name, 1)
-    shape = stored.shape if isinstance(stored, h5py.h5d.DatasetID) else None
-    if shape is None or len(shape) != dimensions:
-        wanted = "one-dimensional" if dimensions == 1 else f"{dimensions}-dimensional"
+    wanted = "one-dimensional" if dimensions == 1 else f"{dimensions}-dimensional"
+    if not isinstance(stored, h5py.h5d.DatasetID) or stored.shape is None:
         raise AmiwarpError(
             f"no {wanted} dataset '{name}'; the file is incomplete", ErrorCode.FILE_DAMAGED
         )
+    if len(stored.shape) != dimensions:
+        raise AmiwarpError(
+            f"dataset '{name}' has the shape {stored.shape}; expected a {wanted} one, see "
+            "docs/reference/recording-format.md",
+            ErrorCode.FORMAT_UNKNOWN,
+        )
+    return _properties(stored)
+
+
+def _properties(stored: Any) -> _Dataset:
+    """Return a dataset of h5py's low-level interface with its properties."""
     creation = stored.get_create_plist()
     is_chunked = creation.get_layout() == h5py.h5d.CHUNKED
     return _Dataset(
         id=stored,
-        shape=shape,
+        shape=stored.shape,
         dtype=stored.dtype,
         chunks=creation.get_chunk() if is_chunked else None,
         filters=[creation.get_filter(number) for number in range(creation.get_nfilters())],
     )
 
 
-def row_bytes(dataset: Any) -> int:
+def row_bytes(dataset: _Dataset) -> int:
     """Return the size of a dataset's row in memory [bytes]."""
     return int(dataset.dtype.itemsize) * math.prod(dataset.shape[1:])
 
 
-def plain_length(dataset: Any, name: str, file_bytes: int) -> int:
+def plain_length(dataset: _Dataset, name: str, file_bytes: int) -> int:
     """Return the length of a dataset without chunks, after checking that the file holds all of it."""
     count = int(dataset.shape[0]) if dataset.shape else 1
     offset = dataset.id.get_offset()
@@ -240,12 +251,13 @@ def plain_length(dataset: Any, name: str, file_bytes: int) -> int:
     return count
 
 
-def _chunked_length(dataset: Any, name: str, chunks: list[Any], unfinished: bool) -> int:
+def _chunked_length(dataset: _Dataset, name: str, chunks: list[Any], unfinished: bool) -> int:
     """Return the length of a dataset with chunks, after checking that no chunk is missing.
 
     An unfinished file ends at the first missing chunk.
     """
     count = int(dataset.shape[0])
+    assert dataset.chunks is not None
     size = dataset.chunks[0]
     held = 0
     while held < len(chunks) and chunks[held].chunk_offset[0] == held * size:
@@ -283,8 +295,9 @@ def _chunks(dataset: _Dataset, name: str, about: FileFacts) -> list[Any]:
     return chunks
 
 
-def bytes_of_chunk(dataset: Any, name: str) -> int:
+def bytes_of_chunk(dataset: _Dataset, name: str) -> int:
     """Return the size of a dataset's chunk in memory [bytes], after checking that it is not too large."""
+    assert dataset.chunks is not None
     size = math.prod(dataset.chunks) * int(dataset.dtype.itemsize)
     if size > CHUNK_BYTES:
         raise AmiwarpError(
@@ -348,8 +361,9 @@ def _stored_places(dataset: _Dataset, chunks: list[Any]) -> list[tuple[int, int]
     return [(chunk.byte_offset, chunk.size) for chunk in chunks]
 
 
-def check_stored(dataset: Any, name: str, path: str) -> None:
+def check_stored(opened: h5py.Dataset, name: str, path: str) -> None:
     """Check that the file holds all of a dataset, in chunks that fit into memory."""
+    dataset = _properties(opened.id)
     if dataset.chunks is None:
         plain_length(dataset, name, os.path.getsize(path))
         return
@@ -358,7 +372,7 @@ def check_stored(dataset: Any, name: str, path: str) -> None:
     )
     if declared != dataset.id.get_num_chunks():
         raise AmiwarpError(
-            f"dataset '{name}' declares {dataset.shape[0]} rows, which it does not hold; it is damaged",
+            f"dataset '{name}' declares {dataset.shape[0]} rows, which it does not hold; copy the file again",
             ErrorCode.FILE_DAMAGED,
         )
     bytes_of_chunk(dataset, name)

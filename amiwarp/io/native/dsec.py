@@ -14,7 +14,8 @@ import numpy as np
 
 from amiwarp.events.recording import Events, regroup
 from amiwarp.io.hdf5.chunk_file import ChunkFile
-from amiwarp.io.hdf5.chunks import CHUNK, append_values, make_dataset
+from amiwarp.io.hdf5.chunks import CHUNK
+from amiwarp.io.hdf5.datasets import append_values, make_dataset
 from amiwarp.io.native.layout import EVENTS
 from amiwarp.io.native.ms_index import ms_entries
 from amiwarp.io.output_formats import Outline

@@ -28,7 +28,8 @@ from amiwarp.events.recording import Events, MetadataValue
 from amiwarp.events.truth import EventTruth
 from amiwarp.io.columns.options import GivenLayout
 from amiwarp.io.file_access import allocate
-from amiwarp.io.hdf5.chunks import CHUNK, append_chunk, encode, make_dataset
+from amiwarp.io.hdf5.chunks import CHUNK, encode
+from amiwarp.io.hdf5.datasets import append_chunk, make_dataset
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.native.copying import save_recording
 from amiwarp.io.native.header import check_sensor_size, write_header

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import check_truth
-from amiwarp.io.hdf5.chunks import CHUNK, make_dataset
+from amiwarp.io.hdf5.chunks import CHUNK
+from amiwarp.io.hdf5.datasets import make_dataset
 from amiwarp.io.native.layout import Columns
 from amiwarp.io.output_formats import Codec
 from amiwarp.validation import shown

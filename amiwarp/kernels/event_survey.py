@@ -1,4 +1,4 @@
-"""Kernels that check decoded events in blocks: their order in time, and their largest coordinates."""
+"""What blocks of decoded events hold: their order in time, which is repaired, and their largest coordinates."""
 
 import warp as wp
 
@@ -15,7 +15,7 @@ class Survey:
     """Time of its first event [us]."""
     latest: wp.int64
     """Largest time [us]."""
-    falls: int
+    decreases: int
     """Number of events that are earlier than the one before."""
     right: int
     """Largest column [px]."""
@@ -48,11 +48,11 @@ def latest_time(t: wp.array(dtype=wp.int64), start: int, stop: int) -> wp.int64:
 
 @wp.func_native("""
     const int64_t* time = (const int64_t*)t.data;
-    int64_t falls = 0;
-    for (int i = start + 1; i < stop; ++i) falls += time[i] < time[i - 1];
-    return (int)falls;
+    int64_t decreases = 0;
+    for (int i = start + 1; i < stop; ++i) decreases += time[i] < time[i - 1];
+    return (int)decreases;
 """)
-def count_falls(t: wp.array(dtype=wp.int64), start: int, stop: int) -> int:
+def count_decreases(t: wp.array(dtype=wp.int64), start: int, stop: int) -> int:
     """Return how many times from ``start`` to before ``stop`` are earlier than the one before."""
 
 
@@ -61,18 +61,18 @@ def survey_events(
     x: wp.array(dtype=wp.uint16),
     y: wp.array(dtype=wp.uint16),
     t: wp.array(dtype=wp.int64),
-    length: int,
+    block_events: int,
     start: int,
     surveys: wp.array(dtype=Survey),
 ):
-    """Note what each block of ``length`` events holds. One thread reads one block."""
+    """Note what each block of ``block_events`` events holds. One thread reads one block."""
     block = wp.tid() + start
-    first = block * length
-    stop = wp.min(first + length, t.shape[0])
+    first = block * block_events
+    stop = wp.min(first + block_events, t.shape[0])
     survey = Survey()
     survey.first = load_int64(t, first)
     survey.latest = latest_time(t, first, stop)
-    survey.falls = count_falls(t, first, stop)
+    survey.decreases = count_decreases(t, first, stop)
     survey.right = largest_coordinate(x, first, stop)
     survey.bottom = largest_coordinate(y, first, stop)
     surveys[block] = survey
@@ -80,12 +80,12 @@ def survey_events(
 
 @wp.kernel
 def raise_times(
-    length: int,
+    block_events: int,
     floors: wp.array(dtype=wp.int64),
     start: int,
     t: wp.array(dtype=wp.int64),
     raised: wp.array(dtype=int),
-    furthest: wp.array(dtype=wp.int64),
+    largest_raise_us: wp.array(dtype=wp.int64),
 ):
     """Raise each time of a block to the largest so far, and note how many were raised, and by how much at most [us].
 
@@ -95,7 +95,7 @@ def raise_times(
     latest = floors[block]
     count = int(0)
     most = wp.int64(0)
-    for i in range(block * length, wp.min((block + 1) * length, t.shape[0])):
+    for i in range(block * block_events, wp.min((block + 1) * block_events, t.shape[0])):
         now = load_int64(t, i)
         if now < latest:
             store_int64(t, i, latest)
@@ -104,4 +104,4 @@ def raise_times(
         else:
             latest = now
     raised[block] = count
-    furthest[block] = most
+    largest_raise_us[block] = most
