@@ -314,7 +314,8 @@ OPENED_OTHERWISE = {
     "amiwarp.io.hdf5.server_objects: h5py.h5o.open(parent, key)": "group or dataset",
     "amiwarp.io.hdf5.server_columns: h5py.File(path, 'r')": "reading process",
     "amiwarp.io.columns.matlab: loadmat(path, simplify_cells=True)": "reading process",
-    "amiwarp.io.text.reader: np.loadtxt(kept, np.int64, ndmin=1, comments=None, encoding='ascii', usecols=time_column)": "lines",
+    "amiwarp.io.text.reader: "
+    "np.loadtxt(kept, np.int64, ndmin=1, comments=None, encoding='ascii', usecols=time_column)": "lines",
     "amiwarp.io.text.reader: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
     "amiwarp.plotting.figures: Image.open(buffer)": "bytes",
     "amiwarp.simulation.worlds.mesh_reader: Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)": "bytes",
