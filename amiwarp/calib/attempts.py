@@ -100,7 +100,8 @@ def _with_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, A
     calibrator, tried = with_mended_encoder(calibrator, tried)
     straight, straight_tried = with_straight_angles(calibrator, tried)
     last, answer = _with_camera_examined(straight, straight_tried)
-    if straight.harmonics != calibrator.harmonics and tried.camera_turned:
+    doubtful = tried.camera_turned or tried.unexplained
+    if doubtful and straight.harmonics != calibrator.harmonics:
         # A camera that turns looks like errors of the angles, too: the lower cost decides.
         uncorrected, rival = _with_camera_examined(calibrator, tried)
         if rival.accepted and not (answer.accepted and answer.cost <= rival.cost):
