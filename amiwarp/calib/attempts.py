@@ -100,10 +100,11 @@ def _with_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, A
     calibrator, tried = with_mended_encoder(calibrator, tried)
     straight, straight_tried = with_straight_angles(calibrator, tried)
     last, answer = _with_camera_examined(straight, straight_tried)
-    doubtful = tried.camera_turned or tried.unexplained
-    if doubtful and straight.harmonics != calibrator.harmonics:
+    is_doubtful = straight_tried.camera_turned or straight_tried.unexplained
+    if is_doubtful and straight.harmonics != calibrator.harmonics:
         # A camera that turns looks like errors of the angles, too: the lower cost decides.
-        uncorrected, rival = _with_camera_examined(calibrator, tried)
+        held = calibrator.attempt(angles_hold=True)
+        uncorrected, rival = _with_camera_examined(calibrator, held)
         if rival.accepted and not (answer.accepted and answer.cost <= rival.cost):
             last = uncorrected
             answer = rival
