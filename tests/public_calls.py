@@ -479,8 +479,6 @@ OWN: dict[str, dict[str, Any]] = {
     "ImuModel.preset": {"name": "bmi160"},
     "ImuModel.follow": {"trajectory": STILL, "duration_s": 0.01},
     "ImuModel.turn": {"rotation": aw.CameraMotion(), "duration_s": 0.01},
-    "CameraMotion.angular_velocity": {"t": [0.0]},
-    "Trajectory.derivatives": {"t": [0.0]},
     "EventSensor": {"cameras": 2},
     "EventSensor.step": {"images": np.zeros((2, 3, 4), np.float32), "t_us": 0},
     "PictureFolder": _all(FOLDER),

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.other_sensors import ImuSamples
 from amiwarp.schema.calls import guarded
-from amiwarp.simulation.motion import CameraMotion
-from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.simulation.motion import CameraMotion, rates_of
+from amiwarp.simulation.worlds.trajectory import Trajectory, derivatives_of
 from amiwarp.validation import array, one_of, real, whole
 
 GRAVITY = 9.80665
@@ -83,10 +83,10 @@ class ImuModel:
     """Random walk of the accelerometer's bias [m/s^3/sqrt(Hz)]."""
     accelerometer_bias: float = 0.0
     """Standard deviation of the accelerometer's first bias, of each axis [m/s^2]."""
-    gyroscope_range: float = math.inf
-    """Largest angular velocity that is measured [rad/s]."""
-    accelerometer_range: float = math.inf
-    """Largest acceleration that is measured [m/s^2]."""
+    gyroscope_range: float | None = None
+    """Largest angular velocity that is measured [rad/s]; None for any."""
+    accelerometer_range: float | None = None
+    """Largest acceleration that is measured [m/s^2]; None for any."""
     bits: int = 0
     """Bits of a sample over twice the range, 8 to 32; 0 for samples that are not rounded."""
     to_camera: ArrayLike = field(default_factory=lambda: np.eye(3))
@@ -108,9 +108,8 @@ class ImuModel:
             object.__setattr__(self, name, real(getattr(self, name), f"IMU {name}", 0.0, limit))
         for name in ("gyroscope_range", "accelerometer_range"):
             value = getattr(self, name)
-            if value != math.inf:
-                value = real(value, f"IMU {name}", 1e-3, 1e5)
-            object.__setattr__(self, name, value)
+            if value is not None:
+                object.__setattr__(self, name, real(value, f"IMU {name}", 1e-3, 1e5))
         self._check_bits()
         place = array(self.position, "IMU position").astype(np.float64)
         if place.shape != (3,) or not (np.abs(place) <= 10.0).all():
@@ -131,7 +130,7 @@ class ImuModel:
         if bits < 8:
             raise AmiwarpError(f"IMU bits is {bits}; give 8 to 32, or 0 for samples as they are")
         for name in ("gyroscope_range", "accelerometer_range"):
-            if getattr(self, name) == math.inf:
+            if getattr(self, name) is None:
                 raise AmiwarpError(
                     f"IMU bits is {bits}, but {name} is unlimited; give {name}, or bits=0"
                 )
@@ -207,7 +206,7 @@ class ImuModel:
         Examples
         --------
         >>> still = amiwarp.Trajectory.still([0, 0, 0], look_at=[1, 0, 0])
-        >>> imu = amiwarp.ImuModel(rate_hz=100).samples(still, 0.1)
+        >>> imu = amiwarp.ImuModel(rate_hz=100).follow(still, 0.1)
         >>> len(imu), imu.acceleration[0].round(5).tolist()
         (11, [0.0, -9.80665, 0.0])
         """
@@ -302,6 +301,8 @@ class ImuModel:
         steps[0] = first_bias
         bias = np.cumsum(steps, axis=0)
         measured = true + bias + noise * rng.standard_normal(true.shape)
+        if limit is None:
+            return np.asarray(measured)
         measured = np.clip(measured, -limit, limit)
         if self.bits:
             # The largest code is one step below the range, as in two's complement.
@@ -322,17 +323,19 @@ def motion_of(trajectory: Trajectory, t: NDArray[np.float64]) -> Motion:
     times = np.asarray(trajectory.t, np.float64)
     moving = (t >= times[0]) & (t <= times[-1])
     if len(times) > 1 and moving.any():
-        acceleration[moving], rate[moving], rate_change[moving] = trajectory.derivatives(t[moving])
+        acceleration[moving], rate[moving], rate_change[moving] = derivatives_of(
+            trajectory, t[moving]
+        )
     return Motion(to_world, acceleration, rate, rate_change)
 
 
 def rotation_of(motion: CameraMotion, duration_s: float, t: NDArray[np.float64]) -> Motion:
     """Return how a camera turns in front of a picture at times [s], shape ``(n,)``."""
     to_picture = motion.orientation(duration_s)(np.clip(t, 0.0, duration_s))
-    rate = motion.angular_velocity(t)
+    rate = rates_of(motion, t)
     half_s = 1e-4
-    ahead = motion.angular_velocity(t + half_s)
-    behind = motion.angular_velocity(t - half_s)
+    ahead = rates_of(motion, t + half_s)
+    behind = rates_of(motion, t - half_s)
     return Motion(to_picture, np.zeros_like(rate), rate, (ahead - behind) / (2.0 * half_s))
 
 

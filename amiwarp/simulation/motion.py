@@ -456,29 +456,6 @@ class CameraMotion:
         """Whether the angular velocity never changes."""
         return bool((self._table()[:, 1:] == self._table()[0, 1:]).all())
 
-    def angular_velocity(self, t: ArrayLike) -> NDArray[np.float64]:
-        """Return the angular velocity at given times.
-
-        Parameters
-        ----------
-        t : array_like
-            Times [s], shape ``(n,)``.
-
-        Returns
-        -------
-        ndarray
-            Angular velocity of the camera in its own frame [rad/s], shape ``(n, 3)``.
-
-        Examples
-        --------
-        >>> amiwarp.CameraMotion((0.0, 0.5, 0.0)).angular_velocity([0.0]).tolist()
-        [[0.0, 0.5, 0.0]]
-        """
-        table = self._table()
-        at = array(t, "t").astype(np.float64)
-        columns = [np.interp(at, table[:, 0], column) for column in table[:, 1:].T]
-        return np.stack(columns, axis=-1)
-
     def orientation(
         self, duration_s: float
     ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
@@ -505,7 +482,7 @@ class CameraMotion:
         # The rate of each step is the rate at its middle.
         step = ROTATION_INTERVAL
         grid = np.arange(math.ceil(duration_s / step) + 2) * step
-        rates = self.angular_velocity(grid + step / 2.0)
+        rates = rates_of(self, grid + step / 2.0)
         nodes = [np.eye(3)]
         for matrix in Rotation.from_rotvec(rates * step).as_matrix()[:-1]:
             nodes.append(nodes[-1] @ matrix)
@@ -517,6 +494,13 @@ class CameraMotion:
             return np.asarray(corners[i] @ rest)
 
         return at
+
+
+def rates_of(rotation: CameraMotion, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angular velocity of a camera in its own frame at times [s], in rad/s, shape ``(n, 3)``."""
+    table = rotation._table()
+    columns = [np.interp(t, table[:, 0], column) for column in table[:, 1:].T]
+    return np.stack(columns, axis=-1)
 
 
 def _check_table(what: str, table: NDArray[np.float64], columns: int = 2) -> None:

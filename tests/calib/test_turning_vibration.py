@@ -89,9 +89,8 @@ def test_a_rotation_beside_an_encoder_that_is_not_found_is_said(
 
     monkeypatch.setattr(attempts, "with_mended_encoder", unchanged)
     monkeypatch.setattr(attempts, "with_straight_angles", unchanged)
-    calibrator = cast(
-        "Calibrator", SimpleNamespace(settings=SimpleNamespace(free=None, model="mirror"))
-    )
+    settings = SimpleNamespace(free=None, model="mirror")
+    calibrator = cast("Calibrator", SimpleNamespace(settings=settings, harmonics=None))
     summary = SimpleNamespace(cost=0.1, accepted=True, rotation_gain=0.33, moving=())
     tried = Attempt(cast("Any", Found(summary)))
     better = attempt(0.02)

@@ -181,8 +181,3 @@ def test_unknown_presets_and_too_many_samples_are_refused() -> None:
         ImuModel.preset("bmi161")
     with pytest.raises(AmiwarpError, match="IMU samples"):
         ImuModel(rate_hz=1e5).turn(CameraMotion(), 1e5)
-
-
-def test_times_outside_of_a_trajectory_have_no_derivatives() -> None:
-    with pytest.raises(AmiwarpError, match=r"from 0 to 0\.5 s"):
-        waving().derivatives([0.6])

@@ -217,7 +217,7 @@ def test_settings_are_different_and_one_is_the_default(known: KnownRecording) ->
     for quick in (False, True):
         ways = calibration_rows.calibration_settings(known, quick=quick)
         assert len({way.label for way in ways}) == len(ways)
-        assert [way.label for way in ways if way.fields("cpu")["default"]] == ["default"]
+        assert [way.label for way in ways if way.row_fields("cpu")["default"]] == ["default"]
         for way in ways:
             way.settings.check()
             check("calibration", settings_to(way.settings))
@@ -717,7 +717,14 @@ def calibrations(
         )
         took = 1e-3 * low_ms * (high_ms / low_ms) ** min(max(late, 0.0), 1.0)
         out.append(
-            Row(**way.fields("cpu"), events=10**7, seconds=took, spread=0.1, repeats=3, error_px=px)
+            Row(
+                **way.row_fields("cpu"),
+                events=10**7,
+                seconds=took,
+                spread=0.1,
+                repeats=3,
+                error_px=px,
+            )
         )
     return out
 
@@ -738,7 +745,7 @@ def compensations(mev_per_s: dict[str, float], others: dict[str, float], files: 
         rough = math.hypot(
             errors[way.model], 12.0 / way.angles, 0.408 if way.vote is Vote.NEAREST else 0.0
         )
-        out.append(made(way.fields("cpu"), speed, rough))
+        out.append(made(way.row_fields("cpu"), speed, rough))
     fixed: dict[str, Any] = {
         "chart": "compensation",
         "job": compensation_rows.IMAGE,

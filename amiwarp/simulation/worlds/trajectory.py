@@ -194,55 +194,6 @@ class Trajectory:
         turn, place = self._splines
         return turn(inside).as_matrix(), np.asarray(place(inside))
 
-    def derivatives(
-        self, t: ArrayLike
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return how the trajectory moves at given times.
-
-        Parameters
-        ----------
-        t : array_like
-            Times between the first and the last pose [s], shape ``(k,)``.
-
-        Returns
-        -------
-        acceleration : ndarray
-            Acceleration in the world [m/s^2], shape ``(k, 3)``.
-        angular_velocity : ndarray
-            Angular velocity in the frame of the camera or body [rad/s], shape ``(k, 3)``.
-        angular_acceleration : ndarray
-            Its change [rad/s^2], shape ``(k, 3)``.
-
-        Raises
-        ------
-        AmiwarpError
-            If a time is before the first or after the last pose, where nothing moves.
-
-        Examples
-        --------
-        >>> path = amiwarp.Trajectory([0, 1, 2], [[0, 0, 0], [1, 0, 0], [4, 0, 0]], [[0, 0, 0, 1]] * 3)
-        >>> path.derivatives([0.5])[0].tolist()
-        [[2.0, 0.0, 0.0]]
-        """
-        from scipy.spatial.transform import Rotation
-
-        at, _ = self._table()
-        given = np.atleast_1d(np.asarray(array(t, "t"), np.float64))
-        inside = (given >= at[0]) & (given <= at[-1])
-        if given.ndim != 1 or not inside.all():
-            raise AmiwarpError(
-                f"t is {shown(t)}; give times from {at[0]:g} to {at[-1]:g} s, shape (k,)"
-            )
-        nothing = np.zeros((given.size, 3))
-        if at.size == 1:
-            return nothing, nothing.copy(), nothing.copy()
-        if at.size == 2:
-            ends: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
-            rate = (ends[0].inv() * ends[1]).as_rotvec() / (at[1] - at[0])
-            return nothing, np.tile(rate, (given.size, 1)), nothing.copy()
-        turn, place = self._splines
-        return np.asarray(place(given, 2)), turn(given, 1), turn(given, 2)
-
     @classmethod
     def still(
         cls,
@@ -404,6 +355,28 @@ class Trajectory:
         for row in table.tolist():
             lines.append(" ".join(map(repr, row)))
         write_text(path, "\n".join(lines) + "\n", overwrite=overwrite)
+
+
+def derivatives_of(
+    trajectory: Trajectory, t: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return how a trajectory moves at times [s] between its first and its last pose, each of shape ``(n, 3)``.
+
+    They are the acceleration in the world [m/s^2], and the angular velocity [rad/s] and acceleration [rad/s^2] in the
+    frame of the camera or body.
+    """
+    from scipy.spatial.transform import Rotation
+
+    times = np.asarray(trajectory.t, np.float64)
+    nothing = np.zeros((len(t), 3))
+    if len(times) == 1:
+        return nothing, nothing.copy(), nothing.copy()
+    if len(times) == 2:
+        ends: Any = Rotation.from_quat(np.asarray(trajectory.rotation, np.float64))
+        rate = (ends[0].inv() * ends[1]).as_rotvec() / (times[1] - times[0])
+        return nothing, np.tile(rate, (len(t), 1)), nothing.copy()
+    turn, place = trajectory._splines
+    return np.asarray(place(t, 2)), turn(t, 1), turn(t, 2)
 
 
 def looking_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Rotation:

@@ -164,7 +164,7 @@ class ImageSetting:
             words.append(f"1/{self.share} of events")
         return ", ".join(words)
 
-    def fields(self, device: str) -> dict[str, Any]:
+    def row_fields(self, device: str) -> dict[str, Any]:
         """Return the fields of the setting's row that do not depend on the measurement."""
         settings = {
             "model": self.model,
@@ -322,7 +322,7 @@ def _image_tasks(
         yield Task(
             partial(run, setting),
             len(uploads.theta),
-            setting.fields(device),
+            setting.row_fields(device),
             keep=lambda image: image.numpy()[0],
         )
 
