@@ -496,7 +496,7 @@ class CameraMotion:
         return at
 
 
-def rates_of(rotation: CameraMotion, t: NDArray[np.float64]) -> NDArray[np.float64]:
+def rates_of(rotation: CameraMotion, t: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Return the angular velocity of a camera in its own frame at times [s], in rad/s, shape ``(n, 3)``."""
     table = rotation._table()
     columns = [np.interp(t, table[:, 0], column) for column in table[:, 1:].T]
