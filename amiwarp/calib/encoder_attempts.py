@@ -45,6 +45,8 @@ LARGEST_STRAIGHT_COST_RATIO = 1.05
 """Largest ratio of the photometric cost with a corrected encoder to the cost without, if the corrected answer is not
 accepted with a low cost. A right answer may cost more by as much: two maps of the same scene differ so, and one of four
 turns may no longer be whole at the corrected speed."""
+CLEARLY_LOWER_RATIO = 0.95
+"""Ratio of the costs without and with steps of the encoder below which the steps are taken out in any case."""
 MORE_CORRECTIONS = 2
 """Largest number of times that a correction of the encoder's angles is corrected again, if an error of them is left."""
 QUADRATURE = (0.25, 0.5, 2.0, 4.0)
@@ -120,6 +122,8 @@ def _repairs_steps(again: Attempt, tried: Attempt) -> bool:
 
     No prism makes such steps: the attempt needs no lower cost, and what else is wrong is looked for next.
     """
+    if again.cost <= CLEARLY_LOWER_RATIO * tried.cost:
+        return True  # also if it is refused: an answer at impossible angles is no better
     has_harmonics = again.photometric is not None and bool(again.photometric.harmonics)
     may_be_judged = again.accepted or has_harmonics
     explains_as_much = _something_moves(tried) or not _something_moves(again)
