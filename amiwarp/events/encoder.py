@@ -74,9 +74,9 @@ def factors_by_angle(harmonics: ArrayLike, angles: int) -> list[tuple[float, ...
     elif isinstance(harmonics, list | tuple):
         count = len(harmonics)
     sharing = angles if count > FACTORS[0] else 1
-    counts = [sharing * each for each in FACTORS]
+    counts = {FACTORS[0], *(angles * each for each in FACTORS)}
     if count not in counts:
-        *others, last = counts
+        *others, last = sorted(counts)
         raise AmiwarpError(
             f"harmonics is {shown(harmonics)}; expected {', '.join(map(str, others))} or {last} numbers"
         )

@@ -50,6 +50,13 @@ class ToTensor:
             )
         self.representation = representation
         self.options = options
+        parameters = inspect.signature(representation).parameters
+        if not parameters:
+            raise AmiwarpError(
+                f"representation is {shown(representation)}, which takes no events; give a function, such as voxel_grid"
+            )
+        kinds = {parameter.kind for parameter in parameters.values()}
+        self._known = None if inspect.Parameter.VAR_KEYWORD in kinds else {*parameters}
         self._needed = self._check(options)
 
     def _check(self, options: dict[str, Any]) -> tuple[str, ...]:
@@ -77,7 +84,11 @@ class ToTensor:
         if isinstance(events, Recording):
             source = events.events
             width, height = source.size
-            options = {"width": width, "height": height} | options
+            of_recording = {"width": width, "height": height}
+            if self._known is not None:
+                for name in of_recording.keys() - self._known:
+                    del of_recording[name]
+            options = of_recording | options
             if options.get("model") is not None or "encoder" in self._needed:
                 options.setdefault("encoder", events.encoder)
             events = source.slice(0, len(source))

@@ -845,6 +845,15 @@ def test_an_option_of_a_call_replaces_that_of_the_transform() -> None:
     assert transform(events).shape == (BINS, HEIGHT, WIDTH)
 
 
+def test_transform_of_a_function_without_a_size(tmp_path: Path) -> None:
+    events = some_events(200)
+    recording = amiwarp.Recording(amiwarp.MemoryEvents(events, WIDTH, HEIGHT))
+    columns = amiwarp.ToTensor(lambda events: events.x)
+    assert np.array_equal(columns(recording), events.x)
+    with pytest.raises(amiwarp.AmiwarpError, match="takes no events"):
+        amiwarp.ToTensor(lambda: 0)
+
+
 def test_transform_on_a_device(device: str) -> None:
     events = some_events()
     cut = partial(amiwarp.windows, count=4_000)

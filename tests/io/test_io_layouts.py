@@ -1060,6 +1060,20 @@ def test_a_last_line_that_is_cut_off_is_dropped(tmp_path: Path, encoding: str, c
         open_recording(path)
 
 
+@pytest.mark.parametrize("between", ["# end\n", "\n", "% a remark\n\n"])
+def test_comments_before_a_last_line_do_not_count(tmp_path: Path, between: str) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text(f"0.1 1 2 1\n0.2 3 4 0\n{between}0.3 5 6 1")
+    recording = open_recording(path)
+    assert (len(recording.events), "truncated_bytes" in recording.metadata) == (3, False)
+    path.write_text(f"0.1 1 2 1\n0.2 3 4 0\n{between}0.3 5")
+    recording = open_recording(path)
+    assert (len(recording.events), recording.metadata["truncated_bytes"]) == (2, 5)
+    path.write_text("0.1 1 2 1\n0.2 3 4 0\n# end")
+    recording = open_recording(path)
+    assert (len(recording.events), "truncated_bytes" in recording.metadata) == (2, False)
+
+
 def test_a_time_that_lost_digits_is_cut_off(tmp_path: Path) -> None:
     path = made(tmp_path, lines(np.c_[X, Y, P, T]))
     text = path.read_text().rstrip("\n")

@@ -338,3 +338,29 @@ def test_a_flood_without_events_can_be_ended(tmp_path: Path, number: int, kind: 
     assert json.loads(said)["events"] == 0
     assert {p.name for p in tmp_path.iterdir()} == {"o.h5"}
     assert os.path.getsize(tmp_path / "o.h5") > 0
+
+
+@pytest.mark.parametrize(
+    ("spec", "accepts", "address"),
+    [
+        ("unix:/run/dvs-listen.sock", False, "unix:/run/dvs-listen.sock"),
+        ("unix-listen:/run/dvs-listen.sock", True, "unix:/run/dvs-listen.sock"),
+        ("tcp-listen:127.0.0.1:5000", True, "tcp:127.0.0.1:5000"),
+    ],
+)
+def test_a_sender_is_waited_for_where_it_was(
+    monkeypatch: pytest.MonkeyPatch, spec: str, accepts: bool, address: str
+) -> None:
+    asked = []
+
+    def noted(of_listener: bool) -> Callable[[str], Iterator[None]]:
+        def attempts(where: str) -> Iterator[None]:
+            asked.append((of_listener, where))
+            yield None
+
+        return attempts
+
+    monkeypatch.setattr(returning_source, "iter_accepted", noted(True))
+    monkeypatch.setattr(returning_source, "iter_connected", noted(False))
+    assert list(returning_source.socket_attempts(spec)) == [None]
+    assert asked == [(accepts, address)]

@@ -119,8 +119,8 @@ def _text_packets(
         if newline:
             yield parse(whole, line_number)
             line_number += whole.count(b"\n") + 1
-            _, _, before = whole.rpartition(b"\n")
-    if not rest.strip():
+            before = _last_with_values(whole) or before
+    if not holds_values(rest):
         return
     if before and _is_cut_off(rest, before, form, layout):
         notes["truncated_bytes"] = len(rest)
@@ -129,6 +129,15 @@ def _text_packets(
     if before:
         # The last number may have lost digits.
         notes["unended_last_lines"] = 1
+
+
+def _last_with_values(lines: bytes) -> bytes:
+    """Return the last of some lines that is neither empty nor a comment; an empty one if there is none."""
+    while lines:
+        lines, _, line = lines.rpartition(b"\n")
+        if holds_values(line):
+            return line
+    return b""
 
 
 def _is_cut_off(line: bytes, before: bytes, form: TextForm, layout: Layout) -> bool:

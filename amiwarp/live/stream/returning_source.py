@@ -231,8 +231,9 @@ class ReturningSource:
 
 def socket_attempts(spec: str) -> Generator[Callable[..., StreamSource] | None, None, None]:
     """Yield functions of ``hello_s`` that open the stream of a socket's sender again; None at least every second."""
-    iterate = iter_accepted if spec.partition(":")[0].endswith("-listen") else iter_connected
-    for connection in iterate(spec.replace("-listen", "", 1)):
+    kind, _, place = spec.partition(":")
+    iterate = iter_accepted if kind.endswith("-listen") else iter_connected
+    for connection in iterate(f"{kind.removesuffix('-listen')}:{place}"):
         yield None if connection is None else partial(open_connection, spec, connection)
 
 
