@@ -218,9 +218,9 @@ def test_factors_are_those_of_the_angles_in_turn(solved: tuple[Cost, np.ndarray]
         (5.5, 0.02, 0.001, True),
         (4.5, 0.02, 0.02, False),
         (5.5, 0.008, 0.02, False),
-        (8.0, 0.002, 0.006, True),
-        (8.0, 0.002, 0.004, False),
-        (6.5, 0.002, 0.006, False),
+        (8.0, 0.002, 0.016, True),
+        (8.0, 0.002, 0.014, False),
+        (6.5, 0.002, 0.016, False),
     ],
 )
 def test_a_small_share_of_the_residuals_counts_if_it_is_certain_and_moves_events(

@@ -17,7 +17,7 @@ from tests import ROOT
 INNER = {
     "benchmarks": 2,
     "brightness": 1,
-    "calib": 231,
+    "calib": 236,
     "cli": 35,
     "command_line": 1,
     "compensation": 15,

@@ -43,11 +43,11 @@ SKEW = ("skew x", "skew y")
 LEAST_ANGLE_GAIN = 0.01
 """Smallest share that an error of an angle must remove. Right angles leave 0.003 at most."""
 CERTAIN = 7.0
-LEAST_CERTAIN_PX = 0.005
+LEAST_CERTAIN_PX = 0.015
 """Number of standard deviations above which an error of an angle is certain, and how far it must move events then, by a
 linearised fit [px rms]. Much noise makes the share of the residuals small: at a cost of 0.26, errors of both encoders
-that left 0.08 px had shares of 0.007 and 0.002, at 11 and 8 standard deviations. Right angles were within 6, and moved
-events by 0.0015 px."""
+that left 0.08 px had shares of 0.007 and 0.002, at 11 and 8 standard deviations. Right angles moved events by up to
+0.007 px, in a coarse map of a small image."""
 LEAST_SEEN_GAIN = 0.004
 """Share that decides, at a first look at the gradient alone, whether the angles are examined."""
 FIRST_LOOK = 0.5
