@@ -73,18 +73,19 @@ def simulation(name: str, width: int, height: int, rpm: float, seconds: float) -
     return Simulation(scene, camera, PRISM, seconds, PrismMotion(rpm, PHASE), seed=1)
 
 
-def packets(events: Events) -> list[Events]:
+def packets(events: Events, packet_us: int = PACKET_US) -> list[Events]:
     last = int(events.t[-1])
-    edges = np.searchsorted(events.t, np.arange(0, last + 2 * PACKET_US, PACKET_US)).tolist()
+    edges = np.searchsorted(events.t, np.arange(0, last + 2 * packet_us, packet_us)).tolist()
     return [events[a:b] for a, b in itertools.pairwise(edges)]
 
 
-def camera_for(recording: Recording, **options: float) -> PhaseCamera:
+def camera_for(recording: Recording, device: str = "cpu", **options: float) -> PhaseCamera:
     assert recording.camera is not None
     assert recording.encoder is not None
     encoder = EncoderStream()
     encoder.append(recording.encoder.t, recording.encoder.angle)
-    return PhaseCamera(ExactModel(recording.camera, PRISM, PHASE), encoder, **options)
+    model = ExactModel(recording.camera, PRISM, PHASE)
+    return PhaseCamera(model, encoder, device=device, **options)
 
 
 def correlations(

@@ -11,7 +11,6 @@ the 64 bins of a turn. ``take_ms`` is the time from a packet that completes a bi
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import statistics
 import time
@@ -22,9 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp import EncoderStream, Events, ExactModel, LivePicture, PhaseCamera, Recording
+from amiwarp import Events, LivePicture, PhaseCamera, Recording
 from amiwarp.studies.machine import machine
-from benchmarks.pictures import PHASE, PRISM, correlations, simulation
+from benchmarks.pictures import camera_for, correlations, packets, simulation
 
 WIDTH = 640
 HEIGHT = 480
@@ -34,21 +33,6 @@ ALONE = 400
 """Number of pictures that are made without new events."""
 MOST_APART = 0.05
 """Largest difference between the pictures of both devices [thresholds]."""
-
-
-def camera_for(recording: Recording, device: str, **options: float) -> PhaseCamera:
-    assert recording.camera is not None
-    assert recording.encoder is not None
-    encoder = EncoderStream()
-    encoder.append(recording.encoder.t, recording.encoder.angle)
-    model = ExactModel(recording.camera, PRISM, PHASE)
-    return PhaseCamera(model, encoder, device=device, **options)
-
-
-def packets(events: Events, packet_us: int) -> list[Events]:
-    last_us = int(events.t[-1])
-    edges = np.searchsorted(events.t, np.arange(0, last_us + 2 * packet_us, packet_us)).tolist()
-    return [events[first:last] for first, last in itertools.pairwise(edges)]
 
 
 def pictures_of(camera: PhaseCamera, blocks: list[Events]) -> list[LivePicture]:

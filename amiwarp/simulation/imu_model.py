@@ -11,13 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.other_sensors import ImuSamples
+from amiwarp.io.file_sensors import GRAVITY
 from amiwarp.schema.calls import guarded
 from amiwarp.simulation.motion import CameraMotion, rates_of
 from amiwarp.simulation.worlds.trajectory import Trajectory, derivatives_of
 from amiwarp.validation import array, one_of, real, whole
 
-GRAVITY = 9.80665
-"""Standard acceleration of gravity [m/s^2]."""
 UP_IN_WORLD = (0.0, 0.0, 1.0)
 UP_IN_PICTURE = (0.0, -1.0, 0.0)
 """Directions that point away from the ground: in a world, and in the frame of a picture, whose y axis points down."""
