@@ -242,6 +242,8 @@ class PipeSink:
 
     def send(self, data: bytes) -> None:
         """Write complete packets, encoded by the ``encode_...`` functions."""
+        if self._file.closed:
+            raise AmiwarpError(f"{self._name}: the file is closed; open it again")
         try:
             step = PIPE_BYTES if self._may_block_long else max(len(data), 1)
             for start in range(0, len(data), step):
@@ -254,8 +256,6 @@ class PipeSink:
                 f"{self._name}: {error.strerror}; start the program that reads it again",
                 ErrorCode.OUTPUT_FAILED,
             ) from error
-        except ValueError as error:  # Python's error for a closed file
-            raise AmiwarpError(f"{self._name}: the file is closed; open it again") from error
 
     def _wait_for_reader(self) -> None:
         """Wait until the pipe's reader accepts data."""
