@@ -67,10 +67,13 @@ class Allowance:
     Several requests, also in several processes, share it. Starting a process does not count.
     """
 
-    def __init__(self, *arguments: Any) -> None:
-        """Allow the time for the files and folders among the arguments of a request."""
+    def __init__(self, *arguments: Any, small_s: float = CPU_SECONDS) -> None:
+        """Allow the time for the files and folders among the arguments of a request.
+
+        ``small_s``: time for files of at most :data:`SMALL_BYTES` together [s].
+        """
         size = sum(_size(value) for value in arguments if isinstance(value, Path))
-        self.seconds = CPU_SECONDS * max(1.0, size / SMALL_BYTES)
+        self.seconds = small_s * max(1.0, size / SMALL_BYTES)
         """The whole time [s]."""
         self.left = self.seconds
         """The remaining time [s]."""

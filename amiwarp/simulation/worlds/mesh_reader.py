@@ -53,6 +53,11 @@ PICTURES = (
 """Suffixes of picture files that a mesh file may use as textures."""
 TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation matrix from a frame in which y points up to a frame in which z points up."""
+MESH_SECONDS = 15.0
+"""Processor time that a mesh file of at most :data:`~amiwarp.io.reading_process.SMALL_BYTES` may take [s].
+
+A small file may refer to a texture of 67 million pixels, which takes 2.5 s to decode and convert on an idle core.
+"""
 DEFAULT_REFLECTANCE = 0.5
 """Reflectance of meshes whose file gives neither colours nor a material."""
 
@@ -146,7 +151,8 @@ def _called(
 ) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     """Return what :func:`read_parts` returns, and register the files as inputs."""
     # a glTF file has its arrays in files next to it
-    allowance = Allowance(path, path.parent) if kind == "gltf" else Allowance(path)
+    sized = (path, path.parent) if kind == "gltf" else (path,)
+    allowance = Allowance(*sized, small_s=MESH_SECONDS)
     process = borrow()
     try:
         answer, arrays = process.call(
