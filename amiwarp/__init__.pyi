@@ -24,6 +24,7 @@ from .calib.settings import CalibrationOptions as CalibrationOptions
 from .calib.settings import PhotometricSettings as PhotometricSettings
 from .calib.settings import Settings as Settings
 from .choices import CornerMethod as CornerMethod
+from .choices import DepthMethod as DepthMethod
 from .choices import Fill as Fill
 from .choices import FilmMode as FilmMode
 from .choices import Layers as Layers

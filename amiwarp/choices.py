@@ -146,6 +146,21 @@ class PictureMethod(Option):
     """Sums in phase where optic, camera and window allow them, else the solver."""
 
 
+class DepthMethod(Option):
+    """How depths are found from a camera at rest behind a rotating tilted plate.
+
+    Examples
+    --------
+    >>> [method.value for method in amiwarp.DepthMethod]
+    ['photometric', 'phase']
+    """
+
+    PHOTOMETRIC = "photometric"
+    """One brightness map of the scene for each depth that is tried, and the costs of each pixel's pairs of events."""
+    PHASE = "phase"
+    """Sums of each pixel's events in phase with the plate, and the costs of orbits of tiles: faster and coarser."""
+
+
 class Fill(Option):
     """How to fill the parts of a reconstructed picture that the events do not determine.
 

@@ -75,6 +75,10 @@ def measure(
     assert recording.truth is not None
     assert recording.truth.frames is not None
     truth = recording.truth.frames[0].depth
+    row["in_phase"] = by_sums_in_phase(recording, calibration, truth, device)
+    began = time.process_time()
+    amiwarp.depth(recording, calibration, device=device)
+    row["depth_cpu_s"] = time.process_time() - began
     known = found.known & np.isfinite(truth)
     error = found.inverse_depth[known] - 1.0 / truth[known]
     relative, away = np.abs(error * truth[known]), np.abs(error) / found.std[known]
@@ -91,6 +95,29 @@ def measure(
         "stated_phase_std_deg": math.degrees(calibration.uncertainty["phase"]),
         "events_without_depth_share": float(1.0 - known.mean()),
     }  # fmt: skip
+
+
+def by_sums_in_phase(
+    recording: amiwarp.Recording, calibration: amiwarp.Calibration, truth: np.ndarray, device: str
+) -> dict[str, Any]:
+    """Return errors and CPU time of the depths by sums in phase, kernels loaded."""
+    amiwarp.depth(recording, calibration, method="phase", device=device)
+    began = time.process_time()
+    found = amiwarp.depth(recording, calibration, method="phase", device=device)
+    cpu_s = time.process_time() - began
+    known = found.known & np.isfinite(truth)
+    error = found.inverse_depth[known] - 1.0 / truth[known]
+    relative = np.abs(error * truth[known])
+    away = np.abs(error) / found.std[known]
+    return {
+        "known": int(known.sum()),
+        "median_relative_error": float(np.median(relative)),
+        "bias": float(np.median(error * truth[known])),
+        "p95_relative_error": float(np.percentile(relative, 95)),
+        "within_1_std": float(np.mean(away < 1.0)),
+        "within_2_std": float(np.mean(away < 2.0)),
+        "depth_cpu_s": cpu_s,
+    }
 
 
 Call = tuple[str, amiwarp.WorldScene, int, list[int], str, dict[str, Any]]

@@ -87,6 +87,20 @@ def costs_at_rest(
 ) -> PixelCosts:
     """Return the costs of the pixels over a recording from a camera at rest.
 
+    Raises :class:`AmiwarpError` as :func:`span_at_rest`.
+    """
+    source = recording.events
+    turn_us, start, stop = span_at_rest(recording, encoder)
+    events = read_between(source, start, stop)
+    margin = orbit_px(model) * largest * MARGIN
+    return PixelCosts(
+        events, source.size, encoder, longest_gap_us=round(turn_us), margin_px=margin, device=device
+    )
+
+
+def span_at_rest(recording: Recording, encoder: Encoder) -> tuple[float, int, int]:
+    """Return the time of a turn of the plate, and start and stop of the events that tell the depths [us].
+
     Raises :class:`AmiwarpError` if the camera or the scene moves, the plate does not turn, or there are few events.
     """
     source = recording.events
@@ -113,11 +127,7 @@ def costs_at_rest(
     start = round(min(first + turn_us, last + 1 - turn_us))
     end = min(source.find(start) + MOST_EVENTS, len(source) - 1)
     stop = max(int(source.slice(end, end + 1).t[0]), round(start + turn_us)) + 1
-    events = read_between(source, start, stop)
-    margin = orbit_px(model) * largest * MARGIN
-    return PixelCosts(
-        events, source.size, encoder, longest_gap_us=round(turn_us), margin_px=margin, device=device
-    )
+    return turn_us, start, stop
 
 
 def check_still(depths: Depths, name: str) -> None:

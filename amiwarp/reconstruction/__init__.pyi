@@ -13,6 +13,8 @@ from .reconstruct import Reconstruction as Reconstruction
 
 # Names that are in this room only, kept by hand: what people who add to it need.
 
+from .depth_in_phase import TileDepths as TileDepths
+from .depth_in_phase import depths_in_phase as depths_in_phase
 from .film_files import save_film as save_film
 from .locked_angles import MotionPeriod as MotionPeriod
 from .phase_paths import detail_of_paths as detail_of_paths

@@ -14,7 +14,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from amiwarp.choices import CONTRAST, Fill, PictureMethod, Tone
+from amiwarp.choices import CONTRAST, DepthMethod, Fill, PictureMethod, Tone
 from amiwarp.cli import common as cli
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import EventSource, Recording
@@ -645,6 +645,13 @@ def run_depth(
         typer.Option(help="Figure of the depths and their deviations to write (.png)."),
         cli.OUTPUT,
     ] = None,
+    method: Annotated[
+        DepthMethod,
+        typer.Option(
+            help="photometric: a brightness map for each depth. phase: sums of each pixel's events in phase with the "
+            "plate, in a fraction of the time, with one depth for tiles of 48 px."
+        ),
+    ] = DepthMethod.PHOTOMETRIC,
     nearest_m: Annotated[float, typer.Option(help="Smallest depth that is tried (m).")] = 0.25,
     layout: cli.FileOptions,
     common: cli.Common,
@@ -667,6 +674,7 @@ def run_depth(
         found = depth(
             open_recording(recording, **layout.given()),
             Calibration.load(calibration),
+            method=method,
             nearest_m=nearest_m,
             device=device,
             progress=advance,
@@ -684,6 +692,7 @@ def run_depth(
         "file": str(out),
         "width": width,
         "height": height,
+        "method": method.value,
         "known": int(found.known.sum()),
         "depth_m": [float(x) for x in np.percentile(depths, [5, 50, 95])],
         "relative_std": float(np.median((found.std / found.inverse_depth)[found.known])),

@@ -747,6 +747,19 @@ def test_depths_beyond_both_ends_of_what_is_tried_are_unknown() -> None:
     np.testing.assert_allclose(found.inverse_depth[:, between], 1.5, rtol=0, atol=1e-3)  # 1/m
 
 
+def test_depth_is_found_in_phase(seen: amiwarp.Recording, calibration: amiwarp.Calibration) -> None:
+    assert seen.truth is not None
+    assert seen.truth.frames is not None
+    found = amiwarp.depth(seen, calibration, method="phase")
+    truth = seen.truth.frames[0].depth
+    inside = found.known & (np.abs(np.arange(CAMERA.width) - CAMERA.cx) > 8)
+    assert inside.sum() > 2000
+    assert np.median(np.abs(found.inverse_depth * truth - 1.0)[inside]) < 0.06
+    away = np.abs(found.inverse_depth - 1.0 / truth)[inside] / found.std[inside]
+    assert np.mean(away < 2.0) > 0.85
+    assert np.isnan(found.points[~found.known]).all()
+
+
 def test_depth_is_found(
     seen: amiwarp.Recording, calibration: amiwarp.Calibration, tmp_path: Path
 ) -> None:
