@@ -58,7 +58,9 @@ def calibrated(calibrator: Calibrator) -> Calibration:
         return _with_assumptions(calibrator, tried.found())
 
     last = calibrator
-    by_gyroscope = with_gyroscope(last, tried)
+    by_gyroscope = None
+    if calibrator.recording.imu is not None:
+        by_gyroscope = with_gyroscope(last, tried)
     unused_gyroscope = ""
     if by_gyroscope is not None and by_gyroscope.error is not None:
         unused_gyroscope = str(by_gyroscope.error)

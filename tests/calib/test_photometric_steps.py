@@ -77,14 +77,45 @@ def first(problem: Problem) -> Refinement:
     return first_answer(problem, problem.settings.sensor)
 
 
-def test_steps_that_do_not_apply_return_the_same_state(first: Refinement) -> None:
-    for step in steps.STEPS:
-        if step not in (
+def test_steps_without_anything_to_do_return_the_same_state(first: Refinement) -> None:
+    for applies, step in steps.STEPS:
+        if applies(first.problem) and step not in (
             losses.see_what_can_be_examined,
             losses.count_lost_events,
             steps.correct_camera_and_prism,
         ):
             assert step(first) is first, step.__name__
+
+
+def steps_for(problem: Problem) -> set[str]:
+    """Return the names of the steps that apply, but of those that always do."""
+    return {
+        step.__name__
+        for applies, step in steps.STEPS
+        if applies is not steps.always and applies(problem)
+    }
+
+
+def test_steps_apply_to_the_model_and_the_recording(problem: Problem) -> None:
+    assert steps_for(problem) == {"examine_the_angles"}
+    assert steps_for(replace(problem, angles_hold=True)) == {"examine_accepted_angles"}
+    fast = replace(problem, fast=True)
+    assert steps_for(fast) == {"examine_the_angles", "follow_a_fast_camera"}
+    space = problem.sharp.full_space
+    turning = replace(space, start={**space.start, "rate_x": 0.1})
+    moving = replace(problem, sharp=replace(problem.sharp, full_space=turning))
+    assert steps_for(moving) == {"examine_the_angles", "follow_a_slow_camera"}
+
+    of_vibration = replace(problem.sharp, space=replace(problem.sharp.space, model="vibration"))
+    measured = replace(problem, sharp=of_vibration)
+    blind = {
+        "examine_the_angles",
+        "bound_what_blind_pixels_hide",
+        "weigh_the_refractory_doubt",
+    }
+    assert steps_for(measured) == blind
+    unmeasured = replace(measured, recording=replace(problem.recording, encoder=None))
+    assert steps_for(unmeasured) == {*blind, "refuse_unsteady_motion"}
 
 
 def test_the_state_is_frozen_and_a_finished_one_is_the_last(
@@ -100,7 +131,14 @@ def test_the_state_is_frozen_and_a_finished_one_is_the_last(
         taken.append("two")
         return state
 
-    monkeypatch.setattr(steps, "STEPS", (one, two))
+    def three(state: Refinement) -> Refinement:
+        taken.append("three")
+        return state
+
+    def never(problem: Problem) -> bool:
+        return False
+
+    monkeypatch.setattr(steps, "STEPS", ((never, three), (steps.always, one), (steps.always, two)))
     state = steps.refine(problem)
     assert taken == ["one"]
     assert state.findings == (Silence(0.5),)

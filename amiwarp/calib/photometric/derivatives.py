@@ -97,10 +97,7 @@ def shifted(
 
     ``shift`` is a Warp array of shape (2 · padded pairs,), or (2, padded pairs). The map must be solved at ``v``.
     """
-    if angle is None:
-        first, second = cost.by_drift(v)
-    else:
-        first, second = cost.by_angle(v, angle)
+    first, second = cost.by_angle(v, angle)
     column = wp.empty_like(first)
     launch(
         by_shift,
