@@ -153,14 +153,8 @@ def test_a_cost_in_another_space_leaves_the_first_one_as_it_is(
     search, v = first.search, first.answer.x
     cost = search.cost
     cost.residuals(v, rounds=2)
-    calls: list[str] = []
-
-    def column() -> str:
-        calls.append("found")
-        return "column"
-
-    assert cost.column("name", column) == cost.column("name", column) == "column"
-    assert calls == ["found"]
+    assert cost.known_column("name") is None
+    assert cost.keep_column("name", "column") == cost.known_column("name") == "column"
     space = search.space
     other = search.with_cause(FOCAL_LENGTH, v)
     assert (search.space, cost.space) == (space, space)
@@ -168,8 +162,7 @@ def test_a_cost_in_another_space_leaves_the_first_one_as_it_is(
     assert other.space.names == (*space.names, "focal_length")
     wide = other.space.to_vector({**other.space.start, **space.to_values(v)})
     other.cost.slopes(wide)
-    assert cost.column("name", column) == "column"
-    assert calls == ["found", "found"]
+    assert cost.known_column("name") is None
     solved: list[int] = []
     monkeypatch.setattr(cost.brightness, "solve", lambda *_, rounds, **__: solved.append(rounds))
     cost.converge(v)  # the map was solved in the other space

@@ -235,12 +235,14 @@ class Cost:
         at_first, at_second = found
         return at_first, at_second
 
-    def column(self, name: str, find: Callable[[], Any]) -> Any:
-        """Return a derivative of the residuals by name, which is found once for each solution of the map."""
-        columns = self.shared.used_by(self).columns
-        if name not in columns:
-            columns[name] = find(), None
-        column, _ = columns[name]
+    def known_column(self, name: str) -> Any | None:
+        """Return a derivative of the residuals by name, or None if it was not found since the last solution."""
+        column, _ = self.shared.used_by(self).columns.get(name, (None, None))
+        return column
+
+    def keep_column(self, name: str, column: Any) -> Any:
+        """Keep a derivative of the residuals until the next solution of the map, and return it."""
+        self.shared.used_by(self).columns[name] = column, None
         return column
 
     def unexplained_column(self, name: str, column: Any, *, steps: int) -> Any:

@@ -2,7 +2,8 @@
 
 Sharpness is biased by the sensor's hysteresis. This stage models the hysteresis by its equations, see
 :mod:`amiwarp.brightness.solver`. For given parameters the map is the solution of a linear least-squares problem. The
-parameters minimise its robust residual. :func:`refine` searches for the answer, and then takes those :data:`STEPS` that apply.
+parameters minimise its robust residual. :func:`refine` searches for the answer, and then takes the :data:`STEPS` that
+apply.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from amiwarp.calib.photometric.angles import examine_the_angles, examine_accepted_angles
+from amiwarp.calib.photometric.angles import examine_accepted_angles, examine_the_angles
 from amiwarp.calib.photometric.camera_motion import follow_a_fast_camera, follow_a_slow_camera
 from amiwarp.calib.photometric.corrections import (
     correct_camera_and_prism,
@@ -106,7 +107,7 @@ STEPS: tuple[tuple[Condition, Step], ...] = (
     (always, count_lost_events),
     (angles_hold, examine_accepted_angles),
 )
-"""The stage, in order: to what each step applies, and the step. It returns the state unchanged if there is nothing to do."""
+"""The stage, in order: to what each step applies, and the step. If nothing is to be done, it returns the same state."""
 
 
 def refine(problem: Problem) -> Refinement:
