@@ -32,8 +32,7 @@ from amiwarp.calib.repeated_turns import steps_in_events
 from amiwarp.calib.sharpness_search import Search
 from amiwarp.calib.without_encoder import search_on
 from amiwarp.errors import AmiwarpError, ErrorCode
-from amiwarp.events.each_encoder import each_encoder, together
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, each_encoder, together
 from amiwarp.events.recording import Recording
 from amiwarp.optics.models.registry import MODELS
 from amiwarp.optics.prism import Prism

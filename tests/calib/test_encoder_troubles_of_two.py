@@ -13,7 +13,7 @@ import pytest
 from amiwarp import Calibration, Encoder, PrismMotion, Settings, calibrate
 from amiwarp.calib import encoder_attempts
 from amiwarp.calib.calibrator import Attempt, Calibrator
-from amiwarp.events.each_encoder import each_encoder, together
+from amiwarp.events.encoder import each_encoder, together
 from amiwarp.results.calibration import replaces
 from amiwarp.studies.stability.encoders import index_pulses
 from benchmarks import encoder_troubles

@@ -14,6 +14,7 @@ from amiwarp import (
     FlatSide,
     PhotometricSettings,
     Prism,
+    RadialTangential,
     Recording,
     SensorTiming,
     Settings,
@@ -75,6 +76,20 @@ def problem(still: Recording) -> Problem:
 @pytest.fixture(scope="module")
 def first(problem: Problem) -> Refinement:
     return first_answer(problem, problem.settings.sensor)
+
+
+def test_a_search_through_another_lens_measures_its_image(problem: Problem) -> None:
+    sharp = problem.sharp
+    bent = replace(CAMERA, distortion=RadialTangential(k1=-0.1))
+    through = sharp.through(bent)
+    assert through.answer == sharp.answer
+    assert through.stages == sharp.stages
+    assert {through.space.camera, through.full_space.camera} == {bent}
+    here = sharp.sharpness_in(sharp.space, sharp.best)
+    there = sharp.sharpness_in(through.space, sharp.best)
+    assert abs(there - here) > 1e-3 * here
+    assert through.fine.values(sharp.best) == there
+    assert through.sharpness_in(sharp.space, sharp.best) == here
 
 
 def test_steps_without_anything_to_do_return_the_same_state(first: Refinement) -> None:
