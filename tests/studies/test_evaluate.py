@@ -674,7 +674,6 @@ def test_no_names_are_not_all_names(tmp_path: Path, only: str) -> None:
     assert not out.exists()
 
 
-
 def test_a_recording_that_fails_does_not_end_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
