@@ -41,6 +41,8 @@ class PairChains:
         self.arrays.weight = wp.empty(ends, dtype=float, device=device)
         self.arrays.count = wp.empty(self.threads, dtype=int, device=device)
         self.arrays.end = wp.empty(stride, dtype=wp.uint8, device=device)
+        self._columns = (pairs.arrays, atlas, self.arrays)
+        """First inputs of the kernels that sum over the equations."""
 
     def take_positions(self) -> None:
         """Take the present positions, and join pairs that begin where the pair before them ends."""
@@ -67,8 +69,9 @@ class PairChains:
         slices: list[Any],
     ) -> None:
         """Add to ``program``: slices += Aᵀ W A vector, for equations A with weights W."""
+        inputs = [*self._columns, weight, vector]
         kernel = equations_cpu.apply_normal
-        self._add_sum(program, kernel, [weight, vector], slices)
+        program.add_slices(kernel, self.threads, inputs, slices, smallest=FEW_BLOCKS)
 
     def add_transpose(
         self,
@@ -78,8 +81,9 @@ class PairChains:
         slices: list[Any],
     ) -> None:
         """Add to ``program``: slices += Aᵀ W residual."""
+        inputs = [*self._columns, weight, residual]
         kernel = equations_cpu.apply_transpose
-        self._add_sum(program, kernel, [weight, residual], slices)
+        program.add_slices(kernel, self.threads, inputs, slices, smallest=FEW_BLOCKS)
 
     def add_diagonal(self, program: Any, weight: Any, slices: list[Any]) -> None:
         """Add to ``program``: slices += diag(Aᵀ W A). Later products must have the same weights."""
@@ -90,15 +94,6 @@ class PairChains:
             [self.arrays],
             smallest=FEW_BLOCKS,
         )
-        self._add_sum(program, equations_cpu.add_diagonal, [weight], slices)
-
-    def _add_sum(
-        self,
-        program: Any,
-        kernel: Any,
-        vectors: list[Any],
-        slices: list[Any],
-    ) -> None:
-        """Add to ``program`` a kernel that sums over the equations into ``slices``."""
-        inputs = [self._pairs, self._atlas, self.arrays, *vectors]
+        inputs = [*self._columns, weight]
+        kernel = equations_cpu.add_diagonal
         program.add_slices(kernel, self.threads, inputs, slices, smallest=FEW_BLOCKS)

@@ -26,19 +26,18 @@ from amiwarp.calib.bad_pixels import MaskedEventSource, find_bad_pixels, searche
 from amiwarp.calib.calibrator import Attempt, Calibrator, hiding, with_warnings
 from amiwarp.calib.camera_attempts import with_gyroscope, with_rotation, without_rotation
 from amiwarp.calib.coarse_encoder import hidden_by_rounding, rounding_in_words
-from amiwarp.calib.encoder_attempts import (
-    with_mended_encoder,
-    with_order_examined,
-    with_other_encoder,
-    with_straight_angles,
-)
+from amiwarp.calib.lost_count_attempts import with_all_counts
 from amiwarp.calib.photometric import causes, limits
 from amiwarp.calib.prism_path import speed_in_words
+from amiwarp.calib.pulse_attempts import with_path_between_pulses
+from amiwarp.calib.pulses import pulses_only
 from amiwarp.calib.sharpness_search import Search
+from amiwarp.calib.straight_angles import with_straight_angles
 from amiwarp.calib.thinning import middle_time
 from amiwarp.calib.uneven_prism import with_rival_shape
+from amiwarp.calib.wrong_encoder import with_order_examined, with_other_encoder
 from amiwarp.errors import AmiwarpError, ErrorCode
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, each_encoder
 from amiwarp.optics.models.registry import MODELS, size_names
 from amiwarp.optics.prism import Plate, Prism
 from amiwarp.results.calibration import (
@@ -58,7 +57,9 @@ def calibrated(calibrator: Calibrator) -> Calibration:
         return _with_assumptions(calibrator, tried.found())
 
     last = calibrator
-    by_gyroscope = with_gyroscope(last, tried)
+    by_gyroscope = None
+    if calibrator.recording.imu is not None:
+        by_gyroscope = with_gyroscope(last, tried)
     unused_gyroscope = ""
     if by_gyroscope is not None and by_gyroscope.error is not None:
         unused_gyroscope = str(by_gyroscope.error)
@@ -112,6 +113,24 @@ def _with_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, A
         assert given.recording.encoder is not None
         last = with_rounding_named(last, search, given.recording.encoder)
     return last, answer
+
+
+def with_mended_encoder(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, Attempt]:
+    """Put back counts that the encoder lost, or find the path between pulses that come once a turn.
+
+    Return the calibrator of the mended recording, and its attempt; both unchanged if the events do not confirm it, but
+    with what could hide between pulses.
+    """
+    encoder = calibrator.recording.encoder
+    assert encoder is not None
+    kind = MODELS[calibrator.settings.model]
+    if kind.ANGLES > 1 and not kind.PRISM:  # commands may jump, and have no pulses
+        return calibrator, tried
+    if tried.search is None or not tried.search.space.sized:
+        return calibrator, tried
+    if any(map(pulses_only, each_encoder(encoder))):
+        return with_path_between_pulses(calibrator, tried, tried.search)
+    return with_all_counts(calibrator, tried)
 
 
 def _with_camera_examined(calibrator: Calibrator, tried: Attempt) -> tuple[Calibrator, Attempt]:
@@ -192,7 +211,8 @@ def _with_shape_examined(calibrator: Calibrator, found: Calibration) -> Calibrat
     found = with_rival_shape(found, settings.free)
     sizes_given = size_names() & {*settings.bounds, *settings.start}
     if isinstance(recording.prism, Prism) and not sizes_given:
-        found = with_order_examined(calibrator, found)
+        if recording.encoder is not None and recording.encoder.second is not None:
+            found = with_order_examined(calibrator, found)
         checks.check_nominal(found.model_name, found.parameters, recording.prism, recording.name)
     return found
 

@@ -95,12 +95,12 @@ def with_rotation(calibrator: Calibrator, tried: Attempt) -> Attempt:
 def with_gyroscope(calibrator: Calibrator, tried: Attempt) -> Attempt | None:
     """Return the mean of the answers of turns whose rotation the gyroscope tells, for a camera in fast motion.
 
-    None if there is no gyroscope or no fast motion. If the gyroscope cannot be used, the attempt has an error that
-    says why.
+    The recording has samples of an inertial measurement unit. None if there is no fast motion. If the gyroscope cannot
+    be used, the attempt has an error that says why.
     """
     recording = calibrator.recording
     encoder = calibrator.recording.encoder
-    if recording.imu is None or encoder is None:
+    if encoder is None:
         return None
     if calibrator.settings.free is not None or not tried.doubtful:
         return None

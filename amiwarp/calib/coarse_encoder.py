@@ -10,8 +10,7 @@ from amiwarp.calib.photometric.distances import px_per_rad
 from amiwarp.calib.photometric.stated_errors import BOUND
 from amiwarp.calib.photometric.verdicts import angle_names
 from amiwarp.calib.sharpness_search import Search
-from amiwarp.events.each_encoder import each_encoder
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, each_encoder
 from amiwarp.optics.models.registry import MODELS
 
 LEAST_RESTING_SHARE = 0.05

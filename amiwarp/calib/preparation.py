@@ -18,8 +18,7 @@ from amiwarp.calib.sharpness_search import Search
 from amiwarp.calib.thinning import middle_time, thin
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.device_events import check_sensor
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import check_prisms
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, Recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models.registry import MODELS, size_names

@@ -25,8 +25,7 @@ from amiwarp.calib.photometric.distances import px_per_rad
 from amiwarp.calib.photometric.pairs import check_pairs, collect_everywhere, fine_map_is_determined
 from amiwarp.calib.thinning import middle_time
 from amiwarp.errors import AmiwarpError, ErrorCode
-from amiwarp.events.each_encoder import each_encoder, together
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, each_encoder, together
 from amiwarp.events.recording import Recording
 from amiwarp.optics.models.registry import MODELS
 

@@ -134,10 +134,12 @@ class Search:
         return replace(self, answer=Sharpest(dict(values), math.nan), stages=stages)
 
     def through(self, camera: Camera) -> Search:
-        """Return the search for the same events through another lens."""
-        space = replace(self.space, camera=camera)
+        """Return the search for the same events through another lens, at the same answer."""
         full_space = replace(self.full_space, camera=camera)
-        return replace(self, space=space, full_space=full_space)
+        again = Search.over(
+            full_space, self.calibration_events, self.settings, self.device, self.progress
+        )
+        return replace(again, answer=self.answer, stages=self.stages)
 
     def _objective_by_parts(self, kind: Sharpness) -> Objective:
         """Return an objective that measures disjoint parts of the events separately."""

@@ -19,8 +19,7 @@ from amiwarp.events.device_events import (
     time_span,
     wait,
 )
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import check_prisms
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events
 from amiwarp.kernels.compensation import LaunchPlan
 from amiwarp.kernels.encoder_pieces import encoder_params

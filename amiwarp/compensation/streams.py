@@ -15,7 +15,8 @@ from amiwarp.compensation.batches import BatchInFlight, BatchPipeline, StagedBat
 from amiwarp.compensation.packet_copy import PIECE
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_sensor, limits, wait
-from amiwarp.events.encoder_stream import EncoderStream, check_prisms
+from amiwarp.events.encoder import check_prisms
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.recording import Events, held_bytes
 from amiwarp.optics.models.base import Model
 from amiwarp.schema.calls import guarded

@@ -28,4 +28,6 @@ from .truth import WorldLabels as WorldLabels
 
 from .axes import axes_in_words as axes_in_words
 from .axes import orientations as orientations
+from .encoder import each_encoder as each_encoder
+from .encoder import together as together
 from .truth import MemoryMasks as MemoryMasks

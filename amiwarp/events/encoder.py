@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,9 @@ from amiwarp.validation import (
     vector,
     whole,
 )
+
+if TYPE_CHECKING:
+    from amiwarp.events.encoder_stream import EncoderStream
 
 MOST_SAMPLES = 1 << 28
 """Largest number of samples that :meth:`Encoder.constant_speed` makes: three days at one sample per millisecond."""
@@ -717,6 +720,35 @@ class Encoder:
         elapsed += self.clock_offset_us
         sampled = (self.t[start:stop] - origin).astype(np.float64)
         return elapsed, sampled, self.angle[start:stop]
+
+
+def each_encoder(encoder: Encoder) -> tuple[Encoder, ...]:
+    """Return an encoder for each angle of the optic, in their order: the encoder itself if there is one angle."""
+    if encoder.second is None:
+        return (encoder,)
+    return dataclasses.replace(encoder, second=None), encoder.second
+
+
+def together(encoders: Sequence[Encoder]) -> Encoder:
+    """Return the encoder of an optic from the encoders of its angles. Inverse of :func:`each_encoder`."""
+    first, *others = encoders
+    for second in others:
+        first = first.with_second(second)
+    return first
+
+
+def check_prisms(encoder: Encoder | EncoderStream, angles: int) -> None:
+    """Raise :class:`AmiwarpError` if an encoder does not measure this number of angles of a model."""
+    if angles == 1 and encoder.second is not None:
+        raise AmiwarpError(
+            "the encoder belongs to a pair of prisms, the model has one prism; use the model 'risley', or 'mirror'"
+        )
+    if angles == 2 and encoder.second is None:
+        raise AmiwarpError(
+            "the model has two prisms, the encoder measures one; add the other one's encoder, or its speed relative to "
+            "the first (Encoder.with_second, --second-encoder or --second-ratio of 'amiwarp convert'; of a stream, "
+            "EncoderStream(second=EncoderStream()) or EncoderStream(second=-0.5))"
+        )
 
 
 def event_times(t: ArrayLike) -> NDArray[np.int64]:

@@ -445,22 +445,6 @@ def _second_stream(
     return second
 
 
-def check_prisms(encoder: Encoder | EncoderStream, angles: int) -> None:
-    """Raise :class:`AmiwarpError` if an encoder does not measure this number of angles of a model."""
-    if angles == 1 and encoder.second is not None:
-        raise AmiwarpError(
-            "the encoder belongs to a pair of prisms, the model has one prism; use the model 'risley', or 'mirror'"
-        )
-    if angles == 2 and encoder.second is None:
-        how = "Encoder.with_second, --second-encoder or --second-ratio of 'amiwarp convert'"
-        if isinstance(encoder, EncoderStream):
-            how = "EncoderStream(second=EncoderStream()) or EncoderStream(second=-0.5)"
-        raise AmiwarpError(
-            "the model has two prisms, the encoder measures one; add the other one's encoder, or its speed relative to "
-            f"the first ({how})"
-        )
-
-
 def starts_of_runs(t: NDArray[np.int64], angle: NDArray[np.float64]) -> list[int]:
     """Return the indices of the first sample, and of each after a gap or a restart of an :class:`EncoderStream`.
 

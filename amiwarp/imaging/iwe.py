@@ -12,8 +12,7 @@ from amiwarp.choices import Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents, device_for, wait
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import check_prisms
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events
 from amiwarp.imaging.canvas import CanvasShape
 from amiwarp.imaging.uploaded_events import upload_events

@@ -21,8 +21,7 @@ from amiwarp.events.device_events import (
     times_at,
     wait,
 )
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import check_prisms
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, check_coordinates
 from amiwarp.imaging.windows import Windows, check_window_order, collate, on_device
 from amiwarp.kernels import tensors as kernels

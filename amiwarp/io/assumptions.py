@@ -22,7 +22,7 @@ SENSORS = (
     (1280, 960),  # Samsung DVS-Gen4
 )
 """Sizes of known sensors (width, height) [px], for files that do not state a size: the first that holds all
-events is taken."""
+events is taken. They grow in their number of pixels, but the common DVS128 comes before the rare DVS132S."""
 
 
 def smallest_sensor(

@@ -48,14 +48,12 @@ def launch(
     if not device.is_cpu:
         wp.launch(kernel, dim=n, inputs=[*inputs, first], outputs=list(outputs), device=device)
         return
-    ranges = slices(n, cpu_threads(), smallest)
     load(kernel, device)
-
-    def run(start: int, stop: int) -> None:
+    jobs = []
+    for start, stop in slices(n, cpu_threads(), smallest):
         given = [*inputs, first + start]
-        wp.launch(kernel, dim=stop - start, inputs=given, outputs=list(outputs), device=device)
-
-    run_together([partial(run, *span) for span in ranges])
+        jobs.append(partial(wp.launch, kernel, stop - start, given, list(outputs), device=device))
+    run_together(jobs)
 
 
 def launch_slices(

@@ -46,7 +46,12 @@ class Program:
         else:
             blocks = -(-n // BLOCK_DIM)  # rounded up
             ranges = [(0, blocks * BLOCK_DIM)]
-        self._stages.append([self._record(kernel, span, inputs, outputs) for span in ranges])
+        stage = []
+        for start, stop in ranges:
+            given = [*inputs, start]
+            recorded = RecordedLaunch(kernel, given, outputs, device=self.device, n=stop - start)
+            stage.append(recorded.repeat)
+        self._stages.append(stage)
 
     def add_slices(
         self,
@@ -64,17 +69,12 @@ class Program:
         if n == 0:
             return
         ranges = slices(n, len(outputs), smallest) if self.device.is_cpu else [(0, n)]
-        jobs = zip(ranges, outputs, strict=False)
-        self._stages.append([self._record(kernel, span, inputs, [out]) for span, out in jobs])
-
-    def _record(
-        self, kernel: Any, span: tuple[int, int], inputs: Sequence[Any], outputs: Sequence[Any]
-    ) -> Callable[[], None]:
-        """Return a function that repeats the kernel's launch over a range."""
-        first, stop = span
-        inputs = [*inputs, first]
-        recorded = RecordedLaunch(kernel, inputs, outputs, device=self.device, n=stop - first)
-        return recorded.repeat
+        stage = []
+        for (start, stop), out in zip(ranges, outputs, strict=False):
+            given = [*inputs, start]
+            recorded = RecordedLaunch(kernel, given, [out], device=self.device, n=stop - start)
+            stage.append(recorded.repeat)
+        self._stages.append(stage)
 
     def launch(self) -> None:
         """Run all stages once, in the order in which they were added."""

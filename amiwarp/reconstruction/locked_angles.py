@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import check_prisms
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.orbit import LockedAngles, image_grid, paths_of
 

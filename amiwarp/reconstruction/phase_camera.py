@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
-from amiwarp.events.encoder_stream import EncoderStream, check_prisms
+from amiwarp.events.encoder import check_prisms
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.recording import Events
 from amiwarp.imaging.phase import BINS
 from amiwarp.imaging.phase_ring import BIN

@@ -24,9 +24,8 @@ from amiwarp.choices import Fill
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.device_events import DeviceMemoryEvents, device_of, read_between
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.encoder_speed import turn_between
-from amiwarp.events.encoder_stream import check_prisms
 from amiwarp.events.recording import Recording
 from amiwarp.kernels.page_locked_memory import start_read
 from amiwarp.optics.camera_rotation import CameraRotation

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError, ErrorCode
-from amiwarp.events.each_encoder import each_encoder
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, each_encoder
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.json_files import read_json
 from amiwarp.io.output_formats import check_ending

@@ -177,7 +177,7 @@ def no_device(value: Any, kind: Any, *, here: bool) -> str:
     """Return the devices, in words, if a value names none of them. ``here``: this machine must have the device."""
     if not here:
         fits = isinstance(value, str) and re.fullmatch(r"cpu|cuda(:\d+)?", value)
-        return "" if fits else "a device, such as cpu or cuda:0"
+        return "" if fits else "cpu, cuda for all GPUs, or one GPU such as cuda:0"
     import warp as wp
 
     with contextlib.suppress(Exception):  # Warp raises several kinds of errors

@@ -20,9 +20,8 @@ from amiwarp.choices import Sharpness, Vote
 from amiwarp.compensation.in_memory import compensate_events
 from amiwarp.compensation.recordings import at_depths
 from amiwarp.errors import AmiwarpError, ErrorCode
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.encoder_speed import turn_between
-from amiwarp.events.encoder_stream import check_prisms
 from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.canvas import CanvasShape
 from amiwarp.imaging.filters import find_hot_pixels

@@ -4,31 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import math
-import tempfile
 import traceback
 import weakref
-from collections.abc import Callable, Coroutine, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from amiwarp.choices import Axis, Colour, View, Vote
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import iwe
-from amiwarp.io.event_rates import EventRates
 from amiwarp.plotting.colours import Scale, count_scale
 from amiwarp.tasks import Progress
 from amiwarp.viewer import (
     calibration_job,
     captions,
-    clouds_film,
     cost_surface,
     downloads,
     first_phase,
@@ -49,30 +42,16 @@ from amiwarp.viewer.job_progress import JobCancelled, JobProgress
 from amiwarp.viewer.knobs import Knobs
 from amiwarp.viewer.library import Library
 from amiwarp.viewer.look import Look
+from amiwarp.viewer.page_downloads import PageDownloads
 from amiwarp.viewer.page_files import use_page
 from amiwarp.viewer.page_messages import finite_number
+from amiwarp.viewer.page_timeline import PageTimeline
+from amiwarp.viewer.page_work import SLOW, PageWork
 from amiwarp.viewer.shown_window import DisplayedWindow
 from amiwarp.viewer.sliders import FIELD_LIMITS, GIVEN, SLIDERS, UNITS
 from amiwarp.viewer.view_state import History, ViewState
 from amiwarp.viewer.watched_stream import WatchedStream
 
-STEP_S = 0.2
-"""Duration of counting events after which the timeline shows what is counted [s]."""
-MOST_IN_FLIGHT = 8
-"""Largest number of messages to the page that are unsent; while more are waiting, nothing is computed."""
-WAIT_S = 0.02
-"""Interval between two checks of the number of unsent messages [s]."""
-_CUDA_LOCK = asyncio.Lock()
-"""Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""
-QUICK = {
-    **dict.fromkeys(("newest", "window", "suggestion", "state", "knobs"), ("clouds", "images")),
-    "look": ("clouds",),
-}
-"""Updates that are made at once, with the parts of the page that wait for them."""
-SLOW = ("curve", "picture", "statistics")
-"""Updates that take longer; each is named as the part of the page that waits for it."""
-SLOW_ORDER = (*SLOW, "preparation")
-"""Slow updates in the order in which they are made: what is on the page first."""
 PLAY_S = 0.05
 """Shortest interval between two pictures while a recording is played [s]."""
 FOLLOW_S = 0.1
@@ -85,9 +64,7 @@ class Panel(Actions):
     """Panel that connects the page of one browser tab with its inspector. Call :meth:`close` when the tab is closed.
 
     The page may call the methods in :data:`amiwarp.viewer.layout.CALLS`. The server checks their arguments by their
-    annotations. Updates are computed in threads, one after the other. If a slider moves several times meanwhile, only
-    its last position is used. What waits for an update is marked on the page. Nothing is computed while the page does
-    not keep up with the messages.
+    annotations. What is computed for the page is an update or a job of :class:`PageWork`.
     """
 
     def __init__(self, server: Any, inspector: Inspector, library: Library | None = None) -> None:
@@ -96,22 +73,17 @@ class Panel(Actions):
         self.state = server.state
         self.inspector = inspector
         self._library = library
-        self.buffers_lock = asyncio.Lock()
-        """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
-        # Locks, in the order in which they are taken: device_lock, for CUDA; then buffers_lock, for the inspector's own
-        # buffers. Slow updates, calibrations and films work on a snapshot or a copy, and take the first only.
-        self.device_lock: Any = contextlib.nullcontext()
-        if "cuda" in str(inspector.device):
-            self.device_lock = _CUDA_LOCK
-        self._quick_requests: set[str] = set()
-        self._slow_requests: set[str] = set()
-        self._being_made: set[str] = set()
-        self._quick_task: asyncio.Task[None] | None = None
-        self._slow_task: asyncio.Task[None] | None = None
-        self._jobs: set[asyncio.Task[None]] = set()
+        self.work = PageWork(
+            server,
+            on_gpu="cuda" in str(inspector.device),
+            update_quickly=self.update_quickly,
+            update_slowly=self.update_slowly,
+            say=self.say,
+        )
+        """Updates and jobs of the page."""
+        self._timeline = PageTimeline(self)
+        self._downloads = PageDownloads(self)
         self._error_source = ""
-        # The tab's own pool, which ends with it. One thread each for: calibration or film, slow updates, quick updates.
-        self._threads = ThreadPoolExecutor(3, "amiwarp-tab")
         self.shown: DisplayedWindow | None = None
         """Window as the page shows it; None before the first update."""
         self.plays = False
@@ -135,13 +107,8 @@ class Panel(Actions):
         """Name of the change that lasts, with the number of the drag; empty for none."""
         self._drags = 0
         """Number of releases so far."""
-        self._rates: list[EventRates] = []
-        """Counted events of the recording, and of the recordings on its time axis."""
-        self._rates_first_us = 0
-        """First event of the recording when its events were counted [us]."""
-        self._progress = JobProgress(self._show_progress)  # of the latest calibration or film
-        self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
-        use_page(server, self._folder.name)
+        self.progress = JobProgress(self.show_progress)  # of the latest calibration or film
+        use_page(server, self._downloads.folder)
         self.state.client_only(*layout.CLIENT_ONLY)
         self._wanted: dict[str, Any] = {}
         """Values that were set on the page, and that the inspector has not taken yet, in the page's units."""
@@ -157,7 +124,7 @@ class Panel(Actions):
         self._picked = -1
         self.history = None
         self.history_steps = ()
-        self._rates = []  # the next count has not begun
+        self._timeline.forget()
         self._made_for.clear()
         self.use_card(self._has_graphics_card)
         inspector.renew()  # a live stream may have gone on since the inspector was made
@@ -169,16 +136,16 @@ class Panel(Actions):
         self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder})
         self._wanted = {}
         self.time_window = inspector.window or inspector.first_window()
-        self.start_job(self._count_events())
+        self.work.start_job(self._timeline.count_events())
         self.request("window")
         if self.compensates:
             self.request("suggestion")
         self.released()
-        self.request_slow("preparation")
+        self.work.request_slow("preparation")
         if inspector.latest is not None:
             self.play()
         if isinstance(inspector.latest, WatchedStream):
-            self.start_job(self._show_stream_figures(inspector.latest))
+            self.work.start_job(self._show_stream_figures(inspector.latest))
         self.bookmarks = None if inspector.path is None else Bookmarks(inspector.path)
         self._list_views()
         if inspector.bookmark:
@@ -186,20 +153,18 @@ class Panel(Actions):
 
     def close(self) -> None:
         """Stop all work of the browser tab, and remove its downloads. A thread ends when its current work is done."""
-        self._folder.cleanup()
+        self._downloads.close()
         self.cancel()
         self.inspector.close()
-        for task in self._jobs:
-            task.cancel()
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        self.work.close()
 
     def cancel(self) -> None:
         """Stop the calibration or the film that is being made."""
-        self._progress.cancelled = True
+        self.progress.cancelled = True
 
     def end_film(self) -> None:
         """End the film that is being made with the pictures made so far."""
-        self._progress.ended = True
+        self.progress.ended = True
 
     @property
     def look(self) -> Look:
@@ -271,34 +236,7 @@ class Panel(Actions):
         """
         self._change = f"{change} {self._drags}" if change else ""
         self._lasting = bool(change)
-        self._quick_requests.update(what)
-        self._show_pending()
-        if self._quick_task is None or self._quick_task.done():
-            self._quick_task = self.start_job(self._run_quick_updates())
-
-    def request_slow(self, *what: str) -> None:
-        """Request updates of :data:`SLOW_ORDER`, which run in a thread after all quick updates."""
-        self._slow_requests.update(what)
-        self._show_pending()
-        if self._slow_task is None or self._slow_task.done():
-            self._slow_task = self.start_job(self._run_slow_updates())
-
-    async def until_drawn(self) -> None:
-        """Wait until no quick update is pending."""
-        while self._quick_task is not None and not self._quick_task.done():
-            await asyncio.wait([self._quick_task])
-
-    def start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Run a job until it ends or the browser tab is closed."""
-        task = asyncio.get_running_loop().create_task(work)
-        self._jobs.add(task)
-        task.add_done_callback(self._job_ended)
-        return task
-
-    async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
-        """Call ``work`` in one of the browser tab's threads, and return its result."""
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._threads, partial(work, *args, **options))
+        self.work.request_quick(*what)
 
     def say(self, text: str, severity: str = "info") -> None:
         """Show a message."""
@@ -316,62 +254,6 @@ class Panel(Actions):
         else:
             if self.state.severity == "error" and self._error_source == what:
                 self.state.update({"message": "", "severity": "info"})
-
-    def _show_pending(self) -> None:
-        """Show which parts of the page wait for an update."""
-        parts = (self._slow_requests | self._being_made) & {*SLOW}
-        for what in self._quick_requests | self._being_made:
-            parts.update(QUICK.get(what, ()))
-        self.state.updating = sorted(parts)
-
-    def _job_ended(self, task: asyncio.Task[None]) -> None:
-        """Forget a job, and show the error that ended it."""
-        self._jobs.discard(task)
-        error = None if task.cancelled() else task.exception()
-        if error is not None:
-            if isinstance(error, (AmiwarpError, OSError)):
-                self.say(str(error), "error")
-                return
-            logging.getLogger(__name__).error("the page's work failed", exc_info=error)
-            text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
-            self.say(text, "error")
-
-    async def _run_quick_updates(self) -> None:
-        """Make the requested quick updates until none is left; requests that arrive meanwhile are made together."""
-        while self._quick_requests:
-            while self._page_lags():
-                await asyncio.sleep(WAIT_S)
-            todo = self._quick_requests
-            self._quick_requests = set()
-            async with self._marked_on_page(todo), self.device_lock, self.buffers_lock:
-                await self.update_quickly(todo)
-            await asyncio.sleep(0)
-
-    def _page_lags(self) -> bool:
-        """Return whether the page does not keep up with the messages."""
-        page = self.server.protocol
-        return page is not None and page.network_monitor.pending > MOST_IN_FLIGHT
-
-    async def _run_slow_updates(self) -> None:
-        """Make the requested slow updates one after the other, each when no quick update is pending."""
-        while self._slow_requests:
-            await self.until_drawn()
-            name = min(self._slow_requests, key=SLOW_ORDER.index)
-            self._slow_requests.discard(name)
-            async with self._marked_on_page({name}), self.device_lock:
-                with self.errors_shown(name):
-                    await self.update_slowly(name)
-
-    @contextlib.asynccontextmanager
-    async def _marked_on_page(self, todo: set[str]) -> Any:
-        """Mark updates as being made, and send the state to the browser when they are made."""
-        self._being_made |= todo
-        try:
-            yield
-        finally:
-            self._being_made -= todo
-            with self.state:
-                self._show_pending()
 
     def _listen(self) -> None:
         """Follow the state variables that the page sets, and offer the methods that it calls."""
@@ -397,13 +279,13 @@ class Panel(Actions):
             self.request("knobs")
             self._change = change
         self._drags += 1
-        self.request_slow(*SLOW)
+        self.work.request_slow(*SLOW)
 
     def choose(self, name: str) -> None:
         """Select the parameter over which the sharpness curve is drawn."""
         if name in SLIDERS and name != self.state.knob:
             self.state.knob = name
-            self.request_slow("curve")
+            self.work.request_slow("curve")
 
     def typed(self, name: str, text: str) -> None:
         """Set the value that a user typed into a number field."""
@@ -453,20 +335,20 @@ class Panel(Actions):
         if self.inspector.fixed_count is None:
             super().step(count)
         else:
-            self.start_job(self._step_events(count))
+            self.work.start_job(self._step_events(count))
 
     async def _step_events(self, count: int) -> None:
         with self.errors_shown("window"):
-            self.move(await self.in_thread(self.inspector.start_after, count))
+            self.move(await self.work.in_thread(self.inspector.start_after, count))
             self.released()
 
     def list_hot(self) -> None:
         """List the hot pixels of the recording."""
-        self.start_job(self._list_hot())
+        self.work.start_job(self._list_hot())
 
     async def _list_hot(self) -> None:
         with self.errors_shown("hot pixels"):
-            hot = await self.in_thread(lambda: self.inspector.hot_pixels)
+            hot = await self.work.in_thread(lambda: self.inspector.hot_pixels)
             rows = [
                 [pixel.x, pixel.y, f"{pixel.rate:,.0f}", f"{100.0 * pixel.share:.3g}"]
                 for pixel in hot
@@ -515,7 +397,7 @@ class Panel(Actions):
     def open_file(self, name: str) -> None:
         """Show another recording of the folder."""
         self.state.open_shown = False
-        self.start_job(self._open_file(name))
+        self.work.start_job(self._open_file(name))
 
     async def _open_file(self, name: str) -> None:
         if self._library is None:
@@ -524,8 +406,8 @@ class Panel(Actions):
             self.cancel()
         self.state.playing = False
         with self.errors_shown("file"):
-            inspector = await self.in_thread(self._library.open, name)
-            await self.until_drawn()
+            inspector = await self.work.in_thread(self._library.open, name)
+            await self.work.until_drawn()
             self.start(inspector)
         self.state.flush()
 
@@ -604,7 +486,7 @@ class Panel(Actions):
         end = min(float(end_ms), float(self.state.whole_ms))
         if end - start > 1e-2:
             self.state.rate_span = [start, end]
-            self.start_job(self._show_zoomed_rates())
+            self.work.start_job(self._timeline.show_zoomed())
 
     def play(self) -> None:
         """Play the recording from the current window, or follow a live stream; stop if already playing."""
@@ -615,7 +497,7 @@ class Panel(Actions):
             work = (
                 self._play_recording() if self.inspector.latest is None else self._follow_stream()
             )
-            self.start_job(work).add_done_callback(lambda _: setattr(self, "plays", False))
+            self.work.start_job(work).add_done_callback(lambda _: setattr(self, "plays", False))
 
     async def _play_recording(self) -> None:
         """Move the time window on, by as much as real time has gone on, until playing is stopped."""
@@ -627,39 +509,39 @@ class Panel(Actions):
             with state:
                 shown_us = 1e6 * elapsed_s * float(state.speed)
                 state.playing = self.advance(shown_us, loop=bool(state.loop))
-            await self.until_drawn()
+            await self.work.until_drawn()
             await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
             elapsed_s = loop.time() - start_s
         self.released()
 
     async def _follow_stream(self) -> None:
         """Show the current events of a live stream, again and again."""
-        await self.until_drawn()  # with the suggested region
+        await self.work.until_drawn()  # with the suggested region
         loop = asyncio.get_running_loop()
         counted_s = -math.inf
         while self.state.playing:
             start_s = loop.time()
             if start_s >= counted_s + RATES_S:
                 counted_s = start_s
-                self.start_job(self._count_events())
+                self.work.start_job(self._timeline.count_events())
             self.request("newest")
-            await self.until_drawn()
+            await self.work.until_drawn()
             await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
 
     def record(self) -> None:
         """Save a live stream from now on to a new file in the current folder of the server, or finish the file."""
         if isinstance(self.inspector.latest, WatchedStream):
-            self.start_job(self._start_or_stop_recording(self.inspector.latest))
+            self.work.start_job(self._start_or_stop_recording(self.inspector.latest))
 
     async def _start_or_stop_recording(self, source: WatchedStream) -> None:
         with self.errors_shown("recording"):
             if source.is_recording:
-                self.say(f"saved {await self.in_thread(source.stop_recording)}", "success")
+                self.say(f"saved {await self.work.in_thread(source.stop_recording)}", "success")
             else:
                 stem = downloads.file_stem(self.inspector.recording.name)
                 path = downloads.unused_path(f"{stem}.h5").resolve()
-                await self.in_thread(source.record, path)
+                await self.work.in_thread(source.record, path)
                 self.say(
                     f"recording to {path} until you press stop, or the stream or the command ends"
                 )
@@ -676,57 +558,6 @@ class Panel(Actions):
     def _clock_us(self, time_ms: float) -> int:
         """Return a time of the page, which counts from the first event [ms], on the events' clock [us]."""
         return int(self.inspector.recording.events.t_first) + round(time_ms * 1e3)
-
-    async def _count_events(self) -> None:
-        """Count the recording's events in the background, for the timeline."""
-        inspectors = (self.inspector, *self.inspector.besides)
-        rates = [EventRates(each.recording.events) for each in inspectors]
-        self._rates = rates
-        self._rates_first_us = self.inspector.recording.events.t_first
-        with self.errors_shown("timeline"):
-            for each in rates:
-                finished = False
-                while not finished and rates is self._rates:
-                    finished = await self.in_thread(each.fill, STEP_S)
-                    await self._show_rates()
-        self.state.flush()
-
-    async def _show_zoomed_rates(self) -> None:
-        with self.errors_shown("timeline"):
-            await self._show_rates()
-        self.state.flush()
-
-    async def _show_rates(self) -> None:
-        """Show what is counted of the shown part of the time, unless the page shows another part before it is ready."""
-        rates = self._rates
-        span = self.state.rate_span
-        if not rates:
-            return
-        values = await self.in_thread(self._rate_state, self.inspector, rates, span)
-        if rates is self._rates and span == self.state.rate_span:
-            with self.state:
-                self.state.update(values)
-
-    def _rate_state(
-        self, inspector: Inspector, rates: list[EventRates], span: list[float]
-    ) -> dict[str, Any]:
-        """Return the state variables of the timeline between two times [ms]. It may read events from a file."""
-        # Of a live stream, the counted events may be a second older than the shown ones.
-        first_us = self._rates_first_us
-        start_us, end_us = (round(1e3 * each) for each in span)
-        own, *others = rates
-        _, own_rates = own.curve(first_us + start_us, first_us + end_us, layout.RATE_BINS)
-        off, on = map(page_state.float_bytes, own_rates)
-        rows = []
-        for each, counted in zip(inspector.besides, others, strict=True):
-            _, rates_beside = counted.curve(
-                each.time_of(start_us), each.time_of(end_us), layout.RATE_BINS
-            )
-            off_beside, on_beside = map(page_state.float_bytes, rates_beside)
-            name = captions.beside_text(each)
-            rows.append({"name": name, "on": on_beside, "off": off_beside})
-        note = "" if own.share >= 1.0 else f"counting events: {100.0 * own.share:.0f} %"
-        return {"rate_on": on, "rate_off": off, "rate_note": note, "rate_rows": rows}
 
     # Parameters of the prism, and those to compare with
 
@@ -814,8 +645,8 @@ class Panel(Actions):
                     "surface": None,
                 }
             )
-            self._progress = JobProgress(self._show_progress)
-            self.start_job(self._calibrate(self._progress))
+            self.progress = JobProgress(self.show_progress)
+            self.work.start_job(self._calibrate(self.progress))
         elif self.state.calibrating:
             self.cancel()
             self.state.busy = "calibrating: cancelling"
@@ -826,8 +657,8 @@ class Panel(Actions):
         state = self.state
         try:
             find = partial(calibration_job.find_calibration, whole=state.scope != layout.SCOPES[0])
-            async with self.device_lock:
-                answer = await self.in_thread(
+            async with self.work.device_lock:
+                answer = await self.work.in_thread(
                     _result_or_error, find, weakref.ref(inspector), progress
                 )
             if self.inspector is not inspector:  # another recording was opened meanwhile
@@ -841,10 +672,10 @@ class Panel(Actions):
             self.calibration_result, text = answer
             with state:
                 state.update({"found": text, "against_choices": self._against_choices()})
-            async with self.device_lock:
+            async with self.work.device_lock:
                 draw = partial(cost_surface.cost_surface, found=self.calibration_result)
                 self._surface_middle = inspector.knobs
-                surface = await self.in_thread(
+                surface = await self.work.in_thread(
                     _result_or_error, draw, weakref.ref(inspector), progress
                 )
             if not isinstance(surface, str) and self.inspector is inspector:
@@ -852,11 +683,11 @@ class Panel(Actions):
                     state.surface = surface
         finally:
             # In another recording, the next calibration may run already.
-            if self._progress is progress:
+            if self.progress is progress:
                 with state:
                     state.update({"busy": "", "calibrating": False})
 
-    def _show_progress(self, what: str, share: float) -> None:
+    def show_progress(self, what: str, share: float) -> None:
         """Show the current step of a calibration or a film, and the finished share, 0 to 1."""
         with self.state:
             self.state.update({"busy": what, "progress": round(100 * min(share, 1.0))})
@@ -867,8 +698,6 @@ class Panel(Actions):
         self.state.update({"found": "", "surface": None})
         if self.state.against == "found":
             self.show_b(self.b)
-
-    # Downloads
 
     def export(self, what: str) -> None:
         """Give the browser a file; ``what`` is a name in :data:`amiwarp.viewer.layout.EXPORTS`."""
@@ -881,73 +710,9 @@ class Panel(Actions):
                 self.server.js_call("page", what, name, words)
         elif what in layout.FILMS:
             if not self.state.busy:
-                self.start_job(self._write_film(what))
+                self.work.start_job(self._downloads.write_film(what))
         else:
-            self.start_job(self._write_export(what))
-
-    async def _write_export(self, what: str) -> None:
-        """Write a file that is no film, and give it to the browser."""
-        async with self.device_lock, self.buffers_lock:
-            await self._download(what, partial(WRITERS[what], self))
-
-    def write_figure(self, path: Path) -> None:
-        """Write what the page shows as a figure."""
-        from amiwarp.viewer.publish import Page, save_figure
-
-        save_figure(
-            self.inspector,
-            path,
-            page=Page(),
-            view=self.view,
-            look=self.look,
-            against=self.against,
-        )
-
-    def write_values(self, path: Path) -> None:
-        """Write the values of the second image."""
-        save_values(path, self._make_images().after)
-
-    async def _write_film(self, what: str) -> None:
-        """Make a film in a thread, with its progress on the page, and give it to the browser."""
-        state = self.state
-        look = self.look.for_clouds([title for _, title in state.titles])
-        progress = JobProgress(self._show_progress)
-        self._progress = progress
-        film = partial(
-            clouds_film.write_film,
-            inspector=self.inspector.copy(),
-            look=look,
-            view=self.view,
-            progress=progress,
-            what=what,
-            against=self.against,
-            with_orbit=bool(state.orbit_shown),
-            speed=float(state.speed),
-            ended=lambda: progress.ended,
-        )
-        self._show_progress(f"making the {layout.EXPORTS[what][0]}", 0.0)
-        try:
-            with contextlib.suppress(JobCancelled):
-                async with self.device_lock:
-                    await self._download(what, film)
-        finally:
-            with state:
-                state.busy = ""
-
-    async def _download(self, what: str, write: Callable[[Path], object]) -> None:
-        """Write a file in a thread, and give it to the browser."""
-        name = downloads.download_name(self.inspector.recording.name, what)
-        with self.errors_shown("export"):
-            path = Path(self._folder.name) / name
-            path.unlink(missing_ok=True)
-            await self.in_thread(write, path)
-            about = path.stat()
-            # With its time, as a browser keeps what it has loaded from an address.
-            address = f"{self.server.name}/{name}?{about.st_mtime_ns}"
-            self.server.js_call("page", "download", name, address)
-            size = f"{about.st_size / 1e3:,.0f} kB"
-            self.say(f"{name}: {size}, in the browser's downloads", "success")
-        self.state.flush()
+            self.work.start_job(self._downloads.write_file(what))
 
     # Undo, redo, reset, and the state in the page's address
 
@@ -982,7 +747,7 @@ class Panel(Actions):
         wanted = self.travelled()
         if wanted is None:
             return
-        await self.in_thread(view_state.apply_state, self.inspector, wanted)
+        await self.work.in_thread(view_state.apply_state, self.inspector, wanted)
         state = self.state
         selection = wanted.selection
         region = list(selection.region or (0, 0, *state.size))
@@ -1034,7 +799,7 @@ class Panel(Actions):
     async def _take_newest(self) -> None:
         """Take the current events of a live stream."""
         with self.errors_shown("stream"):
-            await self.in_thread(self.inspector.renew)
+            await self.work.in_thread(self.inspector.renew)
             self.state.update(layout.source_state(self.inspector))
             self.time_window = self.newest_window()
 
@@ -1066,7 +831,7 @@ class Panel(Actions):
             if "state" in todo:
                 await self._apply_history_steps()
             self.show_knobs()
-            self.shown, values = await self.in_thread(self._displayed)
+            self.shown, values = await self.work.in_thread(self._displayed)
         except AmiwarpError:
             self.inspector.knobs, self.inspector.sources = good
             self.show_knobs()
@@ -1104,20 +869,21 @@ class Panel(Actions):
         """Make a slow update: "curve", "picture" (of a slow kind), "statistics" or "preparation" of such a picture."""
         inspector = self.inspector.snapshot()  # a live stream changes nothing in it
         made_for = inspector.window_and_selection
-        await self._update_part(name, inspector)
-        if name != "preparation":
-            self._made_for[name] = made_for
-            self._show_old()
+        with self.errors_shown(name):
+            await self._update_part(name, inspector)
+            if name != "preparation":
+                self._made_for[name] = made_for
+                self._show_old()
 
     async def _update_part(self, name: str, inspector: Inspector) -> None:
         if name == "preparation":
-            await self.in_thread(images.prepare, inspector)
+            await self.work.in_thread(images.prepare, inspector)
         elif name == "statistics":
-            self.state.statistics = await self.in_thread(inspector.statistics)
+            self.state.statistics = await self.work.in_thread(inspector.statistics)
         elif name == "curve":
             await self._update_curve(inspector)
         elif self.image in SLOW_KINDS and self.shown is not None:
-            self.state.update(await self.in_thread(self._image_state, self.shown, inspector))
+            self.state.update(await self.work.in_thread(self._image_state, self.shown, inspector))
 
     async def _read_window(self, *, suggest: bool) -> None:
         """Read the window and the selection that the page shows."""
@@ -1132,7 +898,7 @@ class Panel(Actions):
         known_count = inspector.fixed_count
         inspector.fixed_count = int(state.fixed_count) or None
         try:
-            await self.in_thread(inspector.open, start_us, length_us, self._selection())
+            await self.work.in_thread(inspector.open, start_us, length_us, self._selection())
         except AmiwarpError:
             inspector.fixed_count = known_count
             state.fixed_count = known_count or 0
@@ -1141,10 +907,10 @@ class Panel(Actions):
             start_us, length_us = inspector.window
             self.time_window = inspector.window
         if suggest:
-            await self.in_thread(first_phase.estimate_phase, inspector)
-            region = await self.in_thread(inspector.suggest_region)
+            await self.work.in_thread(first_phase.estimate_phase, inspector)
+            region = await self.work.in_thread(inspector.suggest_region)
             state.update({"region_wanted": list(region), "region_kind": "suggested"})
-            await self.in_thread(inspector.open, start_us, length_us, self._selection())
+            await self.work.in_thread(inspector.open, start_us, length_us, self._selection())
         self._picked = -1
 
     def _selection(self) -> Selection:
@@ -1230,7 +996,7 @@ class Panel(Actions):
     ) -> dict[str, Any]:
         """Return the state variables of the images of the region, or why there are none."""
         try:
-            made = self._make_images(shown, inspector)
+            made = self.make_images(shown, inspector)
         except AmiwarpError as error:
             return {"before": None, "after": None, "image_note": str(error)}
         after_scale = made.after_scale or made.scale
@@ -1247,7 +1013,7 @@ class Panel(Actions):
             "image_note": made.note,
         }
 
-    def _make_images(
+    def make_images(
         self, shown: DisplayedWindow | None = None, inspector: Inspector | None = None
     ) -> ShownImages:
         """Return the images as the page has chosen them, of the tab's inspector or of a snapshot of it."""
@@ -1267,12 +1033,12 @@ class Panel(Actions):
         state = self.state
         name = self.state.knob
         describe = partial(calibration_job.calibrated_events, inspector)
-        _, selection_text = await self.in_thread(describe, whole=False)
-        _, whole_text = await self.in_thread(describe, whole=True)
+        _, selection_text = await self.work.in_thread(describe, whole=False)
+        _, whole_text = await self.work.in_thread(describe, whole=True)
         state.calibrate_on = [selection_text, whole_text]
         if not self.compensates:
             return
-        values, scores = await self.in_thread(inspector.curve, name)
+        values, scores = await self.work.in_thread(inspector.curve, name)
         x: list[float] = (values / UNITS[name]).tolist()
         if not x:
             return
@@ -1308,24 +1074,3 @@ def _result_or_error(
         return str(error)
     finally:
         inspector = None  # this frame may be kept alive, too
-
-
-WRITERS: dict[str, Callable[[Panel, Path], object]] = {
-    "pdf": Panel.write_figure,
-    "svg": Panel.write_figure,
-    "values": Panel.write_values,
-    "csv": lambda panel, path: downloads.write_table(panel.inspector, path),
-    "npz": lambda panel, path: downloads.write_table(panel.inspector, path),
-    "events": lambda panel, path: downloads.write_events(panel.inspector, path, compensated=False),
-    "compensated": lambda panel, path: downloads.write_events(
-        panel.inspector, path, compensated=True
-    ),
-    "calibration": lambda panel, path: panel.inspector.as_calibration().save(path),
-    "vtp": lambda panel, path: downloads.write_cloud(
-        panel.inspector, path, axis=panel.look.axis, compensated=False
-    ),
-    "vtp_after": lambda panel, path: downloads.write_cloud(
-        panel.inspector, path, axis=panel.look.axis, compensated=True
-    ),
-}
-"""Functions that write the downloads that are no films, by the names in :data:`amiwarp.viewer.layout.EXPORTS`."""

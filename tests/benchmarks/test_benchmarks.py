@@ -492,7 +492,6 @@ def test_a_walk_has_the_functions_that_run_and_the_frames_above_the_deepest_laun
         "kernels/compensation.py LaunchPlan.run",
         "kernels/launch.py launch",
         "kernels/workers.py run_together",
-        "kernels/launch.py launch.<locals>.run",
     )
 
     before = {path: set(functions) for path, functions in walk.functions.items()}

@@ -113,7 +113,7 @@ def test_both_angles_drift_by_the_ratio_of_their_speeds(solved: tuple[Cost, np.n
     for end in (0, 1):
         drifting, first, second = (
             each[end].numpy()[:n]
-            for each in (cost.by_drift(v), cost.by_angle(v, 0), cost.by_angle(v, 1))
+            for each in (cost.by_angle(v), cost.by_angle(v, 0), cost.by_angle(v, 1))
         )
         known = np.isfinite(drifting) & np.isfinite(first) & np.isfinite(second)
         expected = (first + SPEEDS[1] / SPEEDS[0] * second)[known]

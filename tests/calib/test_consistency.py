@@ -30,7 +30,7 @@ from amiwarp import (
     simulate,
     truth_model,
 )
-from amiwarp.calib import encoder_attempts
+from amiwarp.calib import straight_angles
 from amiwarp.calib.photometric import angles, limits, systematic
 from amiwarp.calib.photometric.causes import FACES, FOCAL_LENGTH, SEAT, SIDE
 from amiwarp.calib.photometric.consistency import CLOCK, LEAST_GAIN, Consistency, LikelyCause
@@ -158,7 +158,7 @@ def test_an_accepted_answer_confirms_a_corrected_encoder(
 ) -> None:
     """Its cost may be that of other pairs: the last turn may no longer be whole at the corrected speed."""
     assert wide.encoder is not None
-    monkeypatch.setattr(encoder_attempts, "LARGEST_STRAIGHT_COST_RATIO", 0.0)
+    monkeypatch.setattr(straight_angles, "LARGEST_STRAIGHT_COST_RATIO", 0.0)
     assert calibrated(replace(wide, encoder=bent(wide.encoder))).harmonics is not None
 
 

@@ -22,7 +22,14 @@ from amiwarp import (
     Settings,
     calibrate,
 )
-from amiwarp.calib import checks, coarse_encoder, encoder_attempts
+from amiwarp.calib import (
+    attempts,
+    checks,
+    coarse_encoder,
+    pulse_attempts,
+    start_burst,
+    straight_angles,
+)
 from amiwarp.calib.calibrator import Calibrator
 from amiwarp.calib.lost_counts import Step, changes_of_mean, lost_counts, without_steps
 from amiwarp.calib.photometric import limits
@@ -30,7 +37,6 @@ from amiwarp.calib.photometric.losses import step_if_missing
 from amiwarp.calib.prism_path import PathFit
 from amiwarp.calib.pulses import confirm, pulses_only, smooth_path
 from amiwarp.calib.repeated_turns import steps_in_events
-from amiwarp.calib.start_burst import burst_size, without_start_burst
 from amiwarp.viewer import Inspector
 from benchmarks import encoder_troubles
 from benchmarks.encoder_troubles import (
@@ -328,17 +334,17 @@ def test_all_pairs_decide_what_few_leave_open(
         def run(self) -> Encoder:
             return path
 
-    monkeypatch.setattr(encoder_attempts, "PathFit", Fit)
-    monkeypatch.setattr(encoder_attempts, "px_per_rad", lambda *_: 0.0)
+    monkeypatch.setattr(pulse_attempts, "PathFit", Fit)
+    monkeypatch.setattr(pulse_attempts, "px_per_rad", lambda *_: 0.0)
     start = SimpleNamespace(
         calibration_events=SimpleNamespace(events=pulses.events[:]),
         space=SimpleNamespace(to_vector=lambda _: None),
         best={},
     )
-    monkeypatch.setattr(encoder_attempts, "search_on", lambda *_: start)
+    monkeypatch.setattr(pulse_attempts, "search_on", lambda *_: start)
     calibrator = Calibrator(pulses, Settings(model="exact"), "cpu", None)
     tried: Any = SimpleNamespace(doubtful=True, calibration=None)
-    between = encoder_attempts.between_pulses(
+    between = pulse_attempts.between_pulses(
         calibrator,
         tried,
         SimpleNamespace(full_space=None),  # type: ignore[arg-type]
@@ -371,9 +377,9 @@ def test_a_path_may_cost_a_little_more(
         unexplained=False,
         camera_turned=False,
     )
-    monkeypatch.setattr(encoder_attempts, "between_pulses", lambda *_: between)
+    monkeypatch.setattr(pulse_attempts, "between_pulses", lambda *_: between)
     monkeypatch.setattr(Calibrator, "attempt", lambda _: again)
-    calibrator, attempt = encoder_attempts.with_mended_encoder(given, tried)
+    calibrator, attempt = attempts.with_mended_encoder(given, tried)
     assert (attempt is again) == taken
     left_px = math.sqrt(0.05**2 - 0.003**2)
     hidden_px = 0.006 if taken else left_px + 0.006
@@ -417,9 +423,9 @@ def test_a_burst_is_set_aside_whatever_the_clock(
     given = source.slice(0, len(source))
     ticks = MemoryEvents(Events(given.x, given.y, given.t // tick_us * tick_us, given.p), *SIZE)
     plain = replace(still, recording=replace(still.recording, events=ticks))
-    assert without_start_burst(plain.recording)[1] == ()
+    assert start_burst.without_start_burst(plain.recording)[1] == ()
     started = encoder_troubles.with_burst(plain, 6139, stamps, before_us).recording
-    used, (said,) = without_start_burst(started)
+    used, (said,) = start_burst.without_start_burst(started)
     gone = len(started.events) - len(used.events)
     assert 6139 <= gone < 6139 + 1500  # those of two milliseconds at most
     assert f"{gone:,} events c" in said
@@ -513,7 +519,7 @@ def counted(numbers: list[int], window_us: int = 2000) -> MemoryEvents:
 def test_events_that_grow_fewer_slowly_are_no_burst(next_one: int, is_burst: bool) -> None:
     """A third of what the first window has beyond the usual number is left in the second one."""
     numbers = [10_000, next_one, *[1900] * 60]
-    assert burst_size(counted(numbers)) == (10_000 if is_burst else 0)
+    assert start_burst.burst_size(counted(numbers)) == (10_000 if is_burst else 0)
 
 
 def test_a_full_second_window_ends_the_search_for_a_burst(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -526,9 +532,9 @@ def test_a_full_second_window_ends_the_search_for_a_burst(monkeypatch: pytest.Mo
         return read_slice(self, start, stop)
 
     monkeypatch.setattr(MemoryEvents, "slice", counting)
-    assert burst_size(counted([2000] * 60)) == 0
+    assert start_burst.burst_size(counted([2000] * 60)) == 0
     assert read == []
-    assert burst_size(counted([4000, 2000, *[1900] * 60])) == 4000
+    assert start_burst.burst_size(counted([4000, 2000, *[1900] * 60])) == 4000
     assert len(read) == 1
 
 
@@ -565,22 +571,22 @@ def test_a_path_between_pulses_that_explains_little_is_said(
     between = SimpleNamespace(
         calibrator=replace(calibrator, mended=path), deviation_px=0.05, std_px=0.003
     )
-    monkeypatch.setattr(encoder_attempts, "confirmed_by", lambda *_: False)
-    monkeypatch.setattr(encoder_attempts, "between_pulses", lambda *_: between)
+    monkeypatch.setattr(pulse_attempts, "confirmed_by", lambda *_: False)
+    monkeypatch.setattr(pulse_attempts, "between_pulses", lambda *_: between)
     monkeypatch.setattr(Calibrator, "attempt", lambda _: again)
-    found, kept = encoder_attempts.with_mended_encoder(calibrator, tried)
+    found, kept = attempts.with_mended_encoder(calibrator, tried)
     assert kept is tried
     assert found.mended is None
     assert ("gives pulses only" in found.mended_words) == said
     monkeypatch.setattr(
-        encoder_attempts,
+        pulse_attempts,
         "confirmed_by",
         lambda by, given: by.mended is path and given is pulses,
     )
-    found, kept = encoder_attempts.with_mended_encoder(calibrator, tried)
+    found, kept = attempts.with_mended_encoder(calibrator, tried)
     assert (found.mended is path, kept is again) == (said, said)
     again.camera_turned = True
-    assert encoder_attempts.with_mended_encoder(calibrator, tried)[1] is tried
+    assert attempts.with_mended_encoder(calibrator, tried)[1] is tried
 
 
 @pytest.mark.parametrize(
@@ -630,7 +636,7 @@ def test_counts_are_put_back_although_something_else_is_wrong_too(
         photometric=SimpleNamespace(harmonics=harmonics),
     )
     monkeypatch.setattr(Calibrator, "attempt", lambda *_, **__: again)
-    found, kept = encoder_attempts.with_mended_encoder(calibrator, tried)
+    found, kept = attempts.with_mended_encoder(calibrator, tried)
     assert (kept is again) == is_taken
     assert ("steps by" in found.mended_words) == is_taken
 
@@ -647,8 +653,8 @@ def test_a_path_that_is_not_determined_between_pulses_is_said(
     def undetermined(*_: Any) -> None:
         raise AmiwarpError("undetermined")
 
-    monkeypatch.setattr(encoder_attempts, "between_pulses", undetermined)
-    found, kept = encoder_attempts.with_mended_encoder(calibrator, tried)
+    monkeypatch.setattr(pulse_attempts, "between_pulses", undetermined)
+    found, kept = attempts.with_mended_encoder(calibrator, tried)
     assert kept is tried
     assert "gives pulses only" in found.mended_words
 
@@ -671,12 +677,12 @@ def test_what_a_correction_of_the_angles_leaves_is_corrected_too(
         )
 
     monkeypatch.setattr(Calibrator, "attempt", attempt)
-    monkeypatch.setattr(encoder_attempts, "with_warnings", lambda found, *_: found)
+    monkeypatch.setattr(straight_angles, "with_warnings", lambda found, *_: found)
     calibrator = Calibrator(still.recording, Settings(model="exact"), "cpu", None)
     tried: Any = SimpleNamespace(
         photometric=SimpleNamespace(harmonics=first, parameters={}), cost=0.25, accepted=False
     )
-    found, _ = encoder_attempts.with_straight_angles(calibrator, tried)
+    found, _ = straight_angles.with_straight_angles(calibrator, tried)
     both = (0.021, 0.01, 0.0, 0.005)
     assert tried_with == [first, pytest.approx(both)]
     assert found.harmonics == pytest.approx(both if further_cost < 0.1 else first)
@@ -697,12 +703,12 @@ def test_a_correction_of_an_accepted_answer_must_be_accepted_and_lower_the_cost(
     )
     monkeypatch.setattr(Calibrator, "attempt", lambda *_, **__: again)
     said: list[str] = []
-    monkeypatch.setattr(encoder_attempts, "with_warnings", lambda _, *words: said.extend(words))
+    monkeypatch.setattr(straight_angles, "with_warnings", lambda _, *words: said.extend(words))
     calibrator = Calibrator(still.recording, Settings(model="exact"), "cpu", None)
     tried: Any = SimpleNamespace(
         photometric=SimpleNamespace(harmonics=third, parameters={}), cost=0.1, accepted=True
     )
-    found, kept = encoder_attempts.with_straight_angles(calibrator, tried)
+    found, kept = straight_angles.with_straight_angles(calibrator, tried)
     assert (found.harmonics == third) == (kept is not tried) == is_taken
     corrected = "the encoder's angle is wrong by 1.1 deg three times a turn: it was corrected"
     assert said == [corrected] * is_taken

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from amiwarp import Calibration, Encoder, PrismMotion, Settings, calibrate
-from amiwarp.calib import encoder_attempts
+from amiwarp.calib import attempts, lost_count_attempts
 from amiwarp.calib.calibrator import Attempt, Calibrator
-from amiwarp.events.each_encoder import each_encoder, together
+from amiwarp.events import each_encoder, together
 from amiwarp.results.calibration import replaces
 from amiwarp.studies.stability.encoders import index_pulses
 from benchmarks import encoder_troubles
@@ -63,7 +63,7 @@ def test_encoders_come_one_by_one_and_together_again(pair: Trouble) -> None:
 
 def test_counts_that_the_second_encoder_lost_are_put_back(pair: Trouble, slipped: Trouble) -> None:
     tried = cast(Attempt, SimpleNamespace(doubtful=True))
-    mended = encoder_attempts._with_all_counts(calibrator_of(slipped), tried)
+    mended = lost_count_attempts.without_lost_counts(calibrator_of(slipped), tried)
     assert mended is not None
     assert mended.mended is not None
     assert mended.recording.encoder is mended.mended
@@ -73,7 +73,7 @@ def test_counts_that_the_second_encoder_lost_are_put_back(pair: Trouble, slipped
     assert "first" not in said
     for found, true in zip(each_encoder(mended.mended), encoders_of(pair), strict=True):
         np.testing.assert_allclose(found.angle, true.angle, rtol=0, atol=math.radians(0.15))
-    assert encoder_attempts._with_all_counts(calibrator_of(pair), tried) is None
+    assert lost_count_attempts.without_lost_counts(calibrator_of(pair), tried) is None
 
 
 def test_commands_of_a_mirror_keep_their_jumps(slipped: Trouble) -> None:
@@ -81,7 +81,7 @@ def test_commands_of_a_mirror_keep_their_jumps(slipped: Trouble) -> None:
     mirror = replace(calibrator_of(slipped), settings=Settings(model="mirror"))
     search = SimpleNamespace(space=SimpleNamespace(sized=True))
     tried = cast(Attempt, SimpleNamespace(search=search, doubtful=True))
-    assert encoder_attempts.with_mended_encoder(mirror, tried) == (mirror, tried)
+    assert attempts.with_mended_encoder(mirror, tried) == (mirror, tried)
 
 
 def test_a_path_of_two_angles_is_for_the_encoders_of_both(slipped: Trouble) -> None:

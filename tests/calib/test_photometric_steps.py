@@ -14,6 +14,7 @@ from amiwarp import (
     FlatSide,
     PhotometricSettings,
     Prism,
+    RadialTangential,
     Recording,
     SensorTiming,
     Settings,
@@ -77,14 +78,59 @@ def first(problem: Problem) -> Refinement:
     return first_answer(problem, problem.settings.sensor)
 
 
-def test_steps_that_do_not_apply_return_the_same_state(first: Refinement) -> None:
-    for step in steps.STEPS:
-        if step not in (
+def test_a_search_through_another_lens_measures_its_image(problem: Problem) -> None:
+    sharp = problem.sharp
+    bent = replace(CAMERA, distortion=RadialTangential(k1=-0.1))
+    through = sharp.through(bent)
+    assert through.answer == sharp.answer
+    assert through.stages == sharp.stages
+    assert {through.space.camera, through.full_space.camera} == {bent}
+    here = sharp.sharpness_in(sharp.space, sharp.best)
+    there = sharp.sharpness_in(through.space, sharp.best)
+    assert abs(there - here) > 1e-3 * here
+    assert through.fine.values(sharp.best) == there
+    assert through.sharpness_in(sharp.space, sharp.best) == here
+
+
+def test_steps_without_anything_to_do_return_the_same_state(first: Refinement) -> None:
+    for applies, step in steps.STEPS:
+        if applies(first.problem) and step not in (
             losses.see_what_can_be_examined,
             losses.count_lost_events,
             steps.correct_camera_and_prism,
         ):
             assert step(first) is first, step.__name__
+
+
+def steps_for(problem: Problem) -> set[str]:
+    """Return the names of the steps that apply, but of those that always do."""
+    return {
+        step.__name__
+        for applies, step in steps.STEPS
+        if applies is not steps.always and applies(problem)
+    }
+
+
+def test_steps_apply_to_the_model_and_the_recording(problem: Problem) -> None:
+    assert steps_for(problem) == {"examine_the_angles"}
+    assert steps_for(replace(problem, angles_hold=True)) == {"examine_accepted_angles"}
+    fast = replace(problem, fast=True)
+    assert steps_for(fast) == {"examine_the_angles", "follow_a_fast_camera"}
+    space = problem.sharp.full_space
+    turning = replace(space, start={**space.start, "rate_x": 0.1})
+    moving = replace(problem, sharp=replace(problem.sharp, full_space=turning))
+    assert steps_for(moving) == {"examine_the_angles", "follow_a_slow_camera"}
+
+    of_vibration = replace(problem.sharp, space=replace(problem.sharp.space, model="vibration"))
+    measured = replace(problem, sharp=of_vibration)
+    blind = {
+        "examine_the_angles",
+        "bound_what_blind_pixels_hide",
+        "weigh_the_refractory_doubt",
+    }
+    assert steps_for(measured) == blind
+    unmeasured = replace(measured, recording=replace(problem.recording, encoder=None))
+    assert steps_for(unmeasured) == {*blind, "refuse_unsteady_motion"}
 
 
 def test_the_state_is_frozen_and_a_finished_one_is_the_last(
@@ -100,7 +146,14 @@ def test_the_state_is_frozen_and_a_finished_one_is_the_last(
         taken.append("two")
         return state
 
-    monkeypatch.setattr(steps, "STEPS", (one, two))
+    def three(state: Refinement) -> Refinement:
+        taken.append("three")
+        return state
+
+    def never(problem: Problem) -> bool:
+        return False
+
+    monkeypatch.setattr(steps, "STEPS", ((never, three), (steps.always, one), (steps.always, two)))
     state = steps.refine(problem)
     assert taken == ["one"]
     assert state.findings == (Silence(0.5),)
@@ -115,14 +168,8 @@ def test_a_cost_in_another_space_leaves_the_first_one_as_it_is(
     search, v = first.search, first.answer.x
     cost = search.cost
     cost.residuals(v, rounds=2)
-    calls: list[str] = []
-
-    def column() -> str:
-        calls.append("found")
-        return "column"
-
-    assert cost.column("name", column) == cost.column("name", column) == "column"
-    assert calls == ["found"]
+    assert cost.known_column("name") is None
+    assert cost.keep_column("name", "column") == cost.known_column("name") == "column"
     space = search.space
     other = search.with_cause(FOCAL_LENGTH, v)
     assert (search.space, cost.space) == (space, space)
@@ -130,8 +177,7 @@ def test_a_cost_in_another_space_leaves_the_first_one_as_it_is(
     assert other.space.names == (*space.names, "focal_length")
     wide = other.space.to_vector({**other.space.start, **space.to_values(v)})
     other.cost.slopes(wide)
-    assert cost.column("name", column) == "column"
-    assert calls == ["found", "found"]
+    assert cost.known_column("name") is None
     solved: list[int] = []
     monkeypatch.setattr(cost.brightness, "solve", lambda *_, rounds, **__: solved.append(rounds))
     cost.converge(v)  # the map was solved in the other space

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import pytest
 
-from amiwarp.calib import attempts, encoder_attempts
+from amiwarp.calib import attempts, other_angles
 from amiwarp.calib.calibrator import Attempt, Calibrator
 
 
@@ -91,6 +91,6 @@ def test_impossible_steps_are_taken_out_even_if_the_answer_is_refused() -> None:
     """A prism does not jump. With 12 deg lost, an answer was accepted that a turning camera explained, 0.3 px off."""
     tried = as_attempt(Tried(0.53, unexplained=True))
     refused = as_attempt(Tried(0.45, accepted=False, unexplained=True))
-    assert encoder_attempts._repairs_steps(refused, tried)
+    assert other_angles.repairs_steps(refused, tried)
     as_dear = as_attempt(Tried(0.52, accepted=False, unexplained=True))
-    assert not encoder_attempts._repairs_steps(as_dear, tried)
+    assert not other_angles.repairs_steps(as_dear, tried)

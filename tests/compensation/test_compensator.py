@@ -604,7 +604,8 @@ def test_a_hole_in_the_samples_of_either_encoder_is_marked(which: int) -> None:
 
 def test_the_streams_encoders_must_suit_the_model() -> None:
     with pytest.raises(
-        AmiwarpError, match=r"two prisms, .* \(EncoderStream\(second=EncoderStream\(\)\) or"
+        AmiwarpError,
+        match=r"two prisms, .* of a stream, EncoderStream\(second=EncoderStream\(\)\) or",
     ):
         Compensator(MIRROR, EncoderStream())
     with pytest.raises(

@@ -323,6 +323,10 @@ def test_unknown_keywords_and_too_many_arguments(call: PublicCall) -> None:
             lambda: amiwarp.calibrate(RECORDING, device="gpu"),
             "device is 'gpu'; expected a device of this machine.*cpu",
         ),
+        (
+            lambda: amiwarp.evaluate("report", device="gpu"),
+            "device is 'gpu'; expected cpu, cuda for all GPUs, or one GPU such as cuda:0",
+        ),
         (lambda: RECORDING.encoder.angle_at(math.nan), "nan|NaN|whole"),
         (lambda: amiwarp.World(1.0, ()), "World|world"),
         (

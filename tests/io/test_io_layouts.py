@@ -1075,14 +1075,20 @@ def test_comments_before_a_last_line_do_not_count(tmp_path: Path, between: str) 
 
 
 def test_a_time_that_lost_digits_is_cut_off(tmp_path: Path) -> None:
+    """Neither is it the last time, which is read from the end of a large file."""
     path = made(tmp_path, lines(np.c_[X, Y, P, T]))
     text = path.read_text().rstrip("\n")
     path.write_text(text)
     recording = open_recording(path)
     assert_same(recording)
     assert "truncated_bytes" not in recording.metadata
+    assert recording.events.last_time() == T[-1]
     path.write_text(text[:-1])
     recording = open_recording(path)
+    assert recording.events.last_time() == recording.events.t_last == T[-2]
+    path.write_text(text + "\n# end\n")
+    assert open_recording(path).events.last_time() == T[-1]
+    path.write_text(text[:-1])
     assert (len(recording.events), recording.metadata["truncated_bytes"]) == (
         N - 1,
         len(text.split("\n")[-1]) - 1,

@@ -661,6 +661,19 @@ def test_a_recording_from_the_command_line(tmp_path: Path) -> None:
     assert "plain.h5" in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.parametrize("only", [",", "", " , "])
+def test_no_names_are_not_all_names(tmp_path: Path, only: str) -> None:
+    from typer.testing import CliRunner
+
+    from tests.command_line import app
+
+    out = tmp_path / "out"
+    result = CliRunner().invoke(app, ["evaluate", "--out", str(out), "--only", only])
+    assert result.exit_code != 0
+    assert "names no evaluation; give names such as texture,flow" in result.output
+    assert not out.exists()
+
+
 def test_a_recording_that_fails_does_not_end_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -83,7 +83,7 @@ def test_only_unforeseen_errors_of_jobs_are_internal(error: Exception, text: str
         raise error
 
     async def work(panel: Any) -> None:
-        await asyncio.wait([panel.start_job(failing())])
+        await asyncio.wait([panel.work.start_job(failing())])
         await until(lambda: panel.state.message == text)
 
     with_panel(Inspector(recorded("own")), work)
@@ -98,8 +98,8 @@ def test_slow_updates_begin_with_what_is_on_the_page(monkeypatch: pytest.MonkeyP
         async def note(name: str) -> None:
             made.append(name)
 
-        monkeypatch.setattr(panel, "update_slowly", note)
-        panel.request_slow("preparation", "statistics", "picture", "curve")
+        monkeypatch.setattr(panel.work, "update_slowly", note)
+        panel.work.request_slow("preparation", "statistics", "picture", "curve")
         await until(lambda: len(made) == 4)
         assert made == ["curve", "picture", "statistics", "preparation"]
 
@@ -182,7 +182,7 @@ def test_a_calibration_of_the_recording_before_is_forgotten(
         await until(lambda: panel.shown is not None)
         panel.calibrate()
         await until(lambda: len(started) == 1)
-        old = next(job for job in panel._jobs if "_calibrate" in repr(job.get_coro()))
+        old = next(job for job in panel.work.jobs if "_calibrate" in repr(job.get_coro()))
         panel.start(Inspector(recorded("next")))
         await until(lambda: panel.shown is not None)
         panel.calibrate()

@@ -30,7 +30,7 @@ from amiwarp.viewer.commands import exposure_warning
 from amiwarp.viewer.host_names import HostNames, address, is_local, reachable
 from amiwarp.viewer.layout import CALLS, SETTABLE
 from amiwarp.viewer.page_messages import MOST_BYTES, MessageFilter
-from amiwarp.viewer.panel import MOST_IN_FLIGHT
+from amiwarp.viewer.page_work import MOST_IN_FLIGHT
 from amiwarp.viewer.serve import serve
 from tests.viewer.test_serve import COUNT, TOKEN, WAIT_S, Counters, get, origin_of, served, until
 

@@ -87,21 +87,7 @@ def examined_errors(kind: type[Model]) -> tuple[tuple[str, ...], ...]:
     return (SKEW,)
 
 
-def examine_the_angles_first(state: Refinement) -> Refinement:
-    """End if the angles have an error, so that it is corrected before lens and prism are examined."""
-    if state.problem.angles_hold:
-        return state
-    return _without_angle_errors(state)
-
-
-def examine_the_angles_last(state: Refinement) -> Refinement:
-    """Refuse the answer if its angles have an error although lens and prism were corrected first."""
-    if state.refusal or not state.problem.angles_hold:
-        return state
-    return _without_angle_errors(state)
-
-
-def _without_angle_errors(state: Refinement) -> Refinement:
+def examine_the_angles(state: Refinement) -> Refinement:
     """Note errors of the angles, and end unless there is but a small delay of the read-out."""
     if not state.are_angles_examined:
         return state
@@ -116,6 +102,13 @@ def _without_angle_errors(state: Refinement) -> Refinement:
         return state.ending()
     search.cost.renew(v)
     return state
+
+
+def examine_accepted_angles(state: Refinement) -> Refinement:
+    """Examine the angles unless the answer is refused, after lens and prism were corrected."""
+    if state.refusal:
+        return state
+    return examine_the_angles(state)
 
 
 def _as_finding(state: Refinement, errors: dict[str, float]) -> AngleError:

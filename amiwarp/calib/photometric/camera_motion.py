@@ -18,9 +18,7 @@ and over :data:`limits.LARGEST_STILL_COST`."""
 
 
 def follow_a_fast_camera(state: Refinement) -> Refinement:
-    """End with an answer for tiles whose scenes move on their own paths, if the camera is in fast motion."""
-    if not state.problem.fast:
-        return state
+    """End with an answer for tiles whose scenes move on their own paths."""
     free = _with_free_paths(state, FAST_PATH_TERMS)
     values = state.space.to_values(state.answer.x)
     answer = free.search.search(free.space.to_vector(values))
@@ -36,7 +34,7 @@ def follow_a_slow_camera(state: Refinement) -> Refinement:
     space = state.space
     only_motion_is_free = set(space.names).issubset(MOTION)
     tiles = len(state.search.cost.brightness.tiles.origin)
-    if not space.moving or only_motion_is_free or tiles == 1:
+    if only_motion_is_free or tiles == 1:
         return state
 
     free = _with_free_paths(state, PATH_TERMS)

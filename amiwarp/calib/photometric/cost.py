@@ -66,8 +66,8 @@ class SharedMap:
         self.columns: dict[str, tuple[Any, Any]] = {}
         """Derivatives of the residuals at the last solution, on the device, by name; each with the part of it that no
         change of the map explains, or None if that was not needed yet."""
-        self.by_angle: dict[str, tuple[Any, Any]] = {}
-        """Derivatives of the residuals by the angles at the last solution, by the number of the angle or ``all``."""
+        self.by_angle: dict[int | None, tuple[Any, Any]] = {}
+        """Derivatives of the residuals by the angles at the last solution, by the number of the angle; None for all."""
         self._user: Cost | None = None
 
     def used_by(self, cost: Cost) -> SharedMap:
@@ -194,62 +194,55 @@ class Cost:
         if not self._is_solved_at(v):
             self.residuals(v, rounds=2)
 
-    def by_drift(self, v: Vector) -> tuple[Any, Any]:
-        """Return the derivatives of the residuals by the angle at the first and at the second events of the pairs.
+    def by_angle(self, v: Vector, angle: int | None = None) -> tuple[Any, Any]:
+        """Return the derivatives of the residuals by an angle at the first and at the second events of the pairs.
 
-        A second angle of the model turns with the first one by the ratio of their speeds, as in a time that passes. The
-        derivatives are on the device, shape (padded pairs,) each. The map must be solved at ``v``.
+        ``angle`` is the number of the model's angle that changes while the others stay. Without it, all angles drift: a
+        second one turns with the first one by the ratio of their speeds, as in a time that passes. The derivatives are
+        on the device, shape (padded pairs,) each. The map must be solved at ``v``.
         """
         known = self.shared.used_by(self).by_angle
-        if "all" not in known:
-            known["all"] = self._find_by_drift(self.at(v))
-        return known["all"]
-
-    def by_angle(self, v: Vector, angle: int = 0) -> tuple[Any, Any]:
-        """Return the derivatives as :meth:`by_drift` does, by one of the model's angles while the others stay.
-
-        ``angle`` is its number.
-        """
         if MODELS[self.space.model].ANGLES == 1:
-            return self.by_drift(v)
-        known = self.shared.used_by(self).by_angle
-        name = str(angle)
-        if name not in known:
-            known[name] = self._find_by_angle(v, angle)
-        return known[name]
+            angle = None
+        if angle not in known:
+            values = self.space.to_values(v)
+            if angle is None:
+                known[None] = self._find_by_drift(values)
+            elif angle == 0:
+                known[0] = self._find_by_drift({**values, "ratio": 0.0})
+            else:
+                both_at_first, both_at_second = self._find_by_drift({**values, "ratio": 1.0})
+                at_first, at_second = self.by_angle(v, 0)
+                known[angle] = (
+                    _difference(both_at_first, at_first),
+                    _difference(both_at_second, at_second),
+                )
+        return known[angle]
 
-    def _find_by_angle(self, v: Vector, angle: int) -> tuple[Any, Any]:
-        """Return the derivatives by one of two angles, see :meth:`by_angle`."""
-        values = self.space.to_values(v)
-        if angle == 0:
-            only_first = place_arguments(self.space, {**values, "ratio": 0.0})
-            return self._find_by_drift(only_first)
-        both = place_arguments(self.space, {**values, "ratio": 1.0})
-        both_at_first, both_at_second = self._find_by_drift(both)
-        at_first, at_second = self.by_angle(v, 0)
-        return _difference(both_at_first, at_first), _difference(both_at_second, at_second)
-
-    def _find_by_drift(self, at: dict[str, Any]) -> tuple[Any, Any]:
+    def _find_by_drift(self, values: Mapping[str, float]) -> tuple[Any, Any]:
         """Return the derivatives by a drift of the angles at the first and at the second events of the pairs."""
         pairs = self.brightness.pairs
-
-        def by(end: int) -> Any:
+        at = place_arguments(self.space, values)
+        found = []
+        for end in range(2):
             shape = (2, pairs.arrays.stride)
             shift = wp.zeros(shape, dtype=float, device=self.brightness.device)
             shift[end].fill_(1.0)
             drifting = {**at, "arrays": pairs.with_columns(slope=shift.flatten())}
             up = {**drifting, "drift": STEP_RAD}
             down = {**drifting, "drift": -STEP_RAD}
-            return self.brightness.find_slope(up, down, 2.0 * STEP_RAD)
+            found.append(self.brightness.find_slope(up, down, 2.0 * STEP_RAD))
+        at_first, at_second = found
+        return at_first, at_second
 
-        return by(0), by(1)
+    def known_column(self, name: str) -> Any | None:
+        """Return a derivative of the residuals by name, or None if it was not found since the last solution."""
+        column, _ = self.shared.used_by(self).columns.get(name, (None, None))
+        return column
 
-    def column(self, name: str, find: Callable[[], Any]) -> Any:
-        """Return a derivative of the residuals by name, which is found once for each solution of the map."""
-        columns = self.shared.used_by(self).columns
-        if name not in columns:
-            columns[name] = find(), None
-        column, _ = columns[name]
+    def keep_column(self, name: str, column: Any) -> Any:
+        """Keep a derivative of the residuals until the next solution of the map, and return it."""
+        self.shared.used_by(self).columns[name] = column, None
         return column
 
     def unexplained_column(self, name: str, column: Any, *, steps: int) -> Any:

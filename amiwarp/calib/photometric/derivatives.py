@@ -6,7 +6,6 @@ They are on the device, and found once for each solution of the map.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -71,17 +70,17 @@ def slopes(
 
     They are on the device. The map must be solved at ``v``.
     """
-
-    def by(name: str) -> Any:
-        step = np.zeros(len(v))
-        step[space.names.index(name)] = SLOPE_PX
-        up = place_arguments(space, space.to_values(v + step))
-        down = place_arguments(space, space.to_values(v - step))
-        return cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
-
     columns = {}
     for name in names:
-        columns[name] = cost.column(name, partial(by, name))
+        column = cost.known_column(name)
+        if column is None:
+            step = np.zeros(len(v))
+            step[space.names.index(name)] = SLOPE_PX
+            up = place_arguments(space, space.to_values(v + step))
+            down = place_arguments(space, space.to_values(v - step))
+            slope = cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
+            column = cost.keep_column(name, slope)
+        columns[name] = column
     return columns
 
 
@@ -97,10 +96,7 @@ def shifted(
 
     ``shift`` is a Warp array of shape (2 · padded pairs,), or (2, padded pairs). The map must be solved at ``v``.
     """
-    if angle is None:
-        first, second = cost.by_drift(v)
-    else:
-        first, second = cost.by_angle(v, angle)
+    first, second = cost.by_angle(v, angle)
     column = wp.empty_like(first)
     launch(
         by_shift,
@@ -139,16 +135,16 @@ def by_rotation(cost: Cost, best: Vector) -> dict[str, Any]:
     times = cost.brightness.pairs.some_times
     half_s = max(0.5 * float(np.ptp(times)), 1e-6)
     rate = SLOPE_PX / space.camera.fx / half_s  # moves the middle by the step in half the time
-
-    def about(axis: Vector) -> Any:
-        x, y, z = axis * rate
-        # one-sided differences: a camera at rest is faster to compute, and only the gain counts
-        turning = {**at, "camera_rotation": CameraRotation((x, y, z))}
-        return cost.brightness.find_slope(turning, at, SLOPE_PX)
-
     columns = {}
     for name, axis in zip(RATES, np.eye(3), strict=True):
-        columns[name] = cost.column(name, partial(about, axis))
+        column = cost.known_column(name)
+        if column is None:
+            # One-sided differences: a camera at rest is faster to compute, and only the gain counts.
+            x, y, z = axis * rate
+            turning = {**at, "camera_rotation": CameraRotation((x, y, z))}
+            slope = cost.brightness.find_slope(turning, at, SLOPE_PX)
+            column = cost.keep_column(name, slope)
+        columns[name] = column
     return columns
 
 
@@ -212,10 +208,13 @@ def by_cause(cost: Cost, best: Vector, cause: SuspectedError) -> dict[str, Any]:
     values = space.to_values(best)
     try:
         if cause == SIDE:
-            other = place_arguments(other_side(space), values_with_other_side(space, values))
-            here = place_arguments(space, values)
-            by_side = partial(cost.brightness.find_slope, other, here, 1.0)
-            return {FLAT_SIDE: cost.column(FLAT_SIDE, by_side)}
+            column = cost.known_column(FLAT_SIDE)
+            if column is None:
+                other = place_arguments(other_side(space), values_with_other_side(space, values))
+                here = place_arguments(space, values)
+                slope = cost.brightness.find_slope(other, here, 1.0)
+                column = cost.keep_column(FLAT_SIDE, slope)
+            return {FLAT_SIDE: column}
         wide, v = with_cause(space, cause, values)
     except AmiwarpError:
         return {}  # it moves no event

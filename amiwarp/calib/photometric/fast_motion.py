@@ -26,7 +26,7 @@ def bound_what_blind_pixels_hide(state: Refinement) -> Refinement:
     """Note how far the image moves while a pixel is blind, and how much an error of that time changes the answer."""
     kind = MODELS[state.space.model]
     has_angles = state.are_angles_examined or kind.ANGLES > 1
-    if kind.PRISM or not has_angles:
+    if not has_angles:
         return state
     problem = state.problem
     cost = state.search.cost
@@ -71,7 +71,7 @@ def by_refractory(cost: Cost, best: Vector) -> Vector:
     The period sets the reference of a pair, its first event, later. The map must be solved at ``best``.
     """
     columns = slopes(cost, cost.space, best, cost.space.names)
-    columns["refractory"], _ = cost.by_drift(best)
+    columns["refractory"], _ = cost.by_angle(best)
     fit = linear_fit(cost, columns)
     hessian = fit.hessian.sum(axis=0)
     of_parameters = hessian[:-1, :-1]

@@ -102,7 +102,7 @@ class Refinement:
 
 
 Step = Callable[[Refinement], Refinement]
-"""Part of the stage: it returns the state after it, and the same state if it does not apply."""
+"""Part of the stage: it returns the state after it, and the same state if there is nothing to do."""
 
 
 def first_answer(problem: Problem, sensor: SensorTiming) -> Refinement:

@@ -20,7 +20,6 @@ from amiwarp.calib.photometric.findings import UnsteadyMotion
 from amiwarp.calib.photometric.linear_fit import linear_fit, telling
 from amiwarp.calib.photometric.refinement import Refinement
 from amiwarp.calib.photometric.stated_errors import BOUND
-from amiwarp.optics.models.registry import MODELS
 
 if TYPE_CHECKING:
     from amiwarp.calib.photometric.cost import Cost
@@ -49,9 +48,7 @@ AMPLITUDE_SHARE = 0.4
 
 def refuse_unsteady_motion(state: Refinement) -> Refinement:
     """Note what a vibration does beyond its model, and how much a change of its amplitude could hide."""
-    if MODELS[state.space.model].PRISM or not state.are_angles_examined:
-        return state
-    if state.problem.recording.encoder is not None:
+    if not state.are_angles_examined:
         return state
     cost = state.search.cost
     cost.converge(state.answer.x)

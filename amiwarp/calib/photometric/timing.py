@@ -127,7 +127,7 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
     relative, _ = darkness(cost.brightness, space.build(space.to_values(v)))
     columns = slopes(cost, space, v, space.names)
     # the refractory period sets the reference of a pair, its first event, later
-    columns["refractory"], _ = cost.by_drift(v)
+    columns["refractory"], _ = cost.by_angle(v)
     columns["slow"] = shifted(cost, v, relative)
     fit = linear_fit(cost, columns)
 

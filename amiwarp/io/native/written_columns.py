@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.each_encoder import each_encoder
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, each_encoder
 from amiwarp.events.recording import Events
 from amiwarp.events.truth import EVENT_COLUMNS, EventTruth, check_truth
 from amiwarp.io.hdf5.chunks import CHUNK

@@ -86,13 +86,15 @@ def open_text(path: Path, given: GivenLayout) -> Recording:
 
 
 def _last_time(path: Path, form: TextForm, layout: Layout, estimate: int) -> int | None:
-    """Return the time of the last line [us], or None if it holds none."""
+    """Return the time of the last event [us], or None if the end of the file holds none."""
     tail = text_tail(path, 2 * LONGEST_LINE)
-    # The first line of the tail may be cut off.
-    _, *lines = tail.split(b"\n")
     with contextlib.suppress(ValueError, IndexError, OverflowError):
-        with_values = [line for line in lines if holds_values(line)]
-        words = form.row.words(with_values[-1])
+        # The first line of the tail may be cut off, as may be a last one without a newline.
+        _, *lines, rest = tail.split(b"\n")
+        last = _last_with_values(b"\n".join(lines))
+        if holds_values(rest) and not (last and _is_cut_off(rest, last, form, layout)):
+            last = rest
+        words = form.row.words(last)
         t = float(words[layout.columns["t"]])
         return round(t * TIME_UNITS[layout.unit])
     return None

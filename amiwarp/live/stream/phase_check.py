@@ -7,6 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_stream import EncoderStream
@@ -59,12 +61,13 @@ class PhaseCheck:
         ``every_s``: interval between estimates [s]; ``say`` is called with a message if the phase changed.
         """
         # Here, because it takes long to load, and ``record`` does not need it.
-        from amiwarp.calib.calibration import calibrate
+        from amiwarp.calib.preparation import prepare
+        from amiwarp.calib.settings import Settings
 
         self._calibration = calibration
         self._every_s = every_s
         self._say = say
-        self._calibrate = calibrate
+        self._prepare = prepare
         self._due = 0.0
         self._closed = False
         self._recent: deque[Events] = deque()
@@ -76,6 +79,22 @@ class PhaseCheck:
         photometric = calibration.photometric
         sharp = {} if photometric is None else photometric.sharpness_parameters
         self._usual = {name: sharp.get(name, calibration.parameters[name]) for name in self._names}
+        start = {**calibration.parameters, **self._usual}
+        for name in ("clock_offset", "rpm"):  # the encoder has them
+            start.pop(name, None)
+        bounds = {}
+        for name, usual in self._usual.items():
+            bounds[name] = (usual - SEARCH_RAD, usual + SEARCH_RAD)
+        self._settings = Settings(
+            model=calibration.model_name,
+            free=self._names,
+            start=start,
+            stages=("sharpness",),
+            events=100_000,
+            bounds=bounds,
+            global_evaluations=EVALUATIONS,
+            local_algorithm="LN_SBPLX",
+        )
         self._estimated: list[PhaseEstimate] = []
         self._first_estimate: list[PhaseEstimate] = []
         self._offset: float | None = None
@@ -180,12 +199,8 @@ class PhaseCheck:
             self._thread.join(None if math.isinf(most_s) else most_s)
 
     def _estimate(self, events: Events, encoder: Encoder) -> None:
-        """Estimate the phases by a calibration in which all other parameters are fixed."""
+        """Estimate the phases by a search for the sharpest image, in which all other parameters are fixed."""
         known = self._calibration
-        bounds = {}
-        for name in self._names:
-            usual = self._usual[name]
-            bounds[name] = (usual - SEARCH_RAD, usual + SEARCH_RAD)
         recording = Recording(
             MemoryEvents(events, known.camera.width, known.camera.height),
             known.camera,
@@ -193,26 +208,14 @@ class PhaseCheck:
             known.prism,
             name="the stream",
         )
-        start = {**known.parameters, **self._usual}
-        for name in ("clock_offset", "rpm"):  # the encoder has them
-            start.pop(name, None)
         try:
-            calibration = self._calibrate(
-                recording,
-                model=known.model_name,
-                free=self._names,
-                start=start,
-                stages=("sharpness",),
-                events=100_000,
-                bounds=bounds,
-                global_evaluations=EVALUATIONS,
-                local_algorithm="LN_SBPLX",
-                device="cpu",
-            )
-        except AmiwarpError:
+            (prepared,) = self._prepare(recording, self._settings)
+            search = prepared.run()
+            _, std = search.check_answer(recording.name)
+        except (AmiwarpError, np.linalg.LinAlgError):
             return  # for example without texture: a later estimate may succeed
         estimated = []
         for name in self._names:
-            offset = calibration.parameters[name] - self._usual[name]
-            estimated.append(PhaseEstimate(name, offset, calibration.uncertainty[name]))
+            offset = search.best[name] - self._usual[name]
+            estimated.append(PhaseEstimate(name, offset, std[name]))
         self._estimated = estimated

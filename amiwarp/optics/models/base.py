@@ -441,7 +441,7 @@ class Model:
         AmiwarpError
             If the arrays have other shapes, types or devices.
         """
-        return _displaced("compensate_points", self, xy, theta)
+        return _displaced(kernels.compensate_points, self, xy, theta)
 
     def deflect_points(self, xy: Points, theta: Points) -> Points:
         """Return the observed pixel of a scene ray, given its pixel without the prism.
@@ -465,14 +465,30 @@ class Model:
         AmiwarpError
             If the arrays have other shapes, types or devices.
         """
-        return _displaced("deflect_points", self, xy, theta)
+        return _displaced(kernels.deflect_points, self, xy, theta)
 
 
-def _displaced(kernel_name: str, model: Model, xy: Any, theta: Any) -> Any:
+def _displaced(kernel: Any, model: Model, xy: Any, theta: Any) -> Any:
     """Return points moved by a kernel, as the arrays that were given: on a device, or NumPy arrays."""
     if isinstance(xy, wp.array):
-        return _displaced_on_device(kernel_name, model, xy, theta)
-    xy = array(xy, "xy")
+        points = xy
+        angles = _angles_on_device(model, points, theta)
+    else:
+        xy = array(xy, "xy")
+        points, angles = _on_host(model, xy, theta)
+    device = points.device
+    moved = wp.empty_like(points)
+    params = model.params(device)
+    camera = model_camera(model, device)
+    launch(kernel, len(points), [params, camera, points, angles.flatten()], [moved], device=device)
+    if points is xy:
+        return moved
+    dtype = xy.dtype if np.issubdtype(xy.dtype, np.floating) else np.float32
+    return moved.numpy().astype(dtype, copy=False)
+
+
+def _on_host(model: Model, xy: NDArray[Any], theta: Any) -> tuple[wp.array, wp.array]:
+    """Return points and all angles of a model as Warp arrays on the CPU."""
     theta = array(theta, "theta")
     are_points = xy.ndim == 2 and xy.shape[1] == 2
     if not are_points or theta.shape not in _shapes(len(xy), model.ANGLES):
@@ -481,14 +497,11 @@ def _displaced(kernel_name: str, model: Model, xy: Any, theta: Any) -> Any:
         )
     if theta.ndim != model.ANGLES:
         theta = model.all_angles(theta)
-    points, angles = points_on_host(xy, theta)
-    moved = _displaced_on_device(kernel_name, model, points, angles)
-    dtype = xy.dtype if np.issubdtype(xy.dtype, np.floating) else np.float32
-    return moved.numpy().astype(dtype, copy=False)
+    return points_on_host(xy, theta)
 
 
-def _displaced_on_device(kernel_name: str, model: Model, xy: wp.array, theta: Any) -> wp.array:
-    """Return points moved by a kernel, on their device."""
+def _angles_on_device(model: Model, xy: wp.array, theta: Any) -> wp.array:
+    """Return all angles of a model at points on a device."""
     device = xy.device
     if not isinstance(theta, wp.array) or theta.device != device or theta.dtype is not wp.float32:
         raise AmiwarpError(
@@ -501,16 +514,8 @@ def _displaced_on_device(kernel_name: str, model: Model, xy: wp.array, theta: An
         raise AmiwarpError(f"{given}; {wanted}")
     if theta.ndim < model.ANGLES:
         all_angles = model.all_angles(theta.numpy())
-        theta = wp.array(all_angles, dtype=float, device=device)
-    moved = wp.empty_like(xy)
-    launch(
-        getattr(kernels, kernel_name),
-        len(xy),
-        [model.params(device), model_camera(model, device), xy, theta.flatten()],
-        [moved],
-        device=device,
-    )
-    return moved
+        return wp.array(all_angles, dtype=float, device=device)
+    return theta
 
 
 def _shapes(points: int, angles: int) -> tuple[tuple[int, ...], ...]:

@@ -10,6 +10,7 @@ import typer
 
 from amiwarp.cli import common as cli
 from amiwarp.cli import say
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.studies.long_runs import AVERAGE_S, LocalWorkers, Scheduler, failed_lines
 
 if TYPE_CHECKING:
@@ -58,18 +59,24 @@ def run_evaluate(
     from amiwarp.studies.cluster import ANY_GPU
     from amiwarp.studies.evaluate.evaluation import evaluate
 
+    names = [name.strip() for name in (only or "").split(",") if name.strip()]
+    if only is not None and not names:
+        raise AmiwarpError(
+            f"--only is {only!r}, which names no evaluation; give names such as texture,flow, or leave --only out",
+            ErrorCode.OPTIONS,
+        )
+
     device = ANY_GPU
     if common.device != ANY_GPU:
         device = cli.choose_device(common.device)
     elif scheduler is None:
         cli.choose_device("cuda:0")  # refuses a machine without a GPU
 
-    names = [name.strip() for name in (only or "").split(",")]
     try:
         with cli.progress("starting workers", average_s=AVERAGE_S) as advance:
             done = evaluate(
                 out,
-                only=tuple(name for name in names if name),
+                only=tuple(names),
                 full=full,
                 seeds=seeds,
                 recordings=recording or (),
