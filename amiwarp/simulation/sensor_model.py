@@ -33,7 +33,11 @@ class SensorModel:
     contrast_off: float = 0.25
     """OFF threshold: decrease of natural log intensity that causes an OFF event."""
     mismatch: float = 0.03
-    """Relative standard deviation of the ON and OFF thresholds between pixels."""
+    """Relative standard deviation of the ON and OFF thresholds between pixels, 0 to 0.5.
+
+    The thresholds of a pixel are normally distributed and independent, but never below a tenth of the nominal ones. At
+    0.3, 0.1 % of the thresholds lie at this limit, at 0.5, 3.6 %.
+    """
     refractory_us: float = 100.0
     """Refractory period: time after an event in which the pixel is blind [us].
 

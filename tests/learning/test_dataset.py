@@ -32,7 +32,7 @@ from amiwarp.io.recorded_dataset import MANIFEST
 from amiwarp.kernels import quiet_start
 from amiwarp.learning.dataset import making, sources, specification, worker
 from amiwarp.learning.dataset.files import JOURNAL, TABLE
-from amiwarp.learning.dataset.items import Item, _counts, list_items
+from amiwarp.learning.dataset.items import Item, _counts, list_items, sources_of_splits
 from amiwarp.learning.dataset.specification import load_specification
 from amiwarp.studies import cluster
 from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker, threads_of_worker
@@ -196,7 +196,13 @@ def test_a_source_lies_in_one_split(place: Path) -> None:
         item.split for item in items if item.source.endswith(("disc/0.png", "copy.png"))
     } == splits[hashlib.sha256(copy.read_bytes()).hexdigest()]
     train = sum(found == {"train"} for found in splits.values())
+    assert train == 325
+    text = (place / "spec.toml").read_text()
+    (place / "spec.toml").write_text("stratify = false\n" + text)
+    drawn = list_items(load_specification(place / "spec.toml"))
+    train = len({item.same for item in drawn if item.split == "train"})
     assert train == pytest.approx(0.8 * 406, abs=30)
+    assert train != 325
     other = BASE.replace("duration_s", "split_seed = 1\nduration_s", 1)
     (place / "spec.toml").write_text("seeds = 200\n" + other + PICTURES + worlds)
     assert [i.split for i in list_items(load_specification(place / "spec.toml"))] != [
@@ -548,6 +554,67 @@ def test_each_split_gets_its_share_and_at_least_one(total: int, shares: tuple[fl
         )
 
 
+def divided(place: Path) -> dict[str, dict[str, int]]:
+    """Return the number of sources of each split by class."""
+    loaded = load_specification(place / "spec.toml")
+    return sources_of_splits(loaded, list_items(loaded))
+
+
+def test_each_class_is_divided_unless_another_rule_is_given(place: Path) -> None:
+    """Ten sources of a label give six, two and two of each; one class too small, and all are divided together."""
+    rng = np.random.default_rng(3)
+    for folder, count in (("disc", 7), ("square", 7)):
+        for k in range(count):
+            Image.fromarray(rng.integers(0, 256, (4, 4), np.uint8)).save(
+                place / "pictures" / folder / f"new{k}.png"
+            )
+    shares = "splits = {train = 0.6, val = 0.2, test = 0.2}\n"
+    (place / "spec.toml").write_text(shares + BASE + PICTURES)
+    six = {"train": 6, "val": 2, "test": 2}
+    assert divided(place) == {"class = 'disc'": six, "class = 'square'": six}
+    result = run(
+        place / "spec.toml", place / "out", "--dry-run", "--workers", "1", "--device", "cpu"
+    )
+    assert (
+        "sources: train 12, val 4, test 4; divided by class = 'disc': train 6, val 2, test 2; class = 'square': "
+        "train 6, val 2, test 2 (the field stratify gives another rule)" in result.stdout
+    )
+    (place / "spec.toml").write_text("stratify = false\n" + shares + BASE + PICTURES)
+    drawn = divided(place)
+    assert list(drawn) == [""]
+    assert sum(drawn[""].values()) == 20
+    assert drawn[""]["train"] != 12
+    for k in range(7):
+        (place / "pictures" / "square" / f"new{k}.png").unlink()
+    (place / "pictures" / "square" / "1.png").unlink()
+    (place / "spec.toml").write_text(shares + BASE + PICTURES)
+    assert divided(place) == {"all sources": {"train": 7, "val": 3, "test": 2}}
+    (place / "spec.toml").write_text("stratify = true\n" + shares + BASE + PICTURES)
+    with pytest.raises(
+        AmiwarpError, match=r"stratify is True; expected the name of a label, or false"
+    ):
+        load_specification(place / "spec.toml")
+
+
+def test_one_source_of_many_splits_is_for_training(place: Path) -> None:
+    (place / "spec.toml").write_text(BASE + PICTURES.replace("*/*", "disc/0"))
+    assert divided(place) == {"all sources": {"train": 1}}
+
+
+def test_a_spread_that_one_sample_cannot_tell_is_not_zero(place: Path) -> None:
+    one = BASE.replace(', {apex_deg = 2.0, flat_side = "camera"}', "")
+    (place / "spec.toml").write_text(one + PICTURES.replace("*/*", "disc/0"))
+    words = (place / "spec.toml", place / "out", "--dry-run", "--workers", "1", "--device", "cpu")
+    text = run(*words).stdout
+    assert "(spread unknown: a kind of source has only one sample)" in text
+    assert json.loads(run(*words, "--json").stdout)["uncertainty"] is None
+    (place / "spec.toml").write_text(BASE + PICTURES.replace("*/*", "disc/0"))
+    all_sampled = amiwarp.plan_dataset(place / "spec.toml", place / "out", workers=1)
+    assert all_sampled.samples == all_sampled.recordings == 2
+    assert all_sampled.uncertainty is not None
+    assert all_sampled.uncertainty > 0.0
+
+
 def test_what_cannot_be_stratified_is_named(place: Path) -> None:
     def fails(message: str) -> None:
         with pytest.raises(AmiwarpError, match=message):
@@ -563,7 +630,7 @@ def test_what_cannot_be_stratified_is_named(place: Path) -> None:
     (place / "spec.toml").write_text(text)
     (place / "pictures" / "square" / "5.png").unlink()
     fails(
-        r"class 'square' has 2 different sources for the 3 splits train, val, test; add sources of it, or give fewer"
+        r"class = 'square' has 2 different sources for the 3 splits train, val, test; add sources of it, or give fewer"
     )
     (place / "spec.toml").write_text("splits = {train = 0.5, test = 0.5, val = 0.0}\n" + text)
     assert len(list_items(load_specification(place / "spec.toml"))) == 10

@@ -17,7 +17,7 @@ from amiwarp.io.unfinished import scratch_folder
 from amiwarp.kernels import quiet_start
 from amiwarp.learning.dataset import specification as spec
 from amiwarp.learning.dataset.files import Journal, check_folder, require_pyarrow, write_manifest
-from amiwarp.learning.dataset.items import Item, list_items
+from amiwarp.learning.dataset.items import Item, list_items, sources_of_splits
 from amiwarp.learning.dataset.worker import Failed, Job, Made, make
 from amiwarp.schema.calls import guarded
 from amiwarp.studies import cluster
@@ -39,7 +39,7 @@ class DatasetSummary:
     >>> summary = amiwarp.DatasetSummary(
     ...     recordings=12, made=11, kept=0, failed={"train/a-1.h5": "no such file"}, not_in_specification=(),
     ...     splits={"train": 11}, events=10, size_bytes=100, seconds=2.0, worker_seconds=3.0,
-    ...     processor_seconds=2.5, workers=2)
+    ...     processor_seconds=2.5, workers=2, sources_of_splits={"all sources": {"train": 2}})
     >>> summary.made + summary.kept + len(summary.failed) == summary.recordings
     True
     """
@@ -68,6 +68,8 @@ class DatasetSummary:
     """Processor time that they spent, added up [s]."""
     workers: int
     """Largest number of workers; 0 if there was nothing to make."""
+    sources_of_splits: Mapping[str, Mapping[str, int]]
+    """Number of different sources of each split, as in :attr:`DatasetPlan.sources_of_splits`."""
     damaged: tuple[str, ...] = ()
     """What was wrong with the journal, and with each damaged recording. These recordings were made again."""
 
@@ -199,6 +201,7 @@ def _make_missing(
         worker_seconds=sum(made.seconds for made in run.made),
         processor_seconds=sum(made.processor_s for made in run.made),
         workers=run.most_workers,
+        sources_of_splits=sources_of_splits(loaded, items),
         damaged=tuple(journal.damaged),
     )
 

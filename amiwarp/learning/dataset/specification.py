@@ -73,6 +73,16 @@ def _seeds(value: Any, name: str) -> tuple[int, ...]:
     return tuple(range(whole(value, name, 1, MOST_RECORDINGS, hint)))
 
 
+def _stratify(value: Any, name: str) -> str | Literal[False]:
+    """Return the label whose values are divided among the splits, or False."""
+    if value is False or (isinstance(value, str) and value):
+        return value
+    raise AmiwarpError(
+        f"{name} is {shown(value)}; expected the name of a label, or false to draw the split of each source",
+        ErrorCode.FIELD,
+    )
+
+
 _MAKERS: dict[str, Callable[[], SensorModel]] = {"default": SensorModel, "ideal": SensorModel.ideal}
 """Sensors by name, in addition to the presets of :class:`SensorModel`."""
 
@@ -265,8 +275,11 @@ class _File:
     camera: CameraEntry = field(default_factory=CameraEntry)
     splits: Mapping[str, float] = field(default_factory=lambda: dict(SPLITS))
     split_seed: int = 0
-    stratify: str | None = None
-    """Label whose values, the classes, are each divided among the splits by their shares; None: a draw per source."""
+    stratify: Annotated[Any, _stratify] = None
+    """Label whose values, the classes, are each divided among the splits by their shares; False: a draw per source.
+
+    None: the first label that all sources have and whose classes have at least as many sources as there are splits;
+    without such a label, all sources are one class."""
     truth_hz: Annotated[float, partial(real, low=1e-3, high=1e6, hint=" Hz")] | None = None
     output: OutputEntry | None = None
     """Tensors to write instead of recordings; None: recordings."""
