@@ -283,8 +283,8 @@ def run_truth(
     flow: Annotated[
         Literal["dsec", "mvsec"] | None,
         typer.Option(
-            help="Export optical flow between the recorded instants. dsec: writes 16-bit flow/forward/*.png and "
-            "flow/forward_timestamps.txt; mvsec: writes NAME_gt_flow_dist.npz."
+            help="Export optical flow between the recorded instants. dsec: writes 16-bit flow/forward/*.png, "
+            "flow/backward/*.png and their times; mvsec: writes NAME_gt_flow_dist.npz."
         ),
     ] = None,
     with_prism: Annotated[
@@ -304,7 +304,7 @@ def run_truth(
 ) -> None:
     """Export the ground truth of a simulated world: optical flow in the DSEC or MVSEC format, poses as TUM files.
 
-    Flow requires a recording that was simulated with --truth-hz.
+    Flow requires a recording that was simulated with --truth-hz or --truth-us.
     """
     began = time.perf_counter()
     if flow is None and poses is None:
