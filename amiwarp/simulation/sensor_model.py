@@ -20,7 +20,9 @@ class SensorModel:
     Notes
     -----
     Photoreceptor, leak and shot noise follow v2e (Y. Hu, S.-C. Liu and T. Delbruck, "v2e: From Video Frames to
-    Realistic DVS Events", CVPR Workshops 2021).
+    Realistic DVS Events", CVPR Workshops 2021). The second stage follows P. Lichtsteiner, C. Posch and T. Delbruck, "A
+    128x128 120 dB 15 us Latency Asynchronous Temporal Contrast Vision Sensor", IEEE JSSC 43(2), 2008, and R. Graca, B.
+    McReynolds and T. Delbruck, "Shining light on the DVS pixel", CVPR Workshops 2023.
 
     Examples
     --------
@@ -65,6 +67,13 @@ class SensorModel:
     ``1 / (2 pi cutoff)``. Its cut-off frequency is proportional to the luminance plus 0.02, the stray light and dark
     current that the simulator adds to every picture.
     """
+    buffer_hz: float | None = 0.0
+    """Bandwidth of the photoreceptor's second stage [Hz], whatever the light; 0 or None for unlimited bandwidth.
+
+    The source follower behind a photoreceptor is another first-order low-pass filter, whose cut-off frequency a bias
+    sets (bias_fo of Prophesee's sensors, PrSFBp of DAVIS). In bright light it limits the bandwidth, in the dark the
+    first stage does.
+    """
     shot_noise_dark: float = 1.0
     """Rate of random events in the dark, relative to that at white, 1 to 1000; v2e uses 4.
 
@@ -103,7 +112,11 @@ class SensorModel:
                   "noise_rate_cov_decades": 1.0, "row_us": 1e4, "bus_queue": 1e9}  # fmt: skip
         for name, limit in limits.items():
             object.__setattr__(self, name, real(getattr(self, name), f"sensor {name}", 0.0, limit))
-        for name, least, limit in (("cutoff_hz", 0.01, 1e7), ("bus_rate_mev_s", 1e-3, 1e5)):
+        for name, least, limit in (
+            ("cutoff_hz", 0.01, 1e7),
+            ("buffer_hz", 0.01, 1e7),
+            ("bus_rate_mev_s", 1e-3, 1e5),
+        ):
             object.__setattr__(
                 self, name, _real_or_none(getattr(self, name), f"sensor {name}", least, limit)
             )

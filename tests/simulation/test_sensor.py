@@ -16,6 +16,7 @@ from amiwarp import (
     Camera,
     CameraMotion,
     Events,
+    EventSensor,
     Prism,
     PrismMotion,
     Scene,
@@ -26,6 +27,7 @@ from amiwarp import (
 from amiwarp.kernels import photoreceptors, pixels
 from amiwarp.simulation import DARK
 from amiwarp.simulation.commands.rig_options import SensorOptions
+from reference import second_simulator
 
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))
 PRISM = Prism(math.radians(3.0), 1.55)
@@ -118,22 +120,34 @@ def ramp() -> Scene:
 
 
 def crossing_times(
-    angle: float, rate: float, cutoff: float, contrast: float, duration: float
+    angle: float,
+    rate: float,
+    cutoff: float,
+    contrast: float,
+    duration: float,
+    buffer: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Times at which the photoreceptor of one pixel crosses its thresholds [us], by SciPy's solver in float64."""
+    """Times at which the photoreceptor of one pixel crosses its thresholds [us], by SciPy's solver in float64.
+
+    ``buffer``: cut-off frequency of its second stage [Hz]; 0 for one stage.
+    """
 
     def light_level(t: float) -> float:
         return SLOPE * (math.tan(angle + rate * t) + math.tan(FOV / 2.0)) + math.log(0.5)
 
     def change(t: float, y: NDArray[np.float64]) -> list[float]:
         x = light_level(t)
-        return [2.0 * math.pi * cutoff * math.exp(x) / (1.0 + DARK) * (x - y[0])]
+        first, second = y
+        return [
+            2.0 * math.pi * cutoff * math.exp(x) / (1.0 + DARK) * (x - first),
+            2.0 * math.pi * buffer * (first - second),
+        ]
 
     t = np.arange(0.0, duration, 2e-6)
     start = light_level(0.0)
     y = solve_ivp(
-        change, (0.0, duration), [start], t_eval=t, method="LSODA", rtol=1e-8, atol=1e-8
-    ).y[0]
+        change, (0.0, duration), [start, start], t_eval=t, method="LSODA", rtol=1e-8, atol=1e-8
+    ).y[1 if buffer else 0]
     crossed = np.searchsorted(
         np.floor((y - start) / contrast), np.arange(1, int((y[-1] - start) / contrast) + 1)
     )
@@ -141,19 +155,22 @@ def crossing_times(
 
 
 @pytest.mark.parametrize("longest_us", [2000, 137])
+@pytest.mark.parametrize("buffer", [0.0, 40.0, 1000.0])
 def test_filtered_ramp_agrees_with_a_solver_for_any_step(
-    device: str, longest_us: int, monkeypatch: pytest.MonkeyPatch
+    device: str, buffer: float, longest_us: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Time constants are 160 us to 1.8 ms, in the steps of two lengths."""
+    """Time constants of the first stage are 160 us to 1.8 ms, in the steps of two lengths."""
     monkeypatch.setattr("amiwarp.simulation.image_motion.LONGEST_STEP", longest_us)
     rate, contrast, duration, cutoff = 1.0, 0.2, 0.1, 10.0
-    sensor = quiet_sensor(cutoff_hz=cutoff, contrast_on=contrast, contrast_off=contrast)
+    sensor = quiet_sensor(
+        cutoff_hz=cutoff, buffer_hz=buffer, contrast_on=contrast, contrast_off=contrast
+    )
     recording = simulate(ramp(), CAMERA, WIDE, duration_s=duration, motion=0.0, device=device,
                          camera_motion=CameraMotion((0.0, rate, 0.0)), sensor=sensor)  # fmt: skip
     events = recording.events.slice(0, len(recording.events))
     for column in (0, 17, 40):
         expected = crossing_times(
-            math.atan((column - CAMERA.cx) / CAMERA.fx), rate, cutoff, contrast, duration
+            math.atan((column - CAMERA.cx) / CAMERA.fx), rate, cutoff, contrast, duration, buffer
         )
         found = events.t[(events.x == column) & (events.y == 24)]
         n = min(len(found), len(expected))
@@ -162,16 +179,94 @@ def test_filtered_ramp_agrees_with_a_solver_for_any_step(
         np.testing.assert_allclose(found[:n], expected[:n], rtol=0, atol=25.0)  # us
 
 
+@pytest.mark.parametrize(("light", "cutoff"), [(1.0, 0.0), (1.0, 60.0), (0.05, 2000.0)])
+def test_a_step_of_light_passes_two_stages(device: str, light: float, cutoff: float) -> None:
+    """The answer of two low-pass filters in a row to a step, in closed form; the first may be unlimited."""
+    buffer, contrast, last = 200.0, 0.05, 0.03
+    simulation = Simulation(
+        Scene(Switch((0.2, light))), CAMERA, WIDE, 0.2, motion=PrismMotion(0.0), device=device,
+        sensor=quiet_sensor(
+            cutoff_hz=cutoff, buffer_hz=buffer, contrast_on=contrast, contrast_off=contrast
+        ),
+    )  # fmt: skip
+    events, _ = events_of(simulation)
+    found = events.t[(events.x == 20) & (events.y == 30)].astype(np.float64)
+    total = abs(math.log((light + DARK) / (0.2 + DARK)))
+    rates = [2.0 * math.pi * buffer]
+    if cutoff:
+        rates.append(2.0 * math.pi * cutoff * (light + DARK) / (1.0 + DARK))
+    t_us = np.arange(0.0, 100_000.0)
+    weights = (
+        [1.0]
+        if not cutoff
+        else [rates[1] / (rates[1] - rates[0]), rates[0] / (rates[0] - rates[1])]
+    )
+    answer = total * (
+        1.0 - sum(w * np.exp(-r * t_us * 1e-6) for w, r in zip(weights, rates, strict=True))
+    )
+    levels = contrast * np.arange(1, int((total - last) / contrast) + 1)
+    expected = np.searchsorted(answer, levels)
+    assert len(levels) > 8
+    # Us, from the fourth crossing on, because the light of the rise of 100 us has another bandwidth
+    np.testing.assert_allclose(
+        found[3 : len(levels)] - found[3], expected[3:] - expected[3], rtol=0.005, atol=5.0
+    )
+
+
+def test_both_stages_agree_with_the_second_simulator() -> None:
+    """The same scene's light at one pixel, through the second simulator's filters."""
+    rng = np.random.default_rng(4)
+    levels = np.cumsum(rng.normal(0.0, 0.15, (300, 4, 5)), axis=0) - 2.0
+    cutoff, buffer, step_us = 150.0, 400.0, 500
+    model = quiet_sensor(
+        cutoff_hz=cutoff, buffer_hz=buffer, contrast_on=0.1, contrast_off=0.1, refractory_us=0.0
+    )
+    sensor = EventSensor(1, 4, 5, model)
+    sums = np.zeros((4, 5))
+    first = levels[0].copy()
+    second = levels[0].copy()
+    sensor.step(levels[:1].astype(np.float32), 0)
+    for k in range(1, len(levels)):
+        events, _ = sensor.step(levels[k : k + 1].astype(np.float32), k * step_us)
+        sign = 2.0 * events.p.numpy().astype(float) - 1.0
+        np.add.at(sums, (events.y.numpy(), events.x.numpy()), 0.1 * sign)
+        # A hundred pieces, in each of which the bandwidth is constant
+        for j in range(100):
+            start = levels[k - 1] + (levels[k] - levels[k - 1]) * j / 100
+            end = levels[k - 1] + (levels[k] - levels[k - 1]) * (j + 1) / 100
+            light = np.exp(0.5 * (start + end)) / (1.0 + DARK)
+            new_first = second_simulator.low_pass(
+                first, start, end, step_us * 1e-8, 1.0 / (2.0 * np.pi * cutoff * light)
+            )
+            second = np.asarray(
+                second_simulator.low_pass(
+                    second, first, new_first, step_us * 1e-8, 1.0 / (2.0 * np.pi * buffer)
+                )
+            )
+            first = new_first
+        # The events so far say the level to less than a threshold
+        assert np.abs(sums - (second - levels[0])).max() < 0.1 + 0.004
+    assert np.abs(levels[-1] - second).max() > 0.05
+
+
 def test_wide_bandwidth_changes_nothing_and_narrow_bandwidth_loses_events(device: str) -> None:
     clear, _ = events_of(seen_through_prism(quiet_sensor(), device))
-    wide, _ = events_of(seen_through_prism(quiet_sensor(cutoff_hz=1e6), device))
+    wide, _ = events_of(seen_through_prism(quiet_sensor(cutoff_hz=1e6, buffer_hz=1e6), device))
+    second, _ = events_of(seen_through_prism(quiet_sensor(buffer_hz=30.0), device))
+    assert len(second) < 0.7 * len(clear)
     narrow, _ = events_of(seen_through_prism(quiet_sensor(cutoff_hz=30.0), device))
     assert len(wide) == pytest.approx(len(clear), rel=2e-3)
     assert len(narrow) < 0.5 * len(clear)
 
 
 def test_filter_computed_ahead_gives_the_same_events(monkeypatch: pytest.MonkeyPatch) -> None:
-    sensor = SensorModel(cutoff_hz=300.0, shot_noise_hz=30.0, leak_hz=5.0, leak_jitter_fraction=0.2)
+    sensor = SensorModel(
+        cutoff_hz=300.0,
+        buffer_hz=500.0,
+        shot_noise_hz=30.0,
+        leak_hz=5.0,
+        leak_jitter_fraction=0.2,
+    )
     simulation = seen_through_prism(sensor, motion=PrismMotion(-720.0, tilt=(0.02, 0.01)))
     ahead, _ = events_of(simulation)
     monkeypatch.setattr(
@@ -333,6 +428,7 @@ def test_a_busy_bus_keeps_rows_together(device: str) -> None:
     [
         ({"cutoff_hz": -1.0}, "cutoff_hz = -1"),
         ({"cutoff_hz": 1e-9}, "or 0 for none"),
+        ({"buffer_hz": 2e7}, "buffer_hz = 20000000.0"),
         ({"shot_noise_dark": 0.5}, "shot_noise_dark = 0.5"),
         ({"bus_rate_mev_s": 1e9}, "bus_rate_mev_s"),
         ({"bus_queue": math.nan}, "bus_queue = nan"),
