@@ -470,6 +470,7 @@ OWN: dict[str, dict[str, Any]] = {
     "Scene": {"frames": SCENE.frames},
     "Scene.from_picture": {"picture": np.ones((4, 4), np.float32)},
     "SensorModel.preset": {"name": "gen4"},
+    "SensorModel.with_davis_biases": {"diff": 1.0, "on": 2.0, "off": 0.5},
     "EventCamera": {"renderer": Black(2, "cpu")},
     "EventCamera.angles": {"t_us": 0},
     "EventCamera.flow_to": {"state": None},
