@@ -106,6 +106,7 @@ def _plan_lines(plan: DatasetPlan) -> list[str]:
         f"{plan.recordings:,} recordings ({by}), {plan.missing:,} of them missing",
         "splits: " + ", ".join(f"{name} {count:,}" for name, count in plan.splits.items()),
         *_source_lines(plan.sources_of_splits),
+        *_drawn_lines(plan.drawn),
     ]
     if plan.missing:
         spread = "spread unknown: a kind of source has only one sample"
@@ -139,6 +140,16 @@ def _source_lines(sources_of_splits: Mapping[str, Mapping[str, int]]) -> list[st
     return [f"sources: {counts}; {how}"]
 
 
+def _drawn_lines(drawn: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Return the range of each randomised setting in the recordings."""
+    parts = []
+    for name, found in drawn.items():
+        parts.append(
+            f"{name} {found['least']:.4g} .. {found['largest']:.4g}, median {found['median']:.4g}"
+        )
+    return [f"drawn: {'; '.join(parts)}"] if parts else []
+
+
 def _dataset_lines(done: DatasetSummary, out: Path) -> list[str]:
     lines = failed_lines(done.failed, out / "manifest.json")
     lines += cli.made_again(done.damaged)
@@ -152,6 +163,7 @@ def _dataset_lines(done: DatasetSummary, out: Path) -> list[str]:
         f"{out}: {done.made + done.kept:,} of {done.recordings:,} recordings ({splits}), {done.kept:,} of them kept"
     )
     lines += _source_lines(done.sources_of_splits)
+    lines += _drawn_lines(done.drawn)
     if done.made:
         lines.append(_dataset_speed(done))
     return lines

@@ -15,9 +15,10 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.inputs import errors_name
 from amiwarp.learning.dataset import specification as spec
+from amiwarp.learning.dataset.randomise import draw
 from amiwarp.learning.dataset.sources import Source, content_digest, find_sources
 from amiwarp.simulation.worlds.world_choice import POSE_FILES
 from amiwarp.validation import shown
@@ -76,6 +77,12 @@ class Item:
         return f"{self.split}/{stem}-{self.key}{'.npz' if 'output' in self.recipe else '.h5'}"
 
     @property
+    def drawn(self) -> Mapping[str, float]:
+        """Values that the recording drew from the ranges of the specification, by name."""
+        values: Mapping[str, float] = self.recipe.get("drawn", {})
+        return values
+
+    @property
     def output(self) -> spec.OutputEntry | None:
         """Tensors that are written instead of a recording; None for a recording."""
         return spec.OutputEntry(**self.recipe["output"]) if "output" in self.recipe else None
@@ -107,9 +114,28 @@ def list_items(specification: spec.Specification) -> list[Item]:
         for recipe in _recipes(specification, source, axes):
             same = _identity(source.name, source.digest, recipe.get("seed"))
             split, stratum = divided[same]
+            labels = _with_drawn(specification, source, recipe)
             licence = source.entry.licence
-            items.append(Item(recipe, specification.folder, split, source.labels, licence, stratum))
+            items.append(Item(recipe, specification.folder, split, labels, licence, stratum))
     return items
+
+
+def _with_drawn(
+    specification: spec.Specification, source: Source, recipe: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the labels of a recording: those of its source, and the values that it drew.
+
+    Raises :class:`AmiwarpError` for a label with the name of a drawn value.
+    """
+    drawn = recipe.get("drawn", {})
+    both = sorted(source.labels.keys() & drawn.keys())
+    if both:
+        raise AmiwarpError(
+            f"{specification.path}: {source.name} has the label {shown(both[0])}, which randomise draws; rename the "
+            "label",
+            ErrorCode.FIELD,
+        )
+    return {**source.labels, **drawn}
 
 
 def sources_of_splits(
@@ -175,7 +201,10 @@ def _recipes(
     if entry.rotate_deg_s is not None:
         base |= {"rotate_deg_s": entry.rotate_deg_s}
     for trajectory, optic, sensor, seed in itertools.product(*axes):
-        yield base | trajectory | optic | {"sensor": sensor, "seed": seed}
+        recipe = base | trajectory | optic | {"sensor": sensor, "seed": seed}
+        if specification.randomise:
+            recipe["drawn"] = draw(specification.randomise, recipe)
+        yield recipe
 
 
 def _trajectories(specification: spec.Specification, source: Source) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from amiwarp.errors import AmiwarpError, ErrorCode
@@ -18,6 +18,7 @@ from amiwarp.kernels import quiet_start
 from amiwarp.learning.dataset import specification as spec
 from amiwarp.learning.dataset.files import Journal, check_folder, require_pyarrow, write_manifest
 from amiwarp.learning.dataset.items import Item, list_items, sources_of_splits
+from amiwarp.learning.dataset.randomise import drawn_ranges
 from amiwarp.learning.dataset.worker import Failed, Job, Made, make
 from amiwarp.schema.calls import guarded
 from amiwarp.studies import cluster
@@ -70,6 +71,8 @@ class DatasetSummary:
     """Largest number of workers; 0 if there was nothing to make."""
     sources_of_splits: Mapping[str, Mapping[str, int]]
     """Number of different sources of each split, as in :attr:`DatasetPlan.sources_of_splits`."""
+    drawn: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Least, median and largest value of each randomised setting, as in :attr:`DatasetPlan.drawn`."""
     damaged: tuple[str, ...] = ()
     """What was wrong with the journal, and with each damaged recording. These recordings were made again."""
 
@@ -202,6 +205,7 @@ def _make_missing(
         processor_seconds=sum(made.processor_s for made in run.made),
         workers=run.most_workers,
         sources_of_splits=sources_of_splits(loaded, items),
+        drawn=drawn_ranges([item.drawn for item in items]),
         damaged=tuple(journal.damaged),
     )
 

@@ -16,6 +16,7 @@ from amiwarp.learning.dataset import specification as spec
 from amiwarp.learning.dataset import worker
 from amiwarp.learning.dataset.files import Journal, check_folder
 from amiwarp.learning.dataset.items import Item, list_items, sources_of_splits
+from amiwarp.learning.dataset.randomise import drawn_ranges
 from amiwarp.learning.dataset.sources import content_digest
 from amiwarp.learning.dataset.worker import simulation_of
 from amiwarp.schema.calls import guarded
@@ -74,6 +75,8 @@ class DatasetPlan:
     sources_of_splits: Mapping[str, Mapping[str, int]]
     """Number of different sources of each split, by the class whose sources the splits share, such as
     ``class = 'disc'``; an empty text for sources whose splits are drawn."""
+    drawn: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Least, median and largest value of each randomised setting in the recordings, by its name."""
     failed: Mapping[str, str] = field(default_factory=dict)
     """Error message of each sample that could not be made, by its file. The estimate leaves these samples out."""
 
@@ -182,6 +185,7 @@ def plan_dataset(
         workers=count,
         device=device,
         sources_of_splits=sources_of_splits(loaded, items),
+        drawn=drawn_ranges([item.drawn for item in items]),
         failed=failed,
     )
 
