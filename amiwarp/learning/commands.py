@@ -136,8 +136,8 @@ def _source_lines(sources_of_splits: Mapping[str, Mapping[str, int]]) -> list[st
         if more:
             parts.append(f"{more:,} more classes")
         how = f"divided by {'; '.join(parts)} (the field stratify gives another rule)"
-    counts = ", ".join(f"{name} {count:,}" for name, count in total.items())
-    return [f"sources: {counts}; {how}"]
+    sources = ", ".join(f"{name} {count:,}" for name, count in total.items())
+    return [f"sources: {sources}; {how}"]
 
 
 def _drawn_lines(drawn: Mapping[str, Mapping[str, float]]) -> list[str]:

@@ -185,8 +185,8 @@ class SensorModel:
         - cutoff_hz 1000, refractory_us 200, jitter, queue, leak and shot noise: typical values, no source
 
         ``dvxplorer_mini``: iniVation DVXplorer Mini, 640x480, 9 um pixels. The same thresholds and resolutions are
-        published as of the DVXplorer; no other figure of its pixels is public. All values are assumed to be those of
-        ``dvxplorer``.
+        published as of the DVXplorer; no other figure of its pixels is public. All values are taken from
+        ``dvxplorer``, an assumption.
 
         ``davis240c``: iniVation DAVIS240C, 240x180, 18.5 um pixels.
 
@@ -230,7 +230,7 @@ class SensorModel:
         - thresholds 30 %, nominal: the data sheet as quoted in Prophesee's forum ("RCT value of GENX320")
         - latency 150 us: published as "below 150 us at 1000 lux" (Prophesee)
         - no limit of the bus: no public figure
-        - all other values are assumed to be those of ``gen4``, no source
+        - all other values are taken from ``gen4``, an assumption
 
         In all, the jitter of the leak and the spread of the noise rates are 0.1, as in v2e, and except in
         ``davis240c``, shot noise is four times as strong in the dark. Hot pixels have the default: typical values, no

@@ -123,7 +123,7 @@ def list_items(specification: spec.Specification) -> list[Item]:
 def _with_drawn(
     specification: spec.Specification, source: Source, recipe: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the labels of a recording: those of its source, and the values that it drew.
+    """Return the labels of a recording: its source's labels, and the values that it drew.
 
     Raises :class:`AmiwarpError` for a label with the name of a drawn value.
     """
