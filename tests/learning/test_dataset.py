@@ -322,7 +322,7 @@ def test_an_unexpected_error_and_a_dead_worker_fail_their_recording_alone(
 
     monkeypatch.setattr(worker, "write_recording", lambda *_: {}["all"])
     with pytest.raises(
-        AmiwarpError, match=r"no sample of pictures can be made; train/\S+: KeyError: 'all' \(in "
+        AmiwarpError, match=r"no sample of pictures can be made; \w+/\S+: KeyError: 'all' \(in "
     ):
         amiwarp.plan_dataset(place / "spec.toml", place / "elsewhere", workers=1)
 
