@@ -343,7 +343,11 @@ def run_truth(
     if poses is not None:
         data["pose_files"] = _save_poses(out / "poses", truth)
     data["seconds"] = time.perf_counter() - began
-    line = f"{out}: {data['flow_maps']} maps of flow, {data['pose_files']} files of poses, {data['seconds']:.2f} s"
+    direction = " in each direction" if flow == "dsec" else ""
+    line = (
+        f"{out}: {data['flow_maps']} maps of flow{direction}, {data['pose_files']} files of poses, "
+        f"{data['seconds']:.2f} s"
+    )
     cli.report(common, data, [line])
 
 

@@ -897,9 +897,11 @@ def test_the_truth_command_exports(named: Path, stored: Path) -> None:
     names = sorted(
         path.relative_to("out").as_posix() for path in Path("out").rglob("*") if path.is_file()
     )
-    assert names == [*(f"flow/forward/{k:06d}.png" for k in range(4)), "flow/forward_timestamps.txt",
-                     *(f"flow/occlusion/{k:06d}.png" for k in range(4)), "poses/body___square.txt",
-                     "poses/camera.txt"]  # fmt: skip
+    folders = {"forward": 0, "occlusion": 0, "backward": 1, "backward_occlusion": 1}
+    expected = ["flow/forward_timestamps.txt", "flow/backward_timestamps.txt"]
+    for folder, first in folders.items():
+        expected += [f"flow/{folder}/{k:06d}.png" for k in range(first, first + 4)]
+    assert names == sorted([*expected, "poses/body___square.txt", "poses/camera.txt"])
     assert ok("truth", stored, "out", "--flow", "mvsec", "--with-prism")["flow_maps"] == 5
     assert Path("out/world_gt_flow_dist.npz").exists()
     assert "exists" in run("truth", stored, "out", "--poses", "tum").stderr
