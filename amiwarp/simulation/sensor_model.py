@@ -236,9 +236,9 @@ class SensorModel:
         ``davis240c``, shot noise is four times as strong in the dark. Hot pixels have the default: typical values, no
         source. ``buffer_hz`` is unlimited: no public figure.
 
-        Biases change these values. For DAVIS cameras :meth:`with_davis_biases` gives the thresholds. Prophesee
-        publishes the ranges of the biases of the IMX636 and of the GenX320, but not which thresholds and bandwidths
-        follow from them: give ``contrast_on``, ``contrast_off``, ``buffer_hz`` and ``refractory_us`` themselves.
+        Biases change these values. For DAVIS cameras :meth:`with_davis_biases` gives the thresholds. For the IMX636 and
+        the GenX320 we know no public figure of the threshold or bandwidth that a bias gives: give ``contrast_on``,
+        ``contrast_off``, ``buffer_hz`` and ``refractory_us`` themselves.
 
         Examples
         --------
