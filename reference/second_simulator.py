@@ -194,10 +194,10 @@ def events_of(
         start_s, end_s = k * step_s, (k + 1) * step_s
         light = lamp(end_s) * light_at(scene, field(place, end_s)) + LEAST_LIGHT
         new_log = np.log(light)
-        new_first = _low_pass(
+        new_first = low_pass(
             first, log_light, new_log, step_s, 1.0 / (2 * np.pi * sensor.bandwidth_hz * light)
         )
-        voltage = _low_pass(voltage, first, new_first, step_s, 1.0 / (2 * np.pi * sensor.buffer_hz))
+        voltage = low_pass(voltage, first, new_first, step_s, 1.0 / (2 * np.pi * sensor.buffer_hz))
         log_light, first = new_log, new_first
         keep = np.exp(-step_s / (1e-6 * sensor.noise_us))
         kick = sensor.noise * np.sqrt((1.0 - keep**2) / light)
@@ -217,7 +217,7 @@ def _started(light: Array) -> tuple[Array, Array, Array]:
     return log_light, log_light.copy(), log_light.copy()
 
 
-def _low_pass(
+def low_pass(
     state: Array, start: Array, end: Array, step_s: float, constant_s: Array | float
 ) -> Array:
     """Return a first-order low-pass filter's output after a step over which its input grows linearly."""

@@ -160,6 +160,14 @@ class FrameTruth:
     """
     occlusion_with_prism: NDArray[np.uint8]
     """The same of the points that the pixels see through the prism, through the prism."""
+    backward: NDArray[np.float32]
+    """Displacement to the instant before [px], as :attr:`displacement`; NaN at the first instant."""
+    backward_with_prism: NDArray[np.float32]
+    """The same of the points that the pixels see through the prism, whose angle was another one."""
+    backward_occlusion: NDArray[np.uint8]
+    """Where these points were at the instant before, without the prism, as :attr:`occlusion`."""
+    backward_occlusion_with_prism: NDArray[np.uint8]
+    """The same of the points that the pixels see through the prism, through the prism."""
     intensity: NDArray[np.float32]
     """Linear luminance without the prism, shape ``(height, width)``."""
     intensity_with_prism: NDArray[np.float32]
@@ -194,10 +202,25 @@ MAPS = {
     "displacement_with_prism": (np.float32, (2,)),
     "occlusion": (np.uint8, ()),
     "occlusion_with_prism": (np.uint8, ()),
+    "backward": (np.float32, (2,)),
+    "backward_with_prism": (np.float32, (2,)),
+    "backward_occlusion": (np.uint8, ()),
+    "backward_occlusion_with_prism": (np.uint8, ()),
     "intensity": (np.float32, ()),
     "intensity_with_prism": (np.float32, ()),
 }
 """Arrays of :class:`FrameTruth` with one value per pixel: data type, and shape after (height, width)."""
+
+
+OUTSIDE = 2
+"""Value of :attr:`FrameTruth.occlusion` for points outside the image, and if there is no other instant."""
+UNKNOWN_MAPS: dict[str, float] = {
+    "backward": np.nan,
+    "backward_with_prism": np.nan,
+    "backward_occlusion": OUTSIDE,
+    "backward_occlusion_with_prism": OUTSIDE,
+}
+"""Values of the maps that a file may lack, because the first files of the format lack them."""
 
 
 NOT_FINITE: dict[str, Callable[[Any], Any]] = {
@@ -209,6 +232,8 @@ NOT_FINITE: dict[str, Callable[[Any], Any]] = {
     "flow_with_prism": np.isnan,
     "displacement": np.isnan,
     "displacement_with_prism": np.isnan,
+    "backward": np.isnan,
+    "backward_with_prism": np.isnan,
 }
 """Tests for the values that are not finite and have a meaning, such as the depth of the sky, by the last part of a
 dataset's name."""

@@ -283,8 +283,8 @@ def run_truth(
     flow: Annotated[
         Literal["dsec", "mvsec"] | None,
         typer.Option(
-            help="Export optical flow between the recorded instants. dsec: writes 16-bit flow/forward/*.png and "
-            "flow/forward_timestamps.txt; mvsec: writes NAME_gt_flow_dist.npz."
+            help="Export optical flow between the recorded instants. dsec: writes 16-bit flow/forward/*.png, "
+            "flow/backward/*.png and their times; mvsec: writes NAME_gt_flow_dist.npz."
         ),
     ] = None,
     with_prism: Annotated[
@@ -304,7 +304,7 @@ def run_truth(
 ) -> None:
     """Export the ground truth of a simulated world: optical flow in the DSEC or MVSEC format, poses as TUM files.
 
-    Flow requires a recording that was simulated with --truth-hz.
+    Flow requires a recording that was simulated with --truth-hz or --truth-us.
     """
     began = time.perf_counter()
     if flow is None and poses is None:
@@ -343,7 +343,11 @@ def run_truth(
     if poses is not None:
         data["pose_files"] = _save_poses(out / "poses", truth)
     data["seconds"] = time.perf_counter() - began
-    line = f"{out}: {data['flow_maps']} maps of flow, {data['pose_files']} files of poses, {data['seconds']:.2f} s"
+    direction = " in each direction" if flow == "dsec" else ""
+    line = (
+        f"{out}: {data['flow_maps']} maps of flow{direction}, {data['pose_files']} files of poses, "
+        f"{data['seconds']:.2f} s"
+    )
     cli.report(common, data, [line])
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.poses import Poses, PoseStore
-from amiwarp.events.truth import FrameStore
+from amiwarp.events.truth import FrameStore, FrameTruth
 from amiwarp.io.numpy_arrays import write_array
 from amiwarp.io.output_formats import POSE_ENDINGS, check_ending, make_folder
 from amiwarp.io.outputs import NewFile
@@ -48,7 +48,7 @@ def save_flow_dsec(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> int:
-    """Write displacements in the DSEC format: ``forward/000000.png`` ... and ``forward_timestamps.txt``.
+    """Write displacements in the DSEC format: folders ``forward`` and ``backward``, and the times of both.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def save_flow_dsec(
     Returns
     -------
     int
-        Number of written pictures: one per interval between two instants.
+        Number of written pictures in each direction: one per interval between two instants.
 
     Raises
     ------
@@ -76,8 +76,12 @@ def save_flow_dsec(
     Notes
     -----
     A picture has three channels of 16 bits: x and y displacement, each times 128 plus 2¹⁵, and 1 for known pixels.
-    Displacements of 256 px and more do not fit into the format and count as unknown. ``occlusion/000000.png`` ... hold
-    :attr:`FrameTruth.occlusion` of the same intervals, with 8 bits.
+    Displacements of 256 px and more do not fit into the format and count as unknown. A picture is numbered by the
+    instant at which its pixels see: ``forward/000000.png`` leads from the first instant to the second, and
+    ``backward/000001.png`` from the second to the first. ``forward_timestamps.txt`` and ``backward_timestamps.txt``
+    have the two times of each picture [us]. DSEC has no occlusion: ``occlusion/000000.png`` ... and
+    ``backward_occlusion/000001.png`` ... hold :attr:`FrameTruth.occlusion` and :attr:`FrameTruth.backward_occlusion`
+    with 8 bits.
 
     Examples
     --------
@@ -90,36 +94,44 @@ def save_flow_dsec(
     >>> amiwarp.save_flow_dsec("flow", recording.truth.frames)
     2
     """
-    from PIL import Image
-
     intervals = _intervals(frames)
     folder = Path(folder)
-    make_folder(folder / "forward")
-    make_folder(folder / "occlusion")
+    for name in ("forward", "occlusion", "backward", "backward_occlusion"):
+        make_folder(folder / name)
+    head = "# from_timestamp_us, to_timestamp_us"
+    forward_times = [head]
+    backward_times = [head]
     # Either all files appear at the end, or no file.
     with contextlib.ExitStack() as files:
 
-        def new_part(path: Path) -> Path:
-            return files.enter_context(NewFile(path, overwrite=overwrite)).part
+        def write(name: str, content: bytes) -> None:
+            part = files.enter_context(NewFile(folder / name, overwrite=overwrite)).part
+            part.write_bytes(content)
 
-        lines = ["# from_timestamp_us, to_timestamp_us"]
-        for index, (start, stop) in enumerate(intervals):
-            moved, occlusion = _displacement(frames, index, with_prism=with_prism)
-            flow_part = new_part(folder / "forward" / f"{index:06d}.png")
-            flow_part.write_bytes(encode_png16(dsec_picture(moved)))
-
-            # Pillow does not write to the file itself, because it may not notice a full disk.
-            occlusion_part = new_part(folder / "occlusion" / f"{index:06d}.png")
-            buffer = io.BytesIO()
-            Image.fromarray(occlusion).save(buffer, format="PNG")
-            occlusion_part.write_bytes(buffer.getbuffer())
-
-            lines.append(f"{start}, {stop}")
+        for index, frame in enumerate(frames):
+            picture = f"{index:06d}.png"
+            if index < len(intervals):
+                start, stop = intervals[index]
+                moved, occlusion = _displacement(frame, with_prism=with_prism)
+                write(f"forward/{picture}", encode_png16(dsec_picture(moved)))
+                write(f"occlusion/{picture}", _encode_png8(occlusion))
+                forward_times.append(f"{start}, {stop}")
+            if index > 0:
+                start, stop = intervals[index - 1]
+                moved, occlusion = _backward(frame, with_prism=with_prism)
+                write(f"backward/{picture}", encode_png16(dsec_picture(moved)))
+                write(f"backward_occlusion/{picture}", _encode_png8(occlusion))
+                backward_times.append(f"{stop}, {start}")
             if progress is not None:
-                progress("writing flow", (index + 1) / len(intervals))
-        times_part = new_part(folder / "forward_timestamps.txt")
-        times_part.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
+                progress("writing flow", (index + 1) / len(frames))
+        write("forward_timestamps.txt", _text(forward_times))
+        write("backward_timestamps.txt", _text(backward_times))
     return len(intervals)
+
+
+def _text(lines: list[str]) -> bytes:
+    """Return lines as the content of a text file."""
+    return ("\n".join(lines) + "\n").encode("ascii")
 
 
 @guarded
@@ -189,7 +201,7 @@ def save_flow_mvsec(
 
             def maps(axis: int = axis) -> Iterator[bytes]:
                 for index in range(count):
-                    moved, _ = _displacement(frames, index, with_prism=with_prism)
+                    moved, _ = _displacement(frames[index], with_prism=with_prism)
                     known = np.isfinite(moved).all(axis=2)
                     yield np.where(known, moved[..., axis], 0.0).astype("<f4").tobytes()
                     if progress is not None:
@@ -199,7 +211,7 @@ def save_flow_mvsec(
 
         def occlusions() -> Iterator[bytes]:
             for index in range(count):
-                _, occlusion = _displacement(frames, index, with_prism=with_prism)
+                _, occlusion = _displacement(frames[index], with_prism=with_prism)
                 yield occlusion.tobytes()
 
         write_array(archive, "occlusion", (count, height, width), "|u1", occlusions())
@@ -276,13 +288,21 @@ def _intervals(frames: FrameStore) -> list[tuple[int, int]]:
 
 
 def _displacement(
-    frames: FrameStore, index: int, *, with_prism: bool
+    frame: FrameTruth, *, with_prism: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the displacement to the next instant [px], shape (height, width, 2), and the occlusion of the points."""
-    frame = frames[index]
     if with_prism:
         return frame.displacement_with_prism, frame.occlusion_with_prism
     return frame.displacement, frame.occlusion
+
+
+def _backward(
+    frame: FrameTruth, *, with_prism: bool
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Return the displacement to the instant before [px], shape (height, width, 2), and the occlusion of the points."""
+    if with_prism:
+        return frame.backward_with_prism, frame.backward_occlusion_with_prism
+    return frame.backward, frame.backward_occlusion
 
 
 def dsec_picture(displacement: NDArray[np.float32]) -> NDArray[np.uint16]:
@@ -294,6 +314,15 @@ def dsec_picture(displacement: NDArray[np.float32]) -> NDArray[np.uint16]:
     known = (finite & fits)[..., None]
     stored = np.where(known, levels, 0.0)
     return np.concatenate([stored, known], axis=2).astype(np.uint16)
+
+
+def _encode_png8(picture: NDArray[np.uint8]) -> bytes:
+    """Encode a picture of one channel as PNG, in memory: Pillow may not notice a full disk."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="PNG")
+    return buffer.getvalue()
 
 
 def encode_png16(picture: NDArray[np.uint16]) -> bytes:

@@ -2,7 +2,13 @@
 
 import warp as wp
 
-from amiwarp.kernels.photoreceptors import advance_filtered, last_input, next_input
+from amiwarp.kernels.photoreceptors import (
+    Receptor,
+    advance_filtered,
+    last_input,
+    next_input,
+    receptor,
+)
 from amiwarp.kernels.pixels import (
     OPTIONS,
     Pixel,
@@ -70,28 +76,27 @@ def run_filtered_camera_pixels(
     steps: Steps,
     sensor: SensorParams,
     pixels: wp.array(dtype=Pixel),
-    seen: wp.array(dtype=float),
+    receptors: wp.array(dtype=Receptor),
     start: int,
     sink: Sink,
 ):
-    """Simulate pixels whose photoreceptors have limited bandwidth; see :func:`run_camera_pixels`.
-
-    ``seen``: last log intensity that entered each photoreceptor.
-    """
+    """Simulate pixels whose photoreceptors have limited bandwidth; see :func:`run_camera_pixels`."""
     i = start + wp.tid()
     if cameras.starts[i / cameras.pixels] != wp.uint8(0):
-        seen[i] = levels[steps.count - 1, i]
-        pixels[i] = starting_pixel(cameras, sensor, i, seen[i])
+        level = levels[steps.count - 1, i]
+        receptors[i] = receptor(level, level)
+        pixels[i] = starting_pixel(cameras, sensor, i, level)
         return
     p = pixels[i]
-    before = last_input(seen[i])
+    before = last_input(receptors[i].seen)
+    first = receptors[i].first
     span = whole_step(steps, sensor, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
         after = next_input(levels[k, i], before)
-        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+        p, first = advance_filtered(p, first, sensor, sink, i, t0, span, before, after)
         before = after
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = shift_times(p, t0)
-    seen[i] = before.level
+    receptors[i] = receptor(before.level, first)

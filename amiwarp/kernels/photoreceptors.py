@@ -1,9 +1,10 @@
-"""Photoreceptors of the simulated pixels: first-order low-pass filters whose bandwidth is proportional to the light.
+"""Photoreceptors of the simulated pixels: low-pass filters of one or two stages.
 
+The bandwidth of the first stage is proportional to the light, the bandwidth of the second stage, a buffer, is constant.
 These kernels replace the kernels of :mod:`amiwarp.kernels.pixels` if the sensor's bandwidth is limited, or if its leak
 has jitter. The level of a pixel is then the output of its photoreceptor. The input is linear in time between two
-instants, and the filter's equation is solved exactly for it, so that the events hardly depend on the length of the
-steps.
+instants, and the first stage's equation is solved exactly for it, so that the events hardly depend on the length of the
+steps. The second stage's equation is solved exactly for an input that is linear in each piece of a step.
 """
 
 import warp as wp
@@ -45,6 +46,23 @@ SMALL_ANGLE = wp.constant(0.1)
 
 # Change of the log intensity below which a series is more precise in float32
 SMALL_CHANGE = wp.constant(0.3)
+
+
+@wp.struct
+class Receptor:
+    """State of a photoreceptor between two chunks, without its output, which is the level of its pixel."""
+
+    seen: float  # last log intensity of the light
+    first: float  # output of the first stage
+
+
+@wp.func
+def receptor(seen: float, first: float) -> Receptor:
+    """Return the state of a photoreceptor."""
+    result = Receptor()
+    result.seen = seen
+    result.first = first
+    return result
 
 
 @wp.struct
@@ -112,8 +130,27 @@ def piece_count(level: float, before: float, after: float, angle: float, toleran
 
 
 @wp.func
+def pieces_of_step(
+    p: Pixel, first: float, s: SensorParams, before: float, after: float, angle: float
+) -> int:
+    """Return the number of pieces of a step, within which both stages of a photoreceptor are nearly linear.
+
+    ``angle``: duration of the step in time constants of the first stage.
+    """
+    tolerance = LARGEST_BEND * p.on
+    n = piece_count(first, before, after, angle, tolerance)
+    if s.buffer > 0.0:
+        end = after
+        if s.bandwidth > 0.0:
+            end = filter_level(first, before, after, angle)
+        n = wp.max(n, piece_count(p.level, first, end, s.buffer, tolerance))
+    return n
+
+
+@wp.func
 def advance_filtered(
     p: Pixel,
+    first: float,
     s: SensorParams,
     sink: Sink,
     index: int,
@@ -121,14 +158,13 @@ def advance_filtered(
     span: Interval,
     before: Input,
     after: Input,
-) -> Pixel:
-    """Advance a pixel by one step, in which its photoreceptor's input changes from ``before`` to ``after``."""
-    n = piece_count(
-        p.level,
-        before.level,
-        after.level,
-        s.bandwidth * mean_light(before, after),
-        LARGEST_BEND * p.on,
+):
+    """Advance a pixel by one step, in which its photoreceptor's input changes from ``before`` to ``after``.
+
+    Return the pixel, and the output of the photoreceptor's first stage, which was ``first``.
+    """
+    n = pieces_of_step(
+        p, first, s, before.level, after.level, s.bandwidth * mean_light(before, after)
     )
     piece = Interval()
     piece.ticks = span.ticks / n
@@ -141,15 +177,19 @@ def advance_filtered(
         j += 1
         between = wp.lerp(before.level, after.level, piece.share * float(j))
         x1 = next_input(wp.where(j == n, after.level, between), after)
-        level = x1.level
+        end = x1.level
         if s.bandwidth > 0.0:
-            level = filter_level(
-                p.level, x0.level, x1.level, s.bandwidth * piece.share * mean_light(x0, x1)
+            end = filter_level(
+                first, x0.level, x1.level, s.bandwidth * piece.share * mean_light(x0, x1)
             )
+        level = end
+        if s.buffer > 0.0:
+            level = filter_level(p.level, first, end, s.buffer * piece.share)
+        first = end
         piece.drift = piece.share * jittered_leak(p, s) * p.on
         p = advance_pixel(p, s, sink, index, t0 + wp.int64((j - 1) * piece.ticks), piece, level)
         x0 = x1
-    return p
+    return p, first
 
 
 @wp.kernel(
@@ -160,25 +200,26 @@ def run_filtered_pixels(
     steps: Steps,
     sensor: SensorParams,
     pixels: wp.array(dtype=Pixel),
-    seen: wp.array(dtype=float),
+    receptors: wp.array(dtype=Receptor),
     start: int,
     sink: Sink,
 ):
-    """Advance one pixel per thread through all steps of a chunk; ``seen``: its photoreceptor's last input."""
+    """Advance one pixel per thread through all steps of a chunk, with its photoreceptor."""
     i = start + wp.tid()
     p = pixels[i]
-    before = last_input(seen[i])
+    before = last_input(receptors[i].seen)
+    first = receptors[i].first
     span = whole_step(steps, sensor, p)
     ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
     for k in range(steps.count):
         after = next_input(see_level(view, steps.at[steps.margin + k + 1], ray), before)
-        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+        p, first = advance_filtered(p, first, sensor, sink, i, t0, span, before, after)
         before = after
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = shift_times(p, t0)
-    seen[i] = before.level
+    receptors[i] = receptor(before.level, first)
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
@@ -187,14 +228,15 @@ def run_filtered_pixels_ahead(
     steps: Steps,
     sensor: SensorParams,
     pixels: wp.array(dtype=Pixel),
-    seen: wp.array(dtype=float),
+    receptors: wp.array(dtype=Receptor),
     start: int,
     sink: Sink,
 ):
     """Generate the same events as :func:`run_filtered_pixels`, faster on a CPU."""
     i = start + wp.tid()
     p = pixels[i]
-    before = last_input(seen[i])
+    before = last_input(receptors[i].seen)
+    first = receptors[i].first
     span = whole_step(steps, sensor, p)
     ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
@@ -206,9 +248,9 @@ def run_filtered_pixels_ahead(
         j = int(0)
         while j < n:
             after = next_input(levels[j], before)
-            p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+            p, first = advance_filtered(p, first, sensor, sink, i, t0, span, before, after)
             before = after
             t0 += wp.int64(steps.ticks)
             j += 1
     pixels[i] = shift_times(p, t0)
-    seen[i] = before.level
+    receptors[i] = receptor(before.level, first)

@@ -71,6 +71,7 @@ class SensorParams:
     latency: float  # mean latency [ticks]
     jitter: float  # standard deviation of the latency [ticks]
     bandwidth: float  # photoreceptor's angular cut-off frequency per unit of exp(level) [1/step]
+    buffer: float  # angular cut-off frequency of its second stage [1/step]; 0 for none
     dark: float  # luminance added before the logarithm
 
 

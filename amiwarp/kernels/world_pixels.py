@@ -2,7 +2,13 @@
 
 import warp as wp
 
-from amiwarp.kernels.photoreceptors import advance_filtered, last_input, next_input
+from amiwarp.kernels.photoreceptors import (
+    Receptor,
+    advance_filtered,
+    last_input,
+    next_input,
+    receptor,
+)
 from amiwarp.kernels.pixels import (
     OPTIONS,
     Pixel,
@@ -70,24 +76,22 @@ def run_filtered_world_pixels(
     steps: Steps,
     sensor: SensorParams,
     pixels: wp.array(dtype=Pixel),
-    seen: wp.array(dtype=float),
+    receptors: wp.array(dtype=Receptor),
     start: int,
     sink: Sink,
 ):
-    """Simulate pixels whose photoreceptors have limited bandwidth; see :func:`run_world_pixels`.
-
-    ``seen``: last log intensity that entered each photoreceptor.
-    """
+    """Simulate pixels whose photoreceptors have limited bandwidth; see :func:`run_world_pixels`."""
     i = start + wp.tid()
     p = pixels[i]
-    before = last_input(seen[i])
+    before = last_input(receptors[i].seen)
+    first = receptors[i].first
     span = whole_step(steps, sensor, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
         after = next_input(table_level(light, sensor, k, i), before)
-        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+        p, first = advance_filtered(p, first, sensor, sink, i, t0, span, before, after)
         before = after
         t0 += wp.int64(steps.ticks)
         reconverge()
     pixels[i] = shift_times(p, t0)
-    seen[i] = before.level
+    receptors[i] = receptor(before.level, first)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +14,9 @@ from amiwarp.cli import common as cli
 from amiwarp.cli import say
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.studies.long_runs import AVERAGE_S, LocalWorkers, Scheduler, failed_lines
+
+SHOWN_CLASSES = 6
+"""Largest number of classes whose splits are printed."""
 
 if TYPE_CHECKING:
     from amiwarp.learning.dataset.making import DatasetSummary
@@ -100,14 +105,49 @@ def _plan_lines(plan: DatasetPlan) -> list[str]:
     lines = [
         f"{plan.recordings:,} recordings ({by}), {plan.missing:,} of them missing",
         "splits: " + ", ".join(f"{name} {count:,}" for name, count in plan.splits.items()),
+        *_source_lines(plan.sources_of_splits),
+        *_drawn_lines(plan.drawn),
     ]
     if plan.missing:
+        spread = "spread unknown: a kind of source has only one sample"
+        if plan.uncertainty is not None:
+            spread = f"± {100 * plan.uncertainty:.0f} %"
         lines += [
             f"about {plan.events:.3g} events and {plan.size_bytes / 1e9:.3g} GB to write",
-            f"about {duration_text(plan.seconds)} (± {100 * plan.uncertainty:.0f} %) with {plan.workers} workers on "
+            f"about {duration_text(plan.seconds)} ({spread}) with {plan.workers} workers on "
             f"{plan.device} once the workers have started, estimated from {plan.samples} samples",
         ]
     return lines
+
+
+def _source_lines(sources_of_splits: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """Return how many different sources each split has, and by which rule they were divided."""
+    total = Counter[str]()
+    for splits in sources_of_splits.values():
+        total.update(splits)
+    how = "the split of each is drawn (stratify = false)"
+    if "" not in sources_of_splits:
+        strata = list(sources_of_splits)[:SHOWN_CLASSES]
+        parts = []
+        for stratum in strata:
+            counts = sources_of_splits[stratum]
+            parts.append(f"{stratum}: " + ", ".join(f"{name} {counts[name]:,}" for name in counts))
+        more = len(sources_of_splits) - len(strata)
+        if more:
+            parts.append(f"{more:,} more classes")
+        how = f"divided by {'; '.join(parts)} (the field stratify gives another rule)"
+    sources = ", ".join(f"{name} {count:,}" for name, count in total.items())
+    return [f"sources: {sources}; {how}"]
+
+
+def _drawn_lines(drawn: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Return the range of each randomised setting in the recordings."""
+    parts = []
+    for name, found in drawn.items():
+        parts.append(
+            f"{name} {found['least']:.4g} .. {found['largest']:.4g}, median {found['median']:.4g}"
+        )
+    return [f"drawn: {'; '.join(parts)}"] if parts else []
 
 
 def _dataset_lines(done: DatasetSummary, out: Path) -> list[str]:
@@ -122,6 +162,8 @@ def _dataset_lines(done: DatasetSummary, out: Path) -> list[str]:
     lines.append(
         f"{out}: {done.made + done.kept:,} of {done.recordings:,} recordings ({splits}), {done.kept:,} of them kept"
     )
+    lines += _source_lines(done.sources_of_splits)
+    lines += _drawn_lines(done.drawn)
     if done.made:
         lines.append(_dataset_speed(done))
     return lines

@@ -138,8 +138,7 @@ class Engine:
         if self._maps is not None:
             self._view.width = self._maps.placement.width
             self._view.height = self._maps.placement.height
-        sensor = simulation.sensor
-        self._filters = bool(sensor.cutoff_hz or (sensor.leak_hz and sensor.leak_jitter_fraction))
+        self._filters = has_photoreceptors(simulation.sensor)
         self._readout = Readout(simulation, self._device)
         self._state = [wp.empty(self._pixels, dtype=pixels.Pixel, device=self._device)]
         self._buffer = KeyBuffer(self._pixels, self._device)
@@ -292,8 +291,14 @@ class Engine:
             self._set_pixels(self._simulation.pixels)
         if self._filters:
             # At the start, the photoreceptors have settled to the light of the scene.
-            levels = np.ascontiguousarray(self._state[0].numpy()["level"])
-            self._state.append(wp.array(levels, dtype=float, device=self._device))
+            levels = self._state[0].numpy()["level"]
+            receptor_type = cast("Any", photoreceptors.Receptor).numpy_dtype()
+            settled: NDArray[Any] = np.zeros(self._pixels, receptor_type)
+            settled["seen"] = levels
+            settled["first"] = levels
+            self._state.append(
+                wp.array(settled, dtype=photoreceptors.Receptor, device=self._device)
+            )
 
     def _set_pixels(self, given: PixelMap) -> None:
         """Give the pixels the thresholds of a map, and its hot and dead pixels."""
@@ -426,6 +431,12 @@ def instants_in_blocks(table: NDArray[Any]) -> NDArray[np.float32]:
     return np.ascontiguousarray(blocks.swapaxes(1, 2))
 
 
+def has_photoreceptors(sensor: SensorModel) -> bool:
+    """Return whether a sensor needs the kernels with photoreceptors, which also draw the leak's jitter."""
+    filters = sensor.cutoff_hz or sensor.buffer_hz
+    return bool(filters or (sensor.leak_hz and sensor.leak_jitter_fraction))
+
+
 def sensor_params(sensor: SensorModel, step: int) -> Any:
     """Return the sensor's parameters in the kernels' units: ticks of 1/16 us, and time steps of ``step`` [us]."""
     ticks = float(pixels.TICKS)
@@ -439,6 +450,7 @@ def sensor_params(sensor: SensorModel, step: int) -> Any:
     params.noise_white = 1.0 / sensor.shot_noise_dark
     params.spread = math.log(10.0) * sensor.noise_rate_cov_decades
     params.bandwidth = 2.0 * math.pi * (sensor.cutoff_hz or 0.0) * step * 1e-6 / (1.0 + DARK)
+    params.buffer = 2.0 * math.pi * (sensor.buffer_hz or 0.0) * step * 1e-6
     params.dark = DARK
     params.hot_fraction = sensor.hot_fraction
     params.hot = sensor.hot_hz * 1e-6 / ticks

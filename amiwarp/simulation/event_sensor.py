@@ -24,9 +24,10 @@ from amiwarp.kernels import (
 )
 from amiwarp.kernels.camera_keys import CAMERA_LOW_BITS, CameraKeys
 from amiwarp.kernels.camera_pixels import Cameras
+from amiwarp.kernels.photoreceptors import Receptor
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.schema.calls import guarded
-from amiwarp.simulation.engine import LATEST_US, sensor_params
+from amiwarp.simulation.engine import LATEST_US, has_photoreceptors, sensor_params
 from amiwarp.simulation.image_levels import ImageEncoding, ImageLevels
 from amiwarp.simulation.key_buffer import KeyBuffer, sort_keys
 from amiwarp.simulation.readout import bus_of, row_scan
@@ -119,11 +120,9 @@ class EventSensor:
         self._starts = np.ones(n, np.uint8)
         self._kernel = camera_pixels.run_camera_pixels
         self._state = [wp.empty(n * self._pixels, dtype=pixels.Pixel, device=self._device)]
-        leaks_unevenly = self._model.leak_hz and self._model.leak_jitter_fraction
-        filtered = bool(self._model.cutoff_hz or leaks_unevenly)
-        if filtered:
+        if has_photoreceptors(self._model):
             self._kernel = camera_pixels.run_filtered_camera_pixels
-            self._state.append(wp.empty(n * self._pixels, dtype=float, device=self._device))
+            self._state.append(wp.empty(n * self._pixels, dtype=Receptor, device=self._device))
         self._buffer = KeyBuffer(n * self._pixels, self._device, EVENTS_PER_PIXEL)
         self._nothing: wp.array = wp.empty(0, dtype=wp.int64, device=self._device)
         self._carry = self._nothing

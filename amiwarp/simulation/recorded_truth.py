@@ -91,12 +91,18 @@ class RecordedTruth:
         """
         at_the_end = t_us >= self._duration_us
         while self._next_instant < len(self._instants):
-            instant, *following = self._instants[self._next_instant :][:2].tolist()
+            instant = int(self._instants[self._next_instant])
             if instant >= t_us and not at_the_end:
                 return
             assert self._renderer is not None
-            yield self._renderer.at(instant, *following)
+            following = self._other_instant(self._next_instant + 1)
+            before = self._other_instant(self._next_instant - 1)
+            yield self._renderer.at(instant, following, before)
             self._next_instant += 1
+
+    def _other_instant(self, index: int) -> int | None:
+        """Return the time of an instant [us], or None if there is none of this index."""
+        return int(self._instants[index]) if 0 <= index < len(self._instants) else None
 
     def poses_before(self, t_us: int) -> Poses | None:
         """Return the remaining poses before ``t_us`` [us]; None for a picture scene.

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.schema.calls import guarded
+from amiwarp.simulation.sensor_presets import PRESETS
 from amiwarp.validation import one_of, real
+
+SLOPE_FACTOR = 0.7
+"""Typical slope factor of a transistor below its threshold, by which DAVIS thresholds follow from bias currents."""
+CAPACITOR_RATIO = 20.0
+"""Ratio of the two capacitors of a DVS pixel, the amplification of its change detector."""
 
 
 @guarded
@@ -20,7 +27,9 @@ class SensorModel:
     Notes
     -----
     Photoreceptor, leak and shot noise follow v2e (Y. Hu, S.-C. Liu and T. Delbruck, "v2e: From Video Frames to
-    Realistic DVS Events", CVPR Workshops 2021).
+    Realistic DVS Events", CVPR Workshops 2021). The second stage follows P. Lichtsteiner, C. Posch and T. Delbruck, "A
+    128x128 120 dB 15 us Latency Asynchronous Temporal Contrast Vision Sensor", IEEE JSSC 43(2), 2008, and R. Graca, B.
+    McReynolds and T. Delbruck, "Shining light on the DVS pixel", CVPR Workshops 2023.
 
     Examples
     --------
@@ -33,7 +42,11 @@ class SensorModel:
     contrast_off: float = 0.25
     """OFF threshold: decrease of natural log intensity that causes an OFF event."""
     mismatch: float = 0.03
-    """Relative standard deviation of the ON and OFF thresholds between pixels."""
+    """Relative standard deviation of the ON and OFF thresholds between pixels, 0 to 0.5.
+
+    The thresholds of a pixel are normally distributed and independent, but never below a tenth of the nominal ones. At
+    0.3, 0.1 % of the thresholds lie at this limit, at 0.5, 3.6 %.
+    """
     refractory_us: float = 100.0
     """Refractory period: time after an event in which the pixel is blind [us].
 
@@ -60,6 +73,13 @@ class SensorModel:
     The photoreceptor is a first-order low-pass filter of the log intensity, with the time constant
     ``1 / (2 pi cutoff)``. Its cut-off frequency is proportional to the luminance plus 0.02, the stray light and dark
     current that the simulator adds to every picture.
+    """
+    buffer_hz: float | None = 0.0
+    """Bandwidth of the photoreceptor's second stage [Hz], whatever the light; 0 or None for unlimited bandwidth.
+
+    The source follower behind a photoreceptor is another first-order low-pass filter, whose cut-off frequency a bias
+    sets (bias_fo of Prophesee's sensors, PrSFBp of DAVIS). In bright light it limits the bandwidth, in the dark the
+    first stage does.
     """
     shot_noise_dark: float = 1.0
     """Rate of random events in the dark, relative to that at white, 1 to 1000; v2e uses 4.
@@ -99,7 +119,11 @@ class SensorModel:
                   "noise_rate_cov_decades": 1.0, "row_us": 1e4, "bus_queue": 1e9}  # fmt: skip
         for name, limit in limits.items():
             object.__setattr__(self, name, real(getattr(self, name), f"sensor {name}", 0.0, limit))
-        for name, least, limit in (("cutoff_hz", 0.01, 1e7), ("bus_rate_mev_s", 1e-3, 1e5)):
+        for name, least, limit in (
+            ("cutoff_hz", 0.01, 1e7),
+            ("buffer_hz", 0.01, 1e7),
+            ("bus_rate_mev_s", 1e-3, 1e5),
+        ):
             object.__setattr__(
                 self, name, _real_or_none(getattr(self, name), f"sensor {name}", least, limit)
             )
@@ -133,7 +157,7 @@ class SensorModel:
         Parameters
         ----------
         name : str
-            Camera: ``dvxplorer``, ``davis346`` or ``gen4``.
+            Camera: ``dvxplorer``, ``dvxplorer_mini``, ``davis240c``, ``davis346``, ``gen4``, ``evk4`` or ``genx320``.
 
         Returns
         -------
@@ -160,92 +184,116 @@ class SensorModel:
         - bus rate: 165 million events/s
         - cutoff_hz 1000, refractory_us 200, jitter, queue, leak and shot noise: typical values, no source
 
+        ``dvxplorer_mini``: iniVation DVXplorer Mini, 640x480, 9 um pixels. The same thresholds and resolutions are
+        published as of the DVXplorer; no other figure of its pixels is public. All values are taken from
+        ``dvxplorer``, an assumption.
+
+        ``davis240c``: iniVation DAVIS240C, 240x180, 18.5 um pixels.
+
+        - thresholds 11 %, the smallest: C. Brandli et al., "A 240x180 130 dB 3 us Latency Global Shutter Spatiotemporal
+          Vision Sensor", IEEE JSSC 49(10), 2014
+        - latency 12 us at 1000 lux, bus rate 12 million events/s, and 0.1 noise events of a pixel per second, taken as
+          the leak: G. Gallego et al., "Event-based Vision: A Survey", IEEE TPAMI 2022, table 1
+        - mismatch 0.19 and cutoff_hz 3000: the standard deviation of 2.1 % contrast, and the bandwidth of 3 kHz at 1000
+          lux, that P. Lichtsteiner et al. measured on an earlier chip (IEEE JSSC 43(2), 2008)
+        - shot noise of 5 1/s in the dark: v2e's parameters for a noisy sensor. In bright light it is a thousandth, as
+          the published 0.1 events are taken for the leak
+        - refractory_us 500: default of v2e
+        - jitter, queue: typical values, no source
+
         ``davis346``: iniVation DAVIS346, 346x260, 18.5 um pixels.
 
-        - thresholds 14.3 % ON and 22.5 % OFF, at which half of the pixels respond: G. Gallego et al., "Event-based
-          Vision: A Survey", IEEE TPAMI 2022, table 1
+        - thresholds 14.3 % ON and 22.5 % OFF, at which half of the pixels respond: G. Gallego et al., as above
         - latency 20 us, the smallest; bus rate 12 million events/s: data sheet (inivation.com, DAVIS346.pdf)
         - mismatch 0.15, refractory_us 500 and cutoff_hz 300: defaults of v2e (standard deviation 0.03 of thresholds of
-          0.2); the standard deviation of 2.1 % contrast that P. Lichtsteiner et al. measured on an earlier chip (IEEE
-          JSSC 43(2), 2008) is 0.16 of the ON threshold
+          0.2); the standard deviation of 2.1 % contrast of the earlier chip is 0.16 of the ON threshold
         - leak_hz 0.1: v2e's parameters for a noisy sensor
         - jitter, queue, shot noise: typical values, no source
 
         ``gen4``: Prophesee Gen4 and Sony IMX636, 1280x720, 4.86 um pixels.
 
         - thresholds 25 %, nominal: data of the camera EVK4 (Prophesee); the smallest threshold is lower
-        - latency 100 us: published as "below 100 us at 1000 lux" (Prophesee, EVK4); its manual states 220 us as
-          typical at 25 % contrast
+        - latency 100 us: published as "below 100 us at 1000 lux" (Prophesee, EVK4)
         - bus rate 1066 million events/s: T. Finateu et al., "A 1280x720 Back-Illuminated Stacked Temporal Contrast
           Event-Based Vision Sensor with 4.86 um Pixels, 1.066 GEPS Readout", ISSCC 2020; cameras with USB
           transmit less
         - cutoff_hz 2000, refractory_us 100, mismatch, jitter, queue, leak and shot noise: typical values, no source
 
-        In all three, shot noise is four times as strong in the dark, and the jitter of the leak and the spread of the
-        noise rates are 0.1, as in v2e. Hot pixels have the default: typical values, no source.
+        ``evk4``: Prophesee EVK4 with the Sony IMX636; values as of ``gen4``, except:
+
+        - latency 220 us: typical at 25 % contrast, its manual
+        - bus rate 50 million events/s: 1.6 Gbit/s by USB (Prophesee), if an event takes 32 bits; EVT 3.0 packs more
+          densely
+
+        ``genx320``: Prophesee GenX320, 320x320, 6.3 um pixels.
+
+        - thresholds 30 %, nominal: the data sheet as quoted in Prophesee's forum ("RCT value of GENX320")
+        - latency 150 us: published as "below 150 us at 1000 lux" (Prophesee)
+        - no limit of the bus: no public figure
+        - all other values are taken from ``gen4``, an assumption
+
+        In all, the jitter of the leak and the spread of the noise rates are 0.1, as in v2e, and except in
+        ``davis240c``, shot noise is four times as strong in the dark. Hot pixels have the default: typical values, no
+        source. ``buffer_hz`` is unlimited: no public figure.
+
+        Biases change these values. For DAVIS cameras :meth:`with_davis_biases` gives the thresholds. For the IMX636 and
+        the GenX320 we know no public figure of the threshold or bandwidth that a bias gives: give ``contrast_on``,
+        ``contrast_off``, ``buffer_hz`` and ``refractory_us`` themselves.
 
         Examples
         --------
         >>> amiwarp.SensorModel.preset("davis346").bus_rate_mev_s
         12.0
         """
-        return cls(**_PRESETS[one_of(name, _PRESETS, "sensor preset")])
+        return cls(**PRESETS[one_of(name, PRESETS, "sensor preset")])
+
+    def with_davis_biases(self, diff: float, on: float, off: float) -> SensorModel:
+        """Return this sensor with the thresholds that bias currents of a DVS or DAVIS pixel give.
+
+        Parameters
+        ----------
+        diff, on, off : float
+            Currents of the biases DiffBn, OnBn and OffBn, in any common unit. OnBn is larger than DiffBn, and OffBn is
+            smaller.
+
+        Returns
+        -------
+        SensorModel
+            The sensor model with other ``contrast_on`` and ``contrast_off``.
+
+        Raises
+        ------
+        AmiwarpError
+            If a current is not positive, or the order of the currents is another one.
+
+        Notes
+        -----
+        The thresholds are (κn / κp²) (C2 / C1) ln(on / diff) and (κn / κp²) (C2 / C1) ln(diff / off). The slope factors
+        κ are 0.7, and the ratio C1 / C2 of the pixel's capacitors is 20 (Y. Nozaki and T. Delbruck, "Temperature and
+        Parasitic Photocurrent Effects in Dynamic Vision Sensors", IEEE TED 64(8), 2017; P. Lichtsteiner et al., IEEE
+        JSSC 43(2), 2008). The slope factors are typical values, and the ratio is the ratio of the DVS128.
+
+        Examples
+        --------
+        >>> sensor = amiwarp.SensorModel.preset("davis346").with_davis_biases(diff=1.0, on=10.0, off=0.1)
+        >>> round(sensor.contrast_on, 3), round(sensor.contrast_off, 3)
+        (0.164, 0.164)
+        """
+        diff = real(diff, "bias current diff", 1e-15, 1e15)
+        on = real(on, "bias current on", 1e-15, 1e15)
+        off = real(off, "bias current off", 1e-15, 1e15)
+        if not off < diff < on:
+            raise AmiwarpError(
+                f"bias currents off, diff and on are {off:g}, {diff:g} and {on:g}; give rising ones, or "
+                "the pixel fires without an end"
+            )
+        gain = SLOPE_FACTOR / SLOPE_FACTOR**2 / CAPACITOR_RATIO
+        return replace(
+            self, contrast_on=gain * math.log(on / diff), contrast_off=gain * math.log(diff / off)
+        )
 
 
 def _real_or_none(value: float | None, what: str, least: float, limit: float) -> float:
     """Return a value that must lie between ``least`` and ``limit``; return 0.0 if the value is None or 0."""
     number = 0.0 if value is None else real(value, what, 0.0, limit)
     return number if number == 0.0 else real(number, what, least, limit, " (or 0 for none)")
-
-
-_PRESETS: dict[str, dict[str, float]] = {
-    "dvxplorer": {
-        "contrast_on": math.log(1.13),
-        "contrast_off": math.log(1.13),
-        "mismatch": 0.32,
-        "refractory_us": 200.0,
-        "latency_us": 200.0,
-        "latency_jitter_us": 50.0,
-        "leak_hz": 0.05,
-        "shot_noise_hz": 0.5,
-        "shot_noise_dark": 4.0,
-        "leak_jitter_fraction": 0.1,
-        "noise_rate_cov_decades": 0.1,
-        "cutoff_hz": 1000.0,
-        "row_us": 0.4,
-        "bus_rate_mev_s": 165.0,
-        "bus_queue": 16384.0,
-    },
-    "davis346": {
-        "contrast_on": math.log(1.143),
-        "contrast_off": math.log(1.225),
-        "mismatch": 0.15,
-        "refractory_us": 500.0,
-        "latency_us": 20.0,
-        "latency_jitter_us": 10.0,
-        "leak_hz": 0.1,
-        "shot_noise_hz": 1.0,
-        "shot_noise_dark": 4.0,
-        "leak_jitter_fraction": 0.1,
-        "noise_rate_cov_decades": 0.1,
-        "cutoff_hz": 300.0,
-        "bus_rate_mev_s": 12.0,
-        "bus_queue": 4096.0,
-    },
-    "gen4": {
-        "contrast_on": math.log(1.25),
-        "contrast_off": math.log(1.25),
-        "mismatch": 0.03,
-        "refractory_us": 100.0,
-        "latency_us": 100.0,
-        "latency_jitter_us": 30.0,
-        "leak_hz": 0.05,
-        "shot_noise_hz": 0.5,
-        "shot_noise_dark": 4.0,
-        "leak_jitter_fraction": 0.1,
-        "noise_rate_cov_decades": 0.1,
-        "cutoff_hz": 2000.0,
-        "bus_rate_mev_s": 1066.0,
-        "bus_queue": 65536.0,
-    },
-}

@@ -38,6 +38,7 @@ from amiwarp.simulation.picture_maps import log_view
 from amiwarp.simulation.recorded_truth import RecordedTruth, chosen_instants
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.true_parameters import true_parameters
+from amiwarp.simulation.truth_renderer import TruthRenderer
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.tasks import Progress
 
@@ -192,6 +193,49 @@ class Simulation(SimulationValues):
             Log intensity, float32, shape ``(height, width)``.
         """
         return log_view(self)
+
+    def displacement(
+        self, t0_us: int, t1_us: int, *, with_prism: bool = False
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Return how the points of a world that the pixels see at one time move until another time, before or after it.
+
+        For many pairs of times, make a :class:`amiwarp.TruthRenderer` once and call its method of the same name.
+
+        Parameters
+        ----------
+        t0_us : int
+            Time at which the pixels see the points [us], from 0 to the end of the recording.
+        t1_us : int
+            Time to which the points move [us], from 0 to the end of the recording.
+        with_prism : bool, default False
+            Whether the pixels see the points through the prism, at its angles of both times.
+
+        Returns
+        -------
+        displacement : numpy.ndarray
+            Displacement (x, y) in the image [px], shape ``(height, width, 2)``; NaN where a point cannot be projected.
+        occlusion : numpy.ndarray
+            0 for points that are visible at ``t1_us``, 1 for points that another surface hides, 2 for points outside
+            the image, shape ``(height, width)``.
+
+        Raises
+        ------
+        AmiwarpError
+            If the scene is a picture, or a time lies outside the recording.
+
+        Examples
+        --------
+        >>> square = amiwarp.Mesh([[-1, 2, -1], [1, 2, -1], [1, 2, 1], [-1, 2, 1]], [[0, 1, 2], [0, 2, 3]])
+        >>> scene = amiwarp.WorldScene(
+        ...     amiwarp.World("example", (amiwarp.Body("wall", square),)),
+        ...     amiwarp.Trajectory.still([0, 0, 0], look_at=[0, 1, 0]))
+        >>> simulation = amiwarp.Simulation(
+        ...     scene, amiwarp.Camera.from_fov(32, 24, 1.0), amiwarp.Prism(0.01), duration_s=0.01)
+        >>> moved, occlusion = simulation.displacement(10_000, 2_000, with_prism=True)
+        >>> moved.shape, occlusion.shape
+        ((24, 32, 2), (24, 32))
+        """
+        return TruthRenderer(self).displacement(t0_us, t1_us, with_prism=with_prism)
 
     def run(
         self,

@@ -10,10 +10,9 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.truth import FrameTruth
+from amiwarp.events.truth import OUTSIDE, FrameTruth
 from amiwarp.kernels import prism_view
 from amiwarp.optics.models.angles import wrap_angle
-from amiwarp.optics.models.base import Model
 from amiwarp.optics.models.plate import PlateModel
 from amiwarp.schema.calls import guarded
 from amiwarp.simulation.description import SimulationValues
@@ -24,6 +23,7 @@ from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.sight import WorldSight
 from amiwarp.simulation.worlds.surfaces import SurfaceView, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.validation import whole
 
 ANGLE = 1e-3
 """Half of the angle over which derivatives with respect to direction are difference quotients [rad]."""
@@ -31,8 +31,6 @@ DEFLECTING_STEPS = 4
 """Number of steps of the fixed-point iteration that finds the pixel that sees a point through a plate."""
 NEARER = 1e-3
 """Relative difference of depth from which a surface hides a point."""
-OUTSIDE = 2
-"""Value of :attr:`amiwarp.FrameTruth.occlusion` for points outside the image."""
 MOMENT_S = 1e-4
 """Time between the moments whose difference quotient is the optical flow [s]."""
 
@@ -104,7 +102,7 @@ class TruthRenderer:
         self._rays = pixel_rays(simulation.camera)
         self._pixels = simulation.camera.rays_to_pixels(self._rays)
 
-    def at(self, t_us: int, next_us: int | None = None) -> FrameTruth:
+    def at(self, t_us: int, next_us: int | None = None, before_us: int | None = None) -> FrameTruth:
         """Return the ground truth of all pixels at a time.
 
         Parameters
@@ -113,6 +111,9 @@ class TruthRenderer:
             Time from the start of the recording [us].
         next_us : int, optional
             Time of the next instant [us], to which displacements and occlusion refer. Without it, they are unknown.
+        before_us : int, optional
+            Time of the instant before [us], to which backward displacements and occlusion refer. Without it, they are
+            unknown.
 
         Returns
         -------
@@ -121,29 +122,24 @@ class TruthRenderer:
             and the positions of the joints.
         """
         t = t_us * 1e-6
-        next_t = t if next_us is None else next_us * 1e-6
         camera = self._simulation.camera
         (rotation,), (position,) = self._poses([t])
-        self._world.set_instants(np.array([t, next_t]))
 
-        # What each pixel sees without the prism.
-        pixels = self._pixels
-        bare = surfaces_at(self._world, self._rays, rotation, position)
+        # What each pixel sees without the prism, and through the prism or the plate.
+        self._world.set_instants(np.array([t]))
+        bare, pixels = self._seen(t_us, prism=False)
         flow = self._flow(bare, pixels, t)
-        moved, occluded = self._moved(bare, pixels, t_us, next_us, prism=False)
-
-        # What it sees through the prism or the plate, and where this would appear without it.
+        through, places = self._seen(t_us, prism=True)
         if self._simulation.plate is None:
-            theta = self._angles(t_us)
-            model = self._simulation.moving_model
-            places = model.compensate_points(pixels, theta)
-            through = surfaces_at(self._world, camera.pixels_to_rays(places), rotation, position)
             speed = self._flow(through, places, t)
-            prism_flow = self._prism_flow(model, places, speed, theta, t_us)
+            prism_flow = self._prism_flow(places, speed, t_us)
         else:
-            through, places = self._through_plate(t, rotation, position)
             prism_flow = self._plate_flow(self._simulation.plate, through, places, t)
+
+        moved, occluded = self._moved(bare, pixels, t_us, next_us, prism=False)
+        back, back_occluded = self._moved(bare, pixels, t_us, before_us, prism=False)
         prism_moved, prism_occluded = self._moved(through, places, t_us, next_us, prism=True)
+        prism_back, prism_back_occluded = self._moved(through, places, t_us, before_us, prism=True)
 
         size = (camera.height, camera.width)
         joints = self._scene.world.joints
@@ -154,16 +150,67 @@ class TruthRenderer:
             instance=bare.instance.reshape(size).astype(np.uint16),
             flow=flow.astype(np.float32).reshape(*size, 2),
             flow_with_prism=prism_flow.astype(np.float32).reshape(*size, 2),
-            displacement=moved.astype(np.float32).reshape(*size, 2),
-            displacement_with_prism=prism_moved.astype(np.float32).reshape(*size, 2),
-            occlusion=occluded.reshape(size),
-            occlusion_with_prism=prism_occluded.reshape(size),
+            displacement=moved,
+            displacement_with_prism=prism_moved,
+            occlusion=occluded,
+            occlusion_with_prism=prism_occluded,
+            backward=back,
+            backward_with_prism=prism_back,
+            backward_occlusion=back_occluded,
+            backward_occlusion_with_prism=prism_back_occluded,
             intensity=self.luminance(t_us),
             intensity_with_prism=self._intensity(t_us, prism=True).reshape(size),
             rotation=rotation @ mirrored(self._simulation).T,
             position=position,
             joints={name: path.poses([t])[1][0] for name, path in joints.items()},
         )
+
+    def displacement(
+        self, t0_us: int, t1_us: int, *, with_prism: bool = False
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Return how the points that the pixels see at one time move until another time, before or after it.
+
+        Parameters
+        ----------
+        t0_us : int
+            Time at which the pixels see the points [us], from 0 to the end of the recording.
+        t1_us : int
+            Time to which the points move [us], from 0 to the end of the recording.
+        with_prism : bool, default False
+            Whether the pixels see the points through the prism, at its angles of both times.
+
+        Returns
+        -------
+        displacement : numpy.ndarray
+            Displacement (x, y) in the image [px], shape ``(height, width, 2)``; NaN where a point cannot be projected.
+        occlusion : numpy.ndarray
+            0 for points that are visible at ``t1_us``, 1 for points that another surface hides, 2 for points outside
+            the image, shape ``(height, width)``.
+
+        Raises
+        ------
+        AmiwarpError
+            If a time lies outside the recording.
+
+        Examples
+        --------
+        >>> square = amiwarp.Mesh([[-1, 2, -1], [1, 2, -1], [1, 2, 1], [-1, 2, 1]], [[0, 1, 2], [0, 2, 3]])
+        >>> world = amiwarp.World("example", (amiwarp.Body("wall", square),))
+        >>> ahead = amiwarp.Trajectory.still([0, 0, 0], look_at=[0, 1, 0]).rotation
+        >>> way = amiwarp.Trajectory([0.0, 0.01], [[0, 0, 0], [0.02, 0, 0]], [ahead[0], ahead[0]])
+        >>> camera = amiwarp.Camera.from_fov(32, 24, 1.0)
+        >>> simulation = amiwarp.Simulation(
+        ...     amiwarp.WorldScene(world, way), camera, amiwarp.Prism(0.01), duration_s=0.01)
+        >>> moved, occlusion = amiwarp.TruthRenderer(simulation).displacement(0, 10_000)
+        >>> bool(abs(moved[12, 16, 0] + camera.fx * 0.02 / 2.0) < 1e-3)
+        True
+        """
+        duration_us = self._simulation.duration_us
+        t0_us = whole(t0_us, "t0_us", 0, duration_us, " us")
+        t1_us = whole(t1_us, "t1_us", 0, duration_us, " us")
+        self._world.set_instants(np.array([t0_us * 1e-6]))
+        surfaces, places = self._seen(t0_us, prism=with_prism)
+        return self._moved(surfaces, places, t0_us, t1_us, prism=with_prism)
 
     def luminance(self, t_us: int) -> NDArray[np.float32]:
         """Return the linear luminance without the prism at a time, which takes a fraction of the time of :meth:`at`.
@@ -185,6 +232,22 @@ class TruthRenderer:
         """Return how directions of the camera at rest look in the world at times [s], (n, 3, 3), and its places."""
         rotation, position = self._scene.trajectory.poses(t)
         return rotation @ mirrored(self._simulation), position
+
+    def _seen(self, t_us: int, *, prism: bool) -> tuple[SurfaceView, NDArray[np.float64]]:
+        """Return the surfaces that the pixels see at a time, and where these appear without the prism [px], (n, 2).
+
+        The world shows its first instant, which is this time.
+        """
+        t = t_us * 1e-6
+        (rotation,), (position,) = self._poses([t])
+        if not prism:
+            return surfaces_at(self._world, self._rays, rotation, position), self._pixels
+        if self._simulation.plate is not None:
+            return self._through_plate(t, rotation, position)
+        model = self._simulation.moving_model
+        places = model.compensate_points(self._pixels, self._angles(t_us))
+        rays = self._simulation.camera.pixels_to_rays(places)
+        return surfaces_at(self._world, rays, rotation, position), places
 
     def _flow(
         self, surfaces: SurfaceView, pixels: NDArray[np.float64], t: float
@@ -248,20 +311,21 @@ class TruthRenderer:
         surfaces: SurfaceView,
         places: NDArray[np.float64],
         t_us: int,
-        next_us: int | None,
+        other_us: int | None,
         *,
         prism: bool,
-    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-        """Return the displacement of what the pixels see until ``next_us`` [px], shape (n, 2), and its occlusion, (n,).
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Return the displacement of what the pixels see until ``other_us`` [px], shape (height, width, 2).
 
-        ``surfaces``: surfaces that appear at ``places`` [px] in the image without the prism; ``prism``: whether the
-        pixels see them through the prism.
+        The second array has its occlusion, shape (height, width). ``surfaces``: surfaces that appear at ``places`` [px]
+        in the image without the prism; ``prism``: whether the pixels see them through the prism. The world then shows
+        the other time.
         """
-        n = len(self._rays)
-        if next_us is None:
-            return np.full((n, 2), np.nan), np.full(n, OUTSIDE, np.uint8)
-        later = next_us * 1e-6
         camera = self._simulation.camera
+        shape = (camera.height, camera.width)
+        if other_us is None:
+            return np.full((*shape, 2), np.nan, np.float32), np.full(shape, OUTSIDE, np.uint8)
+        later = other_us * 1e-6
         plate = self._simulation.plate if prism else None
 
         # Pixels that will see the points, and the rays that will lead there.
@@ -275,30 +339,29 @@ class TruthRenderer:
             centres, behind = self._behind_plate(rays, later)
             rays = behind.astype(np.float64)
         elif prism:
-            ends = self._simulation.moving_model.deflect_points(ends, self._angles(next_us))
+            ends = self._simulation.moving_model.deflect_points(ends, self._angles(other_us))
 
         # A point is hidden if something nearer will lie on its ray.
         (rotation,), (position,) = self._poses([later])
-        hit = surfaces_at(self._world, rays, rotation, position, instant=1, centres=centres)
+        self._world.set_instants(np.array([later]))
+        hit = surfaces_at(self._world, rays, rotation, position, centres=centres)
         hidden = hit.depth < depth * (1.0 - NEARER)
         size = np.array([camera.width, camera.height])
         inside = ((ends > -0.5) & (ends < size - 0.5)).all(axis=1)
         occlusion = np.where(inside, hidden, OUTSIDE).astype(np.uint8)
-        return ends - self._pixels, occlusion
+        moved = (ends - self._pixels).astype(np.float32)
+        return moved.reshape(*shape, 2), occlusion.reshape(shape)
 
     def _prism_flow(
-        self,
-        model: Model,
-        places: NDArray[np.float64],
-        speed: NDArray[np.float64],
-        theta: NDArray[np.float64],
-        t_us: int,
+        self, places: NDArray[np.float64], speed: NDArray[np.float64], t_us: int
     ) -> NDArray[np.float64]:
         """Return the optical flow [px/s] that pixels see through the turning prism, shape (n, 2).
 
         ``places``: points [px] that the pixels would see without the prism; ``speed``: the flow at these points without
-        the prism [px/s]; ``theta``: prism angle [rad].
+        the prism [px/s].
         """
+        model = self._simulation.moving_model
+        theta = self._angles(t_us)
         # What the scene moves, seen through the prism at rest: one pixel to both sides along the motion.
         size = np.linalg.norm(speed, axis=1, keepdims=True)
         aside = speed / np.maximum(size, 1e-9)

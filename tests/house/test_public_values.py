@@ -182,7 +182,7 @@ MEANT: dict[tuple[str, str], str] = {
     ("FrameTruth", "depth"): "infinite",
     **{
         ("FrameTruth", f"{what}{seen}"): "NaN"
-        for what in ("flow", "displacement")
+        for what in ("flow", "displacement", "backward")
         for seen in ("", "_with_prism")
     },
     ("Truth.known_at", "xy"): "NaN",

@@ -127,6 +127,8 @@ MEANINGS = {
         "truth/frames/flow_with_prism",
         "truth/frames/displacement",
         "truth/frames/displacement_with_prism",
+        "truth/frames/backward",
+        "truth/frames/backward_with_prism",
     },
     np.inf: {"truth/events/depth", "truth/frames/depth"},
     -np.inf: set(),

@@ -32,12 +32,11 @@ from amiwarp.io.recorded_dataset import MANIFEST
 from amiwarp.kernels import quiet_start
 from amiwarp.learning.dataset import making, sources, specification, worker
 from amiwarp.learning.dataset.files import JOURNAL, TABLE
-from amiwarp.learning.dataset.items import Item, _counts, list_items
-from amiwarp.learning.dataset.specification import load_specification
 from amiwarp.studies import cluster
 from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker, threads_of_worker
 from tests import ROOT
 from tests.command_line import app
+from tests.learning.specifications import divided, items_of
 
 HEAD = 'format = "amiwarp-dataset-specification"\nversion = 1\n'
 PICTURES = """
@@ -159,14 +158,14 @@ def test_parquet_equals_json(place: Path) -> None:
 
 
 def test_seeds_depend_on_the_recording_alone(place: Path) -> None:
-    before = {item.key: item for item in list_items(load_specification(place / "spec.toml"))}
+    before = {item.key: item for item in items_of(place / "spec.toml")}
     assert len({item.seed for item in before.values()}) == 12
     (place / "pictures" / "disc" / "00.png").write_bytes(
         (place / "pictures" / "disc" / "0.png").read_bytes()
     )
     more = BASE.replace("[1800.0]", "[60.0, 1800.0]").replace('["ideal"]', '["davis346", "ideal"]')
     (place / "spec.toml").write_text("seeds = [4, 0]\n" + more + PICTURES)
-    after = {item.key: item for item in list_items(load_specification(place / "spec.toml"))}
+    after = {item.key: item for item in items_of(place / "spec.toml")}
     assert len(after) == 7 * 2 * 2 * 2 * 2
     assert {key: item.seed for key, item in after.items() if key in before} == {
         k: i.seed for k, i in before.items()
@@ -181,7 +180,7 @@ def test_a_source_lies_in_one_split(place: Path) -> None:
     copy = place / "pictures" / "square" / "copy.png"
     copy.write_bytes((place / "pictures" / "disc" / "0.png").read_bytes())
     (place / "spec.toml").write_text("seeds = 200\n" + BASE + PICTURES + worlds)
-    items = list_items(load_specification(place / "spec.toml"))
+    items = items_of(place / "spec.toml")
     splits: dict[str, set[str]] = {}
     for item in items:
         of = (
@@ -196,12 +195,16 @@ def test_a_source_lies_in_one_split(place: Path) -> None:
         item.split for item in items if item.source.endswith(("disc/0.png", "copy.png"))
     } == splits[hashlib.sha256(copy.read_bytes()).hexdigest()]
     train = sum(found == {"train"} for found in splits.values())
+    assert train == 325
+    text = (place / "spec.toml").read_text()
+    (place / "spec.toml").write_text("stratify = false\n" + text)
+    drawn = items_of(place / "spec.toml")
+    train = len({item.same for item in drawn if item.split == "train"})
     assert train == pytest.approx(0.8 * 406, abs=30)
+    assert train != 325
     other = BASE.replace("duration_s", "split_seed = 1\nduration_s", 1)
     (place / "spec.toml").write_text("seeds = 200\n" + other + PICTURES + worlds)
-    assert [i.split for i in list_items(load_specification(place / "spec.toml"))] != [
-        i.split for i in items
-    ]
+    assert [i.split for i in items_of(place / "spec.toml")] != [i.split for i in items]
 
 
 def test_what_is_there_is_kept_and_damage_is_repaired(place: Path) -> None:
@@ -251,7 +254,7 @@ def test_a_recording_moves_to_the_folder_of_its_split(place: Path) -> None:
     (place / "spec.toml").write_text(
         BASE.replace("duration_s", f"split_seed = 5\n{halves}", 1) + PICTURES
     )
-    items = list_items(load_specification(place / "spec.toml"))
+    items = items_of(place / "spec.toml")
     moved = sorted({item.file for item in items} - set(before))
     damaged = place / "out" / next(file for file in before if file.endswith(moved[0].split("/")[1]))
     damaged.write_bytes(damaged.read_bytes()[:-1] + b"x")
@@ -294,7 +297,7 @@ def test_an_unexpected_error_and_a_dead_worker_fail_their_recording_alone(
 ) -> None:
     write = worker.write_recording
 
-    def planted(item: Item, *args: Any) -> Any:
+    def planted(item: Any, *args: Any) -> Any:
         if item.source.endswith("0.png"):
             raise np.linalg.LinAlgError("Singular\nmatrix")
         return write(item, *args)
@@ -319,11 +322,11 @@ def test_an_unexpected_error_and_a_dead_worker_fail_their_recording_alone(
 
     monkeypatch.setattr(worker, "write_recording", lambda *_: {}["all"])
     with pytest.raises(
-        AmiwarpError, match=r"no sample of pictures can be made; train/\S+: KeyError: 'all' \(in "
+        AmiwarpError, match=r"no sample of pictures can be made; \w+/\S+: KeyError: 'all' \(in "
     ):
         amiwarp.plan_dataset(place / "spec.toml", place / "elsewhere", workers=1)
 
-    (item, *_) = list_items(load_specification(place / "spec.toml"))
+    (item, *_) = items_of(place / "spec.toml")
     job = worker.Job(item, place, place, "cpu", 1)
     dead: Future[Any] = Future()
     dead.set_exception(type("KilledWorker", (Exception,), {})("make-1"))
@@ -486,7 +489,7 @@ def test_few_jobs_wait_and_the_rest_is_not_read() -> None:
         assert sorted(f.result() for _, f in run_jobs(alone, str, range(5))) == list("01234")
 
 
-def spread(items: list[Item]) -> dict[Any, dict[str, int]]:
+def spread(items: list[Any]) -> dict[Any, dict[str, int]]:
     """Return how many different sources of each class lie in each split."""
     found: dict[Any, dict[str, set[str]]] = {}
     for item in items:
@@ -516,42 +519,101 @@ def test_splits_are_stratified_by_class(place: Path) -> None:
     worlds = '[[sources]]\nworlds = ["room"]\nlabels = {class = "room"}\n'
     text = 'stratify = "class"\nseeds = 10\n' + BASE + PICTURES + worlds
     (place / "spec.toml").write_text(text)
-    items = list_items(load_specification(place / "spec.toml"))
+    items = items_of(place / "spec.toml")
     # 25 * 0.1 = 2.5 is rounded to 3 and 2: the first of two equal remainders gets the source
     expected = {"disc": (32, 4, 4), "square": (20, 3, 2), "room": (8, 1, 1)}
     assert spread(items) == {
         name: dict(zip(("train", "val", "test"), of, strict=True)) for name, of in expected.items()
     }
-    assert [i.split for i in list_items(load_specification(place / "spec.toml"))] == [
-        i.split for i in items
-    ]
+    assert [i.split for i in items_of(place / "spec.toml")] == [i.split for i in items]
     (place / "spec.toml").write_text("split_seed = 1\n" + text)
-    other = list_items(load_specification(place / "spec.toml"))
+    other = items_of(place / "spec.toml")
     assert spread(other) == spread(items)
     assert [i.split for i in other] != [i.split for i in items]
     (place / "pictures" / "disc" / "one_more.png").write_bytes(b"a")
     (place / "spec.toml").write_text(text)
-    more = {item.key: item.split for item in list_items(load_specification(place / "spec.toml"))}
+    more = {item.key: item.split for item in items_of(place / "spec.toml")}
     moved = {item.source for item in items if more[item.key] != item.split}
     assert len(moved) <= 3
 
 
-@pytest.mark.parametrize("total", [3, 4, 7, 10, 101])
+@pytest.mark.parametrize("total", [3, 4, 7, 10, 51])
 @pytest.mark.parametrize("shares", [(0.8, 0.1, 0.1), (0.98, 0.01, 0.01), (0.5, 0.25, 0.25)])
-def test_each_split_gets_its_share_and_at_least_one(total: int, shares: tuple[float, ...]) -> None:
-    counts = list(_counts(dict(zip("abc", shares, strict=True)), total).values())
+def test_each_split_gets_its_share_and_at_least_one(
+    tmp_path: Path, total: int, shares: tuple[float, ...]
+) -> None:
+    for k in range(total):
+        (tmp_path / f"{k}.png").write_bytes(bytes([k]))
+    splits = f"splits = {{a = {shares[0]}, b = {shares[1]}, c = {shares[2]}}}\n"
+    (tmp_path / "spec.toml").write_text(splits + BASE + '[[sources]]\npictures = "*.png"\n')
+    counts = list(divided(tmp_path / "spec.toml")["all sources"].values())
     assert sum(counts) == total
-    assert min(counts) >= 1
+    assert len(counts) == 3
     for count, share in zip(counts, shares, strict=True):
         assert count == 1 or abs(count - share * total) < 1.0 + (
             counts.count(1) if total * min(shares) < 1.0 else 0
         )
 
 
+def test_each_class_is_divided_unless_another_rule_is_given(place: Path) -> None:
+    """Ten sources of a label give six, two and two of each; one class too small, and all are divided together."""
+    rng = np.random.default_rng(3)
+    for folder, count in (("disc", 7), ("square", 7)):
+        for k in range(count):
+            Image.fromarray(rng.integers(0, 256, (4, 4), np.uint8)).save(
+                place / "pictures" / folder / f"new{k}.png"
+            )
+    shares = "splits = {train = 0.6, val = 0.2, test = 0.2}\n"
+    (place / "spec.toml").write_text(shares + BASE + PICTURES)
+    six = {"train": 6, "val": 2, "test": 2}
+    assert divided(place / "spec.toml") == {"class = 'disc'": six, "class = 'square'": six}
+    result = run(
+        place / "spec.toml", place / "out", "--dry-run", "--workers", "1", "--device", "cpu"
+    )
+    assert (
+        "sources: train 12, val 4, test 4; divided by class = 'disc': train 6, val 2, test 2; class = 'square': "
+        "train 6, val 2, test 2 (the field stratify gives another rule)" in result.stdout
+    )
+    (place / "spec.toml").write_text("stratify = false\n" + shares + BASE + PICTURES)
+    drawn = divided(place / "spec.toml")
+    assert list(drawn) == [""]
+    assert sum(drawn[""].values()) == 20
+    assert drawn[""]["train"] != 12
+    for k in range(7):
+        (place / "pictures" / "square" / f"new{k}.png").unlink()
+    (place / "pictures" / "square" / "1.png").unlink()
+    (place / "spec.toml").write_text(shares + BASE + PICTURES)
+    assert divided(place / "spec.toml") == {"all sources": {"train": 7, "val": 3, "test": 2}}
+    (place / "spec.toml").write_text("stratify = true\n" + shares + BASE + PICTURES)
+    with pytest.raises(
+        AmiwarpError, match=r"stratify is True; expected the name of a label, or false"
+    ):
+        items_of(place / "spec.toml")
+
+
+def test_one_source_of_many_splits_is_for_training(place: Path) -> None:
+    (place / "spec.toml").write_text(BASE + PICTURES.replace("*/*", "disc/0"))
+    assert divided(place / "spec.toml") == {"all sources": {"train": 1}}
+
+
+def test_a_spread_that_one_sample_cannot_tell_is_not_zero(place: Path) -> None:
+    one = BASE.replace(', {apex_deg = 2.0, flat_side = "camera"}', "")
+    (place / "spec.toml").write_text(one + PICTURES.replace("*/*", "disc/0"))
+    words = (place / "spec.toml", place / "out", "--dry-run", "--workers", "1", "--device", "cpu")
+    text = run(*words).stdout
+    assert "(spread unknown: a kind of source has only one sample)" in text
+    assert json.loads(run(*words, "--json").stdout)["uncertainty"] is None
+    (place / "spec.toml").write_text(BASE + PICTURES.replace("*/*", "disc/0"))
+    all_sampled = amiwarp.plan_dataset(place / "spec.toml", place / "out", workers=1)
+    assert all_sampled.samples == all_sampled.recordings == 2
+    assert all_sampled.uncertainty is not None
+    assert all_sampled.uncertainty > 0.0
+
+
 def test_what_cannot_be_stratified_is_named(place: Path) -> None:
     def fails(message: str) -> None:
         with pytest.raises(AmiwarpError, match=message):
-            list_items(load_specification(place / "spec.toml"))
+            items_of(place / "spec.toml")
 
     text = 'stratify = "class"\n' + BASE + PICTURES
     (place / "spec.toml").write_text(text.replace('"class"', '"colour"', 1))
@@ -563,10 +625,10 @@ def test_what_cannot_be_stratified_is_named(place: Path) -> None:
     (place / "spec.toml").write_text(text)
     (place / "pictures" / "square" / "5.png").unlink()
     fails(
-        r"class 'square' has 2 different sources for the 3 splits train, val, test; add sources of it, or give fewer"
+        r"class = 'square' has 2 different sources for the 3 splits train, val, test; add sources of it, or give fewer"
     )
     (place / "spec.toml").write_text("splits = {train = 0.5, test = 0.5, val = 0.0}\n" + text)
-    assert len(list_items(load_specification(place / "spec.toml"))) == 10
+    assert len(items_of(place / "spec.toml")) == 10
     (place / "pictures" / "square" / "5.png").write_bytes(
         (place / "pictures" / "disc" / "0.png").read_bytes()
     )
@@ -599,7 +661,7 @@ def test_plain_cameras_have_neither_prism_nor_encoder(place: Path) -> None:
         assert (recording.prism, recording.encoder) == (None, None)
         assert recording.truth is not None
         assert len(recording.events) == item["events"] > 100
-    (item, *_) = list_items(load_specification(place / "spec.toml"))
+    (item, *_) = items_of(place / "spec.toml")
     expected = amiwarp.Simulation(
         amiwarp.Scene.from_picture(place / item.source), amiwarp.Camera.from_fov(24, 18, math.radians(40.0)),
         amiwarp.Prism(0.0), 0.05, camera_motion=amiwarp.CameraMotion((0.0, math.radians(200.0), 0.0)),
@@ -788,7 +850,7 @@ def test_tensors_of_windows_with_the_truth_of_a_world(
     assert make(moving).failed == {}
     rows = manifest(moving)["items"]
     dataset = amiwarp.RecordedDataset(moving / "out", transform=arrays_of)
-    items = {item.file: item for item in list_items(load_specification(moving / "spec.toml"))}
+    items = {item.file: item for item in items_of(moving / "spec.toml")}
     for row, arrays in zip(rows, dataset, strict=True):
         events = recording.events.slice(0, 10**9)
         if row["source_kind"] != "recordings":
@@ -838,7 +900,7 @@ def arrays_of(arrays: dict[str, np.ndarray], labels: dict[str, Any]) -> dict[str
 def test_a_wrong_output_is_named(place: Path, output: str, message: str) -> None:
     (place / "spec.toml").write_text(BASE + f"output = {output}\n" + PICTURES)
     with pytest.raises(AmiwarpError, match=message):
-        load_specification(place / "spec.toml")
+        items_of(place / "spec.toml")
 
 
 def test_plain_cameras_and_prisms_see_the_same_world(place: Path) -> None:
@@ -846,11 +908,11 @@ def test_plain_cameras_and_prisms_see_the_same_world(place: Path) -> None:
         '[[sources]]\nworlds = ["room"]\ntrajectories = ["handheld"]\nlabels = {class = "room"}\n'
     )
     (place / "spec.toml").write_text(BASE + "seeds = 2\ntruth_hz = 100.0\n" + worlds)
-    alone = {item.key for item in list_items(load_specification(place / "spec.toml"))}
+    alone = {item.key for item in items_of(place / "spec.toml")}
     (place / "spec.toml").write_text(
         BASE + "no_prism = true\nseeds = 2\ntruth_hz = 100.0\n" + worlds
     )
-    items = list_items(load_specification(place / "spec.toml"))
+    items = items_of(place / "spec.toml")
     assert alone < {item.key for item in items}
     assert len(items) == 6  # two prisms and a plain camera, two seeds
     pairs = [[i for i in items if i.recipe["seed"] == seed] for seed in (0, 1)]
@@ -891,7 +953,7 @@ def test_what_contradicts_a_plain_camera_is_named(
     assert old in PLAIN
     (place / "spec.toml").write_text(HEAD + PLAIN.replace(old, new, 1))
     with pytest.raises(AmiwarpError, match=message):
-        load_specification(place / "spec.toml")
+        items_of(place / "spec.toml")
 
 
 def test_other_sources(place: Path, recording: amiwarp.Recording) -> None:
@@ -1078,14 +1140,14 @@ def test_large_specifications_are_refused_or_read_in_linear_time(
     with pytest.raises(
         AmiwarpError, match=r"field seeds = 5000000 is not a whole number in 1 \.\. 1000000"
     ):
-        load_specification(path)
+        items_of(path)
     path.write_text("seeds = 1000000\n" + BASE + PICTURES)
     made: list[object] = []
     monkeypatch.setattr("amiwarp.learning.dataset.items.Item", lambda *values: made.append(values))
     with pytest.raises(
         AmiwarpError, match=r"spec\.toml: describes 12,000,000 recordings; divide it among"
     ):
-        list_items(load_specification(path))
+        items_of(path)
     assert not made
     compared = 0
 
@@ -1109,10 +1171,10 @@ def test_large_specifications_are_refused_or_read_in_linear_time(
         with pytest.raises(
             AmiwarpError, match=r"spec\.toml: .*line \d+ has a key of more than 32 parts; use"
         ):
-            load_specification(path)
+            items_of(path)
     path.write_bytes(b"#" * (1 << 20) + b"\n")
     with pytest.raises(AmiwarpError, match=r"spec\.toml: .*is larger than 1 MiB"):
-        load_specification(path)
+        items_of(path)
 
 
 def test_a_pattern_visits_a_limited_number_of_entries(
@@ -1174,7 +1236,7 @@ def test_a_mesh_or_a_file_of_poses_that_changed_is_seen(place: Path) -> None:
     for mesh, poses in (("a", "a"), ("b", "a"), ("b", "b"), ("b", "b")):
         (place / "tile.obj").write_text(mesh)
         (place / "poses.csv").write_text(poses)
-        keys |= {item.key for item in list_items(load_specification(place / "spec.toml"))}
+        keys |= {item.key for item in items_of(place / "spec.toml")}
     assert len(keys) == 3 * 2
 
 
@@ -1189,7 +1251,7 @@ def test_what_a_mesh_names_is_part_of_its_world(place: Path) -> None:
     for name, grey in (("t.png", 0), ("t.png", 9), ("t.png\nKs 0 0 0", 9), ("no.png", 9)):
         (place / "tile.mtl").write_text(f"newmtl a\nmap_Kd {name}\n")
         Image.new("L", (4, 4), grey).save(place / "t.png")
-        keys.append(list_items(load_specification(place / "spec.toml"))[0].key)
+        keys.append(items_of(place / "spec.toml")[0].key)
     assert len(set(keys)) == 4
 
 
@@ -1211,13 +1273,13 @@ def test_a_table_with_two_labels_for_one_file_is_refused(
         BASE + '[[sources]]\npictures = "pictures/*/*.png"\nlabel_table = "labels.csv"\n'
     )
     with pytest.raises(AmiwarpError, match=f"labels.csv: .*{message}"):
-        list_items(load_specification(place / "spec.toml"))
+        items_of(place / "spec.toml")
 
 
 def test_the_specification_of_the_guide(place: Path) -> None:
     page = (ROOT / "docs" / "how-to" / "dataset.md").read_text()
     (place / "shapes.toml").write_text(page.partition("```toml\n")[2].partition("```")[0])
-    items = list_items(load_specification(place / "shapes.toml"))
+    items = items_of(place / "shapes.toml")
     assert len(items) == (6 + 2) * 2 * 2 * 2 * 2
     assert {item.labels["background"] for item in items} == {"grey", "room"}
     fast = [item.recipe["sensor"] for item in items if item.recipe["sensor"]["name"] == "fast"]
@@ -1231,7 +1293,7 @@ def test_the_specification_of_the_guide(place: Path) -> None:
 def test_recordings_are_those_of_the_simulator_on_each_device(place: Path, device: str) -> None:
     done = make(place, device="cpu" if device == "cpu" else ANY_GPU)
     assert (done.made, done.failed) == (12, {})
-    items = {item.file: item for item in list_items(load_specification(place / "spec.toml"))}
+    items = {item.file: item for item in items_of(place / "spec.toml")}
     for row in manifest(place)["items"][:3]:
         recording = amiwarp.open_recording(place / "out" / row["file"])
         expected = worker.simulation_of(items[row["file"]], device).run().events

@@ -27,7 +27,9 @@ from amiwarp.simulation.engine import Engine
 
 CAMERA = Camera.from_fov(40, 30, math.radians(50.0))
 NOISY = SensorModel(shot_noise_hz=30.0, leak_hz=20.0, hot_fraction=0.02, noise_rate_cov_decades=0.2)
-EVERYTHING = replace(NOISY, cutoff_hz=300.0, shot_noise_dark=4.0, leak_jitter_fraction=0.3)
+EVERYTHING = replace(
+    NOISY, cutoff_hz=300.0, buffer_hz=700.0, shot_noise_dark=4.0, leak_jitter_fraction=0.3
+)
 MODELS = {
     "default": SensorModel(),
     "noisy": NOISY,
@@ -48,7 +50,9 @@ class Watched(Engine):
 
     def look(self) -> None:
         size = (self._simulation.camera.height, self._simulation.camera.width)
-        levels = self._state[1].numpy() if self._filters else self._state[0].numpy()["level"]
+        levels = (
+            self._state[1].numpy()["seen"] if self._filters else self._state[0].numpy()["level"]
+        )
         self.images.append(np.array(levels, np.float32).reshape(size))
 
     def _start_pixels(self, steps: Any) -> None:

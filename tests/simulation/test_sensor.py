@@ -16,6 +16,7 @@ from amiwarp import (
     Camera,
     CameraMotion,
     Events,
+    EventSensor,
     Prism,
     PrismMotion,
     Scene,
@@ -26,6 +27,7 @@ from amiwarp import (
 from amiwarp.kernels import photoreceptors, pixels
 from amiwarp.simulation import DARK
 from amiwarp.simulation.commands.rig_options import SensorOptions
+from reference import second_simulator
 
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))
 PRISM = Prism(math.radians(3.0), 1.55)
@@ -118,22 +120,34 @@ def ramp() -> Scene:
 
 
 def crossing_times(
-    angle: float, rate: float, cutoff: float, contrast: float, duration: float
+    angle: float,
+    rate: float,
+    cutoff: float,
+    contrast: float,
+    duration: float,
+    buffer: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Times at which the photoreceptor of one pixel crosses its thresholds [us], by SciPy's solver in float64."""
+    """Times at which the photoreceptor of one pixel crosses its thresholds [us], by SciPy's solver in float64.
+
+    ``buffer``: cut-off frequency of its second stage [Hz]; 0 for one stage.
+    """
 
     def light_level(t: float) -> float:
         return SLOPE * (math.tan(angle + rate * t) + math.tan(FOV / 2.0)) + math.log(0.5)
 
     def change(t: float, y: NDArray[np.float64]) -> list[float]:
         x = light_level(t)
-        return [2.0 * math.pi * cutoff * math.exp(x) / (1.0 + DARK) * (x - y[0])]
+        first, second = y
+        return [
+            2.0 * math.pi * cutoff * math.exp(x) / (1.0 + DARK) * (x - first),
+            2.0 * math.pi * buffer * (first - second),
+        ]
 
     t = np.arange(0.0, duration, 2e-6)
     start = light_level(0.0)
     y = solve_ivp(
-        change, (0.0, duration), [start], t_eval=t, method="LSODA", rtol=1e-8, atol=1e-8
-    ).y[0]
+        change, (0.0, duration), [start, start], t_eval=t, method="LSODA", rtol=1e-8, atol=1e-8
+    ).y[1 if buffer else 0]
     crossed = np.searchsorted(
         np.floor((y - start) / contrast), np.arange(1, int((y[-1] - start) / contrast) + 1)
     )
@@ -141,19 +155,22 @@ def crossing_times(
 
 
 @pytest.mark.parametrize("longest_us", [2000, 137])
+@pytest.mark.parametrize("buffer", [0.0, 40.0, 1000.0])
 def test_filtered_ramp_agrees_with_a_solver_for_any_step(
-    device: str, longest_us: int, monkeypatch: pytest.MonkeyPatch
+    device: str, buffer: float, longest_us: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Time constants are 160 us to 1.8 ms, in the steps of two lengths."""
+    """Time constants of the first stage are 160 us to 1.8 ms, in the steps of two lengths."""
     monkeypatch.setattr("amiwarp.simulation.image_motion.LONGEST_STEP", longest_us)
     rate, contrast, duration, cutoff = 1.0, 0.2, 0.1, 10.0
-    sensor = quiet_sensor(cutoff_hz=cutoff, contrast_on=contrast, contrast_off=contrast)
+    sensor = quiet_sensor(
+        cutoff_hz=cutoff, buffer_hz=buffer, contrast_on=contrast, contrast_off=contrast
+    )
     recording = simulate(ramp(), CAMERA, WIDE, duration_s=duration, motion=0.0, device=device,
                          camera_motion=CameraMotion((0.0, rate, 0.0)), sensor=sensor)  # fmt: skip
     events = recording.events.slice(0, len(recording.events))
     for column in (0, 17, 40):
         expected = crossing_times(
-            math.atan((column - CAMERA.cx) / CAMERA.fx), rate, cutoff, contrast, duration
+            math.atan((column - CAMERA.cx) / CAMERA.fx), rate, cutoff, contrast, duration, buffer
         )
         found = events.t[(events.x == column) & (events.y == 24)]
         n = min(len(found), len(expected))
@@ -162,16 +179,110 @@ def test_filtered_ramp_agrees_with_a_solver_for_any_step(
         np.testing.assert_allclose(found[:n], expected[:n], rtol=0, atol=25.0)  # us
 
 
+@pytest.mark.parametrize(("light", "cutoff"), [(1.0, 0.0), (1.0, 60.0), (0.05, 2000.0)])
+def test_a_step_of_light_passes_two_stages(device: str, light: float, cutoff: float) -> None:
+    """The answer of two low-pass filters in a row to a step, in closed form; the first may be unlimited."""
+    buffer, contrast, last = 200.0, 0.05, 0.03
+    simulation = Simulation(
+        Scene(Switch((0.2, light))), CAMERA, WIDE, 0.2, motion=PrismMotion(0.0), device=device,
+        sensor=quiet_sensor(
+            cutoff_hz=cutoff, buffer_hz=buffer, contrast_on=contrast, contrast_off=contrast
+        ),
+    )  # fmt: skip
+    events, _ = events_of(simulation)
+    found = events.t[(events.x == 20) & (events.y == 30)].astype(np.float64)
+    total = abs(math.log((light + DARK) / (0.2 + DARK)))
+    rates = [2.0 * math.pi * buffer]
+    if cutoff:
+        rates.append(2.0 * math.pi * cutoff * (light + DARK) / (1.0 + DARK))
+    t_us = np.arange(0.0, 100_000.0)
+    weights = (
+        [1.0]
+        if not cutoff
+        else [rates[1] / (rates[1] - rates[0]), rates[0] / (rates[0] - rates[1])]
+    )
+    answer = total * (
+        1.0 - sum(w * np.exp(-r * t_us * 1e-6) for w, r in zip(weights, rates, strict=True))
+    )
+    levels = contrast * np.arange(1, int((total - last) / contrast) + 1)
+    expected = np.searchsorted(answer, levels)
+    assert len(levels) > 8
+    # Us, from the fourth crossing on, because the light of the rise of 100 us has another bandwidth
+    np.testing.assert_allclose(
+        found[3 : len(levels)] - found[3], expected[3:] - expected[3], rtol=0.005, atol=5.0
+    )
+
+
+def test_a_long_step_is_divided_for_the_second_stage(device: str) -> None:
+    """A jump of light, then a step of two time constants of a buffer: crossings along an exponential, no chord."""
+    buffer, jump = 300.0, 2.0
+    sensor = EventSensor(1, 1, 1, quiet_sensor(buffer_hz=buffer, contrast_on=0.1), device=device)
+    found = []
+    for t_us, level in ((0, 0.0), (2, jump), (1002, jump)):
+        events, _ = sensor.step(np.full((1, 1), level, np.float32), t_us)
+        found += events.t.numpy().tolist()
+    tau_us = 1e6 / (2.0 * math.pi * buffer)
+    reached = jump * (1.0 - math.exp(-1001.0 / tau_us))
+    levels = 0.1 * np.arange(1, int(reached / 0.1) + 1)
+    expected = 1.0 - tau_us * np.log(1.0 - levels / jump)
+    assert len(expected) > 15
+    np.testing.assert_allclose(found, expected, rtol=0, atol=6.0)  # us
+
+
+def test_both_stages_agree_with_the_second_simulator() -> None:
+    """The same scene's light at one pixel, through the second simulator's filters."""
+    rng = np.random.default_rng(4)
+    levels = np.cumsum(rng.normal(0.0, 0.15, (300, 4, 5)), axis=0) - 2.0
+    cutoff, buffer, step_us = 150.0, 400.0, 500
+    model = quiet_sensor(
+        cutoff_hz=cutoff, buffer_hz=buffer, contrast_on=0.1, contrast_off=0.1, refractory_us=0.0
+    )
+    sensor = EventSensor(1, 4, 5, model)
+    sums = np.zeros((4, 5))
+    first = levels[0].copy()
+    second = levels[0].copy()
+    sensor.step(levels[:1].astype(np.float32), 0)
+    for k in range(1, len(levels)):
+        events, _ = sensor.step(levels[k : k + 1].astype(np.float32), k * step_us)
+        sign = 2.0 * events.p.numpy().astype(float) - 1.0
+        np.add.at(sums, (events.y.numpy(), events.x.numpy()), 0.1 * sign)
+        # A hundred pieces, in each of which the bandwidth is constant
+        for j in range(100):
+            start = levels[k - 1] + (levels[k] - levels[k - 1]) * j / 100
+            end = levels[k - 1] + (levels[k] - levels[k - 1]) * (j + 1) / 100
+            light = np.exp(0.5 * (start + end)) / (1.0 + DARK)
+            new_first = second_simulator.low_pass(
+                first, start, end, step_us * 1e-8, 1.0 / (2.0 * np.pi * cutoff * light)
+            )
+            second = np.asarray(
+                second_simulator.low_pass(
+                    second, first, new_first, step_us * 1e-8, 1.0 / (2.0 * np.pi * buffer)
+                )
+            )
+            first = new_first
+        # The events so far say the level to less than a threshold
+        assert np.abs(sums - (second - levels[0])).max() < 0.1 + 0.004
+    assert np.abs(levels[-1] - second).max() > 0.05
+
+
 def test_wide_bandwidth_changes_nothing_and_narrow_bandwidth_loses_events(device: str) -> None:
     clear, _ = events_of(seen_through_prism(quiet_sensor(), device))
-    wide, _ = events_of(seen_through_prism(quiet_sensor(cutoff_hz=1e6), device))
+    wide, _ = events_of(seen_through_prism(quiet_sensor(cutoff_hz=1e6, buffer_hz=1e6), device))
+    second, _ = events_of(seen_through_prism(quiet_sensor(buffer_hz=30.0), device))
+    assert len(second) < 0.7 * len(clear)
     narrow, _ = events_of(seen_through_prism(quiet_sensor(cutoff_hz=30.0), device))
     assert len(wide) == pytest.approx(len(clear), rel=2e-3)
     assert len(narrow) < 0.5 * len(clear)
 
 
 def test_filter_computed_ahead_gives_the_same_events(monkeypatch: pytest.MonkeyPatch) -> None:
-    sensor = SensorModel(cutoff_hz=300.0, shot_noise_hz=30.0, leak_hz=5.0, leak_jitter_fraction=0.2)
+    sensor = SensorModel(
+        cutoff_hz=300.0,
+        buffer_hz=500.0,
+        shot_noise_hz=30.0,
+        leak_hz=5.0,
+        leak_jitter_fraction=0.2,
+    )
     simulation = seen_through_prism(sensor, motion=PrismMotion(-720.0, tilt=(0.02, 0.01)))
     ahead, _ = events_of(simulation)
     monkeypatch.setattr(
@@ -333,6 +444,7 @@ def test_a_busy_bus_keeps_rows_together(device: str) -> None:
     [
         ({"cutoff_hz": -1.0}, "cutoff_hz = -1"),
         ({"cutoff_hz": 1e-9}, "or 0 for none"),
+        ({"buffer_hz": 2e7}, "buffer_hz = 20000000.0"),
         ({"shot_noise_dark": 0.5}, "shot_noise_dark = 0.5"),
         ({"bus_rate_mev_s": 1e9}, "bus_rate_mev_s"),
         ({"bus_queue": math.nan}, "bus_queue = nan"),
@@ -352,13 +464,16 @@ def test_a_scan_that_takes_too_long_is_refused() -> None:
 # -- presets
 
 
-@pytest.mark.parametrize("name", ["dvxplorer", "davis346", "gen4"])
+CAMERAS = ("dvxplorer", "dvxplorer_mini", "davis240c", "davis346", "gen4", "evk4", "genx320")
+
+
+@pytest.mark.parametrize("name", CAMERAS)
 def test_presets_make_events(name: str) -> None:
     sensor = SensorModel.preset(name)
     events, _ = events_of(seen_through_prism(sensor))
     assert len(events) > 10_000
     assert sensor.cutoff_hz
-    assert sensor.bus_rate_mev_s
+    assert sensor.bus_rate_mev_s or name == "genx320"  # no figure is public
 
 
 def test_half_of_the_dvxplorer_s_pixels_respond_at_13_percent_and_nearly_all_at_27_5_percent() -> (
@@ -370,8 +485,32 @@ def test_half_of_the_dvxplorer_s_pixels_respond_at_13_percent_and_nearly_all_at_
     assert thresholds.cdf(math.log(1.275)) == pytest.approx(0.999, abs=2e-5)
 
 
+def test_the_background_of_a_davis240c_is_the_published_one() -> None:
+    """0.1 events of a pixel per second in bright light, without the hot pixels; shot noise of 5 in the dark."""
+    sensor = replace(SensorModel.preset("davis240c"), hot_fraction=0.0)
+    pixels_s = CAMERA.width * CAMERA.height * 10.0
+    bright = still(sensor, 10.0, "cpu", light=1.0)
+    assert len(bright) / pixels_s == pytest.approx(0.1, rel=0.1)
+    assert np.mean(bright.p == 1) > 0.9  # leaks
+    dark = still(sensor, 1.0, "cpu", light=0.0)
+    # Each random event sets the reference, which leaves no time for leaks
+    assert len(dark) / pixels_s * 10.0 == pytest.approx(5.0, rel=0.05)
+    assert np.mean(dark.p == 1) == pytest.approx(0.5, abs=0.02)
+
+
+def test_thresholds_of_bias_currents() -> None:
+    """Each factor of e of the currents moves a threshold by 1 / (0.7 * 20)."""
+    sensor = SensorModel.preset("davis346").with_davis_biases(2.0, 2.0 * math.e**3, 2.0 / math.e)
+    assert sensor.contrast_on == pytest.approx(3.0 / 14.0)
+    assert sensor.contrast_off == pytest.approx(1.0 / 14.0)
+    assert sensor.mismatch == SensorModel.preset("davis346").mismatch
+    for biases in ((1.0, 0.5, 0.1), (1.0, 2.0, 1.5), (1.0, 2.0, 0.0)):
+        with pytest.raises(AmiwarpError, match="bias current"):
+            SensorModel().with_davis_biases(*biases)
+
+
 def test_an_unknown_preset_names_the_known_ones() -> None:
-    with pytest.raises(AmiwarpError, match="dvxplorer, davis346, gen4"):
+    with pytest.raises(AmiwarpError, match=", ".join(CAMERAS)):
         SensorModel.preset("eye")
 
 

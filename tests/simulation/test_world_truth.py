@@ -415,7 +415,7 @@ def test_the_page_names_every_dataset(stored: Path) -> None:
         file["truth"].visititems(
             lambda name, found: named.append(name) if isinstance(found, h5py.Dataset) else None
         )
-    assert len(named) == 28
+    assert len(named) == 32
     assert [
         name
         for name in named
@@ -636,8 +636,47 @@ def test_flow_as_dsec_stores_it(recording: amiwarp.Recording, tmp_path: Path) ->
     assert set(np.unique(frames[1].occlusion)) == {0, 1}
     np.testing.assert_array_equal(stored[..., 2], known)
     np.testing.assert_allclose(moved[known], expected[known], rtol=0, atol=0.5 / 128 + 1e-6)
+    times = np.loadtxt(tmp_path / "flow" / "backward_timestamps.txt", delimiter=",", dtype=np.int64)
+    np.testing.assert_array_equal(times, np.column_stack([frames.t[1:], frames.t[:-1]]))
+    pictures = sorted((tmp_path / "flow" / "backward").iterdir())
+    assert [path.name for path in pictures] == [f"{k:06d}.png" for k in range(1, 5)]
+    moved = (png16(pictures[1])[..., :2].astype(np.float64) - 2**15) / 128.0
+    known = np.isfinite(frames[2].backward).all(axis=2)
+    np.testing.assert_allclose(
+        moved[known], frames[2].backward[known], rtol=0, atol=0.5 / 128 + 1e-6
+    )
+    assert np.abs(moved + frames[2].displacement)[known].max() < 0.2  # which moves on as before
+    assert np.abs(moved[known]).max() > 1.0
+    with Image.open(tmp_path / "flow" / "backward_occlusion" / "000002.png") as occluded:
+        np.testing.assert_array_equal(np.asarray(occluded), frames[2].backward_occlusion)
     with refused(ErrorCode.OUTPUT_EXISTS):
         amiwarp.save_flow_dsec(tmp_path / "flow", frames)
+
+
+def test_backward_flow_leads_to_the_instant_before(recording: amiwarp.Recording) -> None:
+    frames = frames_of(recording)
+    assert np.isnan(frames[0].backward).all()
+    assert (frames[0].backward_occlusion_with_prism == 2).all()
+    for k, frame in enumerate(frames[1:], 1):
+        moved, occlusion = simulation().displacement(
+            frame.t_us, frames[k - 1].t_us, with_prism=True
+        )
+        np.testing.assert_array_equal(frame.backward_with_prism, moved)
+        np.testing.assert_array_equal(frame.backward_occlusion_with_prism, occlusion)
+
+
+def test_files_without_backward_flow_are_read(stored: Path, tmp_path: Path) -> None:
+    path = tmp_path / "first.h5"
+    path.write_bytes(stored.read_bytes())
+    with h5py.File(path, "r+") as file:
+        for name in [name for name in file["truth/frames"] if name.startswith("backward")]:
+            del file[f"truth/frames/{name}"]
+    frame = frames_of(amiwarp.open_recording(path))[1]
+    assert np.isnan(frame.backward).all()
+    assert (frame.backward_occlusion == 2).all()
+    np.testing.assert_array_equal(
+        frame.displacement, frames_of(amiwarp.open_recording(stored))[1].displacement
+    )
 
 
 def test_unknown_and_large_flow_is_marked() -> None:
@@ -728,6 +767,19 @@ def test_simulate_a_named_world(named: Path) -> None:
     picture = np.asarray(Image.open("seen.png").convert("RGB"))
     assert picture.shape[1] > 1000
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 1000
+
+
+def test_simulate_chosen_instants(named: Path) -> None:
+    ok("simulate", "t.h5", "--world", "room", "--truth-us", "0,12000,35000", *SHORT)
+    np.testing.assert_array_equal(frames_of(amiwarp.open_recording("t.h5")).t, [0, 12_000, 35_000])
+    for options, words in (
+        (("--truth-us", "0,x"), "'0,x' is not 2 numbers separated by commas"),
+        (("--truth-us", "5,1"), "must increase and lie within 0 .. 40000 us"),
+        (("--truth-us", "5", "--truth-hz", "10"), "give one of them"),
+    ):
+        result = run("simulate", "u.h5", "--world", "room", *options, *SHORT)
+        assert (result.exit_code, words in result.stderr) == (1, True), result.stderr
+        assert not Path("u.h5").exists()
 
 
 def test_simulate_an_imu(named: Path) -> None:
@@ -845,9 +897,11 @@ def test_the_truth_command_exports(named: Path, stored: Path) -> None:
     names = sorted(
         path.relative_to("out").as_posix() for path in Path("out").rglob("*") if path.is_file()
     )
-    assert names == [*(f"flow/forward/{k:06d}.png" for k in range(4)), "flow/forward_timestamps.txt",
-                     *(f"flow/occlusion/{k:06d}.png" for k in range(4)), "poses/body___square.txt",
-                     "poses/camera.txt"]  # fmt: skip
+    folders = {"forward": 0, "occlusion": 0, "backward": 1, "backward_occlusion": 1}
+    expected = ["flow/forward_timestamps.txt", "flow/backward_timestamps.txt"]
+    for folder, first in folders.items():
+        expected += [f"flow/{folder}/{k:06d}.png" for k in range(first, first + 4)]
+    assert names == sorted([*expected, "poses/body___square.txt", "poses/camera.txt"])
     assert ok("truth", stored, "out", "--flow", "mvsec", "--with-prism")["flow_maps"] == 5
     assert Path("out/world_gt_flow_dist.npz").exists()
     assert "exists" in run("truth", stored, "out", "--poses", "tum").stderr

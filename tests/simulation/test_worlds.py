@@ -275,12 +275,14 @@ def test_flow_through_the_prism_is_what_finite_differences_say(
 
 
 @pytest.mark.parametrize("prism", [False, True])
-def test_displacements_and_occlusion_until_the_next_instant(prism: bool, device: str) -> None:
-    world, path, t, later = random_world(3), moving_camera(), 0.4, 0.55
+@pytest.mark.parametrize(("t", "other"), [(0.4, 0.55), (0.55, 0.4)], ids=["forward", "backward"])
+def test_displacements_and_occlusion_between_two_times(
+    t: float, other: float, prism: bool, device: str
+) -> None:
+    world, path = random_world(3), moving_camera()
     simulation = Simulation(
         WorldScene(world, path), CAMERA, Prism(math.radians(1.0)), 1.0, device=device
     )
-    truth = TruthRenderer(simulation).at(round(t * 1e6), round(later * 1e6))
     pixels = (
         np.stack(np.meshgrid(np.arange(64), np.arange(48)), axis=-1)
         .reshape(-1, 2)
@@ -291,36 +293,76 @@ def test_displacements_and_occlusion_until_the_next_instant(prism: bool, device:
         theta = np.full(len(xy), float(simulation.motion.angle([1e6 * at])[0]))
         return oracle.move(CAMERA, simulation.prism, xy, theta, to_scene=to_scene) if prism else xy
 
-    (turn, end_turn), (place, end_place) = path.poses([t, later])
+    (turn, end_turn), (place, end_place) = path.poses([t, other])
     rays = CAMERA.pixels_to_rays(moved(pixels, t, to_scene=True))
     distance, instance, _ = cast(world, t, place, rays @ turn.T)
     seen = place + np.where(instance > 0, distance, 1.0)[:, None] * (rays @ turn.T)
-    away = carried(world, seen, instance, t, later) - end_place
+    away = carried(world, seen, instance, t, other) - end_place
     away[instance == 0] = (rays @ turn.T)[instance == 0]  # the sky is at infinity
     ahead = away @ end_turn
     ends = np.array([CAMERA.fx, CAMERA.fy]) * ahead[:, :2] / ahead[:, 2:] + np.array(
         [CAMERA.cx, CAMERA.cy]
     )
-    ends = moved(ends, later, to_scene=False)
+    ends = moved(ends, other, to_scene=False)
     far = np.where(instance > 0, np.linalg.norm(away, axis=1), np.inf)
     nearest, _, _ = cast(
-        world, later, end_place, away / np.linalg.norm(away, axis=1, keepdims=True)
+        world, other, end_place, away / np.linalg.norm(away, axis=1, keepdims=True)
     )
     inside = ((ends > -0.5) & (ends < [63.5, 47.5])).all(axis=1)
     becomes = np.where(inside, nearest < far * (1.0 - 1e-3), 2)
+    t_us, other_us = round(t * 1e6), round(other * 1e6)
+    found, occlusion = simulation.displacement(t_us, other_us, with_prism=prism)
+    error = np.abs(found.reshape(-1, 2) - (ends - pixels))
+    assert np.median(error) < 1e-4  # px
+    assert np.quantile(error, 0.99) < 2e-3  # a ray along an edge may go either way
+    assert (occlusion.ravel() == becomes).mean() > 0.995
+    assert np.bincount(becomes)[1] > 20
+
+    # The truth of an instant has the same to the next instant, and to the instant before.
     suffix = "_with_prism" if prism else ""
-    found = getattr(truth, f"displacement{suffix}").reshape(-1, 2) - (ends - pixels)
-    assert np.quantile(np.abs(found), 0.99) < 2e-3  # a ray along an edge may go either way
-    # Which is not the displacement divided by the interval
+    renderer = TruthRenderer(simulation)
+    if other > t:
+        truth = renderer.at(t_us, next_us=other_us)
+        names = (f"displacement{suffix}", f"occlusion{suffix}")
+        unknown = (f"backward{suffix}", f"backward_occlusion{suffix}")
+    else:
+        truth = renderer.at(t_us, before_us=other_us)
+        names = (f"backward{suffix}", f"backward_occlusion{suffix}")
+        unknown = (f"displacement{suffix}", f"occlusion{suffix}")
+    np.testing.assert_array_equal(getattr(truth, names[0]), found)
+    np.testing.assert_array_equal(getattr(truth, names[1]), occlusion)
+    assert np.isnan(getattr(truth, unknown[0])).all()
+    assert (getattr(truth, unknown[1]) == 2).all()
+    # Which is not the flow times the interval
     speed = truth.flow_with_prism if prism else truth.flow
-    assert np.quantile(np.abs(speed.reshape(-1, 2) * (later - t) - (ends - pixels)), 0.9) > 0.05
-    occlusion = getattr(truth, f"occlusion{suffix}").ravel()
-    assert (occlusion == becomes).mean() > 0.995
-    assert min(np.bincount(becomes)) > 20
-    assert becomes.max() == (2 if prism else 1)
-    alone = TruthRenderer(simulation).at(round(t * 1e6))
-    assert np.isnan(getattr(alone, f"displacement{suffix}")).all()
-    assert (getattr(alone, f"occlusion{suffix}") == 2).all()
+    straight = speed.reshape(-1, 2) * (other - t)
+    assert np.quantile(np.abs(straight - (ends - pixels)), 0.9) > 0.05
+
+
+def test_what_is_seen_both_ways_returns_to_its_pixel() -> None:
+    """Displacements there and back, at the same point of a body, add up to nothing, through the prism too."""
+    world, path = random_world(3), moving_camera()
+    simulation = Simulation(WorldScene(world, path), CAMERA, Prism(math.radians(1.0)), 1.0)
+    there, occlusion = simulation.displacement(100_000, 130_000, with_prism=True)
+    back, _ = simulation.displacement(130_000, 100_000, with_prism=True)
+    rows, columns = np.nonzero(occlusion == 0)
+    ends = np.stack([columns, rows], axis=1) + there[rows, columns]
+    (x, y) = np.rint(ends).astype(int).T
+    near = np.hypot(*(back[y, x] + there[rows, columns]).T)
+    assert np.abs(there).max() > 1.0
+    assert np.median(near) < 0.01  # px, between neighbouring pixels of a surface
+    still, seen = simulation.displacement(500_000, 500_000)
+    assert np.abs(still).max() < 1e-4
+    assert (seen == 0).all()
+
+
+@pytest.mark.parametrize(("t0", "t1"), [(-1, 5), (0, 1_000_001)])
+def test_displacements_outside_the_recording_are_refused(t0: int, t1: int) -> None:
+    simulation = Simulation(WorldScene(random_world(3), moving_camera()), CAMERA, Prism(0.02), 1.0)
+    with pytest.raises(
+        AmiwarpError, match=r"t[01]_us = .* is not a whole number in 0 .. 1000000 us"
+    ):
+        simulation.displacement(t0, t1)
 
 
 def counts(

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.poses import Poses, rotation_of
-from amiwarp.events.truth import EVENT_COLUMNS, MAPS, FrameTruth, Truth, WorldLabels, check_truth
+from amiwarp.events.truth import (
+    EVENT_COLUMNS,
+    MAPS,
+    UNKNOWN_MAPS,
+    FrameTruth,
+    Truth,
+    WorldLabels,
+    check_truth,
+)
 from amiwarp.io.hdf5.file import Column, Hdf5File
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.native.attributes import attribute
@@ -133,6 +141,8 @@ def _frames(path: Path, file: Hdf5File, size: tuple[int, int]) -> StoredImages |
     maps = {}
     for name, (_, tail) in MAPS.items():
         row = (height, width, *tail)
+        if name in UNKNOWN_MAPS and f"truth/frames/{name}" not in file.columns:
+            continue
         maps[name] = dataset_of(file, f"truth/frames/{name}", count, row)
     poses = dataset_of(file, "truth/frames/pose", count, (7,))
     names = _names(file, "truth/joints/names")
@@ -142,8 +152,11 @@ def _frames(path: Path, file: Hdf5File, size: tuple[int, int]) -> StoredImages |
 
     def read(index: int) -> FrameTruth:
         values = {}
-        for name, (dtype, _) in MAPS.items():
-            values[name] = _read_as(maps[name], dtype, index, index + 1)[0]
+        for name, (dtype, tail) in MAPS.items():
+            if name in maps:
+                values[name] = _read_as(maps[name], dtype, index, index + 1)[0]
+            else:
+                values[name] = np.full((height, width, *tail), UNKNOWN_MAPS[name], dtype)
         pose = _read_as(poses, np.float64, index, index + 1)[0]
         joint_places = {}
         if joints is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 import json
@@ -14,9 +15,10 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.inputs import errors_name
 from amiwarp.learning.dataset import specification as spec
+from amiwarp.learning.dataset.randomise import draw
 from amiwarp.learning.dataset.sources import Source, content_digest, find_sources
 from amiwarp.simulation.worlds.world_choice import POSE_FILES
 from amiwarp.validation import shown
@@ -36,6 +38,8 @@ class Item:
     """Labels by name."""
     licence: str
     """Licence of the source."""
+    stratum: str = ""
+    """Sources among which the splits were divided by their shares, such as ``class = 'disc'``; empty for a draw."""
 
     @cached_property
     def key(self) -> str:
@@ -53,6 +57,11 @@ class Item:
         return str(self.recipe["source"]["name"])
 
     @property
+    def same(self) -> str:
+        """What identifies the source for its split. Equal files, and the worlds of one seed, are the same source."""
+        return _identity(self.source, self.recipe["source"]["sha256"], self.recipe.get("seed"))
+
+    @property
     def seed(self) -> int:
         """Seed of all random numbers except a named world's. It depends on the recipe alone.
 
@@ -66,6 +75,12 @@ class Item:
         """Path of the recording, relative to the folder of the data set."""
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", Path(self.source).stem)[:60]
         return f"{self.split}/{stem}-{self.key}{'.npz' if 'output' in self.recipe else '.h5'}"
+
+    @property
+    def drawn(self) -> Mapping[str, float]:
+        """Values that the recording drew from the ranges of the specification, by name."""
+        values: Mapping[str, float] = self.recipe.get("drawn", {})
+        return values
 
     @property
     def output(self) -> spec.OutputEntry | None:
@@ -93,27 +108,59 @@ def list_items(specification: spec.Specification) -> list[Item]:
             f"{spec.MOST_RECORDINGS:,} recordings each"
         )
     sources = [source for source, _ in axes_of_sources]
-    divide = _drawn if specification.stratify is None else _stratified
-    splits = divide(specification, sources)
+    divided = _divided(specification, sources)
     items = []
     for source, axes in axes_of_sources:
         for recipe in _recipes(specification, source, axes):
-            split = splits[_identity(source, recipe.get("seed"))]
+            same = _identity(source.name, source.digest, recipe.get("seed"))
+            split, stratum = divided[same]
+            labels = _with_drawn(specification, source, recipe)
             licence = source.entry.licence
-            items.append(Item(recipe, specification.folder, split, source.labels, licence))
+            items.append(Item(recipe, specification.folder, split, labels, licence, stratum))
     return items
 
 
-def _identity(source: Source, seed: int | None) -> str:
-    """Return what identifies a source for its split. Equal files, and the worlds of one seed, are the same source."""
-    return source.digest or f"{source.name} {seed}"
+def _with_drawn(
+    specification: spec.Specification, source: Source, recipe: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the labels of a recording: its source's labels, and the values that it drew.
+
+    Raises :class:`AmiwarpError` for a label with the name of a drawn value.
+    """
+    drawn = recipe.get("drawn", {})
+    both = sorted(source.labels.keys() & drawn.keys())
+    if both:
+        raise AmiwarpError(
+            f"{specification.path}: {source.name} has the label {shown(both[0])}, which randomise draws; rename the "
+            "label",
+            ErrorCode.FIELD,
+        )
+    return {**source.labels, **drawn}
+
+
+def sources_of_splits(
+    specification: spec.Specification, items: Sequence[Item]
+) -> dict[str, dict[str, int]]:
+    """Return the number of different sources of each split, by the stratum of the sources."""
+    found: dict[str, dict[str, set[str]]] = {}
+    for item in items:
+        found.setdefault(item.stratum, {}).setdefault(item.split, set()).add(item.same)
+    counts = {}
+    for stratum, splits in found.items():
+        names = [name for name in specification.splits if name in splits]
+        counts[stratum] = {name: len(splits[name]) for name in names}
+    return counts
+
+
+def _identity(name: str, digest: str, seed: int | None) -> str:
+    """Return what identifies a source for its split: its content, or the name and seed of a named world."""
+    return digest or f"{name} {seed}"
 
 
 def _identities(specification: spec.Specification, source: Source) -> list[str]:
     """Return all identities of a source: one, or one for each seed of a named world."""
-    if source.path is not None:
-        return [_identity(source, None)]
-    return [_identity(source, seed) for seed in specification.seeds]
+    seeds = specification.seeds if source.path is None else (None,)
+    return [_identity(source.name, source.digest, seed) for seed in seeds]
 
 
 def _axes(specification: spec.Specification, source: Source) -> tuple[Sequence[Any], ...]:
@@ -154,7 +201,10 @@ def _recipes(
     if entry.rotate_deg_s is not None:
         base |= {"rotate_deg_s": entry.rotate_deg_s}
     for trajectory, optic, sensor, seed in itertools.product(*axes):
-        yield base | trajectory | optic | {"sensor": sensor, "seed": seed}
+        recipe = base | trajectory | optic | {"sensor": sensor, "seed": seed}
+        if specification.randomise:
+            recipe["drawn"] = draw(specification.randomise, recipe)
+        yield recipe
 
 
 def _trajectories(specification: spec.Specification, source: Source) -> list[dict[str, Any]]:
@@ -172,10 +222,38 @@ def _trajectories(specification: spec.Specification, source: Source) -> list[dic
     return motions
 
 
-def _drawn(specification: spec.Specification, sources: Sequence[Source]) -> dict[str, str]:
-    """Return the split of each source by its identity, drawn by a hash of it and of the split seed."""
-    names = dict.fromkeys(same for source in sources for same in _identities(specification, source))
-    return {same: _split(specification, same) for same in names}
+def _divided(
+    specification: spec.Specification, sources: Sequence[Source]
+) -> dict[str, tuple[str, str]]:
+    """Return the split and the stratum of each source by its identity."""
+    if specification.stratify is False:
+        names = dict.fromkeys(
+            same for source in sources for same in _identities(specification, source)
+        )
+        return {same: (_split(specification, same), "") for same in names}
+    if specification.stratify is not None:
+        label = specification.stratify
+        with errors_name(specification.path, lambda: f"field stratify is {shown(label)}"):
+            strata = _strata(specification, sources, label)
+            _check_sizes(specification, strata)
+        return _stratified(specification, strata)
+    for label in _common_labels(sources):
+        with contextlib.suppress(AmiwarpError):
+            strata = _strata(specification, sources, label)
+            _check_sizes(specification, strata)
+            return _stratified(specification, strata)
+    together = [same for source in sources for same in _identities(specification, source)]
+    return _stratified(specification, {"all sources": list(dict.fromkeys(together))})
+
+
+def _common_labels(sources: Sequence[Source]) -> list[str]:
+    """Return the labels that all sources have, with more than one value, in the order of the first source."""
+    labels = []
+    for label in sources[0].labels:
+        values = {source.labels.get(label) for source in sources}
+        if len(values) > 1 and all(label in source.labels for source in sources):
+            labels.append(label)
+    return labels
 
 
 def _split(specification: spec.Specification, same: str) -> str:
@@ -194,51 +272,74 @@ def _draw(specification: spec.Specification, same: str) -> str:
     return _digest([specification.split_seed, same])
 
 
-def _stratified(specification: spec.Specification, sources: Sequence[Source]) -> dict[str, str]:
-    """Return the split of each source by its identity, so that the splits share the sources of every class.
+def _strata(
+    specification: spec.Specification, sources: Sequence[Source], label: str
+) -> dict[str, list[str]]:
+    """Return the identities of the sources of each class, which is a value of a label.
 
-    The sources of a class are ordered by their hash, and this order is cut at the shares. Raises
-    :class:`AmiwarpError` for a source without class or with two of them, and for a class with fewer sources than
-    splits.
+    Raises :class:`AmiwarpError` for a source without class or with two of them.
     """
-    label = str(specification.stratify)
     first: dict[str, Source] = {}
-    classes: defaultdict[Any, list[str]] = defaultdict(list)
-    with errors_name(specification.path, lambda: f"field stratify is {shown(label)}"):
-        for source in sources:
-            if label not in source.labels:
-                raise AmiwarpError(f"{source.name} has no such label; add it, or remove stratify")
-            for same in _identities(specification, source):
-                known = first.setdefault(same, source)
-                if known is source:
-                    classes[source.labels[label]].append(same)
-                elif known.labels[label] != source.labels[label]:
-                    raise AmiwarpError(
-                        f"{known.name} and {source.name} have the same content but the labels "
-                        f"{shown(known.labels[label])} and {shown(source.labels[label])}; remove one of them"
-                    )
-        shares = {name: share for name, share in specification.splits.items() if share > 0.0}
-        splits: dict[str, str] = {}
-        for value, members in classes.items():
-            if len(members) < len(shares):
+    strata: defaultdict[str, list[str]] = defaultdict(list)
+    for source in sources:
+        if label not in source.labels:
+            raise AmiwarpError(f"{source.name} has no such label; add it, or remove stratify")
+        for same in _identities(specification, source):
+            known = first.setdefault(same, source)
+            if known is source:
+                strata[f"{label} = {source.labels[label]!r}"].append(same)
+            elif known.labels[label] != source.labels[label]:
                 raise AmiwarpError(
-                    f"class {shown(value)} has {len(members)} different sources for the {len(shares)} splits "
-                    f"{', '.join(shares)}; add sources of it, or give fewer splits"
+                    f"{known.name} and {source.name} have the same content but the labels "
+                    f"{shown(known.labels[label])} and {shown(source.labels[label])}; remove one of them"
                 )
-            members.sort(key=partial(_draw, specification))
-            names = []
-            for name, count in _counts(shares, len(members)).items():
-                names += [name] * count
-            splits.update(zip(members, names, strict=True))
-    return splits
+    return strata
+
+
+def _check_sizes(specification: spec.Specification, strata: Mapping[str, Sequence[str]]) -> None:
+    """Raise :class:`AmiwarpError` for a class with fewer sources than splits."""
+    names = _shares(specification)
+    for stratum, members in strata.items():
+        if len(members) < len(names):
+            raise AmiwarpError(
+                f"{stratum} has {len(members)} different sources for the {len(names)} splits "
+                f"{', '.join(names)}; add sources of it, or give fewer splits"
+            )
+
+
+def _shares(specification: spec.Specification) -> dict[str, float]:
+    """Return the shares of the splits that get sources."""
+    return {name: share for name, share in specification.splits.items() if share > 0.0}
+
+
+def _stratified(
+    specification: spec.Specification, strata: Mapping[str, list[str]]
+) -> dict[str, tuple[str, str]]:
+    """Return the split and the stratum of each source by its identity, so that the splits share each stratum.
+
+    The sources of a stratum are ordered by their hash, and this order is cut at the shares.
+    """
+    divided = {}
+    for stratum, members in strata.items():
+        ordered = sorted(members, key=partial(_draw, specification))
+        names = []
+        for name, count in _counts(_shares(specification), len(members)).items():
+            names += [name] * count
+        for same, name in zip(ordered, names, strict=True):
+            divided[same] = (name, stratum)
+    return divided
 
 
 def _counts(shares: Mapping[str, float], total: int) -> dict[str, int]:
-    """Return how many of ``total`` sources each split gets: its share, rounded, but at least one."""
+    """Return how many of ``total`` sources each split gets: its share, rounded.
+
+    It is at least one, if there are as many sources as splits.
+    """
+    least = 1 if total >= len(shares) else 0
     exact = {name: share * total for name, share in shares.items()}
-    counts = {name: max(1, math.floor(value)) for name, value in exact.items()}
+    counts = {name: max(least, math.floor(value)) for name, value in exact.items()}
     while (spare := total - sum(counts.values())) != 0:
-        able = [name for name in counts if spare > 0 or counts[name] > 1]
+        able = [name for name in counts if spare > 0 or counts[name] > least]
         name = max(able, key=lambda name: math.copysign(1.0, spare) * (exact[name] - counts[name]))
         counts[name] += 1 if spare > 0 else -1
     return counts

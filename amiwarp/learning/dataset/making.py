@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from amiwarp.errors import AmiwarpError, ErrorCode
@@ -17,7 +17,8 @@ from amiwarp.io.unfinished import scratch_folder
 from amiwarp.kernels import quiet_start
 from amiwarp.learning.dataset import specification as spec
 from amiwarp.learning.dataset.files import Journal, check_folder, require_pyarrow, write_manifest
-from amiwarp.learning.dataset.items import Item, list_items
+from amiwarp.learning.dataset.items import Item, list_items, sources_of_splits
+from amiwarp.learning.dataset.randomise import drawn_ranges
 from amiwarp.learning.dataset.worker import Failed, Job, Made, make
 from amiwarp.schema.calls import guarded
 from amiwarp.studies import cluster
@@ -39,7 +40,7 @@ class DatasetSummary:
     >>> summary = amiwarp.DatasetSummary(
     ...     recordings=12, made=11, kept=0, failed={"train/a-1.h5": "no such file"}, not_in_specification=(),
     ...     splits={"train": 11}, events=10, size_bytes=100, seconds=2.0, worker_seconds=3.0,
-    ...     processor_seconds=2.5, workers=2)
+    ...     processor_seconds=2.5, workers=2, sources_of_splits={"all sources": {"train": 2}})
     >>> summary.made + summary.kept + len(summary.failed) == summary.recordings
     True
     """
@@ -68,6 +69,10 @@ class DatasetSummary:
     """Processor time that they spent, added up [s]."""
     workers: int
     """Largest number of workers; 0 if there was nothing to make."""
+    sources_of_splits: Mapping[str, Mapping[str, int]]
+    """Number of different sources of each split, as in :attr:`DatasetPlan.sources_of_splits`."""
+    drawn: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Least, median and largest value of each randomised setting, as in :attr:`DatasetPlan.drawn`."""
     damaged: tuple[str, ...] = ()
     """What was wrong with the journal, and with each damaged recording. These recordings were made again."""
 
@@ -199,6 +204,8 @@ def _make_missing(
         worker_seconds=sum(made.seconds for made in run.made),
         processor_seconds=sum(made.processor_s for made in run.made),
         workers=run.most_workers,
+        sources_of_splits=sources_of_splits(loaded, items),
+        drawn=drawn_ranges([item.drawn for item in items]),
         damaged=tuple(journal.damaged),
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections import Counter, defaultdict
@@ -14,7 +15,8 @@ from amiwarp.io.unfinished import scratch_folder
 from amiwarp.learning.dataset import specification as spec
 from amiwarp.learning.dataset import worker
 from amiwarp.learning.dataset.files import Journal, check_folder
-from amiwarp.learning.dataset.items import Item, list_items
+from amiwarp.learning.dataset.items import Item, list_items, sources_of_splits
+from amiwarp.learning.dataset.randomise import drawn_ranges
 from amiwarp.learning.dataset.sources import content_digest
 from amiwarp.learning.dataset.worker import simulation_of
 from amiwarp.schema.calls import guarded
@@ -39,7 +41,8 @@ class DatasetPlan:
     --------
     >>> plan = amiwarp.DatasetPlan(
     ...     recordings=12, missing=10, splits={"train": 12}, sources={"pictures": 12}, samples=6, uncertainty=0.1,
-    ...     events=1e6, size_bytes=1e7, worker_seconds=30.0, workers=2, device="cpu")
+    ...     events=1e6, size_bytes=1e7, worker_seconds=30.0, workers=2, device="cpu",
+    ...     sources_of_splits={"all sources": {"train": 2}})
     >>> plan.seconds
     15.0
     """
@@ -54,8 +57,11 @@ class DatasetPlan:
     """Number of recordings of each kind of source."""
     samples: int
     """Number of missing recordings that were sampled."""
-    uncertainty: float
-    """Standard error of the expected time, relative to it, from the spread of the samples."""
+    uncertainty: float | None
+    """Standard error of the expected time, relative to it, from the spread of the samples.
+
+    None if a kind of source has only one sample, so that its spread is unknown.
+    """
     events: float
     """Expected number of events of the missing recordings."""
     size_bytes: float
@@ -66,6 +72,11 @@ class DatasetPlan:
     """Number of workers."""
     device: str
     """Device of the samples."""
+    sources_of_splits: Mapping[str, Mapping[str, int]]
+    """Number of different sources of each split, by the class whose sources the splits share, such as
+    ``class = 'disc'``; an empty text for sources whose splits are drawn."""
+    drawn: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Least, median and largest value of each randomised setting in the recordings, by its name."""
     failed: Mapping[str, str] = field(default_factory=dict)
     """Error message of each sample that could not be made, by its file. The estimate leaves these samples out."""
 
@@ -148,7 +159,8 @@ def plan_dataset(
     10
     """
     out = Path(out)
-    items = list_items(spec.load_specification(specification))
+    loaded = spec.load_specification(specification)
+    items = list_items(loaded)
     check_folder(out)
     journal = Journal(out)
     todo = sorted((item for item in items if not journal.is_there(item)), key=lambda item: item.key)
@@ -166,12 +178,14 @@ def plan_dataset(
         splits=dict(Counter(item.split for item in items)),
         sources=dict(Counter(item.kind for item in items)),
         samples=samples,
-        uncertainty=variance**0.5 / total.seconds if total.seconds else 0.0,
+        uncertainty=_relative_error(variance, total.seconds),
         events=total.events,
         size_bytes=total.bytes,
         worker_seconds=total.seconds,
         workers=count,
         device=device,
+        sources_of_splits=sources_of_splits(loaded, items),
+        drawn=drawn_ranges([item.drawn for item in items]),
         failed=failed,
     )
 
@@ -185,6 +199,8 @@ def _sample_all(
     failed: dict[str, str],
 ) -> tuple[_Cost, int, float]:
     """Return the expected cost of all recordings, the number of samples, and the variance of the expected time [s²].
+
+    The variance is infinite if a group has only one sample.
 
     Each group holds the recordings of one kind of source. Samples that cannot be made are noted in ``failed``.
     """
@@ -200,9 +216,7 @@ def _sample_all(
             for cost in sample:
                 total = total.plus(cost, len(group) / len(sample))
             samples += len(sample)
-            variance += len(group) ** 2 * _variance_of_mean(
-                [cost.seconds for cost in sample], len(group)
-            )
+            variance += len(group) ** 2 * _variance_of_mean([cost.seconds for cost in sample])
     return total, samples, variance
 
 
@@ -237,11 +251,21 @@ def _sample(
     return costs
 
 
-def _variance_of_mean(values: Sequence[float], of: int) -> float:
-    """Return the variance of the mean of values that were drawn from ``of`` without replacement."""
+def _variance_of_mean(values: Sequence[float]) -> float:
+    """Return the variance of the mean of measured values; infinite for one value, whose spread is unknown.
+
+    There is no correction for recordings that are all sampled: making one again takes another time.
+    """
     if len(values) < 2:
-        return 0.0
-    return statistics.variance(values) / len(values) * (1.0 - len(values) / of)
+        return math.inf
+    return statistics.variance(values) / len(values)
+
+
+def _relative_error(variance: float, seconds: float) -> float | None:
+    """Return the standard error relative to the expected time; None if the variance is unknown."""
+    if math.isinf(variance):
+        return None
+    return math.sqrt(variance) / seconds if seconds else 0.0
 
 
 def _whole_cost(item: Item, scratch: Path, device: str) -> _Cost:

@@ -14,6 +14,7 @@ from amiwarp.imaging import tensors
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.json_files import read_toml
 from amiwarp.io.recorded_dataset import SPLIT_NAME
+from amiwarp.learning.dataset.randomise import DrawEntry, check_randomise
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.schema.records import (
@@ -71,6 +72,16 @@ def _seeds(value: Any, name: str) -> tuple[int, ...]:
         return seeds
     hint = "; give their number, or a list of them"
     return tuple(range(whole(value, name, 1, MOST_RECORDINGS, hint)))
+
+
+def _stratify(value: Any, name: str) -> str | Literal[False]:
+    """Return the label whose values are divided among the splits, or False."""
+    if value is False or (isinstance(value, str) and value):
+        return value
+    raise AmiwarpError(
+        f"{name} is {shown(value)}; expected the name of a label, or false to draw the split of each source",
+        ErrorCode.FIELD,
+    )
 
 
 _MAKERS: dict[str, Callable[[], SensorModel]] = {"default": SensorModel, "ideal": SensorModel.ideal}
@@ -265,13 +276,18 @@ class _File:
     camera: CameraEntry = field(default_factory=CameraEntry)
     splits: Mapping[str, float] = field(default_factory=lambda: dict(SPLITS))
     split_seed: int = 0
-    stratify: str | None = None
-    """Label whose values, the classes, are each divided among the splits by their shares; None: a draw per source."""
+    stratify: Annotated[Any, _stratify] = None
+    """Label whose values, the classes, are each divided among the splits by their shares; False: a draw per source.
+
+    None: the first label that all sources have and whose classes have at least as many sources as there are splits;
+    without such a label, all sources are one class."""
     truth_hz: Annotated[float, partial(real, low=1e-3, high=1e6, hint=" Hz")] | None = None
     output: OutputEntry | None = None
     """Tensors to write instead of recordings; None: recordings."""
     sensors: Annotated[Any, _sensors] = field(default_factory=lambda: {"default": SensorModel()})
     """Sensors by name."""
+    randomise: Mapping[str, DrawEntry] = field(default_factory=dict)
+    """Ranges from which each recording draws values, by their names."""
     seeds: Annotated[Any, _seeds] = (0,)
     """Seed of each recording of the same source, optic and sensor."""
 
@@ -345,8 +361,10 @@ def _check(values: _File) -> None:
         )
     for k, entry in enumerate(values.sources):
         _check_source(entry, f"sources[{k}]")
+    kinds = [entry.kind for entry in values.sources]
+    check_randomise(values.randomise, kinds, len(values.prisms), len(values.speeds_rpm))
     if values.no_prism:
-        _check_motion(values.sources)
+        _check_motion(values.sources, shakes="shake_deg" in values.randomise)
 
 
 def _check_output(output: OutputEntry) -> None:
@@ -382,7 +400,7 @@ def _check_output(output: OutputEntry) -> None:
         )
 
 
-def _check_motion(sources: tuple[SourceEntry, ...]) -> None:
+def _check_motion(sources: tuple[SourceEntry, ...], *, shakes: bool) -> None:
     """Raise :class:`AmiwarpError` for a source that a camera without a prism cannot see, or that needs a prism."""
     for k, entry in enumerate(sources):
         if entry.kind == "translated":
@@ -391,7 +409,7 @@ def _check_motion(sources: tuple[SourceEntry, ...]) -> None:
                 "recordings in a specification without prisms, or remove no_prism",
                 ErrorCode.FIELD,
             )
-        if entry.kind == "pictures" and not any(entry.rotate_deg_s or ()):
+        if entry.kind == "pictures" and not any(entry.rotate_deg_s or ()) and not shakes:
             raise AmiwarpError(
                 f"field sources[{k}].pictures stand still, so a camera without a prism (no_prism) sees only noise; "
                 "let the camera turn with rotate_deg_s = [x, y, z], or remove no_prism",

@@ -7,7 +7,7 @@ import os
 import re
 import socket
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,20 +26,21 @@ from amiwarp.io.output_formats import make_folder
 from amiwarp.io.outputs import put_in_place
 from amiwarp.io.tensor_files import save_tensors
 from amiwarp.learning.dataset import specification as spec
+from amiwarp.learning.dataset.drawn_scene import lit, picture_scene, shaken, shaken_motion
 from amiwarp.learning.dataset.items import Item
+from amiwarp.learning.dataset.randomise import SENSOR
 from amiwarp.learning.dataset.sources import content_digest
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.schema.records import LARGEST_INTEGER
-from amiwarp.simulation.description import Scene
 from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.motion import CameraMotion, PrismMotion
+from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.recorded_truth import RecordedTruth, chosen_instants
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.translation.translator import translation
 from amiwarp.simulation.worlds.world_choice import POSE_FILES, open_world
-from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.simulation.worlds.world_scene import BLUR_PX, WorldScene
 from amiwarp.studies import cluster
 from amiwarp.studies.failures import failure_text
 from amiwarp.tasks import limited_cpu_threads
@@ -230,12 +231,19 @@ def _tensors(
 
 
 def simulation_of(item: Item, device: str, duration_s: float | None = None) -> Simulation:
-    """Return the simulation of a recording. ``duration_s`` shortens it."""
+    """Return the simulation of a recording, which stores the values that it drew. ``duration_s`` shortens it."""
+    drawn = item.drawn
     if item.recipe["prism"] is None:
-        return _seen_through(item, Prism(0.0), PrismMotion(), device, duration_s).without_prism()
-    prism = spec.PrismEntry(**item.recipe["prism"]).build()
-    motion = PrismMotion(item.recipe["rpm"])
-    return _seen_through(item, prism, motion, device, duration_s)
+        simulation = _seen_through(item, Prism(0.0), PrismMotion(), device, duration_s)
+        simulation = simulation.without_prism()
+    else:
+        entry = spec.PrismEntry(**item.recipe["prism"])
+        prism = replace(entry, apex_deg=drawn.get("apex_deg", entry.apex_deg)).build()
+        start = math.radians(drawn.get("start_deg", 0.0))
+        motion = PrismMotion(drawn.get("rpm", item.recipe["rpm"]), start)
+        simulation = _seen_through(item, prism, motion, device, duration_s)
+    stored = {f"drawn_{name}": value for name, value in drawn.items()}
+    return replace(simulation, source={**simulation.source, **stored})
 
 
 def _seen_through(
@@ -247,6 +255,8 @@ def _seen_through(
     source = os.fspath(item.folder / item.source)
     length = recipe["duration_s"] if duration_s is None else duration_s
     sensor_values = {name: value for name, value in recipe["sensor"].items() if name != "name"}
+    drawn = item.drawn
+    sensor_values |= {name: value for name, value in drawn.items() if name in SENSOR}
     common: dict[str, Any] = {
         "prism": prism,
         "duration_s": length,
@@ -259,10 +269,15 @@ def _seen_through(
         return translation(open_recording(source), **common)
     if item.kind == "videos":
         return _of_video(item, source, camera, **common)
-    scene = Scene.from_picture(source) if item.kind == "pictures" else _world(item, source)
-    rates_deg = recipe.get("rotate_deg_s", (0.0, 0.0, 0.0))
-    camera_motion = CameraMotion([math.radians(rate) for rate in rates_deg])
-    return Simulation(scene, camera.build(), camera_motion=camera_motion, **common)
+    if item.kind != "pictures":
+        return Simulation(_world(item, source), camera.build(), **common)
+    rates = [math.radians(rate) for rate in recipe.get("rotate_deg_s", (0.0, 0.0, 0.0))]
+    return Simulation(
+        picture_scene(source, drawn),
+        camera.build(),
+        camera_motion=shaken_motion(rates, drawn, recipe["duration_s"]),
+        **common,
+    )
 
 
 def _of_video(item: Item, source: str, entry: spec.CameraEntry, **settings: Any) -> Simulation:
@@ -281,6 +296,10 @@ def _world(item: Item, source: str) -> WorldScene:
     if trajectory is not None and trajectory.lower().endswith(POSE_FILES):
         trajectory = os.fspath(item.folder / trajectory)
     name = item.source if item.kind == "worlds" else source
-    return WorldScene(
-        *open_world(name, trajectory, seed=recipe["seed"], duration_s=recipe["duration_s"])
-    )
+    duration_s = recipe["duration_s"]
+    world, path = open_world(name, trajectory, seed=recipe["seed"], duration_s=duration_s)
+    drawn = item.drawn
+    if "light" in drawn:
+        world = lit(world, drawn["light"])
+    blur = drawn.get("blur_px", BLUR_PX)
+    return WorldScene(world, shaken(path, drawn, duration_s), blur=blur)

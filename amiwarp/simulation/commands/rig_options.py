@@ -411,7 +411,8 @@ class SensorOptions:
     sensor: Annotated[
         str | None,
         sensor_option(
-            help="Known camera whose sensor is simulated: dvxplorer, davis346 or gen4. Other options change it."
+            help="Known camera whose sensor is simulated: dvxplorer, dvxplorer_mini, davis240c, davis346, gen4, evk4 "
+            "or genx320. Other options change it."
         ),
     ] = None
 

@@ -147,6 +147,7 @@ def run_simulate(
         out,
         common,
         truth_hz=world.truth_hz,
+        truth_times_us=world.truth_times_us,
     )
 
 
@@ -178,12 +179,17 @@ def _scene(
 
 
 def write(
-    simulation: Simulation, out: Path, common: cli.Common, *, truth_hz: float | None = None
+    simulation: Simulation,
+    out: Path,
+    common: cli.Common,
+    *,
+    truth_hz: float | None = None,
+    truth_times_us: tuple[float, ...] | None = None,
 ) -> None:
     """Run a simulation, write its recording to ``out`` and print the result."""
     began = time.perf_counter()
     with cli.progress("simulating", average_s=AVERAGE_S) as advance:
-        simulation.write(out, truth_hz=truth_hz, progress=advance)
+        simulation.write(out, truth_hz=truth_hz, truth_times_us=truth_times_us, progress=advance)
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {
         "file": str(out),

@@ -71,6 +71,14 @@ class WorldOptions:
             "(1/s). Default: not recorded."
         ),
     ] = None
+    truth_us: Annotated[
+        str | None,
+        _in_world(
+            help="Instants of this truth instead of a rate (us), such as 0,12000,35000. Displacements lead from each "
+            "to the next one, and back.",
+            metavar="T,T,...",
+        ),
+    ] = None
     preview: Annotated[
         Path | None,
         _in_world(
@@ -88,6 +96,7 @@ class WorldOptions:
             "--seeing": self.seeing,
             "--motion-px": self.motion_px,
             "--truth-hz": self.truth_hz,
+            "--truth-us": self.truth_us,
             "--preview": self.preview,
         }
         if self.world is None:
@@ -102,8 +111,19 @@ class WorldOptions:
                 "--motion-px applies to maps; give --seeing maps, or remove --motion-px",
                 ErrorCode.OPTIONS,
             )
+        if self.truth_hz is not None and self.truth_us is not None:
+            raise AmiwarpError(
+                "--truth-hz and --truth-us are both given; give one of them", ErrorCode.OPTIONS
+            )
         if self.preview is not None:
             check_ending(self.preview, "previews are written", [".png"])
+
+    @property
+    def truth_times_us(self) -> tuple[float, ...] | None:
+        """Instants whose ground truth is recorded [us], or None if they are not given one by one."""
+        if self.truth_us is None:
+            return None
+        return cli.numbers(self.truth_us, self.truth_us.count(",") + 1, "--truth-us")
 
     def build_scene(self, duration_s: float, *, seed: int, blur: float) -> WorldScene:
         """Return the world and the camera's trajectory. ``blur``: standard deviation of the optical blur [px]."""
