@@ -56,11 +56,11 @@ class Input:
 
 
 @wp.func
-def last_input(level: float) -> Input:
-    """Return the photoreceptor's input at a level, with the exponential computed."""
+def last_input(p: Pixel, level: float) -> Input:
+    """Return the photoreceptor's last input, by its level and the exponential that the pixel keeps."""
     result = Input()
     result.level = level
-    result.light = wp.exp(level)
+    result.light = p.light
     return result
 
 
@@ -167,7 +167,7 @@ def run_filtered_pixels(
     """Advance one pixel per thread through all steps of a chunk; ``seen``: its photoreceptor's last input."""
     i = start + wp.tid()
     p = pixels[i]
-    before = last_input(seen[i])
+    before = last_input(p, seen[i])
     span = whole_step(steps, sensor, p)
     ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
@@ -177,6 +177,7 @@ def run_filtered_pixels(
         before = after
         t0 += wp.int64(steps.ticks)
         reconverge()
+    p.light = before.light
     pixels[i] = shift_times(p, t0)
     seen[i] = before.level
 
@@ -194,7 +195,7 @@ def run_filtered_pixels_ahead(
     """Generate the same events as :func:`run_filtered_pixels`, faster on a CPU."""
     i = start + wp.tid()
     p = pixels[i]
-    before = last_input(seen[i])
+    before = last_input(p, seen[i])
     span = whole_step(steps, sensor, p)
     ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
@@ -210,5 +211,6 @@ def run_filtered_pixels_ahead(
             before = after
             t0 += wp.int64(steps.ticks)
             j += 1
+    p.light = before.light
     pixels[i] = shift_times(p, t0)
     seen[i] = before.level

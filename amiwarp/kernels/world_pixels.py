@@ -80,7 +80,7 @@ def run_filtered_world_pixels(
     """
     i = start + wp.tid()
     p = pixels[i]
-    before = last_input(seen[i])
+    before = last_input(p, seen[i])
     span = whole_step(steps, sensor, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
@@ -89,5 +89,6 @@ def run_filtered_world_pixels(
         before = after
         t0 += wp.int64(steps.ticks)
         reconverge()
+    p.light = before.light
     pixels[i] = shift_times(p, t0)
     seen[i] = before.level
