@@ -275,7 +275,7 @@ def numba_loop() -> Callable[..., None]:
             grid[k, y[i], x[i]] += sign * (np.float32(1.0) - end)
             grid[k + 1, y[i], x[i]] += sign * end
 
-    return add  # type: ignore[no-any-return]
+    return add
 
 
 def with_numba(events: Events, device: str) -> Peer:

@@ -118,8 +118,8 @@ def tore_volume(
     size = 2 * depth * height * width
     grid = Grid(*batch.size, steps=depth)
     for first, number, recent in _values(batch, grid, recent_events.keep_recent, 2 * depth, NEVER):
-        t_end = batch.windows.t_end[first : first + number]
-        ends = wp.array(t_end, dtype=wp.int64, device=batch.device)
+        ends_us = batch.windows.t_end[first : first + number]
+        ends = wp.array(ends_us, dtype=wp.int64, device=batch.device)
         part = result_rows(out, first, number)
         inputs = [recent, ends, size, shortest, longest]
         launch(recent_events.read_recent, part.size, inputs, [part], device=batch.device)

@@ -244,7 +244,9 @@ def share_images(batch: WindowBatch, grid: Grid, bins: int) -> wp.array:
     low = 63 - max(fullest.bit_length(), LEAST_BITS)
     of_pixels = not batch.events.whole_pixels or (in_words and parts == 1)
     if of_pixels and takes_whole_windows(batch) and are_sparse(batch, math.prod(shape)):
-        return _shares_of_whole_windows(batch, grid._replace(low=low), bins)
+        scratch = _scratch_of_whole_windows(batch, grid)
+        if scratch <= MOST_EVENTS:  # which kernels can address; otherwise, an error follows below
+            return _shares_of_whole_windows(batch, grid._replace(low=low), bins, scratch)
     out = batch.empty(shape, wp.float32)
     if in_words:  # both shares of an event in one word
         kernel = tensors_cuda.add_event_words
@@ -274,22 +276,27 @@ def share_images(batch: WindowBatch, grid: Grid, bins: int) -> wp.array:
     return out
 
 
-def _shares_of_whole_windows(batch: WindowBatch, grid: Grid, bins: int) -> wp.array:
+def _shares_of_whole_windows(batch: WindowBatch, grid: Grid, bins: int, scratch: int) -> wp.array:
     """Return what :func:`share_images` returns, by kernels that take whole windows."""
     check_lengths(batch.windows, grid)
     out = batch.zeros((grid.layers * bins, grid.height, grid.width), wp.float32)
     if batch.events.whole_pixels:
         kernel = tensors_by_window.add_word_windows
-        scratch = 2 * grid.width * grid.height
     else:
         kernel = tensors_by_window.share_windows
         grid = grid._replace(border=1)
-        image = 2 * grid.layers * (grid.height + 2) * (grid.width + 2)
-        # Behind both images, a place for the events outside
-        scratch = 2 * image + 2 * (grid.width + 16)
     settings = [struct_of(kernels.Grid, *grid), bins]
     run_on_windows(batch, kernel, settings, out, scratch=scratch)
     return out
+
+
+def _scratch_of_whole_windows(batch: WindowBatch, grid: Grid) -> int:
+    """Return the number of words that :func:`_shares_of_whole_windows` needs for each thread: two images."""
+    if batch.events.whole_pixels:
+        return 2 * grid.width * grid.height
+    # An image with a border, of two sums for each pixel; behind both, a place for the events outside
+    image = 2 * grid.layers * (grid.height + 2) * (grid.width + 2)
+    return 2 * image + 2 * (grid.width + 16)
 
 
 CAPACITY = 1 << 19
