@@ -81,6 +81,9 @@ from .imaging.phase_ring import PhaseRing as PhaseRing
 from .imaging.phase_ring import PhaseUpdate as PhaseUpdate
 from .imaging.phase_ring import RingPart as RingPart
 from .imaging.phase_tensor import phase_tensor as phase_tensor
+from .imaging.recent_tensors import event_spike_tensor as event_spike_tensor
+from .imaging.recent_tensors import mixed_density_stack as mixed_density_stack
+from .imaging.recent_tensors import tore_volume as tore_volume
 from .imaging.tensors import event_count as event_count
 from .imaging.tensors import latest_times as latest_times
 from .imaging.tensors import polarity_histogram as polarity_histogram

@@ -1,10 +1,12 @@
 """Speed of :class:`amiwarp.EventSensor`, and the error of its events. Prints JSON, one row per line.
 
     python -m benchmarks.event_sensor [--device cuda:0] [--cameras 1 16 256] [--side 128] [--steps 200]
+        [--models default davis346 dvxplorer]
 
 Each camera sees waves of its own direction. The images lie on the device, and drawing them is not included; events stay
 on the device. ``realtime`` is simulated time over elapsed time: above 1, all cameras are faster than real time.
-``grids`` also makes a voxel grid of 5 bins for each camera and step.
+``grids`` also makes a voxel grid of 5 bins for each camera and step. ``cpu_ms`` is the processor time of a step, which
+depends less on other load.
 
 Two errors are measured in the same run: the number of values in the events of three cameras that differ from those of a
 sensor with one camera, which must be 0; and the largest distance between the times of events on ramps of the log
@@ -14,6 +16,7 @@ intensity and the exact times [us].
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import time
@@ -90,10 +93,11 @@ def ramp_error_us(cameras: int, side: int, device: str) -> float:
 
 
 def timed(
-    images: list[Any], cameras: int, side: int, steps: int, device: str, grids: bool
-) -> tuple[float, int]:
-    """Return the time of a step [s] and the number of events of all steps."""
-    sensor, count = EventSensor(cameras, side, side, device=device), 0
+    images: list[Any], model: SensorModel, steps: int, device: str, grids: bool
+) -> tuple[float, float, int]:
+    """Return the elapsed and the processor time of a step [s], and the number of events of all steps."""
+    cameras, side, _ = images[0].shape
+    sensor, count = EventSensor(cameras, side, side, model, device=device), 0
 
     def one(k: int) -> int:
         found: tuple[DeviceEvents, Windows] = sensor.step(images[k % IMAGES], k * STEP_US)
@@ -105,19 +109,24 @@ def timed(
         one(k)
     wp.synchronize_device(device)
     began = time.perf_counter()
+    processor = time.process_time()
     for k in range(IMAGES, IMAGES + steps):
         count += one(k)
     wp.synchronize_device(device)
-    return (time.perf_counter() - began) / steps, count
+    elapsed = time.perf_counter() - began
+    return elapsed / steps, (time.process_time() - processor) / steps, count
 
 
-def row(cameras: int, side: int, steps: int, device: str) -> dict[str, Any]:
+def row(cameras: int, side: int, steps: int, device: str, name_of_model: str) -> dict[str, Any]:
+    of_default = name_of_model == "default"
+    model = SensorModel() if of_default else SensorModel.preset(name_of_model)
     host = waves(cameras, side)
     images = [wp.array(batch, dtype=float, device=device) for batch in host]
     result: dict[str, Any] = {"cameras": cameras, "side": side, "step_us": STEP_US}
+    result["model"] = name_of_model
     for name, grids in (("events", False), ("grids", True)):
-        seconds, count = timed(images, cameras, side, steps, device, grids)
-        result[name] = {"step_ms": 1e3 * seconds, "realtime": STEP_US * 1e-6 / seconds,
+        seconds, processor, count = timed(images, model, steps, device, grids)
+        result[name] = {"step_ms": 1e3 * seconds, "cpu_ms": 1e3 * processor, "realtime": STEP_US * 1e-6 / seconds,
                         "events_per_s": count / steps / seconds}  # fmt: skip
         result["events_per_step"] = count / steps
     result["differing"] = differing(host, cameras, device)
@@ -133,11 +142,13 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, nargs="+", default=[1, 16, 256])
     parser.add_argument("--side", type=int, default=128)
     parser.add_argument("--steps", type=int, default=200)
+    models = ("default", "davis346", "dvxplorer", "gen4")
+    parser.add_argument("--models", nargs="+", choices=models, default=["default"])
     arguments = parser.parse_args()
     wp.init()
     print(json.dumps({"device": wp.get_device(arguments.device).name}))
-    for cameras in arguments.cameras:
-        result = row(cameras, arguments.side, arguments.steps, arguments.device)
+    for cameras, model in itertools.product(arguments.cameras, arguments.models):
+        result = row(cameras, arguments.side, arguments.steps, arguments.device, model)
         print(json.dumps(result), flush=True)
         if result["differing"] or not result["ramp_error_us"] <= 1.0:
             raise SystemExit(

@@ -2,7 +2,8 @@
 
     python -m benchmarks.tensors [--events 4000000] [--device cuda:0] [--repeats 9] [--out FILE.json]
 
-The main task is one voxel grid of 5 bins at 640 x 480 pixels, of events at random pixels and at 20,000 edge points. On
+The main task is one voxel grid of 5 bins at 640 x 480 pixels, of events at random pixels and at 20,000 edge points.
+Other tasks are grids of few events, and of many windows in one call. On
 a GPU, the events lie there as each library takes them, and ours are checked for their order in every call. Programs run
 in turns, after one pass that compiles them. ``gev_per_s`` is from the median elapsed time. ``cpu_ns`` is the median
 processor time per event, which depends less on other load. A library that is missing, or has no such representation,
@@ -23,6 +24,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,8 @@ RESULTS = Path(__file__).parent / "results"
 WIDTH, HEIGHT, BINS = 640, 480, 5
 SPAN_US = 100_000
 WINDOWS = 32
+FEW = (1_000, 10_000)
+"""Numbers of events in a small call."""
 EVENTS = {"cpu": 4_000_000, "cuda": 100_000_000}
 PEER_EVENTS = 4_000_000
 """Most events for programs on the CPU."""
@@ -171,10 +175,21 @@ def ours(events: Events, device: str, threads: int | None = None) -> list[Progra
         "stacked histogram": (lambda: amiwarp.stacked_histogram(here, WIDTH, HEIGHT, BINS), expected_histogram),
         "latest times": (lambda: amiwarp.latest_times(here, WIDTH, HEIGHT, per_polarity=False), expected_latest),
     }  # fmt: skip
-    return [
-        Program(task, f"amiwarp, {kind}{place}", events, run, expected, threads)
+    name = f"amiwarp, {kind}{place}"
+    programs = [
+        Program(task, name, events, run, expected, threads)
         for task, (run, expected) in tasks.items()
     ]
+    for number in FEW:
+        few = events[:number]
+        run = partial(amiwarp.voxel_grid, put(few), WIDTH, HEIGHT, BINS)
+        programs.append(Program(small(number), name, few, run, expected_grid, threads))
+    return programs
+
+
+def small(number: int) -> str:
+    """Return the name of the task of a grid of few events."""
+    return f"{GRID} of {number:,} events"
 
 
 # Other libraries, as their users write it. Each function returns the program's call and the expected result.
@@ -245,7 +260,9 @@ def with_torch_put(events: Events, device: str) -> Peer:
     return with_torch(events, device, put=True)
 
 
-def with_numba(events: Events, device: str) -> Peer:
+@cache
+def numba_loop() -> Callable[..., None]:
+    """Return a loop over events, compiled by Numba."""
     nb = library("numba")
 
     @nb.njit(fastmath=True)  # type: ignore[untyped-decorator]
@@ -258,12 +275,32 @@ def with_numba(events: Events, device: str) -> Peer:
             grid[k, y[i], x[i]] += sign * (np.float32(1.0) - end)
             grid[k + 1, y[i], x[i]] += sign * end
 
+    return add
+
+
+def with_numba(events: Events, device: str) -> Peer:
+    add = numba_loop()
+
     def run() -> Any:
         grid = np.zeros((BINS, HEIGHT, WIDTH), np.float32)
         add(events.x, events.y, events.t, events.p, grid)
         return grid
 
     return run, expected_grid
+
+
+def windows_with_numba(events: Events, device: str) -> Peer:
+    add = numba_loop()
+    cut = amiwarp.windows(events, count=len(events) // WINDOWS)
+
+    def run() -> Any:
+        grids = np.zeros((len(cut), BINS, HEIGHT, WIDTH), np.float32)
+        for start, stop, grid in zip(cut.start, cut.stop, grids, strict=True):
+            part = events[start:stop]
+            add(part.x, part.y, part.t, part.p, grid)
+        return grids
+
+    return run, expected_windows
 
 
 CUDA_SOURCE = r"""
@@ -403,6 +440,16 @@ def programs(events: Events, device: str) -> tuple[list[Program], list[dict[str,
                 )
             except Missing as error:
                 missing.append({"task": GRID, "program": name, "missing": str(error)})
+    try:
+        name = "Numba, 1 thread, cpu"
+        out.append(
+            Program(f"{GRID}s of {WINDOWS} windows", name, few, *windows_with_numba(few, "cpu"))
+        )
+        for number in FEW:
+            part = few[:number]
+            out.append(Program(small(number), name, part, *with_numba(part, "cpu")))
+    except Missing as error:
+        missing.append({"task": small(FEW[0]), "program": "Numba", "missing": str(error)})
     try:
         fewer = few[:DV_EVENTS]
         out.append(

@@ -346,6 +346,14 @@ def times_at(events: Events | DeviceEvents, indices: NDArray[np.int64]) -> NDArr
     return _look_up(take_times, events.t, indices)
 
 
+def first_and_last_time(events: Events | DeviceEvents) -> tuple[int, int]:
+    """Return the times of the first and the last event, of which there is at least one [us]."""
+    times = _times_on_host(events)
+    if times is None:
+        times = times_at(events, np.array([0, len(events) - 1]))
+    return int(times[0]), int(times[-1])
+
+
 def find_indices(events: Events | DeviceEvents, times: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index of the first event at or after each time."""
     on_host = _times_on_host(events)

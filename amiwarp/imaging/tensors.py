@@ -14,10 +14,12 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
+from amiwarp.imaging.whole_windows import are_sparse, run_on_windows, takes_whole_windows
 from amiwarp.imaging.window_batch import WindowBatch, batch_of
 from amiwarp.imaging.window_images import (
     SMALLEST,
     Grid,
+    check_lengths,
     count_images,
     latest_images,
     normalise,
@@ -26,7 +28,7 @@ from amiwarp.imaging.window_images import (
     struct_of,
 )
 from amiwarp.imaging.windows import Windows
-from amiwarp.kernels import tensor_values
+from amiwarp.kernels import tensor_values, tensors_by_window
 from amiwarp.kernels import tensors as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.models.base import Model
@@ -171,6 +173,11 @@ def _counted(batch: WindowBatch, grid: Grid) -> wp.array:
     if not batch.events.whole_pixels:
         return share_images(batch, grid, 1)
     shape = grid.layers, grid.height, grid.width
+    if takes_whole_windows(batch):
+        out = batch.zeros(shape, wp.int32)
+        settings = [struct_of(kernels.Grid, *grid)]
+        run_on_windows(batch, tensors_by_window.count_windows, settings, out)
+        return out
     out = batch.empty(shape, wp.int32)
     for first, number, images in count_images(batch, grid):
         wp.copy(result_rows(out, first, number), images, count=number * math.prod(shape))
@@ -328,6 +335,12 @@ def stacked_histogram(
     limit = whole(limit, "limit", 1, 255)
     batch = batch_of(events, (width, height), windows, t_start, t_end, model, encoder, device)
     grid = Grid(*batch.size, steps=bins, rate=bins, layers=2)
+    if takes_whole_windows(batch) and are_sparse(batch, 2 * bins * width * height):
+        check_lengths(batch.windows, grid)
+        out = batch.zeros((2 * bins, height, width), wp.uint8)
+        settings = [struct_of(kernels.Grid, *grid), limit]
+        run_on_windows(batch, tensors_by_window.clip_windows, settings, out)
+        return batch.finish(out)
     out = batch.empty((2 * bins, height, width), wp.uint8)
     length = width if batch.device.is_cpu else 1
     for first, number, images in count_images(batch, grid):
@@ -422,9 +435,17 @@ def time_surface(
     batch = batch_of(events, (width, height), windows, t_start, t_end, model, encoder, device)
     grid = Grid(*batch.size, layers=2 if per_polarity else 1)
     size = grid.layers * height * width
-    out = batch.empty((grid.layers, height, width), wp.float32)
+    decay = tensor_values.Decay()
+    decay.tau = tau
+    decay.linear = int(linear)
     if carry:
         _check_carry(events, batch.windows)
+    elif takes_whole_windows(batch):
+        out = batch.zeros((grid.layers, height, width), wp.float32)
+        settings = [struct_of(kernels.Grid, *grid), decay]
+        run_on_windows(batch, tensors_by_window.decay_windows, settings, out, scratch=size)
+        return batch.finish(out if per_polarity else out.reshape((-1, height, width)))
+    out = batch.empty((grid.layers, height, width), wp.float32)
     for first, number, images in latest_images(batch, grid, carry=carry):
         part = result_rows(out, first, number)
         ends = wp.array(
@@ -433,7 +454,7 @@ def time_surface(
         launch(
             tensor_values.decay_times,
             part.size,
-            [images, ends, size, tau, int(linear)],
+            [images, ends, size, decay],
             [part],
             device=batch.device,
         )
@@ -503,6 +524,10 @@ def latest_times(
     out = batch.empty((grid.layers, height, width), wp.int64)
     if carry:
         _check_carry(events, batch.windows)
+    elif takes_whole_windows(batch):
+        settings = [struct_of(kernels.Grid, *grid)]
+        run_on_windows(batch, tensors_by_window.keep_latest_windows, settings, out)
+        return batch.finish(out if per_polarity else out.reshape((-1, height, width)))
     for first, number, images in latest_images(batch, grid, carry=carry):
         size = number * grid.layers * height * width
         wp.copy(result_rows(out, first, number), images, count=size)

@@ -15,10 +15,10 @@ from amiwarp.events.device_events import (
     check_sensor,
     device_for,
     find_indices,
+    first_and_last_time,
     host_numbers,
     idle_numbers,
     limits,
-    times_at,
     wait,
 )
 from amiwarp.events.encoder import Encoder, check_prisms
@@ -56,11 +56,26 @@ class WindowBatch:
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
         """Return an array for the result, shape (windows, *shape)."""
+        return self._allocated(np.empty, shape, dtype)
+
+    def zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        """Return an array of zeros for the result on a CPU, shape (windows, *shape)."""
+        return self._allocated(np.zeros, shape, dtype)
+
+    def _allocated(self, allocate: Any, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        """Return an array for the result, on a CPU by a function of NumPy.
+
+        NumPy asks for large pages of memory, which are there in less time.
+        """
         if math.prod(shape) > MOST_EVENTS:
             raise AmiwarpError(
                 f"a tensor has shape {shape}, more than {MOST_EVENTS} elements; give fewer bins"
             )
-        return wp.empty((len(self.windows), *shape), dtype=dtype, device=self.device)
+        every_shape = (len(self.windows), *shape)
+        if not self.device.is_cpu or not len(self.windows):
+            return wp.empty(every_shape, dtype=dtype, device=self.device)
+        values = allocate(every_shape, wp.dtype_to_numpy(dtype))
+        return wp.array(values, dtype=dtype, device=self.device, copy=False)
 
     def finish(self, out: wp.array) -> Any:
         """Return the result of a public function.
@@ -74,6 +89,22 @@ class WindowBatch:
         idle_numbers[self.device.is_cpu, wp.int32].append(self.faults)
         result = out.numpy() if self.on_host else out
         return result[0] if self.single else result
+
+
+def window_rows(cut: Windows, device: Any) -> tuple[wp.array, int]:
+    """Return windows as the array that kernels take, and the number of their blocks."""
+    blocks = -(-(cut.stop - cut.start) // int(kernels.BLOCK))  # rounded up
+    ends = np.cumsum(blocks)
+    rows = np.empty((len(cut), 6), np.int64)
+    rows[:, 0] = cut.start
+    rows[:, 1] = cut.stop
+    rows[0, 2] = 0
+    rows[1:, 2] = ends[:-1]
+    rows[:, 3] = cut.t_start
+    rows[:, 4] = np.maximum(cut.t_end - cut.t_start, 1)
+    rows[:, 5] = cut.t_end
+    on_device = wp.array(rows, dtype=wp.int64, device=device, copy=not device.is_cpu)
+    return on_device, int(ends[-1])
 
 
 def _check_windows(events: Events, cut: Windows, size: tuple[int, int]) -> None:
@@ -143,7 +174,7 @@ def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | Non
     if limits and not limits[5]:  # known, and the times ascend
         first, last = limits[:2]
     elif len(events):
-        first, last = times_at(events, np.array([0, len(events) - 1])).tolist()
+        first, last = first_and_last_time(events)
     low = first if t_start is None else t_start
     high = last if t_end is None else t_end
     if high < low:

@@ -12,9 +12,11 @@ import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import find_indices
-from amiwarp.imaging.window_batch import MOST_EVENTS, WindowBatch
+from amiwarp.imaging.whole_windows import are_sparse, run_on_windows, takes_whole_windows
+from amiwarp.imaging.window_batch import MOST_EVENTS, WindowBatch, window_rows
 from amiwarp.imaging.windows import Windows
-from amiwarp.kernels import tensor_values, tensors_cpu, tensors_cuda
+from amiwarp.imaging.zeroed_words import give_zeros, take_zeros
+from amiwarp.kernels import tensor_values, tensors_by_window, tensors_cpu, tensors_cuda
 from amiwarp.kernels import tensors as kernels
 from amiwarp.kernels.background_activity import NEVER
 from amiwarp.kernels.launch import launch, slices
@@ -54,19 +56,6 @@ def struct_of(kind: Any, *values: int) -> Any:
     return struct
 
 
-_zeros: list[wp.array] = []
-"""Memory of words on the CPU, all zero, which the next call uses again: new memory takes longer than many events."""
-
-
-def _take_zeros(n: int) -> wp.array:
-    """Return at least ``n`` words on the CPU, all zero."""
-    while _zeros:
-        words = _zeros.pop()
-        if len(words) >= n:
-            return words
-    return wp.zeros(n, dtype=wp.int64, device="cpu")
-
-
 def _images(
     batch: WindowBatch,
     grid: Grid,
@@ -85,7 +74,7 @@ def _images(
     cut = batch.windows
     events = batch.events
     device = batch.device
-    _check_lengths(cut, grid)
+    check_lengths(cut, grid)
     # A window has a group of pixels for each part of its time intervals.
     rows_of_group = grid.height + 2 * grid.border
     columns_of_group = grid.width + 2 * grid.border
@@ -105,14 +94,14 @@ def _images(
             f"a window has {groups * group} pixels in all its images; give fewer bins"
         )
     in_words = device.is_cpu and on_cpu is tensors_cpu.add_event_word_blocks
-    images = _take_zeros(size) if in_words else wp.empty(size, dtype=dtype, device=device)
+    images = take_zeros(size) if in_words else wp.empty(size, dtype=dtype, device=device)
 
     for first in range(0, len(cut), most or 1):
         number = min(most, len(cut) - first)
         if not in_words:
             images.fill_(empty)
         together = cut if number == len(cut) else cut[first : first + number]
-        rows, blocks = _rows(together, device)
+        rows, blocks = window_rows(together, device)
         columns = [events.x, events.y, events.t, events.p]
         inputs = [*columns, rows, struct_of(kernels.Grid, *grid)]
         outputs = [batch.faults, images]
@@ -125,32 +114,16 @@ def _images(
 
     if in_words:
         images.numpy()[trash:size] = 0
-        if images.size * 8 <= 6 * MOST_BYTES["cpu"]:
-            _zeros[:] = [images]
+        give_zeros(images)
 
 
-def _check_lengths(cut: Windows, grid: Grid) -> None:
+def check_lengths(cut: Windows, grid: Grid) -> None:
     """Raise :class:`AmiwarpError` if the time in a window, in the units of the grid, may not be exact."""
     if grid.rate and len(cut):
         longest = int((cut.t_end - cut.t_start).max())
         too_long = (1 << 53) // grid.rate
         if longest >= too_long:
             raise AmiwarpError(f"a window lasts {longest} us; give one below {too_long} us")
-
-
-def _rows(cut: Windows, device: Any) -> tuple[wp.array, int]:
-    """Return windows as the array that kernels take, and the number of their blocks."""
-    blocks = -(-(cut.stop - cut.start) // int(BLOCK))  # rounded up
-    ends = np.cumsum(blocks)
-    rows = np.empty((len(cut), 5), np.int64)
-    rows[:, 0] = cut.start
-    rows[:, 1] = cut.stop
-    rows[0, 2] = 0
-    rows[1:, 2] = ends[:-1]
-    rows[:, 3] = cut.t_start
-    rows[:, 4] = np.maximum(cut.t_end - cut.t_start, 1)
-    on_device = wp.array(rows, dtype=wp.int64, device=device, copy=not device.is_cpu)
-    return on_device, int(ends[-1])
 
 
 def _add_on_cpu(
@@ -262,13 +235,19 @@ def latest_images(
 
 def share_images(batch: WindowBatch, grid: Grid, bins: int) -> wp.array:
     """Return the bins of all windows, shape (windows, layers * bins, height, width)."""
-    out = batch.empty((grid.layers * bins, grid.height, grid.width), wp.float32)
+    shape = grid.layers * bins, grid.height, grid.width
     parts = 1
     fullest = CAPACITY
     if batch.events.whole_pixels:
         parts, fullest = _parts(batch, grid)
     in_words = fullest < CAPACITY
     low = 63 - max(fullest.bit_length(), LEAST_BITS)
+    of_pixels = not batch.events.whole_pixels or (in_words and parts == 1)
+    if of_pixels and takes_whole_windows(batch) and are_sparse(batch, math.prod(shape)):
+        scratch = _scratch_of_whole_windows(batch, grid)
+        if scratch <= MOST_EVENTS:  # which kernels can address; otherwise, an error follows below
+            return _shares_of_whole_windows(batch, grid._replace(low=low), bins, scratch)
+    out = batch.empty(shape, wp.float32)
     if in_words:  # both shares of an event in one word
         kernel = tensors_cuda.add_event_words
         on_cpu = tensors_cpu.add_event_word_blocks
@@ -295,6 +274,29 @@ def share_images(batch: WindowBatch, grid: Grid, bins: int) -> wp.array:
             smallest=SMALLEST // 4,
         )
     return out
+
+
+def _shares_of_whole_windows(batch: WindowBatch, grid: Grid, bins: int, scratch: int) -> wp.array:
+    """Return what :func:`share_images` returns, by kernels that take whole windows."""
+    check_lengths(batch.windows, grid)
+    out = batch.zeros((grid.layers * bins, grid.height, grid.width), wp.float32)
+    if batch.events.whole_pixels:
+        kernel = tensors_by_window.add_word_windows
+    else:
+        kernel = tensors_by_window.share_windows
+        grid = grid._replace(border=1)
+    settings = [struct_of(kernels.Grid, *grid), bins]
+    run_on_windows(batch, kernel, settings, out, scratch=scratch)
+    return out
+
+
+def _scratch_of_whole_windows(batch: WindowBatch, grid: Grid) -> int:
+    """Return the number of words that :func:`_shares_of_whole_windows` needs for each thread: two images."""
+    if batch.events.whole_pixels:
+        return 2 * grid.width * grid.height
+    # An image with a border, of two sums for each pixel; behind both, a place for the events outside
+    image = 2 * grid.layers * (grid.height + 2) * (grid.width + 2)
+    return 2 * image + 2 * (grid.width + 16)
 
 
 CAPACITY = 1 << 19

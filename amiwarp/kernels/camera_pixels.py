@@ -88,7 +88,7 @@ def run_filtered_camera_pixels(
         pixels[i] = starting_pixel(cameras, sensor, i, level)
         return
     p = pixels[i]
-    before = last_input(receptors[i].seen)
+    before = last_input(p, receptors[i].seen)
     first = receptors[i].first
     span = whole_step(steps, sensor, p)
     t0 = wp.int64(0)
@@ -98,5 +98,6 @@ def run_filtered_camera_pixels(
         before = after
         t0 += wp.int64(steps.ticks)
         reconverge()
+    p.light = before.light
     pixels[i] = shift_times(p, t0)
     receptors[i] = receptor(before.level, first)

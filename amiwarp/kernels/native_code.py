@@ -210,14 +210,26 @@ def add_words(
     """Add ``words[first : first + n]`` at their places, modulo 2**64. For CPUs, if no other thread adds there."""
 
 
-@wp.func_native("""
+_HALVES = """
+    const int above = 64 - low, fraction = 2 * low - 64;
+    const double unit = 1.0 / (double)(1 << fraction);
+    const auto end_of = [above](uint64_t word) { return (int64_t)(word << above) >> above; };
+    const auto start_of = [=](uint64_t word) {
+        const int64_t end = end_of(word);
+        return ((int64_t)(word - (uint64_t)end) >> low) * (1 << fraction) - end;
+    };
+"""
+"""The shares of a time interval's start and end that a word of :mod:`amiwarp.kernels.tensors` holds, in ``unit``."""
+
+
+@wp.func_native(
+    _HALVES
+    + """
 #ifdef __CUDACC__
     const int most = 1;
 #else
     const int most = 64;
 #endif
-    const int above = 64 - low, fraction = 2 * low - 64;
-    const double unit = 1.0 / (double)(1 << fraction);
     int64_t total[most];
     for (int bin = bins - 1; bin >= 0; --bin) {
         uint64_t* starts = (uint64_t*)words.data + start + bin * parts * size;
@@ -227,21 +239,17 @@ def add_words(
             float* to = (float*)out.data + at + bin * size + first;
             for (int k = 0; k < m; ++k) total[k] = 0;
             for (int part = 0; part < (bin < steps ? parts : 0); ++part)
-                for (int k = 0; k < m; ++k) {
-                    const uint64_t word = starts[part * size + first + k];
-                    const int64_t shares = (int64_t)(word << above) >> above;
-                    total[k] += ((int64_t)(word - (uint64_t)shares) >> low) * (1 << fraction) - shares;
-                }
+                for (int k = 0; k < m; ++k) total[k] += start_of(starts[part * size + first + k]);
             for (int part = 0; part < (bin > 0 ? parts : 0); ++part)
-                for (int k = 0; k < m; ++k)
-                    total[k] += (int64_t)(ends[part * size + first + k] << above) >> above;
+                for (int k = 0; k < m; ++k) total[k] += end_of(ends[part * size + first + k]);
             for (int k = 0; k < m; ++k) to[k] = (float)((double)total[k] * unit);
         }
 #ifndef __CUDACC__
         for (int part = 0; part < (bin < steps ? parts : 0); ++part) memset(starts + part * size, 0, 8 * n);
 #endif
     }
-""")
+"""
+)
 def read_words(
     out: wp.array(dtype=float),
     at: int,
@@ -259,6 +267,54 @@ def read_words(
     ``low`` is the number of bits of the lower field, ``size`` the number of pixels of an image, ``parts`` the number of
     images of a time interval. On CPUs, the words are cleared.
     """
+
+
+@wp.func_native(
+    _HALVES
+    + """
+    const int* pixel = (const int*)pixels.data;
+    const uint64_t* starts = (const uint64_t*)words.data + start;
+    const uint64_t* ends = (const uint64_t*)words.data + end;
+    float* to = (float*)out.data + at;
+#ifndef __CUDACC__
+    for (int k = 0; k < n; ++k) {
+        __builtin_prefetch(starts + pixel[k]);
+        __builtin_prefetch(ends + pixel[k]);
+        __builtin_prefetch(to + pixel[k], 1);
+    }
+#endif
+    for (int k = 0; k < n; ++k) {
+        const int64_t total = start_of(starts[pixel[k]]) + end_of(ends[pixel[k]]);
+        to[pixel[k]] = (float)((double)total * unit);
+    }
+"""
+)
+def write_words(
+    out: wp.array(dtype=float),
+    at: int,
+    words: wp.array(dtype=wp.int64),
+    low: int,
+    start: int,
+    end: int,
+    pixels: wp.array(dtype=int),
+    n: int,
+):
+    """Write a bin of a voxel grid, which begins at ``out[at]``, at ``n`` pixels.
+
+    ``start``: first word of the image of the time interval that starts there, ``end``: of the one that ends.
+    """
+
+
+@wp.func_native("""
+    const int* place = (const int*)places.data;
+    uint64_t* sum = (uint64_t*)sums.data + first;
+#ifndef __CUDACC__
+    for (int k = 0; k < n; ++k) __builtin_prefetch(sum + place[k], 1);
+#endif
+    for (int k = 0; k < n; ++k) sum[place[k]] = 0;
+""")
+def clear_words(sums: wp.array(dtype=wp.int64), first: int, places: wp.array(dtype=int), n: int):
+    """Set the words at ``n`` places to 0, counted from ``sums[first]``. For CPUs."""
 
 
 @wp.func_native("""

@@ -74,11 +74,11 @@ class Input:
 
 
 @wp.func
-def last_input(level: float) -> Input:
-    """Return the photoreceptor's input at a level, with the exponential computed."""
+def last_input(p: Pixel, level: float) -> Input:
+    """Return the photoreceptor's last input, by its level and the exponential that the pixel keeps."""
     result = Input()
     result.level = level
-    result.light = wp.exp(level)
+    result.light = p.light
     return result
 
 
@@ -207,7 +207,7 @@ def run_filtered_pixels(
     """Advance one pixel per thread through all steps of a chunk, with its photoreceptor."""
     i = start + wp.tid()
     p = pixels[i]
-    before = last_input(receptors[i].seen)
+    before = last_input(p, receptors[i].seen)
     first = receptors[i].first
     span = whole_step(steps, sensor, p)
     ray = ray_in_prism_frame(view, i)
@@ -218,6 +218,7 @@ def run_filtered_pixels(
         before = after
         t0 += wp.int64(steps.ticks)
         reconverge()
+    p.light = before.light
     pixels[i] = shift_times(p, t0)
     receptors[i] = receptor(before.level, first)
 
@@ -235,7 +236,7 @@ def run_filtered_pixels_ahead(
     """Generate the same events as :func:`run_filtered_pixels`, faster on a CPU."""
     i = start + wp.tid()
     p = pixels[i]
-    before = last_input(receptors[i].seen)
+    before = last_input(p, receptors[i].seen)
     first = receptors[i].first
     span = whole_step(steps, sensor, p)
     ray = ray_in_prism_frame(view, i)
@@ -252,5 +253,6 @@ def run_filtered_pixels_ahead(
             before = after
             t0 += wp.int64(steps.ticks)
             j += 1
+    p.light = before.light
     pixels[i] = shift_times(p, t0)
     receptors[i] = receptor(before.level, first)

@@ -86,6 +86,10 @@ class Pixel:
     leak: float  # leak of this pixel, without jitter, relative to the mean leak; 0 for a dead pixel
     noise: float  # shot noise of this pixel in the dark [events per tick]
     hot: float  # rate of additional random events if the pixel is hot [events per tick], else 0
+    jitter: (
+        float  # present leak relative to the leak without jitter; drawn from the generator's state
+    )
+    light: float  # exponential of the last log intensity that entered the photoreceptor
     rng: wp.uint32  # state of the random number generator
     blind_until: wp.int64  # end of the refractory period; NEVER if it has passed
     next_noise: wp.int64  # time of the next random event; NO_NOISE for none
@@ -119,12 +123,18 @@ class Sink:
 
 @wp.func
 def jittered_leak(p: Pixel, s: SensorParams) -> float:
-    """Return a pixel's leak [thresholds per step]. It changes with the generator's state, hence at every event."""
-    leak = s.leak * p.leak
+    """Return a pixel's leak [thresholds per step]."""
+    return s.leak * p.leak * p.jitter
+
+
+@wp.func
+def leak_factor(s: SensorParams, state: wp.uint32) -> float:
+    """Return the ratio of a pixel's leak to its mean at a state of the generator, which changes at every event."""
+    factor = float(1.0)
     if s.leak_jitter > 0.0:
-        rng = wp.rand_init(int(p.rng), 1)
-        leak *= wp.max(1.0 + s.leak_jitter * wp.randn(rng), SMALLEST_LEAK)
-    return leak
+        rng = wp.rand_init(int(state), 1)
+        factor = wp.max(1.0 + s.leak_jitter * wp.randn(rng), SMALLEST_LEAK)
+    return factor
 
 
 @wp.func
@@ -297,6 +307,7 @@ def generate_events(
             f < signal,
         )
         if s.leak_jitter > 0.0 and f < 1.0:
+            p.jitter = leak_factor(s, p.rng)
             change = span.share * jittered_leak(p, s) * p.on - span.drift
             span.drift += change
             rise += change
@@ -343,6 +354,8 @@ def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
     p.last_stamp = wp.int64(-1)
     p.next_noise = draw_waiting_time(p.noise + p.hot, wp.randf(rng))
     p.rng = rng
+    p.jitter = leak_factor(sensor, rng)
+    p.light = wp.exp(level)
     return p
 
 
@@ -398,6 +411,7 @@ def set_pixels(
         rng = p.rng
         p.next_noise = draw_waiting_time(p.noise + p.hot, wp.randf(rng))
         p.rng = rng
+        p.jitter = leak_factor(sensor, rng)
     pixels[i] = p
 
 

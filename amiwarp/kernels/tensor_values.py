@@ -113,21 +113,37 @@ def carry_latest(
         latest[window * size + pixel] = before
 
 
+@wp.struct
+class Decay:
+    """Decay of a time surface."""
+
+    tau: wp.float64  # time constant [us]
+    linear: int  # 1 if it is linear, 0 if it is exponential
+
+
+@wp.func
+def decayed(decay: Decay, elapsed: wp.int64) -> float:
+    """Return the value of a time surface at a time after the latest event [us]; before it, the value is 1."""
+    age = wp.float64(wp.max(elapsed, wp.int64(0))) / decay.tau
+    if decay.linear == 1:
+        return float(wp.max(wp.float64(1.0) - age, wp.float64(0.0)))
+    return float(wp.exp(-age))
+
+
 @wp.kernel
 def decay_times(
     latest: wp.array(dtype=wp.int64),
     t_end: wp.array(dtype=wp.int64),
     size: int,
-    tau: wp.float64,
-    linear: int,
+    decay: Decay,
     start: int,
     out: wp.array(dtype=float),
 ):
     """Compute the time surface: by exponential or linear decay of the latest times until the window's end."""
     i = start + wp.tid()
-    age = wp.float64(wp.max(t_end[i / size] - latest[i], wp.int64(0))) / tau
-    value = wp.where(linear == 1, wp.max(wp.float64(1.0) - age, wp.float64(0.0)), wp.exp(-age))
-    out[i] = wp.where(latest[i] < EARLIEST, 0.0, float(value))
+    out[i] = 0.0
+    if latest[i] >= EARLIEST:
+        out[i] = decayed(decay, t_end[i / size] - latest[i])
 
 
 # Mean and standard deviation of the cells that are not zero.

@@ -46,6 +46,7 @@ STOP = wp.constant(1)  # index after the last event
 FIRST_BLOCK = wp.constant(2)  # number of the first block
 T_START = wp.constant(3)  # start of the time span [us]
 SPAN = wp.constant(4)  # length of the time span [us], at least 1
+T_END = wp.constant(5)  # end of the time span [us]
 
 
 @wp.struct

@@ -83,7 +83,7 @@ def run_filtered_world_pixels(
     """Simulate pixels whose photoreceptors have limited bandwidth; see :func:`run_world_pixels`."""
     i = start + wp.tid()
     p = pixels[i]
-    before = last_input(receptors[i].seen)
+    before = last_input(p, receptors[i].seen)
     first = receptors[i].first
     span = whole_step(steps, sensor, p)
     t0 = wp.int64(0)
@@ -93,5 +93,6 @@ def run_filtered_world_pixels(
         before = after
         t0 += wp.int64(steps.ticks)
         reconverge()
+    p.light = before.light
     pixels[i] = shift_times(p, t0)
     receptors[i] = receptor(before.level, first)

@@ -40,6 +40,8 @@ class KeyBuffer:
         self._sink.count = wp.zeros((self._segments, columns), dtype=int, device=device)
         of_segment = -(-count // self._segments)
         self._reserve((per_pixel or EVENTS_PER_PIXEL) * of_segment)
+        self._before: list[wp.array] = []
+        """The pixels' state before a chunk, from which it runs again if the buffer was too small."""
 
     def _reserve(self, capacity: int) -> None:
         """Allocate room for ``capacity`` keys per segment."""
@@ -54,16 +56,17 @@ class KeyBuffer:
         The kernel gets the ``inputs``, then the pixels' ``state``. The array has twice the needed length, because
         sorting on CUDA needs scratch memory behind the keys.
         """
-        before = [wp.clone(values) for values in state]
+        if len(self._before) != len(state):
+            self._before = [wp.empty_like(values) for values in state]
         while True:
             self._sink.count.zero_()
-            self._launch(kernel, [*inputs, *state])
+            self._launch(kernel, inputs, state)
             counts = self._sink.count.numpy()[:, 0]
             if counts.max() <= self._capacity:
                 return self._pack(counts, carry)
 
             # The buffer was too small: run again from the same state.
-            for values, copy in zip(state, before, strict=True):
+            for values, copy in zip(state, self._before, strict=True):
                 wp.copy(values, copy)
             self._reserve(int(counts.max()) * 5 // 4)
 
@@ -88,19 +91,35 @@ class KeyBuffer:
             wp.copy(keys, carry, dest_offset=int(ends[-1]))
         return keys
 
-    def _launch(self, kernel: Any, inputs: list[Any]) -> None:
-        """Launch the kernel that simulates the pixels, for all pixels."""
+    def _launch(self, kernel: Any, inputs: list[Any], state: list[wp.array]) -> None:
+        """Keep the state of all pixels, and launch the kernel that simulates them."""
 
         def run(start: int, stop: int) -> None:
-            given = [*inputs, start, self._sink]
+            given = [*inputs, *state, start, self._sink]
             wp.launch(kernel, dim=stop - start, inputs=given, device=self._device)
 
         if not self._device.is_cpu:
+            for values, copy in zip(state, self._before, strict=True):
+                wp.copy(copy, values)
             run(0, self._pixels)
             return
+        values_in_bytes = [_in_bytes(values) for values in state]
+        copies_in_bytes = [_in_bytes(values) for values in self._before]
+
+        def keep_and_run(start: int, stop: int) -> None:
+            """Keep the state of some pixels, which then lies in the core's cache, and run them."""
+            for values, copy in zip(values_in_bytes, copies_in_bytes, strict=True):
+                copy[start:stop] = values[start:stop]
+            run(start, stop)
+
         starts = range(0, self._pixels, CPU_RUN)
         stops = [min(start + CPU_RUN, self._pixels) for start in starts]
-        list(workers.pool().map(run, starts, stops))
+        list(workers.pool().map(keep_and_run, starts, stops))
+
+
+def _in_bytes(values: wp.array) -> NDArray[np.uint8]:
+    """Return the memory of an array on the CPU, one row of bytes for each element."""
+    return values.numpy().view(np.uint8).reshape(len(values), -1)
 
 
 def sort_keys(keys: wp.array, total: int, lowest: int, top: int) -> None:

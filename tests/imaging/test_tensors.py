@@ -16,8 +16,7 @@ import warp as wp
 
 import amiwarp
 from amiwarp import AmiwarpError, Camera, DeviceEvents, Encoder, Events, Recording
-from amiwarp.imaging import tensors, window_batch, window_images
-from amiwarp.imaging.window_images import Grid
+from amiwarp.imaging import tensors, whole_windows, window_batch, window_images
 from amiwarp.tasks import limited_cpu_threads
 
 WIDTH, HEIGHT, BINS = 24, 17, 5
@@ -246,6 +245,9 @@ def test_surfaces(device: str) -> None:
     )
     np.testing.assert_allclose(found, expected, rtol=0, atol=EXACT)
     assert (expected == 0.0).any()
+    # A window that begins and ends at its only event
+    alone = host(amiwarp.time_surface(put(events[:1], device), WIDTH, HEIGHT, 1.0))
+    assert alone.max() == 1.0
 
 
 def test_surfaces_are_1_after_the_end_of_the_window(device: str) -> None:
@@ -402,7 +404,9 @@ def test_intervals_in_parts(
         window_batch.batch_of(there, (WIDTH, HEIGHT), None, None, None, None, None, device),
         (int(t[0]), int(t[-1])),
     )
-    parts, fullest = window_images._parts(one, Grid(WIDTH, HEIGHT, steps=BINS - 1, rate=BINS - 1))
+    parts, fullest = window_images._parts(
+        one, window_images.Grid(WIDTH, HEIGHT, steps=BINS - 1, rate=BINS - 1)
+    )
     assert (parts > 1) == (fullest < window_images.CAPACITY) == (burst < window_images.CAPACITY)
     found = host(amiwarp.voxel_grid(there, WIDTH, HEIGHT, BINS))
     assert np.abs(found - linear_grid(events, BINS, BINS - 1, t0, t1)).max() < EXACT
@@ -483,6 +487,51 @@ def test_many_windows_are_those_one_by_one(
     monkeypatch.setattr(window_images, "MOST_BYTES", {"cpu": 1, "cuda": 1})
     for one, other in zip(all_of(given, found), expected, strict=True):
         assert np.array_equal(one, other)
+
+
+def in_both_ways(make: Callable[[], list[np.ndarray]]) -> None:
+    """Compute tensors by threads that take blocks of events, and by threads that take whole windows: the same bits."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(whole_windows, "cpu_threads", lambda: 1 << 30)
+        patch.setattr(whole_windows, "FEW_EVENTS", 0)
+        of_blocks = make()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(whole_windows, "PIXELS_OF_EVENT", 0)
+        patch.setattr(whole_windows, "LEAST_WORK", 1)
+        of_windows = [make(), make()]  # the second time in the memory of the first
+    for again in of_windows:
+        assert all(np.array_equal(a, b) for a, b in zip(of_blocks, again, strict=True))
+
+
+@pytest.mark.parametrize("between", [False, True])
+@pytest.mark.parametrize("cut", CUTS)
+def test_threads_that_take_whole_windows(cut: str, between: bool, every_core: None) -> None:
+    events = positions(some_events()) if between else some_events()
+    found = CUTS[cut](events)
+    in_both_ways(lambda: all_of(events, found))
+    third = (found.t_end - found.t_start) // 3
+    late = amiwarp.Windows(found.start, found.stop, found.t_start + third, found.t_end - third)
+    in_both_ways(lambda: all_of(events, late))
+    for bins in (1, 2, 70):
+        for end_bin in (False, True):
+            grid = partial(amiwarp.voxel_grid, events, WIDTH, HEIGHT, bins, end_bin=end_bin)
+            in_both_ways(lambda grid=grid: [grid(windows=found)])
+
+
+def test_whole_windows_after_a_fault() -> None:
+    """Memory that the next call uses again is as clean as before, also if a call raises an error."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(whole_windows, "PIXELS_OF_EVENT", 0)
+        expected = all_of(some_events(), amiwarp.windows(some_events(), count=900))
+        for at in (70, 19_000):
+            events = some_events()
+            events.x[at] = WIDTH
+            cut = amiwarp.windows(events, count=900)
+            for name in EVERY:
+                with pytest.raises(AmiwarpError, match=f"event {at} .* outside"):
+                    EVERY[name](events, WIDTH, HEIGHT, windows=cut)
+        again = all_of(some_events(), amiwarp.windows(some_events(), count=900))
+    assert all(np.array_equal(a, b) for a, b in zip(expected, again, strict=True))
 
 
 def test_windows_of_equal_duration(device: str) -> None:

@@ -887,6 +887,8 @@ def arrays_of(arrays: dict[str, np.ndarray], labels: dict[str, Any]) -> dict[str
         ("{bins = 3}", "field output.representation is missing; add this field"),
         ('{representation = "voxels"}', "field output.representation is 'voxels'; choose among event_count"),
         ('{representation = "voxel_grid"}', "field output.bins is missing; voxel_grid needs it"),
+        ('{representation = "tore_volume"}', "field output.depth is missing; tore_volume needs it"),
+        ('{representation = "mixed_density_stack", stacks = 33}', "field output.stacks = 33 is not"),
         ('{representation = "voxel_grid", bins = 0}', "field output.bins = 0 is not a whole number"),
         ('{representation = "voxel_grid", bins = 2000000}', "field output.bins = 2000000 is not a whole number in 1"),
         ('{representation = "event_count", t_start = 5, t_end = 1}', "field output.t_end is 1 us, before output.t_st"),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from amiwarp.errors import AmiwarpError, ErrorCode
-from amiwarp.imaging import tensors
+from amiwarp.imaging import recent_tensors, tensors
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.json_files import read_toml
 from amiwarp.io.recorded_dataset import SPLIT_NAME
@@ -168,7 +168,8 @@ def _from_one(value: Any, name: str) -> Any:
 class OutputEntry:
     """Fields of ``output``: tensors that are written instead of recordings.
 
-    The fields without a docstring are parameters of the function in :mod:`amiwarp.imaging.tensors`.
+    The fields without a docstring are parameters of the function in :mod:`amiwarp.imaging.tensors`
+    or :mod:`amiwarp.imaging.recent_tensors`.
     """
 
     representation: Literal[
@@ -178,6 +179,9 @@ class OutputEntry:
         "stacked_histogram",
         "time_surface",
         "latest_times",
+        "tore_volume",
+        "mixed_density_stack",
+        "event_spike_tensor",
     ]
     """Name of the function."""
     bins: Annotated[int, partial(whole, low=1, high=tensors.MOST_BINS)] | None = None
@@ -186,6 +190,10 @@ class OutputEntry:
     limit: Annotated[int, partial(whole, low=1, high=255)] | None = None
     tau_us: Annotated[float, partial(real, low=1e-6)] | None = None
     linear: bool | None = None
+    depth: Annotated[int, partial(whole, low=1, high=recent_tensors.MOST_DEPTH)] | None = None
+    shortest_us: Annotated[float, partial(real, low=0.0)] | None = None
+    longest_us: Annotated[float, partial(real, low=0.0)] | None = None
+    stacks: Annotated[int, partial(whole, low=1, high=recent_tensors.MOST_STACKS)] | None = None
     per_polarity: bool | None = None
     carry: bool | None = None
     t_start: int | None = None
@@ -203,7 +211,8 @@ class OutputEntry:
     @property
     def function(self) -> Callable[..., Any]:
         """Function that makes the tensors."""
-        return getattr(tensors, self.representation)
+        of_recent_events = hasattr(recent_tensors, self.representation)
+        return getattr(recent_tensors if of_recent_events else tensors, self.representation)
 
     @property
     def options(self) -> dict[str, Any]:
