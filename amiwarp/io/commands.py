@@ -22,6 +22,8 @@ from amiwarp.io import convert, description, open_recording
 from amiwarp.io.description_table import table_rows
 from amiwarp.io.opening import head_only
 from amiwarp.io.output_formats import EXTENSION_HELP, Codec, make_folder
+from amiwarp.io.rig_description import describe_rig, rig_rows
+from amiwarp.io.rig_files import is_rig, open_rig
 from amiwarp.io.truth_files import save_flow_dsec, save_flow_mvsec, save_poses_tum
 
 LARGE_BYTES = 1 << 28
@@ -32,7 +34,7 @@ def run_info(
     file: Annotated[
         Path,
         typer.Argument(
-            help="Recording in any supported format, or camera: to list the connected cameras."
+            help="Recording in any supported format, folder of a rig, or camera: to list the connected cameras."
         ),
     ],
     *,
@@ -49,11 +51,17 @@ def run_info(
 ) -> None:
     """Show a recording's format, events, encoder, camera, prism, IMU, frames, truth, repairs and assumptions.
 
+    Of a rig it shows the sensors, their places, and whether their times overlap.
+
     Files of up to 256 MiB are read once, in blocks. Of larger files only the first 4 million events and the end are
     read, unless --count is given. Figures that are then estimates are marked as such.
     """
     if str(file) == "camera:":
         _report_cameras(common)
+        return
+    if is_rig(file):
+        of_rig = describe_rig(open_rig(file), str(file))
+        cli.report(common, of_rig, [cli.table(rig_rows(of_rig))])
         return
     is_large = not count and _file_bytes(file) > LARGE_BYTES
     with contextlib.ExitStack() as reading:
