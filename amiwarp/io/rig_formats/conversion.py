@@ -18,7 +18,7 @@ from amiwarp.io.rig_formats.task import RigTask
 from amiwarp.io.unfinished import scratch_folder
 from amiwarp.schema.calls import guarded
 from amiwarp.tasks import Progress, silent
-from amiwarp.validation import choice, real, vector
+from amiwarp.validation import choice, instance, real, vector
 
 
 class RigFormat(Option):
@@ -146,6 +146,9 @@ def convert_rig(
     """
     out = Path(out)
     chosen = rig_format(out, format)
+    for side, name in (("left", left), ("right", right)):
+        if name is not None:
+            instance(name, str, side)
     task = RigTask(
         rig=rig if isinstance(rig, RigRecording) else open_rig(rig),
         out=out,
