@@ -19,7 +19,6 @@ from amiwarp import (
     save_rig,
 )
 from amiwarp.viewer import Inspector, Panel, ShownRig, main_sensor
-from amiwarp.viewer.layout import SETTABLE
 from tests.viewer.test_serve import WAIT_S, served
 from tests.viewer.test_view_cli import view
 
@@ -147,7 +146,7 @@ def test_on_the_page_all_sensors_follow_the_timeline(browser: Any) -> None:
         panels.append(Panel(server, opened(make_rig())))
         return panels[-1].close
 
-    with served(build, SETTABLE) as (url, _), browser.new_context() as context:
+    with served(build, {}) as (url, _), browser.new_context() as context:
         page = context.new_page()
         page.set_default_timeout(1e3 * WAIT_S)
         page.on("console", lambda each: each.type == "error" and failures.append(each.text))

@@ -1,6 +1,6 @@
 """ROS bags of a rig: for each sensor its events, images, calibration, IMU samples and true poses; places in tf_static.
 
-Messages are those of ROS: `sensor_msgs <https://docs.ros.org/en/api/sensor_msgs/html/index-msg.html>`_,
+Types of messages: `sensor_msgs <https://docs.ros.org/en/api/sensor_msgs/html/index-msg.html>`_,
 `REP 118 <https://www.ros.org/reps/rep-0118.html>`_ for depth (32FC1 in metres, infinite beyond the range, NaN if
 unknown) and `REP 145 <https://www.ros.org/reps/rep-0145.html>`_ for the IMU. The frame ``rig`` is the parent of the
 frames of the sensors, which are called as the sensors.
