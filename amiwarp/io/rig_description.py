@@ -53,9 +53,12 @@ def span_of(recording: Recording) -> tuple[int, int] | None:
 
 def _sensor(rig: RigRecording, name: str) -> dict[str, Any]:
     """Return the description of a sensor, whose place is given in the frame of the first sensor."""
+    from scipy.spatial.transform import Rotation
+
     recording = rig[name].recording
     first = next(iter(rig.sensors))
     place = rig.between(name, first)
+    turned = Rotation.from_matrix(place[:, :3])
     span = span_of(recording)
     width, height = recording.events.size
     rate = None
@@ -78,22 +81,13 @@ def _sensor(rig: RigRecording, name: str) -> dict[str, Any]:
         "last_us": None if span is None else span[1],
         "position_mm": (1e3 * place[:, 3]).tolist(),
         "baseline_mm": 1e3 * float(np.linalg.norm(place[:, 3])),
-        "angle_deg": math.degrees(rotation_angle(place[:, :3])),
+        "angle_deg": math.degrees(turned.magnitude()),
     }
 
 
 def _counted(t: NDArray[np.int64]) -> dict[str, Any]:
     """Return the number and the rate of records at the times ``t`` [us]."""
     return {"count": len(t), "rate_hz": mean_rate(t)}
-
-
-def rotation_angle(rotation: NDArray[np.float64]) -> float:
-    """Return the angle of a rotation matrix [rad]."""
-    # The sine is exact for small angles, where the cosine is not.
-    x = rotation[2, 1] - rotation[1, 2]
-    y = rotation[0, 2] - rotation[2, 0]
-    z = rotation[1, 0] - rotation[0, 1]
-    return math.atan2(math.sqrt(x * x + y * y + z * z), float(np.trace(rotation)) - 1.0)
 
 
 def _clock_warnings(spans: dict[str, tuple[int, int]]) -> list[str]:

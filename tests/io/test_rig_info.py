@@ -18,7 +18,7 @@ TIMES = np.arange(5) * 25_000
 
 
 def place(degrees: float, x: float, y: float, z: float) -> Any:
-    turned = Rotation.from_rotvec([0, np.radians(degrees), 0]).as_matrix()
+    turned = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
     return np.column_stack([turned, [x, y, z]])
 
 
