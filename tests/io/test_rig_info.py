@@ -58,9 +58,11 @@ def test_info_shows_sensors_and_places(tmp_path: Path) -> None:
     assert left["imu"] == {"count": 51, "rate_hz": pytest.approx(500)}
     assert tof["depth_maps"] == {"count": 5, "rate_hz": pytest.approx(40)}
     assert tof["angle_deg"] == pytest.approx(3, abs=1e-9)
-    assert tof["position_mm"] == pytest.approx([0, 300, 0], abs=1e-9)
+    seen_by_left = np.linalg.inv(place(10, 0, 0, 0)[:, :3]) @ [0, 300, 0]
+    assert tof["position_mm"] == pytest.approx(seen_by_left.tolist(), abs=1e-9)
     assert (data["common_us"], data["warnings"]) == ([500, 100_000], [])
-    assert "300 mm from left (x 0, y 300, z 0), turned by 3 deg" in text
+    x, y, z = seen_by_left
+    assert f"300 mm from left (x {x:.6g}, y {y:.6g}, z {z:.6g}), turned by 3 deg" in text
     assert "events, 6 x 4 px, FOV 60 deg, 1,001 events (0.01 Mev/s), 51 IMU samples" in text
     assert "world room" in text
 
