@@ -556,6 +556,21 @@ def test_what_cannot_be_written_is_named(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_without_names_the_outermost_cameras_are_left_and_right(tmp_path: Path) -> None:
+    sensors = {}
+    for name, x in (("middle", 0.0), ("east", 0.3), ("near", 0.1), ("west", -0.2)):
+        seen = Recording(events_of(1, COLOUR), COLOUR)
+        sensors[name] = RigSensor("events", seen, np.column_stack([np.eye(3), [x, 0, 0]]))
+    rig = RigRecording(sensors)
+
+    def roles(name: str, **given: str) -> list[str]:
+        return list(convert_rig(rig, tmp_path / name, format="dsec", **given).roles.values())  # type: ignore[arg-type]
+
+    assert roles("a") == ["west", "east"]
+    assert roles("b", left="middle") == ["middle", "east"]
+    assert roles("c", right="near") == ["west", "near"]
+
+
 def test_existing_folders_stay(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     for name, message in (
