@@ -101,7 +101,7 @@ def _nearest_picture(name: str, store: ImageStore, span: Span) -> SensorPicture:
     middle = span.start_us + span.length_us // 2
     index = int(np.argmin(np.abs(store.t - middle)))
     t = int(store.t[index])
-    text = f"{(t - span.first_us) * 1e-3:.1f} ms (middle {(t - middle) * 1e-3:+.1f} ms)"
+    text = f"{(t - span.first_us) * 1e-3:.1f} ms ({(t - middle) * 1e-3:+.1f} ms)"
     image = store[index]
     if image.dtype == np.float32:
         metres = np.where(np.isfinite(image), image, np.nan)

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.events.other_sensors import mean_rate
 from amiwarp.io.camera_files import kalibr_camera
 from amiwarp.io.rig_formats.files import camera_from_imu, write_imu_table, write_yaml
 from amiwarp.io.rig_formats.kalibr import frame_cameras, write_frames
-from amiwarp.io.rig_formats.task import Matrix, RigTask, pose_matrices
+from amiwarp.io.rig_formats.task import RigTask, pose_matrices
 
 MODELS = {"none": "radial-tangential", "radtan": "radial-tangential", "equidistant": "equidistant"}
 """EuRoC's names of the distortion models, by Kalibr's."""
@@ -85,7 +86,7 @@ def _write_camera(task: RigTask, folder: Path, name: str, first: str, carrier: s
     write_yaml(folder / "sensor.yaml", about)
 
 
-def _matrix(values: Matrix) -> dict[str, Any]:
+def _matrix(values: NDArray[np.floating[Any]]) -> dict[str, Any]:
     """Return a matrix as the files hold it."""
     rows, columns = values.shape
     return {"cols": columns, "rows": rows, "data": values.ravel().tolist()}

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-from collections.abc import Iterator
+from collections.abc import Generator
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -26,7 +26,7 @@ from amiwarp.io.rig_formats.task import Matrix, RigTask
 from amiwarp.io.ros.ros1_writer import ARRAY, EARLIEST_NS, ArrayEncoder
 from amiwarp.io.ros.ros2_writer import MESSAGE, PacketEncoder, ros2_file
 
-Messages: TypeAlias = Iterator[tuple[int, Any, bytes]]
+Messages: TypeAlias = Generator[tuple[int, Any, bytes], None, None]
 """Time of the recording [ns], connection of the library, which stands for a topic, and serialised message."""
 
 RIG_FRAME = "rig"
