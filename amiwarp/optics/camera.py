@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,9 @@ from amiwarp.optics.distortion import (
 from amiwarp.schema.calls import guarded
 from amiwarp.schema.records import build, fields_of
 from amiwarp.validation import INT64, array, one_of, real, shown, vector, whole
+
+if TYPE_CHECKING:
+    from amiwarp.events.recording import Events
 
 LARGEST_SIZE = 65536
 """Largest width and height of a sensor [px], because columns and rows of events are uint16."""
@@ -276,6 +279,43 @@ class Camera:
             If the array has another shape or does not hold numbers.
         """
         return _run("rays_to_pixels", self, rays, (3, 2))
+
+    @guarded
+    def undistort(self, events: Events, target: Camera | None = None) -> Events:
+        """Return events as a camera without lens distortion would see them.
+
+        Parameters
+        ----------
+        events : Events
+            Events of this camera: of the sensor, or compensated.
+        target : Camera, optional
+            The camera that would see them, at the same place with the same orientation, such as a pinhole camera with
+            another focal length. By default, a pinhole camera with the ``fx``, ``fy``, ``cx`` and ``cy`` of this one.
+
+        Returns
+        -------
+        Events
+            The same events at float32 coordinates [px], NaN for an event that no ray reaches, or that lies behind the
+            image plane of ``target``. Other events may lie outside the image. Times and polarities are unchanged.
+
+        Raises
+        ------
+        AmiwarpError
+            If an event of a sensor lies outside this camera's image.
+
+        Examples
+        --------
+        >>> lens = amiwarp.RadialTangential(k1=-0.2)
+        >>> camera = amiwarp.Camera(640, 480, 500.0, 500.0, 320.0, 240.0, lens)
+        >>> events = amiwarp.Events.from_arrays(x=[320, 639], y=[240, 240], t=[0, 10], p=[1, 0])
+        >>> camera.undistort(events).x.round(1)
+        array([320. , 674.7], dtype=float32)
+        """
+        from amiwarp.optics.undistortion import undistorted_places
+
+        seen_by = replace(self, distortion=None) if target is None else target
+        places = undistorted_places(events, self, seen_by)
+        return replace(events, x=places.x, y=places.y)
 
 
 def check_size(width: float, height: float, where: object) -> None:
