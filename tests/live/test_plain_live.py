@@ -1,0 +1,249 @@
+"""Live streams of a plain camera, without a calibration: the command and the iterator for programs."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Encoder,
+    EventFilter,
+    Events,
+    MemoryEvents,
+    Prism,
+    RadialTangential,
+    Recording,
+    compensate_events,
+    compensate_live,
+    find_hot_pixels,
+    open_recording,
+    save_camera,
+    save_recording,
+    stream_live,
+)
+from amiwarp.compensation import OUTSIDE
+from amiwarp.live.commands.session import describe
+from amiwarp.live.stream.session_status import SessionStatus, StageStatus
+from reference.calibration_sample import exact_calibration
+from tests.command_line import app
+from tests.io.test_io_readers import assert_equal
+
+SIZE = 64, 48
+LENS = Camera(64, 48, 50.0, 52.0, 30.5, 24.0, RadialTangential(-0.3, 0.05))
+PRISM = Prism(0.035)
+KNOWN = exact_calibration(LENS, PRISM, {"apex": PRISM.apex, "phase": 0.4})
+N = 30_000
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with a plain recording, one with an encoder, the camera, and a calibration."""
+    path = tmp_path_factory.mktemp("plain")
+    rng = np.random.default_rng(2)
+    t = np.sort(rng.integers(0, 200_000, N))
+    x, y = rng.integers(0, 64, N), rng.integers(0, 48, N)
+    is_hot = rng.random(N) < 0.02
+    x[is_hot], y[is_hot] = 7, 9
+    events = MemoryEvents(Events.from_arrays(x, y, t, rng.integers(0, 2, N)), *SIZE)
+    save_recording(path / "plain.h5", Recording(events, LENS))
+    encoder = Encoder.constant_speed(720.0, -5000, 205_000)
+    save_recording(path / "turned.h5", Recording(events, LENS, encoder, PRISM))
+    save_camera(path / "camera.json", LENS)
+    KNOWN.save(path / "calibration.json")
+    return path
+
+
+def live(*args: object) -> dict[str, Any]:
+    done = CliRunner().invoke(app, ["live", *map(str, args), "--fast", "--json"])
+    assert done.exit_code == 0, done.stderr
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+def test_a_plain_stream_is_filtered_undistorted_and_recorded(folder: Path, tmp_path: Path) -> None:
+    source = folder / "plain.h5"
+    out, raw = tmp_path / "out.h5", tmp_path / "raw.h5"
+    result = live(
+        source, "--out", out, "--record", raw, "--hot-pixels", source, "--region", "3,2,60,48",
+        "--refractory-us", 700, "--background-ms", 3, "--max-rate", 0.02, "--only", "on",
+        "--undistort", folder / "camera.json",
+    )  # fmt: skip
+    events = open_recording(source).events[:]
+    hot = find_hot_pixels(events, SIZE)
+    assert np.argwhere(hot).tolist() == [[9, 7]]
+    chosen = EventFilter(
+        region=(3, 2, 60, 48), polarity=1, hot_pixels=hot, refractory_us=700, background_us=3000,
+        most_per_s=20_000.0,
+    )  # fmt: skip
+    wanted = chosen.apply(events, SIZE)
+    found = open_recording(out)
+    assert_equal(found.events[:], LENS.undistort(wanted))
+    assert found.camera == Camera(64, 48, 50.0, 52.0, 30.5, 24.0)
+    assert "refractory_us 700" in str(found.metadata["filter"])
+    assert_equal(open_recording(raw).events[:], events)
+    assert open_recording(raw).camera == LENS
+    assert result["events"] == N
+    assert result["compensated"] == 0
+    assert result["model"] is None
+    assert "events are not compensated" in result["messages"][0]
+    read, filtered, undistorted = result["stages"]
+    assert read["received"] == read["passed"] == filtered["received"] == N
+    assert filtered["passed"] == len(wanted) == undistorted["received"] == undistorted["passed"]
+    assert sum(filtered["removed"].values()) == N - len(wanted)
+    assert min(filtered["removed"].values()) > 0
+    assert undistorted["marked"]["outside"] == result["outside"] > 0
+
+
+def test_without_stages_the_output_is_the_sensors_events(folder: Path, tmp_path: Path) -> None:
+    live(folder / "plain.h5", "--out", tmp_path / "out.h5")
+    found = open_recording(tmp_path / "out.h5")
+    assert_equal(found.events[:], open_recording(folder / "plain.h5").events[:])
+    assert found.events[:].whole_pixels
+    assert found.encoder is None
+    assert "filter" not in found.metadata
+
+
+def test_a_source_with_an_encoder_keeps_it_without_a_calibration(
+    folder: Path, tmp_path: Path
+) -> None:
+    live(folder / "turned.h5", "--record", tmp_path / "raw.h5", "--out", tmp_path / "out.h5")
+    for name in ("raw.h5", "out.h5"):
+        found = open_recording(tmp_path / name)
+        assert found.encoder is not None
+        assert found.prism == PRISM
+
+
+@pytest.mark.parametrize("undistort", [True, False])
+def test_plain_packets_are_served(folder: Path, undistort: bool) -> None:
+    """A receiver of --to gets the events after the last stage, and of --raw-to all of them."""
+    args = ["--undistort", folder / "camera.json"] if undistort else []
+    found: list[Events] = []
+    with stream_live(folder / "plain.h5", fast=True, filter=EventFilter(polarity=1)) as packets:
+        wanted = Events.concatenate([packet.events for packet in packets])
+    done = CliRunner().invoke(
+        app,
+        ["live", str(folder / "plain.h5"), "--fast", "--only", "on", "--to", "-", *map(str, args)],
+    )
+    assert done.exit_code == 0, done.stderr
+    from amiwarp import Compensated
+    from amiwarp.live.stream import Hello, PacketDecoder
+
+    hello = None
+    for message in PacketDecoder("test").feed(done.stdout_bytes):
+        if isinstance(message, Hello):
+            hello = message
+        elif isinstance(message, Compensated):
+            assert undistort
+            found.append(message.events)
+        elif isinstance(message, Events):
+            assert not undistort
+            found.append(message)
+    assert hello is not None
+    assert hello.camera == (Camera(64, 48, 50.0, 52.0, 30.5, 24.0) if undistort else LENS)
+    assert_equal(Events.concatenate(found), LENS.undistort(wanted) if undistort else wanted)
+
+
+def test_compensated_events_are_filtered_before_and_undistorted_after(
+    folder: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.h5"
+    result = live(
+        folder / "turned.h5", "--calibration", folder / "calibration.json", "--out", out,
+        "--refractory-us", 900, "--undistort", folder / "calibration.json",
+    )  # fmt: skip
+    recording = open_recording(folder / "turned.h5")
+    chosen = EventFilter(refractory_us=900)
+    kept = chosen.apply(recording.events[:], SIZE)
+    assert recording.encoder is not None
+    xy = compensate_events(kept, KNOWN.model, recording.encoder)
+    columns = np.ascontiguousarray(xy.T)
+    wanted = LENS.undistort(Events(*columns, kept.t, kept.p))
+    names = [stage["name"] for stage in result["stages"]]
+    assert names == ["read", "filter", "compensate", "undistort"]
+    found = open_recording(out).events[:]
+    assert np.array_equal(found.t, kept.t)
+    np.testing.assert_allclose(found.x, wanted.x, rtol=0, atol=1e-3)  # px
+    with compensate_live(
+        folder / "turned.h5", KNOWN, filter=chosen, undistort=True, fast=True
+    ) as packets:
+        in_program = Events.concatenate([packet.events for packet in packets])
+    assert_equal(in_program, found)
+    assert [stage.name for stage in packets.stages] == names
+
+
+def test_programs_iterate_over_a_plain_stream(folder: Path) -> None:
+    chosen = EventFilter(refractory_us=400, background_us=2000)
+    with stream_live(folder / "plain.h5", filter=chosen, undistort=LENS, fast=True) as packets:
+        assert packets.size == SIZE
+        found = list(packets)
+    events = open_recording(folder / "plain.h5").events[:]
+    wanted = LENS.undistort(chosen.apply(events, SIZE))
+    assert_equal(Events.concatenate([packet.events for packet in found]), wanted)
+    marked = sum(int(np.count_nonzero(packet.flags & OUTSIDE)) for packet in found)
+    assert packets.stages[-1].marked == {"outside": marked}
+    assert [stage.name for stage in packets.stages] == ["read", "filter", "undistort"]
+
+
+def test_leaving_a_plain_stream_ends_its_threads(folder: Path) -> None:
+    with stream_live(folder / "plain.h5") as packets:
+        next(packets)
+    assert "amiwarp-live" not in [thread.name for thread in threading.enumerate()]
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["--picture", "p.mp4"], "--picture needs a calibration"),
+        (["--adaptive"], "--adaptive needs a calibration"),
+        (["--watch-s", "3"], "--watch-s needs a calibration"),
+        (["--region", "0,0,65,48"], "expected a part of the image of 64x48 px"),
+        (["--undistort", "small.json"], "is a camera of 32x24 pixels, the source has 64x48"),
+        (["--undistort", "none.json"], "none.json"),
+        (["--hot-pixels", "small.h5"], "give a recording of the same camera"),
+        (
+            ["--calibration", "calibration.json", "--undistort", "other.json"],
+            "is another camera than the calibration's",
+        ),
+    ],
+)
+def test_stages_that_do_not_fit_are_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], says: str
+) -> None:
+    monkeypatch.chdir(folder)
+    save_camera("small.json", Camera.from_fov(32, 24, 1.0), overwrite=True)
+    save_camera("other.json", Camera.from_fov(64, 48, 1.0), overwrite=True)
+    one = Events.from_arrays([1], [1], [0], [1])
+    save_recording("small.h5", Recording(MemoryEvents(one, 32, 24)), overwrite=True)
+    before = set(folder.iterdir())
+    done = CliRunner().invoke(app, ["live", "turned.h5", "--out", "o.h5", *args])
+    assert done.exit_code == 1
+    assert says in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert set(folder.iterdir()) == before
+
+
+def test_a_foreign_camera_is_refused_and_the_source_is_closed(folder: Path) -> None:
+    with (
+        pytest.raises(AmiwarpError, match="give the camera of this source"),
+        stream_live(folder / "plain.h5", undistort=Camera.from_fov(32, 24, 1.0)),
+    ):
+        pass
+
+
+def test_the_status_line_of_a_plain_stream_names_no_encoder() -> None:
+    stages = [StageStatus("read", 200, 200), StageStatus("filter", 200, 50)]
+    status = SessionStatus(seconds=1.0, events=200, done=50, latency_ms=(3.0, 4.0), stages=stages)
+    text = describe(status, 200)
+    assert "latency 3.0 ms" in text
+    assert "filter keeps 25 %" in text
+    assert "encoder" not in text
+    status.stages.append(StageStatus("compensate", 50, 50))
+    assert "encoder 100.0 %" in describe(status, 200)
