@@ -86,6 +86,8 @@ from .imaging.tensors import polarity_histogram as polarity_histogram
 from .imaging.tensors import stacked_histogram as stacked_histogram
 from .imaging.tensors import time_surface as time_surface
 from .imaging.tensors import voxel_grid as voxel_grid
+from .imaging.tensor_stream import StreamTensor as StreamTensor
+from .imaging.tensor_stream import TensorStream as TensorStream
 from .imaging.to_tensor import ToTensor as ToTensor
 from .imaging.windows import Windows as Windows
 from .imaging.windows import collate as collate

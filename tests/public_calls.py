@@ -331,6 +331,8 @@ OWN: dict[str, dict[str, Any]] = {
     },
     "convert": {"source_path": "in.h5"},
     "EventFilter.apply": {"size": (4, 3)},
+    "StreamTensor": {"tensor": np.zeros((2, 3)), "t_start": 0, "t_end": 10, "events": 0},
+    "TensorStream": {"representation": aw.ToTensor(aw.event_count, width=4, height=3), "rate_hz": 50.0},
     "filter_recording": {"chosen": aw.EventFilter(every=2)},
     "render": {"path": _new(".mp4")},
     "FilmSummary": {"frames": 1, "height": 2, "fps": 30.0, "speed": 1.0, "decay_us": None, "events": 5},

@@ -16,6 +16,8 @@ from .phase import weighted_sums as weighted_sums
 from .phase_ring import PhaseRing as PhaseRing
 from .phase_ring import PhaseUpdate as PhaseUpdate
 from .phase_ring import RingPart as RingPart
+from .tensor_stream import StreamTensor as StreamTensor
+from .tensor_stream import TensorStream as TensorStream
 from .tensors import event_count as event_count
 from .tensors import latest_times as latest_times
 from .tensors import polarity_histogram as polarity_histogram

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import json
+import socket
+import struct
 import threading
+import time
+import zlib
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -21,6 +27,8 @@ from amiwarp import (
     Prism,
     RadialTangential,
     Recording,
+    TensorStream,
+    ToTensor,
     compensate_events,
     compensate_live,
     find_hot_pixels,
@@ -28,6 +36,7 @@ from amiwarp import (
     save_camera,
     save_recording,
     stream_live,
+    voxel_grid,
 )
 from amiwarp.compensation import OUTSIDE
 from amiwarp.live.commands.session import describe
@@ -35,6 +44,7 @@ from amiwarp.live.stream.session_status import SessionStatus, StageStatus
 from reference.calibration_sample import exact_calibration
 from tests.command_line import app
 from tests.io.test_io_readers import assert_equal
+from tests.rig_world import LONG_S
 
 SIZE = 64, 48
 LENS = Camera(64, 48, 50.0, 52.0, 30.5, 24.0, RadialTangential(-0.3, 0.05))
@@ -247,3 +257,117 @@ def test_the_status_line_of_a_plain_stream_names_no_encoder() -> None:
     assert "encoder" not in text
     status.stages.append(StageStatus("compensate", 50, 50))
     assert "encoder 100.0 %" in describe(status, 200)
+
+
+def read_tensors(data: bytes) -> list[tuple[int, int, int, np.ndarray]]:
+    """Return start, end, number of events and array of the tensors of a stream, as the page's receiver reads them."""
+    found = []
+    start = 0
+    while start < len(data):
+        magic, version, kind, _, rows, length, check = struct.unpack_from("<4sBBHIII", data, start)
+        payload = data[start + 20 : start + 20 + length]
+        assert (magic, version, check) == (b"AMIS", 1, zlib.crc32(payload))
+        if kind == 8:
+            assert rows == 1
+            array = np.load(io.BytesIO(payload[24:]), allow_pickle=False)
+            found.append((*struct.unpack_from("<qqQ", payload), array))
+        start += 20 + length
+    assert kind == 6
+    return found
+
+
+def test_tensors_are_written_and_served(folder: Path, tmp_path: Path) -> None:
+    events = open_recording(folder / "plain.h5").events[:]
+    to_tensor = ToTensor(voxel_grid, width=64, height=48, bins=3)
+    stream = TensorStream(to_tensor, 100.0)
+    wanted = [*stream.put(LENS.undistort(events)), stream.finish()]
+    address = f"unix:{tmp_path}/tensors"
+    received: list[bytes] = []
+
+    def receive() -> None:
+        while not (tmp_path / "tensors").exists():
+            time.sleep(0.002)
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(str(tmp_path / "tensors"))
+            while data := connection.recv(1 << 16):
+                received.append(data)
+
+    thread = threading.Thread(target=receive)
+    thread.start()
+    done = CliRunner().invoke(
+        app,
+        ["live", str(folder / "plain.h5"), "--json", "--undistort", str(folder / "camera.json"),
+         "--tensor", "voxel", "--tensor-bins", "3", "--tensor-hz", "100", "--tensor-to", address,
+         "--tensor-out", str(tmp_path / "t.h5")],
+    )  # fmt: skip
+    thread.join(LONG_S)
+    assert done.exit_code == 0, done.stderr
+    counts = json.loads(done.stdout)["tensors"]
+    assert counts == {"made": len(wanted), "events": N, "dropped_events": 0, "not_sent": 0}
+    with h5py.File(tmp_path / "t.h5") as file:
+        assert file["tensor"].shape == (len(wanted), 3, 48, 64)
+        for k, each in enumerate(wanted):
+            assert each is not None
+            assert np.array_equal(file["tensor"][k], each.tensor)
+            times = tuple(int(file[name][k]) for name in ("t_start", "t_end", "events"))
+            assert times == (each.t_start, each.t_end, each.events)
+    served = read_tensors(b"".join(received))
+    assert 0 < len(served) <= len(wanted)  # from the moment on in which the receiver connected
+    by_start = {each.t_start: each for each in wanted if each is not None}
+    for t_start, t_end, count, array in served:
+        same = by_start[t_start]
+        assert (t_end, count) == (same.t_end, same.events)
+        assert np.array_equal(array, same.tensor)
+
+
+def test_a_receiver_that_dies_or_sleeps_stops_nothing(folder: Path, tmp_path: Path) -> None:
+    """A receiver that takes nothing misses whole tensors, which are counted; one that leaves is forgotten."""
+    sleeping = socket.socket(socket.AF_UNIX)
+    leaving = socket.socket(socket.AF_UNIX)
+
+    def connect() -> None:
+        while not (tmp_path / "s").exists():
+            time.sleep(0.002)
+        sleeping.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        sleeping.connect(str(tmp_path / "s"))
+        leaving.connect(str(tmp_path / "s"))
+        leaving.close()
+
+    thread = threading.Thread(target=connect)
+    thread.start()
+    done = CliRunner().invoke(
+        app,
+        ["live", str(folder / "plain.h5"), "--json", "--tensor", "voxel", "--tensor-bins", "200",
+         "--tensor-hz", "200", "--tensor-to", f"unix:{tmp_path}/s"],
+    )  # fmt: skip
+    thread.join(LONG_S)
+    sleeping.close()
+    assert done.exit_code == 0, done.stderr
+    counts = json.loads(done.stdout)["tensors"]
+    assert counts["made"] == 40
+    assert counts["events"] == N
+    assert 20 < counts["not_sent"] < 40  # 2.5 MB each, of which 16 MiB may wait
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["--tensor", "voxel"], "--tensor has no output"),
+        (["--tensor-hz", "9"], "apply to --tensor"),
+        (["--tensor-out", "t.h5"], "apply to --tensor"),
+        (["--tensor", "voxel", "--tensor-out", "t.npz"], "give a name in .h5"),
+        (["--tensor", "count", "--tensor-bins", "3", "--tensor-out", "t.h5"], "--tensor is count"),
+        (["--tensor", "voxel", "--tensor-to", "-"], "give tcp:HOST:PORT"),
+        (["--tensor", "voxel", "--tensor-out", "plain.h5"], "plain.h5"),
+    ],
+)
+def test_tensor_options_that_do_not_fit_are_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], says: str
+) -> None:
+    monkeypatch.chdir(folder)
+    before = set(folder.iterdir())
+    done = CliRunner().invoke(app, ["live", "plain.h5", "--fast", *args])
+    assert done.exit_code == 1
+    assert says in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert set(folder.iterdir()) == before

@@ -31,6 +31,7 @@ from amiwarp.live.commands.session import (
 )
 from amiwarp.live.commands.stage_options import StageOptions, stage_lines, stage_summary
 from amiwarp.live.commands.stream_description import StreamDescription
+from amiwarp.live.commands.tensor_options import TensorOptions, tensor_lines
 from amiwarp.live.link.link import Link
 from amiwarp.live.queues import Policy
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper
@@ -272,6 +273,7 @@ def run_live(
     outputs: OutputOptions,
     stream: SourceOptions,
     second_ratio: SecondRatio = None,
+    tensors: TensorOptions,
     pictures: PictureOptions,
     processing: ProcessingOptions,
     adaptive: AdaptiveOptions,
@@ -316,6 +318,11 @@ def run_live(
             stop=stop,
             say=line.say,
         )
+        live_tensors = tensors.open(
+            opened.size, described.hello, resources, stop=stop, say=line.say
+        )
+        if live_tensors is not None:
+            receivers.takers.append(live_tensors.output)
         picture_stream = None
         keeper = None
         if calibrated is not None:
@@ -348,9 +355,13 @@ def run_live(
         status = _follow(session, stop, stream.seconds, line, receivers)
         if picture_stream is not None:
             picture_stream.close()
+        if live_tensors is not None:
+            live_tensors.output.close()
     files = list(outputs.files)
     if pictures.picture is not None:
         files.append(str(pictures.picture))
+    if tensors.tensor_out is not None:
+        files.append(str(tensors.tensor_out))
     result: dict[str, Any] = {
         "files": files,
         **session_summary(status, opened),
@@ -358,7 +369,8 @@ def run_live(
         "latency_ms": status.latency_ms,
         "pictures": None if picture_stream is None else _picture_summary(picture_stream),
         "stages": [stage_summary(stage) for stage in status.stages],
-        "lost_packets": receivers.lost_packets,
+        "not_sent": receivers.not_sent,
+        "tensors": None if live_tensors is None else live_tensors.summary(),
         "model": None if calibrated is None else calibrated.model_name,
         "device": device,
         "messages": list(line.messages),
@@ -502,24 +514,18 @@ class _Receivers:
         if options.out is not None:
             self.out = resources.enter_context(stream.writer(options.out))
         self.sink = sink("plain" if stream.is_plain else "compensated", options.to, stream.hello)
-        self._is_plain = stream.is_plain
-        if not stream.is_plain:
+        self.takers: list[Callable[[Compensated], None]] = []
+        """Functions that take packets after the last stage."""
+        if self.sink is not None:
+            self.takers.append(_send_to(self.sink))
+        if stream.is_plain:
+            self.takers += [_show_plain(viewer) for viewer in self.viewers]
+        else:
+            self.takers += self.viewers
             self.raw += self.viewers
 
     @property
-    def sinks(self) -> tuple[Callable[[Compensated], None], ...]:
-        """Functions that take packets after the last stage, and send them."""
-        taking: list[Callable[[Compensated], None]] = []
-        if self.sink is not None:
-            taking.append(_send_to(self.sink))
-        if self._is_plain:
-            taking += [_show_plain(viewer) for viewer in self.viewers]
-        else:
-            taking += self.viewers
-        return tuple(taking)
-
-    @property
-    def lost_packets(self) -> dict[str, int]:
+    def not_sent(self) -> dict[str, int]:
         """Number of packets that slow receivers lost, by the option that serves them."""
         served = {"to": self.sink, "raw_to": self.raw_sink}
         return {name: sink.lost for name, sink in served.items() if sink is not None}
@@ -548,7 +554,7 @@ def _session(
         undistort=stream.lens,
         raw=receivers.raw,
         out=receivers.out,
-        sinks=receivers.sinks,
+        sinks=tuple(receivers.takers),
         watch_s=options.watch_s or None,
         keeper=keeper,
         wait_us=cli.microseconds(options.wait_ms, "ms", "--wait-ms"),
@@ -631,6 +637,7 @@ def _live_lines(result: dict[str, Any], stages: list[str]) -> list[str]:
         return [
             f"{result['events']:,} events, {speed}, not compensated",
             *stages,
+            *tensor_lines(result["tensors"]),
             *controller_lines(result["controller"]),
             *result["files"],
         ]
@@ -650,6 +657,7 @@ def _live_lines(result: dict[str, Any], stages: list[str]) -> list[str]:
         *(stages if len(stages) > 2 else ()),
         *_clock_lines(result["clock"]),
         *controller_lines(result["controller"]),
+        *tensor_lines(result["tensors"]),
         *_picture_lines(result["pictures"], result["seconds"]),
         *result["files"],
     ]
