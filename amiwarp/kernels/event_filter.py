@@ -7,6 +7,7 @@ from amiwarp.kernels.native_code import (
     load_int64,
     load_uint8,
     load_uint16,
+    prefetch_int64,
     store_int64,
     store_uint8,
 )
@@ -22,6 +23,9 @@ REFRACTORY = wp.constant(5)
 BACKGROUND = wp.constant(6)
 RATE = wp.constant(7)
 EVERY = wp.constant(8)
+
+AHEAD = wp.constant(16)
+"""Number of events after which the times of a pixel that are fetched now are needed."""
 
 
 @wp.struct
@@ -132,6 +136,19 @@ def removed_by(parts: FilterParts, state: FilterState, x: int, y: int, t: wp.int
     return 0
 
 
+@wp.func
+def prefetch_times(parts: FilterParts, state: FilterState, x: int, y: int):
+    """Fetch the times that an event of a pixel will need: a large sensor's do not fit into a core's cache."""
+    if parts.refractory_us > wp.int64(0):
+        prefetch_int64(state.kept_t, y * parts.columns + x)
+    if parts.background_us > wp.int64(0):
+        stride = parts.columns + 2
+        above = y * stride + x + 1
+        prefetch_int64(state.fired_t, above)
+        prefetch_int64(state.fired_t, above + stride)
+        prefetch_int64(state.fired_t, above + 2 * stride)
+
+
 @wp.kernel
 def find_removing_parts(
     parts: FilterParts,
@@ -145,6 +162,8 @@ def find_removing_parts(
 ):
     """Find the part that removes each of the first events. One thread passes over them, in their order."""
     for i in range(count):
+        later = wp.min(i + AHEAD, count - 1)
+        prefetch_times(parts, state, int(load_uint16(x, later)), int(load_uint16(y, later)))
         column = int(load_uint16(x, i))
         row = int(load_uint16(y, i))
         polarity = int(load_uint8(p, i))

@@ -355,7 +355,7 @@ def test_a_receiver_that_dies_or_sleeps_stops_nothing(folder: Path, tmp_path: Pa
         (["--tensor", "voxel"], "--tensor has no output"),
         (["--tensor-hz", "9"], "apply to --tensor"),
         (["--tensor-out", "t.h5"], "apply to --tensor"),
-        (["--tensor", "voxel", "--tensor-out", "t.npz"], "give a name in .h5"),
+        (["--tensor", "voxel", "--tensor-out", "t.npz"], "give a name that ends in .h5"),
         (["--tensor", "count", "--tensor-bins", "3", "--tensor-out", "t.h5"], "--tensor is count"),
         (["--tensor", "voxel", "--tensor-to", "-"], "give tcp:HOST:PORT"),
         (["--tensor", "voxel", "--tensor-out", "plain.h5"], "plain.h5"),
