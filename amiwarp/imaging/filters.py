@@ -220,7 +220,7 @@ COUNT = 2 + len(BLOCK_TYPES)
 
 
 def _part_values(chosen: EventFilter, size: tuple[int, int]) -> Any:
-    """Return the values of a filter's parts for the kernel. Those of parts that are not given keep all events."""
+    """Return the values of a filter's parts for the kernel. Parts that are not given keep all events."""
     width, height = size
     parts = kernels.FilterParts()
     parts.columns = width

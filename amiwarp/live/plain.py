@@ -57,7 +57,7 @@ def stream_live(
     ------
     LivePackets
         Iterator over the packets. It raises an error of the source, such as a stream that breaks off, after the last
-        one. Packets have the type of those of :func:`compensate_live`, so that a program serves both kinds of cameras:
+        one. Packets have the type that :func:`compensate_live` gives, so that a program serves both kinds of cameras:
         whole pixels without flags, or undistorted places, with the flag 1 for events outside the image.
 
     Raises
