@@ -39,8 +39,6 @@ from amiwarp import (
     voxel_grid,
 )
 from amiwarp.compensation import OUTSIDE
-from amiwarp.live.commands.session import describe
-from amiwarp.live.stream.session_status import SessionStatus, StageStatus
 from reference.calibration_sample import exact_calibration
 from tests.command_line import app
 from tests.io.test_io_readers import assert_equal
@@ -246,17 +244,6 @@ def test_a_foreign_camera_is_refused_and_the_source_is_closed(folder: Path) -> N
         stream_live(folder / "plain.h5", undistort=Camera.from_fov(32, 24, 1.0)),
     ):
         pass
-
-
-def test_the_status_line_of_a_plain_stream_names_no_encoder() -> None:
-    stages = [StageStatus("read", 200, 200), StageStatus("filter", 200, 50)]
-    status = SessionStatus(seconds=1.0, events=200, done=50, latency_ms=(3.0, 4.0), stages=stages)
-    text = describe(status, 200)
-    assert "latency 3.0 ms" in text
-    assert "filter keeps 25 %" in text
-    assert "encoder" not in text
-    status.stages.append(StageStatus("compensate", 50, 50))
-    assert "encoder 100.0 %" in describe(status, 200)
 
 
 def read_tensors(data: bytes) -> list[tuple[int, int, int, np.ndarray]]:

@@ -22,7 +22,6 @@ from amiwarp import (
 from amiwarp.compensation import OUTSIDE
 from amiwarp.live.link import monotonic_us
 from amiwarp.live.stream import Session, SessionStatus, make_packet
-from amiwarp.live.stream import session as session_module
 from tests.io.test_io_readers import assert_equal
 
 SIZE = WIDTH, HEIGHT = 64, 48
@@ -86,7 +85,7 @@ def test_a_filtered_stream_is_the_filtered_file(
     name: str, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if seed > 1:  # each packet goes through the stages alone
-        monkeypatch.setattr(session_module, "STEP_EVENTS", 1)
+        monkeypatch.setattr("amiwarp.live.stream.session.STEP_EVENTS", 1)
     events = some_events()
     status, packets = ran(cut(events, seed), chosen=FILTERS[name])
     wanted = FILTERS[name].apply(events, SIZE)
@@ -106,7 +105,7 @@ def test_a_filtered_stream_is_the_filtered_file(
 def test_an_undistorted_stream_is_the_undistorted_file(
     lens: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_module, "STEP_EVENTS", 1)
+    monkeypatch.setattr("amiwarp.live.stream.session.STEP_EVENTS", 1)
     camera = Camera(WIDTH, HEIGHT, 50.0, 52.0, 30.5, 24.0, lens)  # type: ignore[arg-type]
     events = some_events()
     status, packets = ran(cut(events, 4), undistort=camera)
