@@ -28,7 +28,9 @@ class TensorWriter:
     def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         self.path = Path(path)
         if self.path.suffix.lower() not in (".h5", ".hdf5"):
-            raise AmiwarpError(f"{self.path}: tensors are written to HDF5; give a name that ends in .h5")
+            raise AmiwarpError(
+                f"{self.path}: tensors are written to HDF5; give a name that ends in .h5"
+            )
         self._new = NewFile(self.path, overwrite=overwrite)
         self._resources = contextlib.ExitStack()
         self._file: Any = None

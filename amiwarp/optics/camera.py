@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from dataclasses import dataclass, is_dataclass, replace
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,9 +23,6 @@ from amiwarp.schema.calls import guarded
 from amiwarp.schema.records import build, fields_of
 from amiwarp.validation import INT64, array, one_of, real, shown, vector, whole
 
-if TYPE_CHECKING:
-    from amiwarp.events.recording import Events
-
 LARGEST_SIZE = 65536
 """Largest width and height of a sensor [px], because columns and rows of events are uint16."""
 LEAST_FOCAL = 1e-3
@@ -38,6 +36,8 @@ CAMERA_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
 Vectors = TypeVar("Vectors")
 """Type of the rows of vectors given to a camera: NumPy array (n, 2) or (n, 3), or Warp array of vec2 or vec3. Results
 have the same type."""
+EventBlock = TypeVar("EventBlock")
+"""Type of events, :class:`amiwarp.Events`. Its room imports this one."""
 
 
 @guarded
@@ -281,7 +281,7 @@ class Camera:
         return _run("rays_to_pixels", self, rays, (3, 2))
 
     @guarded
-    def undistort(self, events: Events, target: Camera | None = None) -> Events:
+    def undistort(self, events: EventBlock, target: Camera | None = None) -> EventBlock:
         """Return events as a camera without lens distortion would see them.
 
         Parameters
@@ -301,7 +301,7 @@ class Camera:
         Raises
         ------
         AmiwarpError
-            If an event of a sensor lies outside this camera's image.
+            If ``events`` are no :class:`Events`, or an event of a sensor lies outside this camera's image.
 
         Examples
         --------
@@ -311,11 +311,67 @@ class Camera:
         >>> camera.undistort(events).x.round(1)
         array([320. , 674.7], dtype=float32)
         """
-        from amiwarp.optics.undistortion import undistorted_places
-
+        if not (is_dataclass(events) and isinstance(getattr(events, "x", None), np.ndarray)):
+            raise AmiwarpError(f"events is {shown(events)}; give amiwarp.Events, in host memory")
         seen_by = replace(self, distortion=None) if target is None else target
         places = undistorted_places(events, self, seen_by)
-        return replace(events, x=places.x, y=places.y)
+        return replace(events, x=places.x, y=places.y)  # type: ignore[type-var]
+
+
+class UndistortedPlaces(NamedTuple):
+    """Places of events in an undistorted image."""
+
+    x: NDArray[np.float32]
+    """Column [px], NaN if no ray reaches the event, shape ``(n,)``."""
+    y: NDArray[np.float32]
+    """Row [px], NaN if no ray reaches the event, shape ``(n,)``."""
+    outside: NDArray[np.bool_]
+    """Whether each event lies on no pixel of the undistorted image, shape ``(n,)``."""
+
+
+def undistorted_places(events: Any, camera: Camera, target: Camera) -> UndistortedPlaces:
+    """Return the places of events of ``camera`` in the image of ``target``, which has the same view.
+
+    Events of a sensor are looked up in a table of all pixels, which is many times faster than a kernel's launch for
+    each packet of a stream. Raises :class:`AmiwarpError` if such an event lies outside the image of ``camera``.
+    """
+    if not events.whole_pixels:
+        return _places_of(np.stack([events.x, events.y], axis=1), camera, target)
+    _check_pixels(events, camera)
+    table = _places_of_pixels(camera, target)
+    pixel = events.y.astype(np.intp)
+    pixel *= camera.width
+    pixel += events.x
+    return UndistortedPlaces(table.x.take(pixel), table.y.take(pixel), table.outside.take(pixel))
+
+
+@lru_cache(maxsize=4)
+def _places_of_pixels(camera: Camera, target: Camera) -> UndistortedPlaces:
+    """Return the places of all pixels, row by row."""
+    rows, columns = np.indices((camera.height, camera.width), np.float32)
+    return _places_of(np.stack([columns.ravel(), rows.ravel()], axis=1), camera, target)
+
+
+def _places_of(xy: NDArray[np.float32], camera: Camera, target: Camera) -> UndistortedPlaces:
+    """Return the places of points of ``camera`` [px], shape (n, 2)."""
+    places = target.rays_to_pixels(camera.pixels_to_rays(xy))
+    x, y = np.ascontiguousarray(places.T)
+    in_columns = (x >= -0.5) & (x < target.width - 0.5)
+    in_rows = (y >= -0.5) & (y < target.height - 0.5)
+    return UndistortedPlaces(x, y, ~(in_columns & in_rows))
+
+
+def _check_pixels(events: Any, camera: Camera) -> None:
+    """Raise :class:`AmiwarpError` if an event lies outside the camera's image."""
+    if not len(events):
+        return
+    largest_x = int(events.x.max())
+    largest_y = int(events.y.max())
+    if largest_x >= camera.width or largest_y >= camera.height:
+        raise AmiwarpError(
+            f"events reach to pixel ({largest_x}, {largest_y}), and the camera has {camera.width}x{camera.height} "
+            "pixels; give the camera of these events"
+        )
 
 
 def check_size(width: float, height: float, where: object) -> None:

@@ -318,7 +318,7 @@ def run_live(
             stop=stop,
             say=line.say,
         )
-        live_tensors = tensors.open(
+        live_tensors = tensors.build(
             opened.size, described.hello, resources, stop=stop, say=line.say
         )
         if live_tensors is not None:

@@ -80,7 +80,7 @@ class TensorOptions:
                 "--tensor-to - is not possible; give tcp:HOST:PORT or unix:PATH", ErrorCode.OPTIONS
             )
 
-    def open(
+    def build(
         self,
         size: tuple[int, int],
         hello: bytes,

@@ -14,8 +14,7 @@ from amiwarp.compensation.streams import OUTSIDE, Compensated
 from amiwarp.events.recording import Events
 from amiwarp.imaging.filters import NAMES, EventFilter, RunningFilter
 from amiwarp.live.stream.session_status import Latencies, SessionStatus, StageStatus
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.undistortion import undistorted_places
+from amiwarp.optics.camera import Camera, undistorted_places
 
 
 class Stage:
