@@ -104,6 +104,22 @@ def test_a_tensor_comes_with_the_first_event_at_the_end_of_its_window() -> None:
     assert (last.t_start, last.t_end) == (9500, 10_500)
 
 
+@pytest.mark.parametrize("rate_hz", [30.0, 7.3, 333.3])
+def test_an_event_at_the_start_of_a_window_belongs_to_it(rate_hz: float) -> None:
+    counted: list[int] = []
+
+    def count(events: Events, *, t_start: int, t_end: int) -> int:
+        counted.append(len(events))
+        return t_end - t_start
+
+    starts = [12_345 + round(1e6 * k / rate_hz) for k in range(2000)]
+    n = len(starts)
+    stream = TensorStream(count, rate_hz)
+    found = stream.put(Events.from_arrays([1] * n, [2] * n, starts, [1] * n))
+    assert [each.t_start for each in found] == starts[:-1]
+    assert counted == [1] * (n - 1)
+
+
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, np.nan, 1e7])
 def test_impossible_rates_are_refused(rate_hz: float) -> None:
     with refused(ErrorCode.INVALID):

@@ -102,7 +102,8 @@ class TensorOptions:
         if self.tensor_out is not None:
             writer = resources.enter_context(TensorWriter(self.tensor_out))
         if self.tensor_to is not None:
-            sink = resources.enter_context(open_sink(self.tensor_to, hello, stop=stop, say=say))
+            sink = open_sink(self.tensor_to, hello, stop=stop, say=say)
+            resources.push(sink)
             say(f"tensors are served at {sink.address}")
 
         def give(found: StreamTensor) -> None:
@@ -120,7 +121,7 @@ class TensorOptions:
         from amiwarp.imaging.to_tensor import ToTensor
 
         width, height = size
-        functions = {
+        functions: dict[str, Callable[..., Any]] = {
             "voxel": tensors.voxel_grid,
             "count": tensors.event_count,
             "polarity": tensors.polarity_histogram,
