@@ -120,10 +120,8 @@ class TensorStream:
         """Return the number of the window of a time [us]."""
         assert self._first_us is not None
         number = int((t - self._first_us) * 1e-6 * self._rate_hz)
-        while self._start_us(number + 1) <= t:
+        while self._start_us(number + 1) <= t:  # the start was rounded down
             number += 1
-        while self._start_us(number) > t:
-            number -= 1
         return number
 
     def _tensor(self) -> StreamTensor:
