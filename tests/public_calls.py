@@ -603,6 +603,9 @@ OBJECTS: dict[str, Any] = {
 MADE: dict[str, Callable[[], Any]] = {
     "Compensator": lambda: aw.Compensator(MODEL, _stream()),
     "PhaseCamera": lambda: aw.PhaseCamera(MODEL, _stream()),
+    "TensorStream": lambda: aw.TensorStream(
+        aw.ToTensor(aw.event_count, width=4, height=3), rate_hz=50.0
+    ),
     "PhaseRing": _ring,
     "EncoderStream": _stream,
     "EventCamera": _eyes,

@@ -23,7 +23,7 @@ class StreamTensor:
     """Tensor of the events of one window of a stream."""
 
     tensor: Any
-    """The tensor, as the representation returns it."""
+    """The tensor, as the representation returns it, not checked."""
     t_start: int
     """Start of the window, on the events' clock [us]."""
     t_end: int
