@@ -93,6 +93,8 @@ from .imaging.tensors import polarity_histogram as polarity_histogram
 from .imaging.tensors import stacked_histogram as stacked_histogram
 from .imaging.tensors import time_surface as time_surface
 from .imaging.tensors import voxel_grid as voxel_grid
+from .imaging.tensor_stream import StreamTensor as StreamTensor
+from .imaging.tensor_stream import TensorStream as TensorStream
 from .imaging.to_tensor import ToTensor as ToTensor
 from .imaging.windows import Windows as Windows
 from .imaging.windows import collate as collate
@@ -137,10 +139,13 @@ from .lens.result import LensCalibration as LensCalibration
 from .live.camera import CameraPackets as CameraPackets
 from .live.camera import open_camera as open_camera
 from .live.compensated import compensate_live as compensate_live
+from .live.items import LivePackets as LivePackets
 from .live.pictures import pictures_live as pictures_live
+from .live.plain import stream_live as stream_live
 from .live.queues import Policy as Policy
 from .live.stream.camera_settings import CameraSettings as CameraSettings
 from .live.stream.packets import Packet as Packet
+from .live.stream.session_status import StageStatus as StageStatus
 from .optics.camera import Camera as Camera
 from .optics.camera_rotation import CameraRotation as CameraRotation
 from .optics.distortion import Distortion as Distortion

@@ -22,6 +22,7 @@ NOT_CALLED = {
     "CalibrationOptions",
     "CameraPackets",
     "InspectorHandle",
+    "LivePackets",
     "LivePicture",
     "LockedAngles",
     "Model",
@@ -272,6 +273,8 @@ OWN: dict[str, dict[str, Any]] = {
     "StageSummary.of": {"name": "n", "stage": STAGE, "names": ("apex",), "values": [{"apex": 0.1}]},
     "compensate_live": {"source": "in.h5"},
     "pictures_live": {"source": "in.h5"},
+    "stream_live": {"source": "in.h5"},
+    "StageStatus": {"name": "read"},
     "open_camera": {"name": "camera:"},
     "CameraSettings": {"biases": {"diff_on": 20}, "region": (1, 2, 3, 4), "masked": ((1, 2),), "flicker_hz": (90, 130)},
     "CompensationSummary": {"events": 1, "outside": 1, "seconds": 1.0},
@@ -330,6 +333,8 @@ OWN: dict[str, dict[str, Any]] = {
     },
     "convert": {"source_path": "in.h5"},
     "EventFilter.apply": {"size": (4, 3)},
+    "StreamTensor": {"tensor": np.zeros((2, 3)), "t_start": 0, "t_end": 10, "events": 0},
+    "TensorStream": {"representation": aw.ToTensor(aw.event_count, width=4, height=3), "rate_hz": 50.0},
     "filter_recording": {"chosen": aw.EventFilter(every=2)},
     "render": {"path": _new(".mp4")},
     "FilmSummary": {"frames": 1, "height": 2, "fps": 30.0, "speed": 1.0, "decay_us": None, "events": 5},
@@ -618,6 +623,9 @@ OBJECTS: dict[str, Any] = {
 MADE: dict[str, Callable[[], Any]] = {
     "Compensator": lambda: aw.Compensator(MODEL, _stream()),
     "PhaseCamera": lambda: aw.PhaseCamera(MODEL, _stream()),
+    "TensorStream": lambda: aw.TensorStream(
+        aw.ToTensor(aw.event_count, width=4, height=3), rate_hz=50.0
+    ),
     "PhaseRing": _ring,
     "EncoderStream": _stream,
     "EventCamera": _eyes,

@@ -177,7 +177,7 @@ COMMANDS = {
     ),
     "live": Command(
         "live",
-        "Compensate the events of a live stream and show rate, latency, coverage and sharpness on one line.",
+        "Filter, compensate and undistort the events of a live stream, and show its figures on one line.",
         "amiwarp live dv --port find --calibration calibration.json --out compensated.h5",
     ),
     "emulate": Command(

@@ -19,6 +19,8 @@ from .phase_ring import RingPart as RingPart
 from .recent_tensors import event_spike_tensor as event_spike_tensor
 from .recent_tensors import mixed_density_stack as mixed_density_stack
 from .recent_tensors import tore_volume as tore_volume
+from .tensor_stream import StreamTensor as StreamTensor
+from .tensor_stream import TensorStream as TensorStream
 from .tensors import event_count as event_count
 from .tensors import latest_times as latest_times
 from .tensors import polarity_histogram as polarity_histogram

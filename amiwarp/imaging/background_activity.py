@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.events.device_events import check_sensor
-from amiwarp.events.recording import Events, check_events
+from amiwarp.events.recording import Events
 from amiwarp.imaging.corners import sensor_side
-from amiwarp.kernels.background_activity import NEVER, mark_background
-from amiwarp.kernels.loading import load
+from amiwarp.imaging.filters import EventFilter, RunningFilter
 from amiwarp.schema.calls import guarded
 from amiwarp.validation import TIME_LIMIT, instance, vector, whole
 
@@ -62,16 +60,5 @@ def find_background_activity(
     sides = vector(size, 2, "size of the sensor", sensor_side)
     width, height = map(int, sides)
     window_us = whole(window_us, "window_us", 1, TIME_LIMIT, " us")
-    check_events(events, width, height, where="events")
-    columns = []
-    for column in (events.x, events.y, events.t):
-        contiguous = np.ascontiguousarray(column)
-        columns.append(wp.array(contiguous, device="cpu", copy=False))
-    never = wp.int64(NEVER)
-    pixels = (width + 2) * (height + 2)  # with a border
-    latest = wp.full(pixels, never, dtype=wp.int64, device="cpu")
-    background = wp.empty(len(events), dtype=wp.bool, device="cpu")
-    load(mark_background, wp.get_device("cpu"))
-    inputs = [*columns, window_us, width + 2, latest]
-    wp.launch(mark_background, 1, inputs, [background], device="cpu")
-    return np.asarray(background.numpy(), np.bool_)
+    chosen = EventFilter(background_us=window_us)
+    return ~RunningFilter(chosen, (width, height)).keep(events)

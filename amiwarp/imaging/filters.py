@@ -30,15 +30,9 @@ from amiwarp.io.native.writer import RecordingWriter
 from amiwarp.io.output_formats import OutputFormat
 from amiwarp.io.outputs import check_output
 from amiwarp.io.unfinished import scratch_folder
-from amiwarp.kernels.background_activity import (
-    NEVER,
-    mark_background,
-    mark_hot_pixels,
-    mark_over_rate,
-    mark_refractory,
-)
-from amiwarp.kernels.launch import launch
-from amiwarp.kernels.loading import load
+from amiwarp.kernels import event_filter as kernels
+from amiwarp.kernels.background_activity import NEVER, mark_hot_pixels
+from amiwarp.kernels.launch import RecordedLaunch, launch
 from amiwarp.kernels.quiet_start import start_once
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.schema.calls import guarded
@@ -129,7 +123,7 @@ class EventFilter:
         AmiwarpError
             If the events are compensated, out of order or outside the sensor, or the size does not fit the filter.
         """
-        return events[RunningFilter(self, size).keep(events)]
+        return RunningFilter(self, size).kept(events)
 
 
 @dataclass
@@ -140,24 +134,21 @@ class RunningFilter:
     """What is kept."""
     size: tuple[int, int]
     """Sensor size (width, height) [px]."""
-    removed: dict[str, int] = field(default_factory=dict)
+    removed: dict[str, int] = field(init=False)
     """Number of events that each part of the filter has removed so far, by its name."""
-    _latest: dict[str, wp.array] = field(default_factory=dict)
-    """Time of the last event of each pixel, by the name of the part that needs it [us]."""
-    _credit: wp.array | None = None
-    """Number of events that a limited rate allows at once."""
+    _state: Any = field(init=False)
+    """What the kernel remembers of the events before."""
+    _block: list[NDArray[Any]] = field(init=False)
+    """Memory for the columns x, y, t and p of a block of events, and for the part that removes each."""
+    _launch: RecordedLaunch = field(init=False)
+    """Launch of the kernel over the first events of the block. A new launch would cost more than a packet."""
     _last_t: int | None = None
     """Time of the last event [us]."""
-    _hot_counts: NDArray[np.int64] = field(init=False)
-    """Number of events of hot pixels that were removed, shape ``(height, width)``."""
-    _reached_last: int = 0
-    """Number of events so far that reached the last part, ``every``."""
 
     def __post_init__(self) -> None:
         start_once()
         width, height = vector(self.size, 2, "size of the sensor", _side)
         self.size = width, height
-        self._hot_counts = np.zeros((height, width), np.int64)
         hot = self.chosen.hot_pixels
         if hot is not None and (
             np.shape(hot) != (height, width) or np.asarray(hot).dtype != np.bool_
@@ -171,121 +162,119 @@ class RunningFilter:
             raise AmiwarpError(
                 f"region is {region}; expected a part of the image of {width}x{height} px"
             )
+        self.removed = {name: 0 for name in PARTS if is_given(self.chosen, name)}
+        self._state = _new_state(self.chosen, self.size)
+        arrays = [wp.empty(BLOCK, dtype=kind, device="cpu") for kind in BLOCK_TYPES]
+        self._block = [array.numpy() for array in arrays]
+        inputs = [_part_values(self.chosen, self.size), self._state, *arrays, 0]
+        self._launch = RecordedLaunch(kernels.find_removing_parts, inputs, [], device="cpu")
 
     def keep(self, events: Events) -> NDArray[np.bool_]:
         """Return which events are kept, where the events follow the events of the last call, bool, shape ``(n,)``."""
         check_sensor(events)
         check_events(events, *self.size, where="events", after_t=self._last_t)
-        if len(events):
-            self._last_t = int(events.t[-1])
-        kept = np.ones(len(events), np.bool_)
-        for name, part in PARTS.items():
-            if not is_given(self.chosen, name):
-                continue
-            candidates = np.flatnonzero(kept)
-            wanted = part(self, events[candidates])
-            kept[candidates[~wanted]] = False
-            self.removed[name] = self.removed.get(name, 0) + int(np.count_nonzero(~wanted))
-        return kept
+        if not len(events):
+            return np.ones(0, np.bool_)
+        self._last_t = int(events.t[-1])
+        removing = np.empty(len(events), np.uint8)
+        for start in range(0, len(events), BLOCK):
+            stop = min(start + BLOCK, len(events))
+            removing[start:stop] = self._removing(events[start:stop])
+        for name in self.removed:
+            self.removed[name] += int(np.count_nonzero(removing == PARTS[name]))
+        return removing == 0
 
-    def _window(self, events: Events) -> NDArray[np.bool_]:
-        assert self.chosen.window is not None
-        start, end = self.chosen.window
-        return (events.t >= start) & (events.t < end)
+    def kept(self, events: Events) -> Events:
+        """Return the events that are kept, as :meth:`keep` chooses them, in new arrays."""
+        # An index takes a quarter of the time of a mask
+        return events[np.flatnonzero(self.keep(events))]
 
-    def _region(self, events: Events) -> NDArray[np.bool_]:
-        assert self.chosen.region is not None
-        left, top, right, bottom = self.chosen.region
-        in_columns = (events.x >= left) & (events.x < right)
-        in_rows = (events.y >= top) & (events.y < bottom)
-        return in_columns & in_rows
-
-    def _polarity(self, events: Events) -> NDArray[np.bool_]:
-        return np.asarray(events.p == self.chosen.polarity, np.bool_)
-
-    def _hot_pixels(self, events: Events) -> NDArray[np.bool_]:
-        assert self.chosen.hot_pixels is not None
-        hot = self.chosen.hot_pixels[events.y, events.x]
-        np.add.at(self._hot_counts, (events.y[hot], events.x[hot]), 1)
-        return ~hot
+    def _removing(self, events: Events) -> NDArray[np.uint8]:
+        """Return the number of the part that removes each event of a block, until the next call."""
+        count = len(events)
+        *columns, removing = self._block
+        for column, values in zip(columns, (events.x, events.y, events.t, events.p), strict=True):
+            column[:count] = values
+        self._launch.set(COUNT, count)
+        self._launch.repeat()
+        return removing[:count]
 
     def hot_counts(self) -> tuple[tuple[int, int, int], ...]:
         """Return column, row [px] and number of removed events of each hot pixel, the busiest first."""
-        rows, columns = np.nonzero(self._hot_counts)
-        counts = self._hot_counts[rows, columns]
+        width, _ = self.size
+        all_counts = self._state.hot_counts.numpy()
+        pixels = np.flatnonzero(all_counts)
+        counts = all_counts[pixels]
         busiest_first = np.argsort(-counts, kind="stable")
-        hot = np.stack([columns, rows, counts], axis=1)[busiest_first]
+        hot = np.stack([pixels % width, pixels // width, counts], axis=1)[busiest_first]
         return tuple((column, row, count) for column, row, count in hot.tolist())
 
-    def _refractory(self, events: Events) -> NDArray[np.bool_]:
-        width, height = self.size
-        kernel = mark_refractory
-        return ~self._marked(
-            "refractory_us", kernel, events, self.chosen.refractory_us, width, width * height
-        )
 
-    def _background(self, events: Events) -> NDArray[np.bool_]:
-        width, height = self.size
-        pixels = (width + 2) * (height + 2)  # with a border
-        kernel = mark_background
-        return ~self._marked(
-            "background_us", kernel, events, self.chosen.background_us, width + 2, pixels
-        )
+BLOCK = 1 << 14
+"""Largest number of events that the kernel filters at a time. They stay in a core's cache."""
+BLOCK_TYPES = (wp.uint16, wp.uint16, wp.int64, wp.uint8, wp.uint8)
+"""Types of the arrays of a block: x, y, t, p, and the part that removes an event."""
+COUNT = 2 + len(BLOCK_TYPES)
+"""Place of the number of events among the arguments of the kernel."""
 
-    def _marked(
-        self, name: str, kernel: Any, events: Events, time_us: int, stride: int, pixels: int
-    ) -> NDArray[np.bool_]:
-        """Return which events a kernel marks that passes over them in order, and keeps a time of each pixel."""
-        if name not in self._latest:
-            never = wp.int64(NEVER)
-            self._latest[name] = wp.full(pixels, never, dtype=wp.int64, device="cpu")
-        columns = [
-            wp.array(column, device="cpu", copy=False) for column in (events.x, events.y, events.t)
-        ]
-        marks = wp.empty(len(events), dtype=wp.bool, device="cpu")
-        load(kernel, wp.get_device("cpu"))
-        inputs = [*columns, time_us, stride, self._latest[name]]
-        wp.launch(kernel, 1, inputs, [marks], device="cpu")
-        return np.asarray(marks.numpy(), np.bool_)
 
-    def _rate(self, events: Events) -> NDArray[np.bool_]:
-        if "most_per_s" not in self._latest:
-            never = wp.int64(NEVER)
-            self._latest["most_per_s"] = wp.full(1, never, dtype=wp.int64, device="cpu")
-            self._credit = wp.full(1, self._most_credit, dtype=wp.float64, device="cpu")
-        over = wp.empty(len(events), dtype=wp.bool, device="cpu")
-        load(mark_over_rate, wp.get_device("cpu"))
-        inputs = [
-            wp.array(events.t, device="cpu", copy=False),
-            1e-6 * self.chosen.most_per_s,
-            self._most_credit,
-        ]
-        outputs = [self._credit, self._latest["most_per_s"], over]
-        wp.launch(mark_over_rate, 1, inputs, outputs, device="cpu")
-        return ~np.asarray(over.numpy(), np.bool_)
+def _part_values(chosen: EventFilter, size: tuple[int, int]) -> Any:
+    """Return the values of a filter's parts for the kernel. Parts that are not given keep all events."""
+    width, height = size
+    parts = kernels.FilterParts()
+    parts.columns = width
+    parts.start, parts.end = chosen.window or (-(2**63), 2**63 - 1)
+    parts.left, parts.top, parts.right, parts.bottom = chosen.region or (0, 0, width, height)
+    parts.polarity = -1 if chosen.polarity is None else chosen.polarity
+    hot = np.zeros(0, np.uint8)
+    if chosen.hot_pixels is not None:
+        hot = chosen.hot_pixels.ravel().astype(np.uint8)
+    parts.hot = wp.array(hot, dtype=wp.uint8, device="cpu")
+    parts.refractory_us = chosen.refractory_us
+    parts.background_us = chosen.background_us
+    parts.rate_per_us = 1e-6 * chosen.most_per_s
+    parts.most_credit = _most_credit(chosen)
+    parts.every = chosen.every
+    return parts
 
-    @property
-    def _most_credit(self) -> float:
-        """Number of events that may follow at once after a pause, with a limited rate."""
-        return max(1.0, self.chosen.most_per_s * CREDIT_S)
 
-    def _every(self, events: Events) -> NDArray[np.bool_]:
-        numbers = self._reached_last + np.arange(len(events))
-        self._reached_last += len(events)
-        return np.asarray(numbers % self.chosen.every == 0, np.bool_)
+def _new_state(chosen: EventFilter, size: tuple[int, int]) -> Any:
+    """Return what the kernel remembers before the first event. Parts that are not given need no memory."""
+    width, height = size
+    pixels = width * height
+    with_border = (width + 2) * (height + 2)
+    state = kernels.FilterState()
+    state.kept_t = _never(pixels if chosen.refractory_us else 0)
+    state.fired_t = _never(with_border if chosen.background_us else 0)
+    has_hot = chosen.hot_pixels is not None
+    state.hot_counts = wp.zeros(pixels if has_hot else 0, dtype=wp.int64, device="cpu")
+    state.credit = wp.full(1, _most_credit(chosen), dtype=wp.float64, device="cpu")
+    state.rate_t = _never(1)
+    state.reached = wp.zeros(1, dtype=wp.int64, device="cpu")
+    return state
+
+
+def _never(count: int) -> wp.array:
+    """Return times before the first event."""
+    return wp.full(count, wp.int64(NEVER), dtype=wp.int64, device="cpu")
+
+
+def _most_credit(chosen: EventFilter) -> float:
+    """Return the number of events that may follow at once after a pause, with a limited rate."""
+    return max(1.0, chosen.most_per_s * CREDIT_S)
 
 
 PARTS = {
-    "window": RunningFilter._window,
-    "region": RunningFilter._region,
-    "polarity": RunningFilter._polarity,
-    "hot_pixels": RunningFilter._hot_pixels,
-    "refractory_us": RunningFilter._refractory,
-    "background_us": RunningFilter._background,
-    "most_per_s": RunningFilter._rate,
-    "every": RunningFilter._every,
+    "window": int(kernels.WINDOW),
+    "region": int(kernels.REGION),
+    "polarity": int(kernels.POLARITY),
+    "hot_pixels": int(kernels.HOT_PIXELS),
+    "refractory_us": int(kernels.REFRACTORY),
+    "background_us": int(kernels.BACKGROUND),
+    "most_per_s": int(kernels.RATE),
+    "every": int(kernels.EVERY),
 }
-"""Parts of a filter by the names of the fields of :class:`EventFilter`, in the order in which they are applied."""
+"""Numbers of a filter's parts in the kernel, by the fields of :class:`EventFilter`, in the order of the parts."""
 NAMES = {
     "window": "time",
     "region": "region",

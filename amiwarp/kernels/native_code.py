@@ -194,6 +194,15 @@ def prefetch_words(sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), 
 
 
 @wp.func_native("""
+#ifndef __CUDACC__
+    __builtin_prefetch((const int64_t*)values.data + i, 1);
+#endif
+""")
+def prefetch_int64(values: wp.array(dtype=wp.int64), i: int):
+    """Fetch element ``i`` into a core's cache, while it goes on."""
+
+
+@wp.func_native("""
     const int* place = (const int*)places.data + first;
     const uint64_t* word = (const uint64_t*)words.data + first;
     uint64_t* sum = (uint64_t*)sums.data;

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from amiwarp.compensation.streams import Compensated
-from amiwarp.live.items import LiveItems, closed_on_error, open_rig
+from amiwarp.imaging.filters import EventFilter
+from amiwarp.live.items import LivePackets, closed_on_error, open_rig
 from amiwarp.live.queues import Policy
 from amiwarp.live.stream.session import Session
 from amiwarp.results.calibration import Calibration
@@ -24,6 +24,8 @@ def compensate_live(
     *,
     port: str | None = None,
     counts_per_turn: int | None = None,
+    filter: EventFilter | None = None,
+    undistort: bool = False,
     fast: bool = False,
     wait_for_source_s: float = 0.0,
     wait_ms: float = 10.0,
@@ -31,7 +33,7 @@ def compensate_live(
     watch_s: float = 10.0,
     device: Any = "cpu",
     say: Callable[[str], None] = print,
-) -> Iterator[Iterator[Compensated]]:
+) -> Iterator[LivePackets]:
     """Compensate the events of a live stream, and iterate over them in a ``with`` block.
 
     This is ``amiwarp live`` for programs. The stream is opened when the block is entered. Background threads read and
@@ -50,6 +52,10 @@ def compensate_live(
         source are used.
     counts_per_turn : int, optional
         Encoder counts per turn, if the controller sends lines of text.
+    filter : EventFilter, optional
+        The events of the sensor that are compensated, by default all.
+    undistort : bool, default False
+        Whether to remove the distortion of the calibrated lens at the end, as :meth:`Camera.undistort` does.
     fast : bool, default False
         Whether to replay a file as fast as possible, not in real time.
     wait_for_source_s : float, default 0.0
@@ -67,8 +73,9 @@ def compensate_live(
 
     Yields
     ------
-    iterator of Compensated
-        The packets. The iterator raises an error of the source, such as a stream that breaks off, after the last one.
+    LivePackets
+        Iterator over the packets, with the counts of each stage. It raises an error of the source, such as a stream
+        that breaks off, after the last one.
 
     Raises
     ------
@@ -104,12 +111,14 @@ def compensate_live(
             wait_for_source_s=wait_for_source_s,
             say=say,
         )
-        packets: LiveItems[Compensated] = LiveItems(opened)
+        packets = LivePackets(opened)
         with closed_on_error(opened):
             session = Session(
                 opened,
                 calibration,
                 link=link,
+                chosen=filter,
+                undistort=calibration.model.camera if undistort else None,
                 sinks=(packets.put,),
                 watch_s=watch_s or None,
                 wait_us=wait_us,

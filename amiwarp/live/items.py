@@ -8,14 +8,16 @@ import queue
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from amiwarp.compensation.recordings import check_size
+from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.live.link.link import Link
 from amiwarp.live.stream.encoder_feed import encoder_count
 from amiwarp.live.stream.packets import Source
 from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.session_status import StageStatus
 from amiwarp.live.stream.sources import open_source
 from amiwarp.results.calibration import Calibration
 from amiwarp.tasks import BackgroundLoop
@@ -81,6 +83,8 @@ class LiveItems(BackgroundLoop, Generic[Item]):
     """Iterator over what a session makes, which runs in a background thread."""
 
     def __init__(self, source: Source) -> None:
+        self.size = source.size
+        """Sensor size (width, height) [px]."""
         self._source = source
         self._stop = threading.Event()
         self._items: queue.Queue[Item | None] = queue.Queue(MOST_ITEMS)
@@ -128,3 +132,27 @@ class LiveItems(BackgroundLoop, Generic[Item]):
                 )
         finally:
             self.put(None)
+
+
+class LivePackets(LiveItems[Compensated]):
+    """Iterator over the packets of a live stream after its last stage, as :class:`Compensated`.
+
+    Parameters
+    ----------
+    source : Any
+        What :func:`stream_live` opens.
+
+    Examples
+    --------
+    >>> with amiwarp.stream_live("camera:") as packets:  # doctest: +SKIP
+    ...     width, height = packets.size
+    ...     first = next(packets)
+    """
+
+    def __init__(self, source: Any) -> None:  # users get it from stream_live, and make none
+        super().__init__(source)
+
+    @property
+    def stages(self) -> tuple[StageStatus, ...]:
+        """Counts and latency of each stage, from "read" on, a fifth of a second old at most. Final after the end."""
+        return tuple(self._session.status.stages)

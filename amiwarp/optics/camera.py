@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass, is_dataclass, replace
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +36,8 @@ CAMERA_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
 Vectors = TypeVar("Vectors")
 """Type of the rows of vectors given to a camera: NumPy array (n, 2) or (n, 3), or Warp array of vec2 or vec3. Results
 have the same type."""
+EventBlock = TypeVar("EventBlock")
+"""Type of events, :class:`amiwarp.Events`. Its room imports this one."""
 
 
 @guarded
@@ -276,6 +279,99 @@ class Camera:
             If the array has another shape or does not hold numbers.
         """
         return _run("rays_to_pixels", self, rays, (3, 2))
+
+    @guarded
+    def undistort(self, events: EventBlock, target: Camera | None = None) -> EventBlock:
+        """Return events as a camera without lens distortion would see them.
+
+        Parameters
+        ----------
+        events : Events
+            Events of this camera: of the sensor, or compensated.
+        target : Camera, optional
+            The camera that would see them, at the same place with the same orientation, such as a pinhole camera with
+            another focal length. By default, a pinhole camera with the ``fx``, ``fy``, ``cx`` and ``cy`` of this one.
+
+        Returns
+        -------
+        Events
+            The same events at float32 coordinates [px], NaN for an event that no ray reaches, or that lies behind the
+            image plane of ``target``. Other events may lie outside the image. Times and polarities are unchanged.
+
+        Raises
+        ------
+        AmiwarpError
+            If ``events`` are no :class:`Events`, or an event of a sensor lies outside this camera's image.
+
+        Examples
+        --------
+        >>> lens = amiwarp.RadialTangential(k1=-0.2)
+        >>> camera = amiwarp.Camera(640, 480, 500.0, 500.0, 320.0, 240.0, lens)
+        >>> events = amiwarp.Events.from_arrays(x=[320, 639], y=[240, 240], t=[0, 10], p=[1, 0])
+        >>> camera.undistort(events).x.round(1)
+        array([320. , 674.7], dtype=float32)
+        """
+        if not (is_dataclass(events) and isinstance(getattr(events, "x", None), np.ndarray)):
+            raise AmiwarpError(f"events is {shown(events)}; give amiwarp.Events, in host memory")
+        seen_by = replace(self, distortion=None) if target is None else target
+        places = undistorted_places(events, self, seen_by)
+        return replace(events, x=places.x, y=places.y)  # type: ignore[type-var]
+
+
+class UndistortedPlaces(NamedTuple):
+    """Places of events in an undistorted image."""
+
+    x: NDArray[np.float32]
+    """Column [px], NaN if no ray reaches the event, shape ``(n,)``."""
+    y: NDArray[np.float32]
+    """Row [px], NaN if no ray reaches the event, shape ``(n,)``."""
+    outside: NDArray[np.bool_]
+    """Whether each event lies on no pixel of the undistorted image, shape ``(n,)``."""
+
+
+def undistorted_places(events: Any, camera: Camera, target: Camera) -> UndistortedPlaces:
+    """Return the places of events of ``camera`` in the image of ``target``, which has the same view.
+
+    Events of a sensor are looked up in a table of all pixels, which is many times faster than a kernel's launch for
+    each packet of a stream. Raises :class:`AmiwarpError` if such an event lies outside the image of ``camera``.
+    """
+    if not events.whole_pixels:
+        return _places_of(np.stack([events.x, events.y], axis=1), camera, target)
+    _check_pixels(events, camera)
+    table = _places_of_pixels(camera, target)
+    pixel = events.y.astype(np.intp)
+    pixel *= camera.width
+    pixel += events.x
+    return UndistortedPlaces(table.x.take(pixel), table.y.take(pixel), table.outside.take(pixel))
+
+
+@lru_cache(maxsize=4)
+def _places_of_pixels(camera: Camera, target: Camera) -> UndistortedPlaces:
+    """Return the places of all pixels, row by row."""
+    rows, columns = np.indices((camera.height, camera.width), np.float32)
+    return _places_of(np.stack([columns.ravel(), rows.ravel()], axis=1), camera, target)
+
+
+def _places_of(xy: NDArray[np.float32], camera: Camera, target: Camera) -> UndistortedPlaces:
+    """Return the places of points of ``camera`` [px], shape (n, 2)."""
+    places = target.rays_to_pixels(camera.pixels_to_rays(xy))
+    x, y = np.ascontiguousarray(places.T)
+    in_columns = (x >= -0.5) & (x < target.width - 0.5)
+    in_rows = (y >= -0.5) & (y < target.height - 0.5)
+    return UndistortedPlaces(x, y, ~(in_columns & in_rows))
+
+
+def _check_pixels(events: Any, camera: Camera) -> None:
+    """Raise :class:`AmiwarpError` if an event lies outside the camera's image."""
+    if not len(events):
+        return
+    largest_x = int(events.x.max())
+    largest_y = int(events.y.max())
+    if largest_x >= camera.width or largest_y >= camera.height:
+        raise AmiwarpError(
+            f"events reach to pixel ({largest_x}, {largest_y}), and the camera has {camera.width}x{camera.height} "
+            "pixels; give the camera of these events"
+        )
 
 
 def check_size(width: float, height: float, where: object) -> None:

@@ -199,6 +199,7 @@ MEANT: dict[tuple[str, str], str] = {
     **{("EllipseModel.fit", name): "NaN" for name in ("xy", "theta", "compensated")},
     ("Parameter", "limits"): "infinite",
     ("Picture", "log"): "not checked",
+    ("StreamTensor", "tensor"): "not checked",
     ("Picture", "unknowns"): "not checked",
 }
 """Parameters for which NaN or infinity means something, and a word of the description that says so. The functions of

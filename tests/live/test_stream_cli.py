@@ -32,6 +32,7 @@ from amiwarp import (
     MemoryEvents,
     Prism,
     Recording,
+    StageStatus,
     compensate,
     open_recording,
     save_recording,
@@ -670,3 +671,14 @@ def test_the_status_line_fits_the_terminal() -> None:
     assert "latency 12.3 ms, encoder 98.7 %, 720 rpm, sharpness 12.30, edges 50 %" in describe(
         full, 200
     )
+
+
+def test_the_status_line_of_a_plain_stream_names_no_encoder() -> None:
+    stages = [StageStatus("read", 200, 200), StageStatus("filter", 200, 50)]
+    status = SessionStatus(seconds=1.0, events=200, done=50, latency_ms=(3.0, 4.0), stages=stages)
+    text = describe(status, 200)
+    assert "latency 3.0 ms" in text
+    assert "filter keeps 25 %" in text
+    assert "encoder" not in text
+    status.stages.append(StageStatus("compensate", 50, 50))
+    assert "encoder 100.0 %" in describe(status, 200)

@@ -1,4 +1,4 @@
-"""``amiwarp live``: motion compensation of a live stream."""
+"""``amiwarp live``: stages of a live stream, from the filter to motion compensation, and its outputs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ import typer
 from amiwarp.cli import common as cli
 from amiwarp.cli import say
 from amiwarp.errors import AmiwarpError, ErrorCode
-from amiwarp.io.native.live_writer import LiveWriter
 from amiwarp.live.commands.controller import controller_lines, controller_summary
 from amiwarp.live.commands.session import (
     SecondRatio,
@@ -27,10 +26,12 @@ from amiwarp.live.commands.session import (
     check_angles,
     check_model,
     check_whole,
-    recorded_from,
     session_summary,
     stopped_by_interrupt,
 )
+from amiwarp.live.commands.stage_options import StageOptions, stage_lines, stage_summary
+from amiwarp.live.commands.stream_description import StreamDescription
+from amiwarp.live.commands.tensor_options import TensorOptions, tensor_lines
 from amiwarp.live.link.link import Link
 from amiwarp.live.queues import Policy
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.session_status import SessionStatus
     from amiwarp.live.stream.sinks import PipeSink, SocketSink
     from amiwarp.optics.models.base import Model
-    from amiwarp.optics.prism import NominalPrism
     from amiwarp.plotting.live_viewers import LiveViewer
     from amiwarp.reconstruction.phase_camera import LivePicture
     from amiwarp.results.calibration import Calibration
@@ -264,67 +264,84 @@ def run_live(
     source: SourceArgument,
     *,
     calibration: Annotated[
-        Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")
-    ],
+        Path | None,
+        typer.Option(
+            help="Calibration file from 'amiwarp calibrate' (.json). Default: none; the events are not compensated."
+        ),
+    ] = None,
+    stages: StageOptions,
     outputs: OutputOptions,
     stream: SourceOptions,
     second_ratio: SecondRatio = None,
+    tensors: TensorOptions,
     pictures: PictureOptions,
     processing: ProcessingOptions,
     adaptive: AdaptiveOptions,
     common: cli.Common,
 ) -> None:
-    """Compensate the events of a live stream and show rate, latency, coverage and sharpness on one line.
+    """Filter, compensate and undistort the events of a live stream, and show its figures on one line.
+
+    Without --calibration, the events of a plain camera pass all other stages, and nothing is compensated. --record and
+    --raw-to get the events as they came, --out and --to those that passed the stages.
 
     Ctrl-C ends the command. If the stream breaks off, it exits with code 1 and keeps the events received so far.
 
     Every event is written once, in order. Events outside the image and events with an extrapolated angle are marked.
     """
-    from amiwarp.compensation.recordings import check_size
     from amiwarp.live.stream.encoder_feed import clock_offset
     from amiwarp.results.calibration import Calibration
 
     outputs.check(json=common.json)
     pictures.check()
+    calibrated = None
+    if calibration is None:
+        _check_plain(pictures, processing, adaptive, second_ratio)
+    else:
+        calibrated = Calibration.load(calibration)
     device = cli.choose_device(common.device)
-    calibrated = Calibration.load(calibration)
     with contextlib.ExitStack() as resources:
         stop = threading.Event()
         line = resources.enter_context(StatusLine())
         link = resources.enter_context(stream.link())
         opened = stream.open(source, line.say)
-        angles = check_angles(opened, link, second_ratio)
-        check_size(calibrated, opened.size, opened.name)
-        check_model(opened, link, angles, calibrated)
+        encoders = _encoders(opened, link, second_ratio, calibrated)
+        chosen = stages.build_filter(opened.size)
+        lens = stages.build_lens(opened.size, calibrated)
         # Before the files: Ctrl-C leaves none unfinished
         resources.enter_context(stopped_by_interrupt(stop))
+        described = StreamDescription(opened, calibrated, chosen, lens, encoders)
         receivers = _Receivers(
             outputs,
-            opened,
-            calibrated,
-            encoders=angles,
+            described,
             offset_us=clock_offset(opened, link),
             resources=resources,
             stop=stop,
             say=line.say,
         )
-        picture_stream = _picture_stream(
-            pictures,
-            processing,
-            opened,
-            calibrated,
-            link,
-            resources,
-            fast=stream.fast,
-            device=device,
-            say=line.say,
+        live_tensors = tensors.build(
+            opened.size, described.hello, resources, stop=stop, say=line.say
         )
+        if live_tensors is not None:
+            receivers.takers.append(live_tensors.output)
+        picture_stream = None
+        keeper = None
+        if calibrated is not None:
+            picture_stream = _picture_stream(
+                pictures,
+                processing,
+                opened,
+                calibrated,
+                link,
+                resources,
+                fast=stream.fast,
+                device=device,
+                say=line.say,
+            )
+            keeper = adaptive.build(calibrated.model, link, line.say)
         if picture_stream is not None:
             receivers.raw.append(picture_stream)
-        keeper = adaptive.build(calibrated.model, link, line.say)
         session = _session(
-            opened,
-            calibrated,
+            described,
             receivers,
             processing,
             link=link,
@@ -333,24 +350,74 @@ def run_live(
             device=device,
             say=line.say,
         )
+        if calibrated is None:
+            line.say("no calibration: events are not compensated; give one with --calibration")
         status = _follow(session, stop, stream.seconds, line, receivers)
         if picture_stream is not None:
             picture_stream.close()
+        if live_tensors is not None:
+            live_tensors.output.close()
     files = list(outputs.files)
     if pictures.picture is not None:
         files.append(str(pictures.picture))
+    if tensors.tensor_out is not None:
+        files.append(str(tensors.tensor_out))
     result: dict[str, Any] = {
         "files": files,
         **session_summary(status, opened),
         "controller": None if link is None else controller_summary(link),
         "latency_ms": status.latency_ms,
         "pictures": None if picture_stream is None else _picture_summary(picture_stream),
-        "model": calibrated.model_name,
+        "stages": [stage_summary(stage) for stage in status.stages],
+        "not_sent": receivers.not_sent,
+        "tensors": None if live_tensors is None else live_tensors.summary(),
+        "model": None if calibrated is None else calibrated.model_name,
         "device": device,
         "messages": list(line.messages),
     }
-    _print_result(result, common, to_stderr=outputs.use_stdout)
+    if calibrated is None:
+        result["compensated"] = 0
+    lines = _live_lines(result, stage_lines(status.stages))
+    _print_result(result, lines, common, to_stderr=outputs.use_stdout)
     check_whole(opened, status)
+
+
+def _check_plain(
+    pictures: PictureOptions,
+    processing: ProcessingOptions,
+    adaptive: AdaptiveOptions,
+    second_ratio: float | None,
+) -> None:
+    """Raise :class:`AmiwarpError` for an option that needs a calibration."""
+    default = ProcessingOptions()
+    given = {
+        "--picture": pictures.picture is not None,
+        "--picture-to": pictures.picture_to is not None,
+        "--adaptive": adaptive.adaptive,
+        "--second-ratio": second_ratio is not None,
+        "--wait-ms": processing.wait_ms != default.wait_ms,
+        "--watch-s": processing.watch_s != default.watch_s,
+    }
+    for name, is_given in given.items():
+        if is_given:
+            raise AmiwarpError(
+                f"{name} needs a calibration; give --calibration, or remove it", ErrorCode.OPTIONS
+            )
+
+
+def _encoders(
+    source: Source, link: Link | None, second_ratio: float | None, calibration: Calibration | None
+) -> int:
+    """Return the number of prism angles of a session. A plain camera may have none."""
+    from amiwarp.compensation.recordings import check_size
+    from amiwarp.live.stream.encoder_feed import encoder_count
+
+    if calibration is None:
+        return encoder_count(source, link)
+    angles = check_angles(source, link, second_ratio)
+    check_size(calibration, source.size, source.name)
+    check_model(source, link, angles, calibration)
+    return angles
 
 
 def _picture_stream(
@@ -413,61 +480,59 @@ class _Receivers:
     def __init__(
         self,
         options: OutputOptions,
-        source: Source,
-        calibration: Calibration,
+        stream: StreamDescription,
         *,
-        encoders: int,
         offset_us: float,
         resources: contextlib.ExitStack,
         stop: threading.Event,
         say: Callable[[str], None],
     ) -> None:
         from amiwarp.live.stream.forward import Forward
+        from amiwarp.live.stream.sinks import open_sink
 
-        def sink(what: str, address: str | None, encoders: int = 1) -> SocketSink | PipeSink | None:
+        def sink(what: str, address: str | None, hello: bytes) -> SocketSink | PipeSink | None:
             if address is None:
                 return None
-            opened = _open_sink(address, calibration, encoders, resources, stop=stop, say=say)
+            opened = open_sink(address, hello, stop=stop, say=say)
+            resources.push(opened)
             if opened.address != address:  # for example, the system chose the port
                 say(f"{what} packets are served at {opened.address}")
             return opened
 
         # First, because a recording that has begun is kept although a viewer's library is missing.
         self.viewers = [
-            resources.enter_context(viewer) for viewer in _open_viewers(options, source)
+            resources.enter_context(viewer) for viewer in _open_viewers(options, stream.source)
         ]
         self.raw: list[RawConsumer] = []
         if options.record is not None:
-            writer = _writer(
-                options.record,
-                source,
-                calibration,
-                compensated=False,
-                encoders=encoders,
-                offset_us=offset_us,
-            )
+            writer = stream.raw_writer(options.record, offset_us)
             self.raw.append(resources.enter_context(writer))
-        self.raw_sink = sink("uncompensated", options.raw_to, encoders)
+        self.raw_sink = sink("uncompensated", options.raw_to, stream.raw_hello)
         if self.raw_sink is not None:
             self.raw.append(Forward(self.raw_sink))
         self.out = None
         if options.out is not None:
-            writer = _writer(options.out, source, calibration, compensated=True, encoders=encoders)
-            self.out = resources.enter_context(writer)
-        self.sink = sink("compensated", options.to)
-        self.raw += self.viewers
+            self.out = resources.enter_context(stream.writer(options.out))
+        self.sink = sink("plain" if stream.is_plain else "compensated", options.to, stream.hello)
+        self.takers: list[Callable[[Compensated], None]] = []
+        """Functions that take packets after the last stage."""
+        if self.sink is not None:
+            self.takers.append(_send_to(self.sink))
+        if stream.is_plain:
+            self.takers += [_show_plain(viewer) for viewer in self.viewers]
+        else:
+            self.takers += self.viewers
+            self.raw += self.viewers
 
     @property
-    def sinks(self) -> tuple[Callable[[Compensated], None], ...]:
-        """Functions that take compensated packets and send them."""
-        if self.sink is None:
-            return tuple(self.viewers)
-        return (_send_to(self.sink), *self.viewers)
+    def not_sent(self) -> dict[str, int]:
+        """Number of packets that slow receivers lost, by the option that serves them."""
+        served = {"to": self.sink, "raw_to": self.raw_sink}
+        return {name: sink.lost for name, sink in served.items() if sink is not None}
 
 
 def _session(
-    source: Source,
-    calibration: Calibration,
+    stream: StreamDescription,
     receivers: _Receivers,
     options: ProcessingOptions,
     *,
@@ -477,17 +542,19 @@ def _session(
     device: str,
     say: Callable[[str], None],
 ) -> Session:
-    """Return the session that compensates the source for the receivers."""
+    """Return the session that processes the source for the receivers."""
     from amiwarp.live.stream.session import Session
 
     return Session(
-        source,
-        calibration,
+        stream.source,
+        stream.calibration,
         link=link,
         second_ratio=second_ratio,
+        chosen=stream.chosen,
+        undistort=stream.lens,
         raw=receivers.raw,
         out=receivers.out,
-        sinks=receivers.sinks,
+        sinks=tuple(receivers.takers),
         watch_s=options.watch_s or None,
         keeper=keeper,
         wait_us=cli.microseconds(options.wait_ms, "ms", "--wait-ms"),
@@ -522,33 +589,15 @@ def _follow(
     return status
 
 
-def _print_result(data: dict[str, Any], common: cli.Common, *, to_stderr: bool) -> None:
+def _print_result(
+    data: dict[str, Any], lines: list[str], common: cli.Common, *, to_stderr: bool
+) -> None:
     """Print the result. If packets use standard output, print it as text on stderr."""
     if not to_stderr:
-        cli.report(common, data, _live_lines(data))
+        cli.report(common, data, lines)
         return
-    for text in _live_lines(data):
+    for text in lines:
         say(text)
-
-
-def _open_sink(
-    address: str,
-    calibration: Calibration,
-    encoders: int,
-    resources: contextlib.ExitStack,
-    *,
-    stop: threading.Event,
-    say: Callable[[str], None],
-) -> SocketSink | PipeSink:
-    """Open the sink at an address, which ``resources`` closes; its hello message describes the calibrated camera."""
-    from amiwarp.live.stream.sinks import open_sink
-    from amiwarp.live.stream.stream_format import encode_hello
-
-    camera = calibration.model.camera
-    hello = encode_hello(camera.width, camera.height, camera, _prism(calibration), encoders)
-    sink = open_sink(address, hello, stop=stop, say=say)
-    resources.push(sink)
-    return sink
 
 
 def _open_viewers(options: OutputOptions, source: Source) -> Iterator[LiveViewer]:
@@ -563,52 +612,35 @@ def _open_viewers(options: OutputOptions, source: Source) -> Iterator[LiveViewer
         yield foxglove_server(options.foxglove, source.size)
 
 
-def _prism(calibration: Calibration) -> NominalPrism | None:
-    """Return the nominal prism of a calibration; None if its optic has no prism, as a mirror."""
-    return calibration.prism if calibration.model.PRISM else None
-
-
 def _send_to(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
-    """Return a function that sends a compensated packet to a sink."""
-    from amiwarp.live.stream.stream_format import encode_compensated
+    """Return a function that sends packets to a sink: whole pixels as events of a sensor, others with their flags."""
+    from amiwarp.live.stream.stream_format import encode_compensated, encode_events
 
-    return lambda packet: sink.send(encode_compensated(packet.events, packet.flags))
+    def send(packet: Compensated) -> None:
+        if packet.events.whole_pixels:
+            sink.send(encode_events(packet.events))
+        else:
+            sink.send(encode_compensated(packet.events, packet.flags))
 
-
-def _writer(
-    path: Path,
-    source: Source,
-    calibration: Calibration,
-    *,
-    compensated: bool,
-    encoders: int,
-    offset_us: float = 0.0,
-) -> LiveWriter:
-    """Return the writer of a recording of the source, as it is or ``compensated``.
-
-    ``encoders``: number of encoders whose samples it stores; ``offset_us``: their clock offset [us].
-    """
-    width, height = source.size
-    metadata = recorded_from(source)
-    if not calibration.model.PRISM:
-        metadata["optic"] = calibration.model_name
-    if compensated:
-        metadata["compensated_with"] = calibration.model_name
-    return LiveWriter(
-        path,
-        width=width,
-        height=height,
-        camera=calibration.model.camera,
-        prism=source.prism or _prism(calibration),
-        metadata=metadata,
-        compensated=compensated,
-        encoders=encoders,
-        clock_offset_us=offset_us,
-    )
+    return send
 
 
-def _live_lines(result: dict[str, Any]) -> list[str]:
+def _show_plain(viewer: LiveViewer) -> Callable[[Compensated], None]:
+    """Return a function that shows a packet that is not compensated."""
+    return lambda packet: viewer.append(packet.events)
+
+
+def _live_lines(result: dict[str, Any], stages: list[str]) -> list[str]:
     """Return the lines of the result: numbers of events and their marks, speed, clocks, controller, pictures, files."""
+    speed = f"{result['seconds']:.1f} s, {result['mev_per_s']:.3g} Mev/s"
+    if result["model"] is None:
+        return [
+            f"{result['events']:,} events, {speed}, not compensated",
+            *stages,
+            *tensor_lines(result["tensors"]),
+            *controller_lines(result["controller"]),
+            *result["files"],
+        ]
     marks = []
     for key, meaning in (
         ("outside", "outside the image"),
@@ -620,11 +652,12 @@ def _live_lines(result: dict[str, Any]) -> list[str]:
         if result[key]:
             marks.append(f"{result[key]:,} {meaning}")
     marked = ", ".join(marks) or "all inside the image with a measured angle"
-    speed = f"{result['seconds']:.1f} s, {result['mev_per_s']:.3g} Mev/s"
     return [
         f"{result['compensated']:,} events ({marked}), {speed} by the {result['model']} model on {result['device']}",
+        *(stages if len(stages) > 2 else ()),
         *_clock_lines(result["clock"]),
         *controller_lines(result["controller"]),
+        *tensor_lines(result["tensors"]),
         *_picture_lines(result["pictures"], result["seconds"]),
         *result["files"],
     ]

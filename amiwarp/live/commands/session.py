@@ -185,7 +185,12 @@ def describe(status: SessionStatus, width: int = 80) -> str:
     parts = [f"{status.seconds:.1f} s", f"{status.rate_mev_s:.2f} Mev/s", *losses[:2]]
     if status.done:
         parts.append(f"latency {status.latency_ms[0]:.1f} ms")
+    names = [stage.name for stage in status.stages]
+    if status.done and (not names or "compensate" in names):
         parts.append(f"encoder {100.0 * status.covered:.1f} %")
+    for stage in status.stages:
+        if stage.name == "filter" and stage.received:
+            parts.append(f"filter keeps {100.0 * stage.passed / stage.received:.0f} %")
     if status.rpm is not None:
         parts.append(f"{status.rpm:.0f} rpm")
     if status.sharpness is not None:

@@ -15,6 +15,7 @@ from .stream_format import encode_encoder as encode_encoder
 from .stream_format import encode_end as encode_end
 from .stream_format import encode_events as encode_events
 from .stream_format import encode_hello as encode_hello
+from .stream_format import encode_tensor as encode_tensor
 from .stream_format import encode_triggers as encode_triggers
 from .packets import make_packet as make_packet
 from .phase_check import PhaseCheck as PhaseCheck

@@ -83,8 +83,12 @@ class Consumers:
             self._put(served, append, t.nbytes + angle.nbytes + index_t.nbytes)
 
     def append_compensated(self, packet: Compensated) -> None:
-        """Pass compensated events to the consumer of compensated events."""
+        """Pass events to the consumer of compensated events. Events of whole pixels are not compensated: no flags."""
         if self.out is None:
+            return
+        if packet.events.whole_pixels:
+            append = partial(self.out.consumer.append, packet.events)
+            self._put(self.out, append, held_bytes(packet.events), len(packet.events))
             return
         flags = packet.flags
         inside = (flags & OUTSIDE) == 0

@@ -1,4 +1,4 @@
-"""Live session: takes events from a source, compensates them, and gives them to files, servers and callbacks.
+"""Live session: takes events from a source, filters and compensates them, and gives them to files, servers, callbacks.
 
 It checks the prism's phase meanwhile.
 """
@@ -11,6 +11,7 @@ from typing import Any
 
 from amiwarp.compensation.streams import Compensated, Compensator
 from amiwarp.events.recording import Events
+from amiwarp.imaging.filters import EventFilter
 from amiwarp.io.native.live_writer import LiveWriter
 from amiwarp.live.event_sorter import EventSorter
 from amiwarp.live.link.camera_clock import NO_SHIFT_US
@@ -23,6 +24,8 @@ from amiwarp.live.stream.encoder_feed import EncoderFeed, event_encoder
 from amiwarp.live.stream.packets import Packet, Source
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.session_status import IntervalFigures, SessionStatus, WindowSharpness
+from amiwarp.live.stream.stages import SessionStages
+from amiwarp.optics.camera import Camera
 from amiwarp.results.calibration import Calibration
 
 CLOCKS_US = NO_SHIFT_US + 2_000_000
@@ -35,6 +38,8 @@ POLL_S = 0.001
 """Longest wait for a packet between two polls of the encoder [s]."""
 QUEUE_EVENTS = 1 << 23
 """Capacity of the queue before the compensator [events]: most of a second of the fastest sensor."""
+STEP_EVENTS = 1 << 16
+"""Number of events that are processed together without a compensator, which has its own batches."""
 STEP_BYTES = 1 << 22
 """Memory of the packets that are processed before controller and stop event are checked again [bytes]."""
 
@@ -46,6 +51,8 @@ class Session:
     example to record. ``link``: its encoder samples replace the source's. ``second_ratio``: speed of the second
     prism of a pair relative to the first, if only the first has an encoder. The consumers ``raw`` get the sensor's
     events, ``out`` gets the compensated events, and both get encoder samples; ``sinks`` get compensated packets.
+    Without a calibration, ``out`` and ``sinks`` get events that are not compensated. ``chosen``: the events for ``out``
+    and ``sinks``; None: all. ``undistort``: camera whose lens distortion they lose; None: they keep it.
     ``watch_s``: interval between checks of the phase [s]; None: no checks. ``keeper``: adaptive speed. ``wait_us``:
     longest wait of an event for its encoder samples [us]. ``policy`` and ``queue_events``: for the queue before the
     compensator. ``say`` is called with messages.
@@ -58,6 +65,8 @@ class Session:
         *,
         link: Link | None = None,
         second_ratio: float | None = None,
+        chosen: EventFilter | None = None,
+        undistort: Camera | None = None,
         raw: Sequence[RawConsumer] = (),
         out: LiveWriter | None = None,
         sinks: tuple[Callable[[Compensated], None], ...] = (),
@@ -85,6 +94,17 @@ class Session:
         self._feed = EncoderFeed(link, self.encoder, self._consumers.append_encoder, say)
         self._queue = PacketQueue(queue_events, policy)
         self._sorter = EventSorter()
+        self._stages = SessionStages(
+            source.size,
+            chosen,
+            undistort,
+            compensates=calibration is not None,
+            delay_us=self._delay_us,
+        )
+        self._collected: list[Events] = []
+        self._collected_us = 0
+        """Events of the current step that the filter has not seen yet, and the time when the first arrived [us]."""
+        self._gives_plain = calibration is None and (out is not None or bool(sinks))
         self._compensator: Compensator | None = None
         self._sharpness: WindowSharpness | None = None
         self._phase_check: PhaseCheck | None = None
@@ -219,14 +239,15 @@ class Session:
         packet = self._queue.get(POLL_S)
         events = 0
         held = 0
-        most = 1 if self._compensator is None else self._compensator.batch
-        while packet is not None:  # compensating waiting packets together is faster
+        most = STEP_EVENTS if self._compensator is None else self._compensator.batch
+        while packet is not None:  # processing waiting packets together is faster
             self._take(packet)
             events = events + len(packet.events)
             held = held + packet.held_bytes
             packet = self._queue.get(0.0) if events < most and held < STEP_BYTES else None
+        self._pass_collected()
         if self._compensator is not None:
-            self._give(self._compensator.take(monotonic_us()))
+            self._give_compensated(self._compensator.take(monotonic_us()))
 
     def _poll_encoder(self) -> None:
         self._feed.poll()
@@ -246,15 +267,43 @@ class Session:
         self._consumers.append(events)
         if self._phase_check is not None:
             self._phase_check.put(events)
+        if not self._collected:
+            self._collected_us = arrived_us
+        self._collected.append(events)
+        if self._compensator is not None and not self._stages.filters:
+            self._pass_collected()  # the compensator joins packets itself, without a further copy
+
+    def _pass_collected(self) -> None:
+        """Filter the collected events, and pass them on to the compensator or the outputs."""
+        if not self._collected:
+            return
+        events = Events.concatenate(self._collected)
+        self._collected = []
+        kept = self._stages.chosen_of(events)
+        if not len(kept):
+            return
         if self._compensator is not None:
-            self._compensator.put(events, monotonic_us(), arrived_us=arrived_us)
+            self._compensator.put(kept, monotonic_us(), arrived_us=self._collected_us)
+        elif self._gives_plain:
+            self._give([self._stages.plain(kept, self._collected_us)])
+
+    def _delay_us(self, event_us: int) -> float:
+        """Return the time since an event [us]: by the clocks, else at least as long."""
+        return monotonic_us() - self._feed.host_time(event_us)
+
+    def _give_compensated(self, packets: list[Compensated]) -> None:
+        """Pass the packets of the compensator to the last stage, and to all consumers."""
+        self._give([self._stages.compensated(packet) for packet in packets])
+        if packets and self._keeper is not None:
+            self._keeper.put(packets, self.encoder)
+        if packets and self._sharpness is not None:
+            sharpness = self._sharpness.update(int(packets[-1].events.t[-1]))
+            self.status.sharpness = self.status.sharpness if sharpness is None else sharpness
 
     def _give(self, packets: list[Compensated]) -> None:
-        """Pass compensated packets to all their consumers."""
-        now = monotonic_us()
+        """Pass packets that have left the last stage to all their consumers."""
         for packet in packets:
-            event_us = int(packet.events.t[-1])
-            self._figures.add(packet, now - self._feed.host_time(event_us), self.status)
+            self._figures.add(packet, self._delay_us(int(packet.events.t[-1])), self.status)
             self._consumers.append_compensated(packet)
             for sink in list(self._sinks):
                 try:
@@ -262,11 +311,6 @@ class Session:
                 except Exception as error:
                     self._fail(error)
                     self._sinks.remove(sink)
-        if packets and self._keeper is not None:
-            self._keeper.put(packets, self.encoder)
-        if packets and self._sharpness is not None:
-            sharpness = self._sharpness.update(int(packets[-1].events.t[-1]))
-            self.status.sharpness = self.status.sharpness if sharpness is None else sharpness
 
     def _report(self, on_status: Callable[[SessionStatus], None]) -> None:
         status = self.status
@@ -275,6 +319,7 @@ class Session:
         self._figures.report(now, status)
         status.dropped = self._queue.dropped
         status.late = self._sorter.late
+        status.stages = self._stages.report(status, self._queue.received)
         status.waiting = self._queue.held + (
             0 if self._compensator is None else self._compensator.waiting
         )
@@ -290,6 +335,7 @@ class Session:
     def _finish(self) -> None:
         """Process all data that are still held back, at the end of the session."""
         self._take_events(self._sorter.flush(), monotonic_us())
+        self._pass_collected()
         end = monotonic_us() + 1e6 * PATIENCE_S
         while self._link is not None and monotonic_us() < end:
             self._poll_encoder()
@@ -303,5 +349,5 @@ class Session:
             self._feed.settle()
             self._poll_encoder()
         if self._compensator is not None:
-            self._give(self._compensator.flush())
+            self._give_compensated(self._compensator.flush())
         self._consumers.drain(self._drain_left)

@@ -1,6 +1,6 @@
 """Status of a live session, and the figures in it that are measured between two reports."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -13,6 +13,43 @@ from amiwarp.live.link.clocks import ClockMap
 
 IMAGE_US = 33_333
 """Length of the time window whose image gives the reported sharpness [us]."""
+
+
+@dataclass(slots=True)
+class StageStatus:
+    """Counts and latency of a stage of a session."""
+
+    name: str
+    """Name of the stage: read, filter, compensate or undistort."""
+    received: int = 0
+    """Number of events that reached the stage."""
+    passed: int = 0
+    """Number of events that left it."""
+    removed: dict[str, int] = field(default_factory=dict)
+    """Number of events that the stage removed, by reason."""
+    marked: dict[str, int] = field(default_factory=dict)
+    """Number of events that the stage passed on with a mark, by reason."""
+    latency_ms: tuple[float, float] | None = None
+    """Median and 99th percentile of the time from an event to its exit from the stage, since the last report [ms]."""
+
+
+class Latencies:
+    """Latencies of the packets that left a stage since the last report."""
+
+    def __init__(self) -> None:
+        self._delays_us: list[float] = []
+
+    def add(self, delay_us: float) -> None:
+        """Add the time from the last event of a packet until now [us]."""
+        self._delays_us.append(delay_us)
+
+    def take(self) -> tuple[float, float] | None:
+        """Return median and 99th percentile [ms], None without packets, and begin again."""
+        if not self._delays_us:
+            return None
+        median, slow = np.percentile(self._delays_us, [50, 99]) * 1e-3
+        self._delays_us.clear()
+        return float(median), float(slow)
 
 
 @dataclass(slots=True)
@@ -57,6 +94,8 @@ class SessionStatus:
     """How this map is known; None without a link."""
     coverage: float | None = None
     """Share of the scene's edges that the last window showed, 0 to 1; None without adaptive speed."""
+    stages: list[StageStatus] = field(default_factory=list)
+    """The stages of the session in their order, from "read" on, each with its counts and its latency."""
 
 
 class IntervalFigures:
@@ -65,7 +104,7 @@ class IntervalFigures:
     def __init__(self, began_us: int) -> None:
         # At the last report: time [us], and numbers of events received, compensated, and without a measured angle.
         self._reported = (began_us, 0, 0, 0)
-        self._latencies: list[float] = []
+        self._latencies = Latencies()
 
     def add(self, packet: Compensated, delay_us: float, status: SessionStatus) -> None:
         """Count a compensated packet in the figures of the interval. ``delay_us``: time from its last event [us]."""
@@ -75,7 +114,7 @@ class IntervalFigures:
             status.outside += int(np.count_nonzero(flags & OUTSIDE))
             status.guessed += int(np.count_nonzero(flags & EXTRAPOLATED))
             status.unknown += int(np.count_nonzero(flags & NO_ANGLE))
-        self._latencies.append(delay_us)
+        self._latencies.add(delay_us)
 
     def report(self, now_us: int, status: SessionStatus) -> None:
         """Write the figures since the last report into the status, and start the next interval."""
@@ -87,10 +126,7 @@ class IntervalFigures:
         if done > 0:
             status.covered = 1.0 - (unsure - unsure_before) / done
         self._reported = (now_us, status.events, status.done, unsure)
-        if self._latencies:
-            median, slow = np.percentile(self._latencies, [50, 99]) * 1e-3
-            status.latency_ms = float(median), float(slow)
-            self._latencies.clear()
+        status.latency_ms = self._latencies.take() or status.latency_ms
 
 
 class WindowSharpness:

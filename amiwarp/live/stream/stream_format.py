@@ -1,5 +1,6 @@
 """Messages of a live stream, encoded as in ``docs/reference/stream-format.md``."""
 
+import io
 import json
 import struct
 import zlib
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events
+from amiwarp.imaging.tensor_stream import StreamTensor
 from amiwarp.io.native.attributes import (
     camera_attributes,
     prism_attributes,
@@ -31,7 +33,7 @@ LONGEST_HELLO = 1 << 16
 """Largest payload of a hello packet [bytes]."""
 HEADER = struct.Struct("<4sBBHIII")
 """Header of an encoded packet: magic, version, kind, 0, number of rows, payload size [bytes], CRC-32 of the payload."""
-HELLO, EVENTS, COMPENSATED, TRIGGERS, ENCODER, END, SECOND_ENCODER = range(1, 8)
+HELLO, EVENTS, COMPENSATED, TRIGGERS, ENCODER, END, SECOND_ENCODER, TENSOR = range(1, 9)
 """Kinds of encoded packets, as numbers in the header."""
 COLUMNS: Mapping[int, tuple[str, ...]] = {
     EVENTS: ("<i8", "<u2", "<u2", "u1"),
@@ -41,6 +43,11 @@ COLUMNS: Mapping[int, tuple[str, ...]] = {
     SECOND_ENCODER: ("<i8", "<f8"),
 }
 """Data types of the columns of an encoded packet, by the packet's kind."""
+LONGEST_TENSOR = 1 << 28
+"""Largest payload of a packet with a tensor [bytes]."""
+TENSOR_TIMES = struct.Struct("<qqQ")
+"""Beginning of the payload of a tensor: start and end of its window [us], and number of events. An array as in a file
+``.npy`` follows."""
 LONGEST_ROW = 19
 """Largest size of a row of a packet of an unknown kind [bytes]."""
 
@@ -122,6 +129,19 @@ def encode_encoder(
 ) -> bytes:
     """Encode samples of the first or second encoder: times on the events' clock [us], unwrapped angles [rad]."""
     return _pack_columns(SECOND_ENCODER if second else ENCODER, t_us, angle)
+
+
+def encode_tensor(found: StreamTensor) -> bytes:
+    """Encode a tensor of a window. Raises :class:`AmiwarpError` for one of more than :data:`LONGEST_TENSOR` bytes."""
+    file = io.BytesIO()
+    file.write(TENSOR_TIMES.pack(found.t_start, found.t_end, found.events))
+    np.lib.format.write_array(file, np.asarray(found.tensor), allow_pickle=False)
+    payload = file.getvalue()
+    if len(payload) > LONGEST_TENSOR:
+        raise AmiwarpError(
+            f"a tensor has {len(payload):,} bytes, more than the {LONGEST_TENSOR:,} of a packet; give fewer bins"
+        )
+    return _pack(TENSOR, 1, payload)
 
 
 def encode_end() -> bytes:
@@ -230,7 +250,11 @@ class PacketDecoder:
         if version != VERSION:
             raise self._error(f"it is of version {version}, not {VERSION}")
         row = _row_bytes(kind)
-        longest = LONGEST_HELLO if kind in (HELLO, END) else MOST * (row or LONGEST_ROW)
+        longest = MOST * (row or LONGEST_ROW)
+        if kind in (HELLO, END):
+            longest = LONGEST_HELLO
+        elif kind == TENSOR:
+            longest = LONGEST_TENSOR
         if length > longest or (row and length != count * row):
             raise self._error(
                 f"it has {count} rows in {length} bytes; expected up to {longest} bytes, {row} per row"
