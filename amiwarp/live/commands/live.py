@@ -27,6 +27,7 @@ from amiwarp.live.commands.session import (
     check_angles,
     check_model,
     check_whole,
+    lost_lines,
     recorded_from,
     session_summary,
     stopped_by_interrupt,
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.picture_stream import PictureStream
     from amiwarp.live.stream.session import Session
     from amiwarp.live.stream.session_status import SessionStatus
-    from amiwarp.live.stream.sinks import PipeSink, SocketSink
+    from amiwarp.live.stream.sinks import Sink
     from amiwarp.optics.models.base import Model
     from amiwarp.optics.prism import NominalPrism
     from amiwarp.plotting.live_viewers import LiveViewer
@@ -143,7 +144,8 @@ class OutputOptions:
     to: Annotated[
         str | None,
         _in_outputs(
-            help="Address to serve compensated packets at: tcp:HOST:PORT, unix:PATH, or - for standard output.",
+            help="Address to serve compensated packets at: tcp:HOST:PORT, unix:PATH, shm:NAME (shared memory), - for "
+            "standard output; or udp:HOST:PORT of the program that receives them.",
             metavar="ADDRESS",
         ),
     ] = None
@@ -424,7 +426,7 @@ class _Receivers:
     ) -> None:
         from amiwarp.live.stream.forward import Forward
 
-        def sink(what: str, address: str | None, encoders: int = 1) -> SocketSink | PipeSink | None:
+        def sink(what: str, address: str | None, encoders: int = 1) -> Sink | None:
             if address is None:
                 return None
             opened = _open_sink(address, calibration, encoders, resources, stop=stop, say=say)
@@ -539,7 +541,7 @@ def _open_sink(
     *,
     stop: threading.Event,
     say: Callable[[str], None],
-) -> SocketSink | PipeSink:
+) -> Sink:
     """Open the sink at an address, which ``resources`` closes; its hello message describes the calibrated camera."""
     from amiwarp.live.stream.sinks import open_sink
     from amiwarp.live.stream.stream_format import encode_hello
@@ -568,7 +570,7 @@ def _prism(calibration: Calibration) -> NominalPrism | None:
     return calibration.prism if calibration.model.PRISM else None
 
 
-def _send_to(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
+def _send_to(sink: Sink) -> Callable[[Compensated], None]:
     """Return a function that sends a compensated packet to a sink."""
     from amiwarp.live.stream.stream_format import encode_compensated
 
@@ -623,6 +625,7 @@ def _live_lines(result: dict[str, Any]) -> list[str]:
     speed = f"{result['seconds']:.1f} s, {result['mev_per_s']:.3g} Mev/s"
     return [
         f"{result['compensated']:,} events ({marked}), {speed} by the {result['model']} model on {result['device']}",
+        *lost_lines(result),
         *_clock_lines(result["clock"]),
         *controller_lines(result["controller"]),
         *_picture_lines(result["pictures"], result["seconds"]),
