@@ -155,12 +155,10 @@ class RingReceiver:
         self.problem: str | None = None
         """Why no more packets will come, in one line; None while they may."""
         self._address = address
-        try:
-            self._memory = untracked_shared_memory(name)
-        except (FileNotFoundError, ValueError) as error:  # ValueError: it has no size yet
-            raise Unreachable(
-                f"{address}: there is no such shared memory; start its writer first"
-            ) from error
+        memory = _attached(name)
+        if memory is None:
+            raise Unreachable(f"{address}: there is no such shared memory; start its writer first")
+        self._memory = memory
         try:
             self._slots, self._slot_bytes, self._place, hello = _read_head(
                 address, self._memory.buf
@@ -312,29 +310,40 @@ def _reserved(name: str, size: int) -> SharedMemory:
 
 def _remove_left_over(name: str) -> None:
     """Remove the ring of a writer that died. Raises :class:`AmiwarpError` if the memory is used, or no ring."""
-    with contextlib.suppress(FileNotFoundError, ValueError):
-        memory = untracked_shared_memory(name)
-        try:
-            is_ring = len(memory.buf) >= HELLO_AT and bytes(memory.buf[:4]) == MAGIC
-            words = memory.buf.cast("Q")
-            lives = is_ring and _lives(words)
-            ring_id = words[RING_ID] if is_ring else 0
-            words.release()
-        finally:
-            memory.close()
-        if lives or not is_ring:
-            what = "another program writes to it" if lives else "it holds something else"
-            raise AmiwarpError(f"shm:{name}: {what}; choose another name", ErrorCode.UNREACHABLE)
-        _remove(name, ring_id)
+    memory = _attached(name)
+    if memory is None:
+        return
+    with contextlib.closing(memory), memory.buf[:HELLO_AT] as head:
+        if len(head) < HELLO_AT or bytes(head[: len(MAGIC)]) != MAGIC:
+            raise AmiwarpError(
+                f"shm:{name}: holds something else than a ring of amiwarp; choose another name",
+                ErrorCode.UNREACHABLE,
+            )
+        with head.cast("Q") as words:
+            ring_id = words[RING_ID]
+            if _lives(words):
+                raise AmiwarpError(
+                    f"shm:{name}: another program writes to it; choose another name",
+                    ErrorCode.UNREACHABLE,
+                )
+    _remove(name, ring_id)
 
 
 def _remove(name: str, ring_id: int) -> None:
     """Remove a name, unless another ring has it by now."""
-    with contextlib.suppress(FileNotFoundError, ValueError):
-        memory = untracked_shared_memory(name)
-        words = memory.buf.cast("Q")
-        is_same = words[RING_ID] == ring_id
-        words.release()
-        memory.close()
-        if is_same:
+    memory = _attached(name)
+    if memory is None:
+        return
+    with contextlib.closing(memory), memory.buf[:HELLO_AT] as head:
+        is_same = len(head) == HELLO_AT and head.cast("Q")[RING_ID] == ring_id
+    if is_same:
+        with contextlib.suppress(FileNotFoundError):
             remove_shared_memory(memory)
+
+
+def _attached(name: str) -> SharedMemory | None:
+    """Return the shared memory of a name; None if there is none, or if it has no size yet."""
+    try:
+        return untracked_shared_memory(name)
+    except (FileNotFoundError, ValueError):
+        return None
