@@ -39,10 +39,10 @@ HELLO_AT = 64
 """Place of the hello packet [bytes]."""
 SLOT_HEAD = 16
 """Size of the head of a slot [bytes]: number of the packet plus 1 (``u64``), its length and its check (``u32``)."""
-SLOTS = 512
-"""Default number of slots."""
-SLOT_BYTES = 1 << 16
-"""Default size of a slot [bytes]. The default ring has 32 MiB: containers often have 64 MiB of shared memory."""
+SLOTS = 192
+"""Default number of slots. The default ring has 48 MiB: containers often have 64 MiB of shared memory."""
+SLOT_BYTES = 1 << 18
+"""Default size of a slot [bytes]. A millisecond of a fast sensor fits; packets that are cut cost twice the time."""
 BEAT_S = 0.2
 """Time between two beats of the writer [s]."""
 DEAD_S = 3.0
