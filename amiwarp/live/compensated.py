@@ -42,7 +42,8 @@ def compensate_live(
     ----------
     source : str or Path
         Source: ``camera:``, ``dv``, ``prophesee``, ``tcp:HOST:PORT``, ``unix:PATH``, ``shm:NAME``, ``udp:HOST:PORT``,
-        ``-`` for standard input, or a file to replay. :class:`CameraSettings` continue the name of a camera: ``f"camera:evk4,{settings}"``.
+        ``-`` for standard input, or a file to replay. :class:`CameraSettings` continue the name of a camera:
+        ``f"camera:evk4,{settings}"``.
     calibration : Calibration
         Calibration of the camera.
     port : str, optional
