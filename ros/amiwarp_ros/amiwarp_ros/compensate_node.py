@@ -11,6 +11,10 @@ from amiwarp_ros.message_source import MessageSource
 from amiwarp_ros.running import run
 
 
+WATCH_S = 10.0
+"""Interval between checks of the calibrated phase [s]."""
+
+
 class CompensateNode(LiveNode):
     """Subscribes to ``events``, and publishes the compensated ones on ``compensated/events``."""
 
@@ -26,6 +30,7 @@ class CompensateNode(LiveNode):
             self.calibration,
             link=self.link,
             sinks=(self._publish,),
+            watch_s=WATCH_S,
             wait_us=round(1000.0 * self.values["wait_ms"]),
             policy=Policy.DROP_OLDEST,
             device=self.values["device"],

@@ -6,6 +6,8 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from amiwarp import AmiwarpError
+
 
 class Diagnostics:
     """Publisher of the state of a node on ``/diagnostics``, once per second."""
@@ -16,7 +18,10 @@ class Diagnostics:
         self._before: dict[str, int] = {}
 
     def publish(self, counts: dict[str, int], figures: dict[str, str], failure: str | None) -> None:
-        """Publish numbers and texts. ``counts`` of what is lost warn when they have grown since the last call."""
+        """Publish numbers and texts. ``counts`` of what is lost warn when they have grown since the last call.
+
+        Raises :class:`AmiwarpError` after a failure was published, which ends the node.
+        """
         grown = [name for name, count in counts.items() if count > self._before.get(name, 0)]
         self._before = dict(counts)
         status = DiagnosticStatus(
@@ -34,3 +39,5 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
+        if failure is not None:
+            raise AmiwarpError(failure)

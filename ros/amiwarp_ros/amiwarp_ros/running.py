@@ -17,14 +17,14 @@ def run(make: Callable[[], Any], args: list[str] | None) -> None:
     rclpy.init(args=args)
     try:
         node = make()
-    except AmiwarpError as error:
-        rclpy.try_shutdown()
-        sys.exit(f"amiwarp_ros: {error}")
-    try:
-        rclpy.spin(node)
+        try:
+            rclpy.spin(node)
+        finally:
+            node.close()
+            node.destroy_node()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except AmiwarpError as error:
+        sys.exit(f"amiwarp_ros: {error}")
     finally:
-        node.close()
-        node.destroy_node()
         rclpy.try_shutdown()
