@@ -10,7 +10,6 @@ from amiwarp_ros.live_node import LiveNode
 from amiwarp_ros.message_source import MessageSource
 from amiwarp_ros.running import run
 
-
 WATCH_S = 10.0
 """Interval between checks of the calibrated phase [s]."""
 
