@@ -51,6 +51,7 @@ def ros() -> Iterator[Any]:
     sys.path.insert(0, str(PACKAGE))
     import amiwarp_ros.compensate_node as compensate_node
     import amiwarp_ros.event_packets as event_packets
+    import amiwarp_ros.event_publisher as event_publisher
     import amiwarp_ros.filter_node as filter_node
     import amiwarp_ros.message_source as message_source
     import amiwarp_ros.pictures_node as pictures_node
@@ -59,6 +60,7 @@ def ros() -> Iterator[Any]:
         stub=rclpy_stub,
         packets=event_packets,
         source=message_source,
+        whole_pixels=event_publisher.whole_pixels,
         Compensate=compensate_node.CompensateNode,
         Filter=filter_node.FilterNode,
         Pictures=pictures_node.PicturesNode,
@@ -287,6 +289,17 @@ def test_the_compensate_node_publishes_what_compensation_gives(
     assert values["published events"] == str(len(got))
     assert values["missing messages"] == "0"
     assert int(values["events with an extrapolated angle"]) == 0
+
+
+def test_events_at_the_border_are_rounded_or_left_out(ros: Any) -> None:
+    x = np.array([-0.6, -0.4, 63.4, 63.6, 10.0, 10.0, np.nan, 20.5], np.float32)
+    y = np.array([5.0, 5.0, 5.0, 5.0, 47.6, -0.4, np.nan, 7.0], np.float32)
+    events = Events(x, y, np.arange(8), np.ones(8, np.uint8))
+    keep = np.array([True] * 7 + [False])
+    found = ros.whole_pixels(events, keep, SIZE)
+    assert (found.x.tolist(), found.y.tolist()) == ([0, 63, 10], [5, 5, 0])
+    assert found.t.tolist() == [1, 2, 5]
+    assert found.x.dtype == np.uint16
 
 
 def test_diagnostics_warn_once_of_messages_that_are_missing(
