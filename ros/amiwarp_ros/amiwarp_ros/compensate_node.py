@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from amiwarp import Compensated, Policy
-from amiwarp.compensation.streams import NO_ANGLE, OUTSIDE
+from amiwarp.compensation.streams import OUTSIDE
 from amiwarp.live.stream import Session
 from amiwarp_ros.event_publisher import EventPublisher, whole_pixels
 from amiwarp_ros.live_node import LiveNode
@@ -51,7 +51,7 @@ class CompensateNode(LiveNode):
     def _publish(self, packet: Compensated) -> None:
         assert self._publisher is not None
         assert self.source is not None
-        keep = packet.flags & (OUTSIDE | NO_ANGLE) == 0
+        keep = packet.flags & OUTSIDE == 0
         events = whole_pixels(packet.events, keep, self.source.size)
         self._publisher.publish(events, self.source.clock.offset_us or 0)
 

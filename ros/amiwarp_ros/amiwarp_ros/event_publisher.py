@@ -44,7 +44,7 @@ class EventPublisher:
 
 
 def whole_pixels(events: Events, keep: Any, size: tuple[int, int]) -> Events:
-    """Return the events of ``keep`` at their nearest pixels, without those outside the image."""
+    """Return the events of ``keep`` at their nearest pixels, without those outside the image or without a position."""
     width, height = size
     x = np.rint(events.x[keep])
     y = np.rint(events.y[keep])
