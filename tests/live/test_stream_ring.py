@@ -209,6 +209,15 @@ def test_memory_of_others_is_left_alone(address: str) -> None:
     assert path.read_bytes() == b"mine" * 25
 
 
+def test_memory_of_another_user_is_an_error(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(*_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(shared_ring, "untracked_shared_memory", denied)
+    with refused(ErrorCode.UNREACHABLE, "Permission denied; run both programs as the same user"):
+        RingReceiver(address)
+
+
 @needs_dev_shm
 def test_a_ring_of_another_version_or_with_other_sizes_is_refused(address: str) -> None:
     with RingSink(address, HELLO, slots=4, slot_bytes=64):

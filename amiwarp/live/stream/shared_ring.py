@@ -167,9 +167,8 @@ class RingReceiver:
             self._memory.close()
             raise
         self._hello: bytes | None = hello
-        size = (
-            self._place + self._slots * self._slot_bytes
-        )  # the memory may be longer, by less than a page
+        # The memory may be longer, by less than a page.
+        size = self._place + self._slots * self._slot_bytes
         self._bytes = self._memory.buf[:size].toreadonly()
         self._words = self._bytes.cast("Q")
         self._halves = self._bytes.cast("I")
@@ -214,6 +213,7 @@ class RingReceiver:
             skipped = ahead - self._slots // 2
             self.lost += skipped
             self._number += skipped
+            self._unfit_since = None
         start = self._place + self._number % self._slots * self._slot_bytes
         after = self._number + 1
         if self._words[start // 8] != after:
@@ -347,3 +347,8 @@ def _attached(name: str) -> SharedMemory | None:
         return untracked_shared_memory(name)
     except (FileNotFoundError, ValueError):
         return None
+    except OSError as error:
+        raise AmiwarpError(
+            f"shm:{name}: cannot open shared memory: {error.strerror or error}; run both programs as the same user",
+            ErrorCode.UNREACHABLE,
+        ) from error
