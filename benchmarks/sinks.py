@@ -2,7 +2,7 @@
 
     python -m benchmarks.sinks [--seconds 2] [--out FILE.json]
 
-A stream of compensated events, in packets of 10,000 (one millisecond of a fast sensor), goes to programs that only
+A stream of compensated events, in packets of 5,000 (half a millisecond of a fast sensor), goes to programs that only
 receive it. ``send_ns`` is the processor time of the thread that calls ``send``, for each event and without encoding.
 Half a millisecond lies between two packets, as between packets of a camera.
 """
@@ -26,7 +26,7 @@ from amiwarp import Events
 from amiwarp.live.stream import encode_compensated, encode_hello, open_sink
 from amiwarp.studies.machine import machine
 
-PACKET = 10_000
+PACKET = 5_000
 PAUSE_S = 0.0005
 REPEATS = 5
 RECEIVER = """

@@ -319,7 +319,7 @@ def test_a_command_records_a_ring_and_leaves_it(address: str, tmp_path: Path) ->
         "--seconds",
         "1",
     ]
-    with RingSink(address, HELLO) as sink:
+    with RingSink(address, HELLO, slots=16_384, slot_bytes=2048) as sink:  # also on a busy machine
         record = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )

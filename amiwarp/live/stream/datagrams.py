@@ -167,11 +167,8 @@ class DatagramReceiver:
             size = self._socket.recv_into(self._buffer)
         except OSError:  # nothing waits; on Windows also: another program's port was closed
             return None
-        packet = self._buffer[HEAD.size : size]
-        if size < HEAD.size or not is_packet(packet):
-            return None
-        packet = bytes(packet)
-        if not checksum_fits(packet, checksum_of(packet)):
+        packet = bytes(self._buffer[HEAD.size : size])
+        if not is_packet(packet) or not checksum_fits(packet, checksum_of(packet)):
             return None
         magic, stream, number = HEAD.unpack_from(self._buffer)
         if self._stream is None and magic == MAGIC and kind_of(packet) == HELLO:
