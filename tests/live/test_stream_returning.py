@@ -362,5 +362,5 @@ def test_a_sender_is_waited_for_where_it_was(
 
     monkeypatch.setattr(returning_source, "iter_accepted", noted(True))
     monkeypatch.setattr(returning_source, "iter_connected", noted(False))
-    assert list(returning_source.socket_attempts(spec)) == [None]
+    assert list(returning_source.sender_attempts(spec)) == [None]
     assert asked == [(accepts, address)]
