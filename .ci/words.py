@@ -33,7 +33,8 @@ def read_list(text: str) -> tuple[dict[str, str], list[str]]:
 def checked_files(skipped: list[str]) -> Iterator[Path]:
     """Yield all files that are checked."""
     yield from sorted(ROOT.glob("*.md"))
-    for folder, endings in (("amiwarp", (".py", ".pyi")), ("docs", (".md", ".py"))):
+    folders = (("amiwarp", (".py", ".pyi")), ("docs", (".md", ".py")), ("ros", (".md", ".py")))
+    for folder, endings in folders:
         for path in sorted((ROOT / folder).rglob("*")):
             name = path.relative_to(ROOT).as_posix()
             away = any(name == skip or name.startswith(f"{skip}/") for skip in skipped)

@@ -9,6 +9,7 @@ Whoever raises the least version of a library in ``pyproject.toml`` looks here f
 | :func:`without_line` | Warp (in none up to 1.19) | keeps to ``log_level`` for what its native code prints |
 | :func:`load_extensions_whole` | h5py, Cython (3.16 was not tried) | passes on a Ctrl-C during an import |
 | :func:`first_page` | trame-client (in none up to 4.1) | takes title, viewport and socket of the page as options |
+| :func:`untracked_shared_memory`, :func:`remove_shared_memory` | Python (3.11, 3.12) | has ``track=False``: 3.13 |
 | :func:`trame_globals_restored`, :func:`remove_from_trame` | trame-server (in none up to 4.1) | has no globals |
 """
 
@@ -20,20 +21,28 @@ import os
 import re
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from functools import cache, wraps
 from importlib.machinery import ExtensionFileLoader
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.tasks import interrupts_later
 
 if TYPE_CHECKING:
+    from multiprocessing.shared_memory import SharedMemory
+
     import numpy as np
     from numpy.typing import NDArray
 
 HEAD = object.__basicsize__
 """Place of the pointer to the values in NumPy's array object (``PyArrayObject_fields`` in its C interface) [bytes]."""
+
+
+_TRACKER_LOCK = threading.Lock()
+"""Held while Python's tracker of resources is hidden from the module of shared memory."""
 
 
 @cache
@@ -121,6 +130,44 @@ def _loaded_whole(load: Callable[..., Any]) -> Callable[..., Any]:
             return load(*arguments)
 
     return whole
+
+
+def untracked_shared_memory(name: str, size: int | None = None) -> SharedMemory:
+    """Open shared memory, or make it with a ``size`` [bytes], without Python's tracker of resources.
+
+    The tracker removes at the end of a program what it only read, although another program still writes to it.
+    """
+    from multiprocessing import shared_memory
+
+    options: dict[str, Any] = {} if size is None else {"create": True, "size": size}
+    if sys.version_info >= (3, 13):
+        return shared_memory.SharedMemory(name, track=False, **options)
+    with _untracked(shared_memory):
+        return shared_memory.SharedMemory(name, **options)
+
+
+def remove_shared_memory(memory: SharedMemory) -> None:
+    """Remove the name of shared memory that :func:`untracked_shared_memory` opened."""
+    from multiprocessing import shared_memory
+
+    with _untracked(shared_memory):
+        memory.unlink()
+
+
+@contextlib.contextmanager
+def _untracked(module: Any) -> Iterator[None]:
+    """Hide the tracker of resources from the module of shared memory."""
+    if sys.version_info >= (3, 13):
+        yield
+        return
+    with _TRACKER_LOCK:
+        tracker = module.resource_tracker
+        nothing = SimpleNamespace(register=lambda *_: None, unregister=lambda *_: None)
+        module.resource_tracker = nothing
+        try:
+            yield
+        finally:
+            module.resource_tracker = tracker
 
 
 def first_page(path: Path, route: str) -> str:

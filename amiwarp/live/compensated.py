@@ -43,8 +43,9 @@ def compensate_live(
     Parameters
     ----------
     source : str or Path
-        Source: ``camera:``, ``dv``, ``prophesee``, ``tcp:HOST:PORT``, ``unix:PATH``, ``-`` for standard input, or a
-        file to replay. :class:`CameraSettings` continue the name of a camera: ``f"camera:evk4,{settings}"``.
+        Source: ``camera:``, ``dv``, ``prophesee``, ``tcp:HOST:PORT``, ``unix:PATH``, ``shm:NAME``, ``udp:HOST:PORT``,
+        ``-`` for standard input, or a file to replay. :class:`CameraSettings` continue the name of a camera:
+        ``f"camera:evk4,{settings}"``.
     calibration : Calibration
         Calibration of the camera.
     port : str, optional

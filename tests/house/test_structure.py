@@ -396,7 +396,7 @@ def test_other_calls_are_no_inputs(code: str) -> None:
     assert list(opened_otherwise(ast.walk(ast.parse(code)))) == []
 
 
-OTHER_ROOMS = {"benchmarks", "firmware", "house", "rig"}
+OTHER_ROOMS = {"benchmarks", "firmware", "house", "rig", "ros"}
 """Folders of tests of what is not in the package: of other folders, and of the repository as a whole."""
 
 

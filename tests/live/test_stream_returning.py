@@ -232,7 +232,7 @@ def test_files_and_pipes_do_not_return(tmp_path: Path, spec: str) -> None:
         app, ["record", spec, str(tmp_path / "o.h5"), "--wait-for-source", "5"]
     )
     assert done.exit_code == 1
-    assert f"{spec}: --wait-for-source applies to sockets and cameras only" in done.stderr
+    assert f"{spec}: --wait-for-source applies to streams and cameras only" in done.stderr
     assert done.stderr.count("\n") == 1
 
 
@@ -362,5 +362,5 @@ def test_a_sender_is_waited_for_where_it_was(
 
     monkeypatch.setattr(returning_source, "iter_accepted", noted(True))
     monkeypatch.setattr(returning_source, "iter_connected", noted(False))
-    assert list(returning_source.socket_attempts(spec)) == [None]
+    assert list(returning_source.sender_attempts(spec)) == [None]
     assert asked == [(accepts, address)]

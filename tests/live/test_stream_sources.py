@@ -30,12 +30,12 @@ from amiwarp.live.stream import (
     encode_events,
     encode_hello,
     encode_triggers,
+    open_sink,
     open_source,
     sinks,
     stream_source,
 )
 from amiwarp.live.stream import sockets as connections
-from amiwarp.live.stream.sinks import open_sink
 from tests.errors import refused
 
 SIZE = (320, 240)
@@ -299,7 +299,7 @@ def test_standard_input_and_output(tmp_path):
         sink.send(encode_events(events))
     script = (
         "from amiwarp.live.stream.stream_format import encode_events, encode_hello\n"
-        "from amiwarp.live.stream.sinks import open_sink\n"
+        "from amiwarp.live.stream import open_sink\n"
         "from amiwarp.live.stream.sources import open_source\n"
         "source = open_source('-')\n"
         "with open_sink('-', encode_hello(*source.size, source.camera, source.prism)) as sink:\n"

@@ -26,6 +26,7 @@ from amiwarp.live.commands.session import (
     check_angles,
     check_model,
     check_whole,
+    lost_lines,
     session_summary,
     stopped_by_interrupt,
 )
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.picture_stream import PictureStream
     from amiwarp.live.stream.session import Session
     from amiwarp.live.stream.session_status import SessionStatus
-    from amiwarp.live.stream.sinks import PipeSink, SocketSink
+    from amiwarp.live.stream.sinks import Sink
     from amiwarp.optics.models.base import Model
     from amiwarp.plotting.live_viewers import LiveViewer
     from amiwarp.reconstruction.phase_camera import LivePicture
@@ -143,7 +144,8 @@ class OutputOptions:
     to: Annotated[
         str | None,
         _in_outputs(
-            help="Address to serve compensated packets at: tcp:HOST:PORT, unix:PATH, or - for standard output.",
+            help="Address to serve compensated packets at: tcp:HOST:PORT, unix:PATH, shm:NAME (shared memory), - for "
+            "standard output; or udp:HOST:PORT of the program that receives them.",
             metavar="ADDRESS",
         ),
     ] = None
@@ -490,7 +492,7 @@ class _Receivers:
         from amiwarp.live.stream.forward import Forward
         from amiwarp.live.stream.sinks import open_sink
 
-        def sink(what: str, address: str | None, hello: bytes) -> SocketSink | PipeSink | None:
+        def sink(what: str, address: str | None, hello: bytes) -> Sink | None:
             if address is None:
                 return None
             opened = open_sink(address, hello, stop=stop, say=say)
@@ -612,7 +614,7 @@ def _open_viewers(options: OutputOptions, source: Source) -> Iterator[LiveViewer
         yield foxglove_server(options.foxglove, source.size)
 
 
-def _send_to(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
+def _send_to(sink: Sink) -> Callable[[Compensated], None]:
     """Return a function that sends packets to a sink: whole pixels as events of a sensor, others with their flags."""
     from amiwarp.live.stream.stream_format import encode_compensated, encode_events
 
@@ -636,6 +638,7 @@ def _live_lines(result: dict[str, Any], stages: list[str]) -> list[str]:
     if result["model"] is None:
         return [
             f"{result['events']:,} events, {speed}, not compensated",
+            *lost_lines(result),
             *stages,
             *tensor_lines(result["tensors"]),
             *controller_lines(result["controller"]),
@@ -655,6 +658,7 @@ def _live_lines(result: dict[str, Any], stages: list[str]) -> list[str]:
     return [
         f"{result['compensated']:,} events ({marked}), {speed} by the {result['model']} model on {result['device']}",
         *(stages if len(stages) > 2 else ()),
+        *lost_lines(result),
         *_clock_lines(result["clock"]),
         *controller_lines(result["controller"]),
         *tensor_lines(result["tensors"]),

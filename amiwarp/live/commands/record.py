@@ -18,6 +18,7 @@ from amiwarp.live.commands.session import (
     StatusLine,
     check_angles,
     check_whole,
+    lost_lines,
     recorded_from,
     session_summary,
     stopped_by_interrupt,
@@ -74,6 +75,7 @@ def run_record(
     }
     lines = [
         f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s",
+        *lost_lines(data),
         *controller_lines(controller),
     ]
     if status.late:

@@ -25,7 +25,7 @@ from amiwarp.validation import real
 if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Source
     from amiwarp.live.stream.session_status import SessionStatus
-    from amiwarp.live.stream.sinks import PipeSink, SocketSink
+    from amiwarp.live.stream.sinks import Sink
     from amiwarp.results.calibration import Calibration
 
 
@@ -35,7 +35,7 @@ SourceArgument = Annotated[
     typer.Argument(
         help="Source: camera:, camera:SERIAL or camera:MODEL, dv, prophesee (each also with settings: "
         "camera:evk4,diff_on=20,region=LEFT:TOP:RIGHT:BOTTOM,masked=X:Y+X:Y,most_mev_s=N,trigger=on,settings=FILE), "
-        "tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
+        "tcp:HOST:PORT, unix:PATH, shm:NAME (shared memory), udp:HOST:PORT, '-' (standard input), or a file to replay."
     ),
 ]
 SecondRatio = Annotated[
@@ -79,7 +79,7 @@ class SourceOptions:
         float,
         _in_source(
             min=0.0,
-            help="Longest wait for the sender of a socket, or for a camera, to return after its stream breaks off "
+            help="Longest wait for the sender of a stream, or for a camera, to return after its stream breaks off "
             "(s); 0: do not wait.",
         ),
     ] = 0.0
@@ -163,11 +163,13 @@ class StatusLine:
                 Text(describe(status, self._console.width), no_wrap=True, overflow="ellipsis")
             )
 
-    def report_lost_packets(self, *sinks: SocketSink | PipeSink | None) -> None:
+    def report_lost_packets(self, *sinks: Sink | None) -> None:
         """Print for each sink how many packets its receivers missed."""
         for sink in sinks:
             if sink is not None and sink.lost:
-                self.say(f"{sink.lost:,} packets were not sent: a receiver is too slow")
+                self.say(
+                    f"{sink.lost:,} packets were not sent: a receiver, or the network, is too slow"
+                )
 
 
 def describe(status: SessionStatus, width: int = 80) -> str:
@@ -280,9 +282,18 @@ def session_summary(status: SessionStatus, source: Source) -> dict[str, Any]:
         "late": status.late,
         "returns": getattr(source, "returns", 0),
         "lost_usb_packets": getattr(source, "lost", 0),
+        "lost_packets": getattr(source, "lost_packets", 0),
         "broke_off": getattr(source, "problem", None),
         "clock": None if status.clock_source is None else _clock_summary(status),
     }
+
+
+def lost_lines(result: dict[str, Any]) -> list[str]:
+    """Return the line of the result about packets that were lost between the sender and this program."""
+    lost = result["lost_packets"]
+    if not lost:
+        return []
+    return [f"{lost:,} packets of the source were lost: this computer, or the network, is too slow"]
 
 
 def _clock_summary(status: SessionStatus) -> dict[str, Any]:

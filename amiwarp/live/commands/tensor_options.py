@@ -19,7 +19,7 @@ from amiwarp.io.tensor_file import TensorWriter
 if TYPE_CHECKING:
     from amiwarp.imaging.tensor_stream import StreamTensor
     from amiwarp.imaging.to_tensor import ToTensor
-    from amiwarp.live.stream.sinks import PipeSink, SocketSink
+    from amiwarp.live.stream.sinks import Sink
     from amiwarp.live.stream.tensor_output import TensorOutput
 
 _in_tensors = partial(typer.Option, rich_help_panel="Tensors")
@@ -139,7 +139,7 @@ class LiveTensors:
 
     output: TensorOutput
     """Taker of the packets of the session."""
-    sink: SocketSink | PipeSink | None
+    sink: Sink | None
     """Server of the tensors."""
 
     def summary(self) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from .adaptive import SpeedController as SpeedController
 from .adaptive import SpeedKeeper as SpeedKeeper
+from .datagrams import DatagramReceiver as DatagramReceiver
+from .datagrams import DatagramSink as DatagramSink
 from .emulated_camera import EmulatedCamera as EmulatedCamera
 from .stream_format import EncoderSamples as EncoderSamples
 from .stream_format import End as End
@@ -26,9 +28,13 @@ from .recent_events import LiveSource as LiveSource
 from .recent_events import RecentEvents as RecentEvents
 from .session import Session as Session
 from .session_status import SessionStatus as SessionStatus
+from .shared_ring import RingReceiver as RingReceiver
+from .shared_ring import RingSink as RingSink
 from .sinks import PipeSink as PipeSink
 from .sinks import SocketSink as SocketSink
+from .sinks import open_sink as open_sink
 from .sources import open_source as open_source
 from .sources import reopen_source as reopen_source
 from .stream_source import FileSource as FileSource
+from .stream_source import PacketSource as PacketSource
 from .stream_source import StreamSource as StreamSource

@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.events.recording import Events
-from amiwarp.live.stream.sinks import PipeSink, SocketSink
+from amiwarp.live.stream.sinks import Sink
 from amiwarp.live.stream.stream_format import encode_encoder, encode_events
 
 
 class Forward:
     """A :class:`~amiwarp.live.stream.consumers.RawConsumer` that sends events and encoder samples to a sink."""
 
-    def __init__(self, sink: SocketSink | PipeSink) -> None:
+    def __init__(self, sink: Sink) -> None:
         self._sink = sink
 
     def append(self, events: Events) -> None:

@@ -19,6 +19,8 @@ from amiwarp.live.stream.packets import IDLE_S, Packet, make_packet
 from amiwarp.live.stream.sockets import Unreachable, iter_accepted, iter_connected
 from amiwarp.live.stream.stream_source import (
     HELLO_S,
+    RECEIVERS,
+    PacketSource,
     StreamSource,
     open_connection,
     open_stream,
@@ -32,13 +34,13 @@ difference than this warns the user [us]."""
 REOPEN_S = 1.0
 """Interval between attempts to open a camera that is gone, and longest wait for the hello of a sender that returns [s].
 """
-SOCKETS = ("tcp", "unix", "tcp-listen", "unix-listen")
+SENDERS = ("tcp", "unix", "tcp-listen", "unix-listen", *RECEIVERS)
 """Kinds of sources whose sender can return. Cameras can return, too."""
 
 
 def can_return(spec: str) -> bool:
     """Return whether a source with this name can be opened again after its stream broke off."""
-    return spec.partition(":")[0] in (*SOCKETS, *CAMERAS)
+    return spec.partition(":")[0] in (*SENDERS, *CAMERAS)
 
 
 class ReturningSource:
@@ -56,9 +58,9 @@ class ReturningSource:
         self, spec: str, wait_s: float, say: Callable[[str], None], *, packet_us: int = 1000
     ) -> None:
         if not can_return(spec):
-            what = "give camera:, dv, prophesee, tcp:, unix:, tcp-listen: or unix-listen:, or omit the option"
+            what = "give camera:, dv, prophesee, tcp:, unix:, tcp-listen:, unix-listen:, shm:, udp:, or omit the option"
             raise AmiwarpError(
-                f"{spec}: --wait-for-source applies to sockets and cameras only, because other sources cannot be "
+                f"{spec}: --wait-for-source applies to streams and cameras only, because other sources cannot be "
                 f"reopened; {what}",
                 ErrorCode.OPTIONS,
             )
@@ -83,6 +85,7 @@ class ReturningSource:
         """How the stream ended, in one line; None if it ended with its end message."""
         self.returns = 0
         """Number of times that the sender returned."""
+        self._lost_packets = 0
         self._events = 0
         self._last: tuple[int, int] | None = None
         """Latest event time, and the host's time of its arrival [us]; None before the first event."""
@@ -111,6 +114,11 @@ class ReturningSource:
             self._say(
                 f"{self.name}: the stream is back after {time.monotonic() - began:.1f} s{same}"
             )
+
+    @property
+    def lost_packets(self) -> int:
+        """Number of packets that were lost between the sender and this program, over all returns."""
+        return self._lost_packets + getattr(self._source, "lost_packets", 0)
 
     def close(self) -> None:
         """Close the connection, see :meth:`Source.close`."""
@@ -192,7 +200,7 @@ class ReturningSource:
         """
         lost = self._source
         again = (
-            _camera_attempts(lost) if isinstance(lost, CameraSource) else socket_attempts(self.name)
+            _camera_attempts(lost) if isinstance(lost, CameraSource) else sender_attempts(self.name)
         )
         with contextlib.closing(again) as attempts:
             for reopen in attempts:
@@ -224,14 +232,23 @@ class ReturningSource:
                 f"{self.name}: is back with another camera, prism or number of encoders; record this camera to another "
                 "file"
             )
+        self._lost_packets = self.lost_packets
         self._source = source
         self.problem = None
         self.returns += 1
 
 
-def socket_attempts(spec: str) -> Generator[Callable[..., StreamSource] | None, None, None]:
-    """Yield functions of ``hello_s`` that open the stream of a socket's sender again; None at least every second."""
+def sender_attempts(spec: str) -> Generator[Callable[..., StreamSource] | None, None, None]:
+    """Yield functions of ``hello_s`` that open the stream of a sender again; None at least every few seconds."""
     kind, _, place = spec.partition(":")
+    while kind in RECEIVERS:
+        try:
+            receiver = RECEIVERS[kind](spec)
+        except Unreachable:
+            yield None
+            time.sleep(IDLE_S)
+        else:
+            yield partial(PacketSource, spec, receiver)
     iterate = iter_accepted if kind.endswith("-listen") else iter_connected
     for connection in iterate(f"{kind.removesuffix('-listen')}:{place}"):
         yield None if connection is None else partial(open_connection, spec, connection)

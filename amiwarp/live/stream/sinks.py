@@ -1,4 +1,4 @@
-"""Sinks of live streams: a server on a socket, and a pipe or file."""
+"""Sinks of live streams: a server on a socket, and a pipe or file. Others are in files of their own."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.live.stream.datagrams import DatagramSink
+from amiwarp.live.stream.shared_ring import RingSink
 from amiwarp.live.stream.sockets import IDLE_S, close_listener, listen, ready
 from amiwarp.live.stream.stream_format import encode_end, packet_count
 
@@ -35,6 +37,30 @@ PIPE_BYTES = getattr(select, "PIPE_BUF", 512)
 """Number of bytes that a pipe accepts without blocking once it is writable."""
 DRAIN_S = 2.0
 """Longest time for sending the last packets when the stream ends [s]."""
+
+
+class Sink(Protocol):
+    """Sink of encoded packets (protocol)."""
+
+    address: str
+    """Its name, see :func:`open_sink`, with the actual port if the port given was 0."""
+    lost: int
+    """Number of packets that were not sent."""
+
+    def __enter__(self) -> Sink: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any, /
+    ) -> None: ...
+
+    def send(self, data: bytes) -> None:
+        """Send complete packets, encoded by the ``encode_...`` functions."""
+
+    def tick(self) -> None:
+        """Continue pending work without new data."""
+
+    def close(self) -> None:
+        """Send the end message and release everything."""
 
 
 @dataclass(slots=True, eq=False)
@@ -292,6 +318,17 @@ def open_sink(
     *,
     stop: threading.Event | None = None,
     say: Callable[[str], None] = lambda _: None,
-) -> SocketSink | PipeSink:
-    """Open a sink by its name: ``-`` for standard output, ``tcp:HOST:PORT`` or ``unix:PATH`` for a server."""
-    return PipeSink(hello, stop=stop) if spec == "-" else SocketSink(spec, hello, say=say)
+) -> Sink:
+    """Open a sink by its name.
+
+    ``-`` is standard output, ``tcp:HOST:PORT`` and ``unix:PATH`` are servers, ``shm:NAME`` is shared memory, and
+    ``udp:HOST:PORT`` sends datagrams. ``say`` is called with messages.
+    """
+    kind = spec.partition(":")[0]
+    if spec == "-":
+        return PipeSink(hello, stop=stop)
+    if kind == "shm":
+        return RingSink(spec, hello)
+    if kind == "udp":
+        return DatagramSink(spec, hello, say=say)
+    return SocketSink(spec, hello, say=say)

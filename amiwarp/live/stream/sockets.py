@@ -50,9 +50,16 @@ def _parse(address: str) -> str | tuple[str, int]:
     kind, _, rest = address.partition(":")
     if kind == "unix" and rest:
         return rest
-    host, _, port = rest.rpartition(":")
-    if kind != "tcp" or not port.isdecimal() or int(port) > 65535:
+    if kind != "tcp":
         raise AmiwarpError(f"{address}: is not an address; give tcp:HOST:PORT or unix:PATH")
+    return host_and_port(address, "tcp:HOST:PORT or unix:PATH")
+
+
+def host_and_port(address: str, forms: str) -> tuple[str, int]:
+    """Return host and port of ``KIND:HOST:PORT``, 127.0.0.1 without a host. ``forms``: what a message suggests."""
+    host, _, port = address.partition(":")[2].rpartition(":")
+    if not port.isdecimal() or int(port) > 65535:
+        raise AmiwarpError(f"{address}: is not an address; give {forms}")
     return host.strip("[]") or "127.0.0.1", int(port)
 
 

@@ -10,7 +10,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.live.stream import returning_source
 from amiwarp.live.stream.cameras import CAMERAS, open_camera_source
 from amiwarp.live.stream.packets import Source
-from amiwarp.live.stream.returning_source import SOCKETS, ReturningSource
+from amiwarp.live.stream.returning_source import SENDERS, ReturningSource
 from amiwarp.live.stream.sockets import Unreachable
 from amiwarp.live.stream.stream_source import FileSource, StreamSource, open_stream
 
@@ -27,7 +27,8 @@ def open_source(
 
     The name of a file replays a recording at ``pace`` times its speed (None: as fast as possible), in packets of
     ``packet_us`` [us]. ``-``, ``tcp:HOST:PORT`` and ``unix:PATH`` read a stream (``docs/reference/stream-format.md``);
-    ``tcp-listen:HOST:PORT`` and ``unix-listen:PATH`` wait for its sender to connect. ``camera:``, ``camera:SERIAL`` and
+    ``tcp-listen:HOST:PORT`` and ``unix-listen:PATH`` wait for its sender to connect. ``shm:NAME`` reads it from shared
+    memory, ``udp:HOST:PORT`` from datagrams that are sent to this address. ``camera:``, ``camera:SERIAL`` and
     ``camera:MODEL`` open a camera; ``dv``, ``dv:SERIAL``, ``prophesee`` and ``prophesee:SERIAL`` open one through other
     libraries. Each may go on with settings (:class:`CameraSettings`). ``wait_s``: how long to wait for the sender of a
     socket, or for a camera, to return after its stream broke off [s]; ``say`` gets messages.
@@ -39,7 +40,7 @@ def open_source(
     if spec == "-":
         # Read the descriptor directly, without the buffer of sys.stdin, and leave it open at the end.
         return StreamSource("standard input", open(0, "rb", buffering=0, closefd=False))
-    if kind in SOCKETS:
+    if kind in SENDERS:
         return open_stream(spec)
     if kind in CAMERAS:
         return open_camera_source(spec, say, packet_us=packet_us)
@@ -52,8 +53,8 @@ def reopen_source(spec: str, stop: threading.Event) -> Source | None:
     Returns None for files and pipes, which cannot be opened again, and after ``stop``.
     """
     kind = spec.partition(":")[0]
-    if kind in SOCKETS:
-        with contextlib.closing(returning_source.socket_attempts(spec)) as attempts:
+    if kind in SENDERS:
+        with contextlib.closing(returning_source.sender_attempts(spec)) as attempts:
             for reopen in attempts:
                 if reopen is not None:
                     # The sender may leave before its hello message.

@@ -1,10 +1,11 @@
 """Messages of a live stream, encoded as in ``docs/reference/stream-format.md``."""
 
 import io
+import itertools
 import json
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -48,6 +49,8 @@ LONGEST_TENSOR = 1 << 28
 TENSOR_TIMES = struct.Struct("<qqQ")
 """Beginning of the payload of a tensor: start and end of its window [us], and number of events. An array as in a file
 ``.npy`` follows."""
+SIZES = {kind: tuple(np.dtype(column).itemsize for column in COLUMNS[kind]) for kind in COLUMNS}
+"""Sizes of a row in the columns of an encoded packet [bytes], by the packet's kind."""
 LONGEST_ROW = 19
 """Largest size of a row of a packet of an unknown kind [bytes]."""
 
@@ -167,18 +170,95 @@ def _pack(kind: int, count: int, payload: bytes) -> bytes:
 
 def packet_count(data: bytes) -> int:
     """Return the number of packets in encoded data, which ends with a complete packet."""
-    count = 0
+    return sum(1 for _ in _packets(data))
+
+
+def split_packets(data: bytes, most_bytes: int) -> Iterator[bytes | memoryview]:
+    """Yield the packets of encoded data, each of at most ``most_bytes``: the rows of a longer one in several packets.
+
+    Raises :class:`AmiwarpError` if the hello packet is longer.
+    """
+    for kind, count, packet in _packets(data):
+        if len(packet) <= most_bytes:
+            yield packet
+            continue
+        if kind not in COLUMNS:
+            what = "a tensor" if kind == TENSOR else "the hello packet"
+            raise AmiwarpError(
+                f"{what} has {len(packet):,} bytes, at most {most_bytes:,} fit; send it over tcp: or unix:"
+            )
+        columns = _columns(kind, packet)
+        rows = (most_bytes - HEADER.size) // _row_bytes(kind)
+        for first in range(0, count, rows):
+            stop = min(first + rows, count)
+            payload = b"".join(
+                column[first * size : stop * size]
+                for column, size in zip(columns, SIZES[kind], strict=True)
+            )
+            yield _pack(kind, stop - first, payload)
+
+
+def join_packets(packets: Iterable[bytes | memoryview]) -> Iterator[bytes]:
+    """Yield packets with the same rows as ``packets``: neighbours of the same kind as one, if it has columns."""
+    for kind, group in itertools.groupby(packets, kind_of):
+        neighbours = list(group)
+        if kind not in COLUMNS or len(neighbours) == 1:
+            yield from map(bytes, neighbours)
+            continue
+        columns = [_columns(kind, packet) for packet in neighbours]
+        payload = b"".join(itertools.chain.from_iterable(zip(*columns, strict=True)))
+        yield _pack(kind, len(payload) // sum(SIZES[kind]), payload)
+
+
+def _packets(data: bytes) -> Iterator[tuple[int, int, memoryview]]:
+    """Yield kind, number of rows and bytes of each packet in encoded data."""
+    view = memoryview(data)
     start = 0
-    while start < len(data):
-        *_, payload_bytes, _ = HEADER.unpack_from(data, start)
-        start += HEADER.size + payload_bytes
-        count += 1
-    return count
+    while start < len(view):
+        _, _, kind, _, count, payload_bytes, _ = HEADER.unpack_from(view, start)
+        stop = start + HEADER.size + payload_bytes
+        yield kind, count, view[start:stop]
+        start = stop
+
+
+def _columns(kind: int, packet: bytes | memoryview) -> list[memoryview]:
+    """Return the bytes of each column of a packet."""
+    view = memoryview(packet)
+    count = (len(view) - HEADER.size) // sum(SIZES[kind])
+    start = HEADER.size
+    columns = []
+    for size in SIZES[kind]:
+        columns.append(view[start : start + count * size])
+        start += count * size
+    return columns
+
+
+def is_packet(data: bytes | memoryview) -> bool:
+    """Return whether ``data`` has the length of one packet and begins like one."""
+    if len(data) < HEADER.size:
+        return False
+    magic, version, _, _, _, payload_bytes, _ = HEADER.unpack_from(data)
+    return bool((magic, version, len(data)) == (MAGIC, VERSION, HEADER.size + payload_bytes))
+
+
+def kind_of(packet: bytes | memoryview) -> int:
+    """Return the kind in the header of a packet."""
+    return int(HEADER.unpack_from(packet)[2])
+
+
+def checksum_of(packet: bytes | memoryview) -> int:
+    """Return the checksum in the header of a packet."""
+    return int(HEADER.unpack_from(packet)[-1])
+
+
+def checksum_fits(packet: bytes, checksum: int) -> bool:
+    """Return whether a packet's header has a checksum, and its payload too."""
+    return checksum_of(packet) == checksum == zlib.crc32(memoryview(packet)[HEADER.size :])
 
 
 def _row_bytes(kind: int) -> int:
     """Return the size of a row of a packet [bytes]; 0 for a kind without rows."""
-    return sum(np.dtype(column).itemsize for column in COLUMNS.get(kind, ()))
+    return sum(SIZES.get(kind, ()))
 
 
 class PacketDecoder:

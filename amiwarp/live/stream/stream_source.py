@@ -1,12 +1,12 @@
-"""Sources that are read once: a recording as a source, and a stream over a socket, a pipe or of a camera."""
+"""Sources that are read once: a recording as a source, and a stream of a socket, pipe, shared memory or datagrams."""
 
 from __future__ import annotations
 
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,9 @@ from amiwarp.events.encoder import LARGEST_ANGLE
 from amiwarp.events.recording import Events
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.stream.datagrams import DatagramReceiver
 from amiwarp.live.stream.packets import IDLE_S, NO_TIMES, Packet, make_packet
+from amiwarp.live.stream.shared_ring import RingReceiver
 from amiwarp.live.stream.sockets import Unreachable, accept, connect, ready
 from amiwarp.live.stream.stream_format import (
     EncoderSamples,
@@ -38,8 +40,11 @@ def open_stream(spec: str) -> StreamSource:
     """Open the stream at an address.
 
     ``tcp:`` and ``unix:`` connect to the sender; ``tcp-listen:`` and ``unix-listen:`` wait for the sender to connect.
+    ``shm:`` and ``udp:`` receive packets, some of which may be lost.
     """
     kind = spec.partition(":")[0]
+    if kind in RECEIVERS:
+        return PacketSource(spec, RECEIVERS[kind](spec))
     connection = (
         accept(spec.replace("-listen", "", 1)) if kind.endswith("-listen") else connect(spec)
     )
@@ -274,3 +279,53 @@ class StreamSource:
                 f"{self.name}: {what}; correct the program that sends it", ErrorCode.FILE_DAMAGED
             )
         return make_packet(now, message)
+
+
+class PacketReceiver(Protocol):
+    """Receiver of complete packets, some of which may be lost (protocol)."""
+
+    lost: int
+    """Number of packets that were lost so far."""
+    problem: str | None
+    """Why no more packets will come, in one line; None while they may."""
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """Return the next packet, at first the hello; None if there is none within the timeout."""
+
+    def close(self) -> None:
+        """Release the memory or the socket."""
+
+
+class PacketSource(StreamSource):
+    """Reads a stream from a receiver of complete packets: of datagrams, or of shared memory.
+
+    Raises :class:`AmiwarpError` for an invalid stream, or one without a hello within :data:`HELLO_S`.
+    """
+
+    def __init__(
+        self, name: str, receiver: PacketReceiver, *, hello_s: float | None = None
+    ) -> None:
+        self._receiver = receiver
+        super().__init__(name, receiver, hello_s=hello_s)
+
+    @property
+    def lost_packets(self) -> int:
+        """Number of packets that were lost so far."""
+        return self._receiver.lost
+
+    def _next(self, timeout_s: float) -> Message | None:
+        packet = self._receiver.receive(timeout_s)
+        if packet is None:
+            if self._receiver.problem is not None:
+                self._break_off(self._receiver.problem)
+            return None
+        message = next(self._decoder.feed(packet), None)
+        self._ended |= isinstance(message, End)
+        return message
+
+
+RECEIVERS: Mapping[str, Callable[[str], PacketReceiver]] = {
+    "shm": RingReceiver,
+    "udp": DatagramReceiver,
+}
+"""Receivers of packets by the kind of address."""
