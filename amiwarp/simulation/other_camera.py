@@ -18,7 +18,7 @@ from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.surfaces import SMALLEST_LAUNCH
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world import World
-from amiwarp.validation import array, real
+from amiwarp.validation import array, as_times, real
 
 TOGETHER = 1 << 16
 """Number of points that are tested together, each at an instant of its own."""
@@ -82,7 +82,7 @@ def places_in(
     Raises
     ------
     AmiwarpError
-        If the arrays have other shapes, or a time is not finite.
+        If the arrays have other shapes, or a time is no whole number.
 
     Notes
     -----
@@ -98,13 +98,11 @@ def places_in(
     ([[15.5, 11.5], [nan, nan]], [True, False])
     """
     in_world = array(places, "places").astype(np.float64)
-    times = array(t_us, "t_us").astype(np.float64)
+    times = as_times(t_us, "t_us")
     if times.ndim != 1 or in_world.shape != (len(times), 3):
         raise AmiwarpError(
             f"places have shape {in_world.shape}, t_us {times.shape}; give (n, 3) and (n,)"
         )
-    if not np.isfinite(times).all():
-        raise AmiwarpError("t_us holds values that are not finite; give times in us")
     if not len(times):
         return PlacesInCamera(np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.bool_))
 
@@ -113,7 +111,8 @@ def places_in(
     points = np.asarray(camera.rays_to_pixels(rays), np.float64)
     size = np.array([camera.width, camera.height])
     # A place that is NaN is not inside.
-    visible = ((points >= -0.5) & (points < size - 0.5)).all(axis=1)
+    in_image = (points >= -0.5) & (points < size - 0.5)
+    visible: NDArray[np.bool_] = np.asarray(in_image.all(axis=1))
     if world is not None:
         inside = np.flatnonzero(visible)
         hidden = _hidden(
@@ -127,14 +126,14 @@ def _hidden(
     world: DeviceWorld,
     starts: NDArray[np.float64],
     places: NDArray[np.float64],
-    t_us: NDArray[np.float64],
+    t_us: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
     """Return whether a surface of a world lies between two points [m], shape (n, 3) each, at a time [us], (n,)."""
     hidden = np.zeros(len(t_us), np.bool_)
     for first in range(0, len(t_us), TOGETHER):
         part = slice(first, first + TOGETHER)
         instants, instant = np.unique(t_us[part], return_inverse=True)
-        world.set_instants(instants * 1e-6)
+        world.set_instants(np.asarray(1e-6 * instants, np.float64))
         device = world.device
         inputs = [
             world.params,
