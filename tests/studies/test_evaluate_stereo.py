@@ -261,6 +261,35 @@ def test_the_gyroscope_is_the_truth_and_its_bias(left: Streams) -> None:
     )
 
 
+def test_rates_from_events_of_a_small_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Events turn to turn find the rate of a handheld camera; the search is replaced by a known answer."""
+    condition = Condition(
+        width=128, height=96, duration_s=0.1, trajectory="handheld", seed=1, rpm=1440.0
+    )
+    streams = Streams(condition, setup=Setup(None, 1400.0, 0.0))
+    known = amiwarp.CameraRotation((0.1, 0.2, 0.3))
+    monkeypatch.setattr(inertial, "estimate_rotation", lambda events, camera: known)
+    values = inertial.measure(streams, QUICK)
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+    rows = {(row["stream"], row["turns"]): row for row in values["rows"]}
+    sources = {Stream.PLAIN.value, Stream.TRUE.value, *OTHER_SOURCES}
+    assert set(rows) == {
+        *((name, turns) for name in sources for turns in inertial.TURNS),
+        (inertial.TURN_TO_TURN, 1.0),
+    }
+    nothing = rows[inertial.NO_MOTION, 1.0]["rate_error"]
+    assert nothing > 2.0  # deg/s: what the camera turns
+    assert rows[inertial.TURN_TO_TURN, 1.0]["rate_error"] < 0.5 * nothing
+    assert rows[inertial.TRUE_FLOW, 1.0]["rate_error"] < 0.3 * nothing
+    assert rows[Stream.PLAIN.value, 0.5]["rate_error"] > math.degrees(0.2)
+    gyroscope = rows[inertial.GYROSCOPE, 1.0]
+    assert gyroscope["rate_error"] == pytest.approx(gyroscope["bias_error"], abs=0.15)
+    assert gyroscope["gyroscope_angle"] == pytest.approx(0.1 * gyroscope["bias_error"], rel=0.1)
+
+
+OTHER_SOURCES = (inertial.GYROSCOPE, inertial.TRUE_FLOW, inertial.NO_MOTION)
+
+
 def inertial_cell(seed: int, errors: dict[str, float]) -> CellResult:
     rows = []
     for turns in inertial.TURNS:

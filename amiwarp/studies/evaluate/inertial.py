@@ -57,6 +57,8 @@ NEEDS_TRUTH = True
 
 TURNS = (0.5, 1.0)
 """Lengths of the windows [turns]."""
+LEFT_OUT = (Stream.RAW, Stream.SAME_COUNT)
+"""Streams without rates: raw events show the prism's motion, and windows of equal count have other lengths."""
 GYROSCOPE = "gyroscope"
 TURN_TO_TURN = "AMI-EV, turn to turn"
 TRUE_FLOW = "true flow"
@@ -100,7 +102,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
         ends = np.linspace(streams.start_us, streams.end_us, windows + 1)
         ends_us = np.rint(ends).astype(np.int64)
         sources = _sources(streams, gyroscope, ends_us)
-        if turns == 1.0:
+        if turns == 1.0 and windows > 1:
             sources[TURN_TO_TURN] = _turn_to_turn(streams, ends_us)
         for name, source in sources.items():
             bias = np.zeros(3)
@@ -212,8 +214,7 @@ def _sources(
     """Return the rates in the windows between successive times, by the names of their sources."""
     rates = {GYROSCOPE: gyroscope.mean_rates(ends_us)}
     for stream in streams.names:
-        # Windows of equal count would be of other lengths.
-        if stream is not Stream.SAME_COUNT:
+        if stream not in LEFT_OUT:
             rates[stream.value] = _rates_of_events(streams, stream, ends_us)
     rates[TRUE_FLOW] = _rates_of_flow(streams, ends_us)
     rates[NO_MOTION] = np.zeros((len(ends_us) - 1, 3))
