@@ -1,5 +1,7 @@
 # Public names of the evaluations, kept by hand: what a new measure is made of.
 
+from . import inertial as inertial
+from . import stereo as stereo
 from .claims import Verdict as Verdict
 from .claims import judge as judge
 from .conditions import Condition as Condition
