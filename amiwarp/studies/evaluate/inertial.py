@@ -192,7 +192,7 @@ def mean_rates(
     ``t_us``: times of the samples [us]; ``ends_us``: the successive times [us], shape (n + 1,).
     """
     seconds = 1e-6 * t_us
-    angles = cumulative_trapezoid(rates, seconds, axis=0, initial=0.0)
+    angles = cumulative_trapezoid(rates, seconds, axis=0, initial=0)
     ends = 1e-6 * ends_us
     at_ends = np.stack([np.interp(ends, seconds, angle) for angle in angles.T], axis=1)
     return np.asarray(np.diff(at_ends, axis=0) / np.diff(ends)[:, None])
