@@ -318,6 +318,7 @@ def test_rates_are_judged_by_source() -> None:
     verdicts = [claim.verdict for claim in inertial.claims(cells)]
     good, bad, none = Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.NOT_TESTABLE
     assert verdicts == [good, good, good, bad, bad, good, *[none] * 12]
-    first, second = inertial.tables(cells)
-    assert len(first.rows) == len(second.rows) == 8
+    rate, bias, over_length = inertial.tables(cells)
+    assert len(rate.rows) == len(bias.rows) == 4
+    assert len(over_length.rows) == 8
     assert {claim.number for claim in inertial.claims(cells)} == {None}

@@ -181,7 +181,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     values = ["right", "complete", "median", "outliers"]
     columns = (
         "seeds",
-        "right",
+        "share right",
         "std",
         "complete",
         "std of complete",
@@ -196,9 +196,9 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
             "Disparity at edges, windows of half a turn",
             (*names, *columns),
             grouped(where(rows, turns=STANDARD_TURNS), names, values),
-            "Right: share of the edge pixels whose disparity is off by at most 1 px. Two streams of the same name are "
-            "compared, such as S-EV and S-EV.",
-            Chart("camera", "right", "stream", "std", panels=("scene",), kind=ChartKind.BARS),
+            "Share right: share of the edge pixels whose disparity is off by at most 1 px. Two streams of the same "
+            "name are compared, such as S-EV and S-EV.",
+            Chart("camera", "share right", "stream", "std", panels=("scene",), kind=ChartKind.BARS),
         ),
         Table(
             "stereo_window",
@@ -206,7 +206,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
             (*names, "window [turns]", *columns),
             grouped(rows, (*names, "turns"), values),
             "Over whole turns, raw events of both cameras are blurred by the same circle, which moves no edge.",
-            Chart("window [turns]", "right", "stream", "std", panels=("scene", "camera")),
+            Chart("window [turns]", "share right", "stream", "std", panels=("scene", "camera")),
         ),
     ]
 
