@@ -48,7 +48,10 @@ PROTOCOL = (
 DIFFERENCES = (
     "The paper does not evaluate stereo: all verdicts here are checks of ours. The size of the blocks was chosen on "
     "recordings of seed 0. The cameras are rectified by construction, and their intrinsics and poses are known "
-    "exactly; both prisms are compensated by one calibration."
+    "exactly; both prisms are compensated by one calibration. That the prisms turn at different angles decides the "
+    "results in fast motion: an edge then fires at different times in the two cameras, between which the rig moves. "
+    "Prisms in phase, which need a common motor, were tried on one small recording only (96x72 px, fast, seed 0): "
+    "half a turn then gives 85 % of the edges, and two S-EVs 81 %."
 )
 VERSION = 1
 NEEDS_TRUTH = True
