@@ -213,6 +213,9 @@ from .simulation.motion import Mirror as Mirror
 from .simulation.motion import PrismMotion as PrismMotion
 from .simulation.motion import Steerer as Steerer
 from .simulation.motion import Vibration as Vibration
+from .simulation.other_camera import PlacesInCamera as PlacesInCamera
+from .simulation.other_camera import disparity as disparity
+from .simulation.other_camera import places_in as places_in
 from .simulation.pictures import PictureFolder as PictureFolder
 from .simulation.pictures import Pictures as Pictures
 from .simulation.pictures import PictureStack as PictureStack

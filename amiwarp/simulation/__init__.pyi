@@ -12,6 +12,9 @@ from .motion import Mirror as Mirror
 from .motion import PrismMotion as PrismMotion
 from .motion import Steerer as Steerer
 from .motion import Vibration as Vibration
+from .other_camera import PlacesInCamera as PlacesInCamera
+from .other_camera import disparity as disparity
+from .other_camera import places_in as places_in
 from .pictures import PictureFolder as PictureFolder
 from .pictures import PictureStack as PictureStack
 from .pictures import Pictures as Pictures

@@ -190,6 +190,8 @@ MEANT: dict[tuple[str, str], str] = {
         for seen in ("", "_with_prism")
     },
     ("Truth.known_at", "xy"): "NaN",
+    ("places_in", "places"): "NaN",
+    ("disparity", "depth"): "NaN",
     ("edge_blur", "sharp_xy"): "NaN",
     **{("DepthMap", name): "NaN" for name in ("inverse_depth", "points")},
     **{("PixelMap", name): "NaN" for name in ("on", "off", "on_std", "off_std")},

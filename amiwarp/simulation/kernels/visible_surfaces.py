@@ -6,7 +6,7 @@ from amiwarp.kernels.camera import pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.plate import bent_by_wedge, seen_from
 from amiwarp.kernels.prism_view import Steps, View
 from amiwarp.simulation.kernels.edges import NAN
-from amiwarp.simulation.kernels.ray_casting import FAR, body_of, cast, meet_face
+from amiwarp.simulation.kernels.ray_casting import FAR, blocked, body_of, cast, meet_face
 from amiwarp.simulation.kernels.world import Pose, World
 from amiwarp.simulation.kernels.world_rays import RayView
 
@@ -60,6 +60,27 @@ def find_surfaces(
     out.instance[i] = instance_of(world, hit.face)
     out.mover[i] = hit.mover
     out.place[i] = origin + hit.distance * direction
+
+
+@wp.kernel
+def find_hidden(
+    world: World,
+    starts: wp.array(dtype=wp.vec3),
+    places: wp.array(dtype=wp.vec3),
+    instants: wp.array(dtype=int),
+    share: float,
+    start: int,
+    hidden: wp.array(dtype=wp.uint8),
+):
+    """Find the places that a surface hides from where they are looked at, within a ``share`` of the way to them.
+
+    ``starts``, ``places``: ends of the way in the world's frame [m]; ``instants``: index of each one's time.
+    """
+    i = start + wp.tid()
+    way = places[i] - starts[i]
+    distance = wp.length(way)
+    is_blocked = blocked(world, instants[i], starts[i], way / distance, share * distance)
+    hidden[i] = wp.where(is_blocked, wp.uint8(1), wp.uint8(0))
 
 
 @wp.kernel

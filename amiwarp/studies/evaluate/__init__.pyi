@@ -1,5 +1,7 @@
 # Public names of the evaluations, kept by hand: what a new measure is made of.
 
+from . import inertial as inertial
+from . import stereo as stereo
 from .claims import Verdict as Verdict
 from .claims import judge as judge
 from .conditions import Condition as Condition
@@ -7,10 +9,24 @@ from .conditions import QUICK as QUICK
 from .corner_tracks import Tracks as Tracks
 from .corner_tracks import link_corners as link_corners
 from .frame_tracks import track_frames as track_frames
+from .inertial import Gyroscope as Gyroscope
+from .inertial import Rates as Rates
+from .inertial import fitted_rate as fitted_rate
+from .inertial import mean_rates as mean_rates
+from .inertial import rate_errors as rate_errors
+from .inertial import true_rates as true_rates
 from .optical_flow import flow_error as flow_error
 from .results import CellResult as CellResult
 from .results import Chart as Chart
 from .results import Table as Table
+from .right_camera import BASELINE_M as BASELINE_M
+from .right_camera import RightCondition as RightCondition
+from .right_camera import right_streams as right_streams
+from .right_camera import to_the_right as to_the_right
+from .stereo import shared_edges as shared_edges
+from .stereo_matching import DisparityError as DisparityError
+from .stereo_matching import disparity_error as disparity_error
+from .stereo_matching import match as match
 from .streams import Frames as Frames
 from .streams import Setup as Setup
 from .streams import Stream as Stream

@@ -22,6 +22,8 @@ EVALUATIONS = (
     "apex_speed",
     "fading",
     "convexity",
+    "stereo",
+    "inertial",
 )
 """Names of the evaluations, in the order of the report: each is a module of this folder, see :class:`Evaluation`."""
 UNCALIBRATED = ("apex_speed", "fading", "convexity")

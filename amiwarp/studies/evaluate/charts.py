@@ -56,8 +56,17 @@ OTHERS = (VERMILION, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, BLACK, GREY)
 """Colours of other series, in their order."""
 CHANCE = "chance"
 """Name of the level of chance."""
-REFERENCE_COLOURS = {CHANCE: GREY, "zero flow": GREY, "truth": BLACK}
-"""Colours of the levels of chance and of predicting nothing, and of the truth, next to the streams."""
+REFERENCE_COLOURS = {
+    CHANCE: GREY,
+    "zero flow": GREY,
+    "truth": BLACK,
+    "one disparity": GREY,
+    "gyroscope": BLACK,
+    "true flow": GREY,
+    "no motion": "0.8",
+    "AMI-EV, turn to turn": PINK,
+}
+"""Colours of the levels of chance of predicting nothing, of the truth, and of other sources, next to the streams."""
 MARKERS = "osD^vPX*"
 """Markers that distinguish the series without colour."""
 

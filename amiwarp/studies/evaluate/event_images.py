@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from amiwarp.studies.evaluate.libraries import library
 
 DENSITY_PX = 1.0
 """Standard deviation of the Gaussian that smooths the density of events in local sharpness [px]."""
+BRIGHT_PERCENTILE = 99.0
+"""Percentile of the non-empty pixels of all images of events that becomes the brightest grey value."""
 TILE_PX = 24
 """Side of the tiles whose sharpness is compared [px]."""
 
@@ -65,6 +68,17 @@ def smooth_image(events: Events, votes: Votes, sigma: float) -> NDArray[np.float
     votes.add_unmoved(events)
     image = votes.take()[0]
     return smoothed(image, sigma)
+
+
+def grey_images(images: Sequence[NDArray[np.floating]]) -> list[NDArray[np.uint8]]:
+    """Return images of events with 8 bits, all on one scale."""
+    positive = np.concatenate([image[image > 0.0] for image in images])
+    brightest = float(np.percentile(positive, BRIGHT_PERCENTILE)) if positive.size else 1.0
+    grey = []
+    for image in images:
+        scaled = np.clip(255.0 / brightest * image, 0.0, 255.0)
+        grey.append(scaled.astype(np.uint8))
+    return grey
 
 
 def pixel_index(events: Events, size: tuple[int, int]) -> NDArray[np.int64]:

@@ -14,12 +14,10 @@ from amiwarp.imaging.iwe import iwe
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.studies.evaluate.camera_motion import estimate_rotation, rotated_back
-from amiwarp.studies.evaluate.event_images import dithered, thinned
+from amiwarp.studies.evaluate.event_images import dithered, grey_images, thinned
 from amiwarp.studies.evaluate.libraries import library
 from amiwarp.studies.evaluate.local_motion import MOST_LOCAL, local_contrast, velocity_grid
 
-BRIGHT_PERCENTILE = 99.0
-"""Percentile of the non-empty pixels of both event images that becomes the brightest grey value."""
 TILE = 16
 """Distance between the centres of overlapping tiles [px]; half of it is the standard deviation of their Gaussian."""
 REACH_PX = 4.0
@@ -34,14 +32,8 @@ def flow_by_dis(
     ``size``: width and height [px]. ``interval_s``: time between the middles of the windows [s].
     Source: T. Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016.
     """
-    images = [iwe(events, *size) for events in (first, second)]
     # Both images are scaled alike, as the flow keeps the brightness of what moves.
-    positive = np.concatenate([image[image > 0.0] for image in images])
-    brightest = float(np.percentile(positive, BRIGHT_PERCENTILE)) if positive.size else 1.0
-    grey = []
-    for image in images:
-        scaled = np.clip(255.0 / brightest * image, 0.0, 255.0)
-        grey.append(scaled.astype(np.uint8))
+    grey = grey_images([iwe(events, *size) for events in (first, second)])
     return frames_flow(grey, interval_s)
 
 

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.events.truth import FrameTruth
 from amiwarp.optics.camera import Camera
+from amiwarp.simulation.other_camera import places_in
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.studies.evaluate.corner_tracks import Tracks
 
@@ -47,12 +48,8 @@ def project(
     ``places``: points in the world [m], shape (n, 3), one for each time ``t_us`` [us], shape (n,). NaN if a point lies
     behind the camera.
     """
-    if not len(places):
-        return np.zeros((0, 2)), np.zeros(0)
-    rotation, position = trajectory.poses(np.asarray(t_us, np.float64) * 1e-6)
-    from_camera = np.asarray(places, np.float64) - position
-    rays = np.einsum("ni,nij->nj", from_camera, rotation)
-    return np.asarray(camera.rays_to_pixels(rays), np.float64), rays[:, 2]
+    seen = places_in(places, t_us, camera, trajectory)
+    return seen.points, seen.depth
 
 
 def true_paths(
