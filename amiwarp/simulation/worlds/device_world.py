@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from typing import Any, cast
+from weakref import WeakValueDictionary
 
 import numpy as np
 import warp as wp
@@ -21,6 +23,19 @@ Compared with Warp's default constructor, rays take 0.5 to 0.65 of the time on a
 """
 LARGEST_PYRAMID = 14
 """Largest number of levels (the texture and its halved copies) of a texture pyramid."""
+
+
+def device_world(world: World, device: Any) -> DeviceWorld:
+    """Return a world on a device, with instants of its own.
+
+    All that the device holds of a world is uploaded once, and shared as long as it is in use.
+    """
+    key = (id(world), str(wp.get_device(device)))
+    uploaded = _uploaded.get(key)
+    if uploaded is None:
+        uploaded = DeviceWorld(world, device)
+        _uploaded[key] = uploaded
+    return uploaded.sharing()
 
 
 class DeviceWorld:
@@ -59,7 +74,16 @@ class DeviceWorld:
             self.params.still = self._mesh(resting, still).id
         faces_at_rest = sum(len(np.asarray(body.mesh.faces)) for body in still)
         self._upload_movers(faces_at_rest)
+        self._shared: DeviceWorld | None = None
         self.set_instants(np.zeros(1))
+
+    def sharing(self) -> DeviceWorld:
+        """Return the same world with instants of its own, which shares everything else."""
+        other = copy(self)
+        other.params = kernels.World()
+        other.params.assign(self.params)
+        other._shared = self  # keeps it in use
+        return other
 
     def _set_sky(self, texels: _Texels) -> None:
         """Describe the sky, and add its panorama to ``texels``."""
@@ -182,6 +206,10 @@ class DeviceWorld:
             flicker = np.sin(2.0 * math.pi * lamp.flicker_hz * t)
             lights[:, k] = lamp.intensity * (1.0 + lamp.flicker_depth * flicker)
         self.params.lamp_light = self._floats(lights)
+
+
+_uploaded: WeakValueDictionary[tuple[int, str], DeviceWorld] = WeakValueDictionary()
+"""Worlds on devices that are in use, by the number of the world and the name of the device."""
 
 
 class _Texels:
