@@ -249,3 +249,12 @@ _PRESETS: dict[str, dict[str, float]] = {
         "bus_queue": 65536.0,
     },
 }
+
+
+def named_sensor(name: str) -> SensorModel:
+    """Return the sensor of a name in a file: ``default``, ``ideal``, or a preset of :class:`SensorModel`."""
+    if name == "default":
+        return SensorModel()
+    if name == "ideal":
+        return SensorModel.ideal()
+    return SensorModel.preset(name)

@@ -35,15 +35,19 @@ class FrameRenderer:
             scene, frames.camera, Prism(0.0), 1.0, PrismMotion(0.0), encoder_model=None
         )
         self._world = device_world(scene.world, device)
-        self._sight = WorldSight(self._simulation, scene, self._world)
+        worlds = [self._world]
+        if frames.colour:
+            worlds = [self._world.in_colour(channel) for channel in range(3)]
+        self._sights = [WorldSight(self._simulation, scene, world) for world in worlds]
         self._view = prism_view_of(self._simulation, self._world.device)
         if frames.readout_us:
-            self._sight.roll()
+            for sight in self._sights:
+                sight.roll()
 
     def light(self, begin_us: int) -> NDArray[np.float32]:
         """Return the mean luminance of a frame, whose middle row's exposure begins at ``begin_us``.
 
-        The shape is (height, width).
+        The shape is (height, width), or (height, width, 3) in colour.
         """
         camera = self._frames.camera
         exposure_us = self._frames.exposure_us
@@ -51,16 +55,18 @@ class FrameRenderer:
         count = self._instants(begins)
         # The middles of equal parts of each exposure, row by row
         parts = (np.arange(count) + 0.5) / count * exposure_us
-        total = np.zeros(camera.width * camera.height)
+        totals = np.zeros((len(self._sights), camera.width * camera.height))
         for first in range(0, count, INSTANTS_TOGETHER):
             together = parts[first : first + INSTANTS_TOGETHER]
             times = (together[:, None] + begins).ravel()
-            self._sight.set_instants(times, self._view)
             steps = steps_of(self._simulation, times, self._world.device)
-            lights = self._sight.light(steps, 0, len(together)).numpy()
-            total += lights.sum(axis=0, dtype=np.float64)
-        mean = (total / count).astype(np.float32)
-        return mean.reshape(camera.height, camera.width)
+            for sight, total in zip(self._sights, totals, strict=True):
+                sight.set_instants(times, self._view)
+                lights = sight.light(steps, 0, len(together)).numpy()
+                total += lights.sum(axis=0, dtype=np.float64)
+        mean = (totals.T / count).astype(np.float32)
+        channels = (3,) if self._frames.colour else ()
+        return mean.reshape(camera.height, camera.width, *channels)
 
     def _row_delays(self) -> NDArray[np.float64]:
         """Return the begins of the rows' exposures after that of the middle row [us]; one for all with a global one."""

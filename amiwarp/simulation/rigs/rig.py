@@ -15,10 +15,12 @@ from amiwarp.optics.prism import Prism
 from amiwarp.schema.calls import guarded
 from amiwarp.simulation.motion import LONGEST_S
 from amiwarp.simulation.rigs.cameras import RigCamera, RigEventCamera
+from amiwarp.simulation.rigs.paper_platform import APEX, VGA, paper_platform
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.mounted_trajectory import MountedTrajectory
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world import World
+from amiwarp.simulation.worlds.world_choice import open_world
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.validation import instance, real, shown, whole
 
@@ -94,6 +96,65 @@ class Rig:
             self.simulation(name)
         except AmiwarpError as error:
             raise AmiwarpError(f"rig's sensor {name!r}: {error}", error.code) from error
+
+    @classmethod
+    def paper_platform(
+        cls,
+        world: str = "room",
+        *,
+        trajectory: str = "handheld",
+        duration_s: float = 2.0,
+        size: tuple[int, int] = VGA,
+        apex: float = APEX,
+        seed: int = 0,
+        device: str = "cpu",
+    ) -> Rig:
+        """Return the platform of the AMI-EV paper in a world.
+
+        Parameters
+        ----------
+        world : str, optional
+            Name of a built-in world, or a world file.
+        trajectory : str, optional
+            Motion of the platform in a built-in world, or a file of poses.
+        duration_s : float, optional
+            Duration [s].
+        size : tuple of int, optional
+            Width and height of all images [px].
+        apex : float, optional
+            Apex angle of the wedge [rad]. The paper uses 0.5 and 1 degree.
+        seed : int, optional
+            Seed of the world and of all random numbers.
+        device : str, optional
+            Device to compute on.
+
+        Returns
+        -------
+        Rig
+            Rig with the event cameras ``ami``, behind the wedge, and ``plain``, and the RealSense D435's cameras
+            ``colour``, ``grey`` and ``depth``.
+
+        Raises
+        ------
+        AmiwarpError
+            If the world does not exist, or a value is out of range.
+
+        Notes
+        -----
+        B. He et al., "Microsaccade-inspired event camera for robotics", Science Robotics 9, 2024, names two DVXplorer
+        (640x480), a wedge at 720 turns/min, and an Intel RealSense D435. The places of the cameras, the lenses'
+        fields of view, and the D435's times of exposure and readout are not in its main text; they are assumed here.
+        Fields of view of the D435 at 640x480, its range, and the distance of 15 mm between its left imager and its
+        colour camera follow Intel's data sheet (337029).
+
+        Examples
+        --------
+        >>> rig = amiwarp.Rig.paper_platform("desk", duration_s=0.1, size=(64, 48))
+        >>> list(rig.sensors)
+        ['ami', 'plain', 'colour', 'grey', 'depth']
+        """
+        of_world, way = open_world(world, trajectory, seed=seed, duration_s=duration_s)
+        return cls(of_world, way, paper_platform(size, apex), duration_s, seed, device)
 
     def trajectory_of(self, name: str) -> Trajectory:
         """Return the trajectory of a camera: the rig's, composed with the place of the camera at every instant.

@@ -1,4 +1,6 @@
-"""Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh. Colours become luminance.
+"""Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh.
+
+Colours become luminance, and red, green and blue relative to it.
 
 A file of a few bytes may declare a mesh of many gigabytes, so trimesh runs in the reading process, which has limits
 of memory and processor time (:mod:`amiwarp.io.reading_process`).
@@ -26,6 +28,7 @@ from amiwarp.simulation.picture_light import (
     srgb_to_linear,
 )
 from amiwarp.simulation.worlds.bodies import Material, Mesh
+from amiwarp.simulation.worlds.colours import is_grey, split_colours
 from amiwarp.validation import one_of, real
 
 if TYPE_CHECKING:
@@ -57,7 +60,8 @@ DEFAULT_REFLECTANCE = 0.5
 """Reflectance of meshes whose file gives neither colours nor a material."""
 
 Arrays = tuple[NDArray[Any] | None, ...]
-"""Vertices, faces, texture coordinates, light and texture of a part; None for an array that it has not."""
+"""Vertices, faces, texture coordinates, light and its colour, texture, and the material's colour of a part; None for
+an array that it has not."""
 
 
 class LoadedMesh(NamedTuple):
@@ -66,7 +70,7 @@ class LoadedMesh(NamedTuple):
     mesh: Mesh
     """Triangles in the frame of the file, turned so that z points up [m]."""
     material: Material
-    """Reflectance and texture that the file gives the mesh."""
+    """Reflectance, texture and colour that the file gives the mesh."""
     name: str
     """Name of the mesh's node in the file."""
 
@@ -164,9 +168,9 @@ def _received(about: dict[str, Any], arrays: list[NDArray[Any]]) -> LoadedMesh:
     values: list[Any] = [
         None if shape is None else arrays.pop(0).reshape(shape) for shape in about["shapes"]
     ]
-    vertices, faces, uv, light, texture = values
-    mesh = Mesh(vertices, faces, uv, light)
-    material = Material(about["reflectance"], texture)
+    vertices, faces, uv, light, light_colour, texture, colour = values
+    mesh = Mesh(vertices, faces, uv, light, light_colour)
+    material = Material(about["reflectance"], texture, colour=colour)
     return LoadedMesh(mesh, material, about["name"])
 
 
@@ -177,7 +181,7 @@ def read_parts(
 
     ``kind``: suffix of the file; ``turn``: matrix (3, 3) by which vertices are multiplied. The first value holds the
     files that the mesh file refers to, and of each part the name, the reflectance and the shapes of its arrays:
-    vertices, faces, texture coordinates, light and texture. A shape is None if the part has no such array.
+    those of :data:`Arrays`. A shape is None if the part has no such array.
     """
     scene, files = _open(Path(path), kind)
     parts: list[dict[str, Any]] = []
@@ -270,13 +274,14 @@ def _part(
         return _textured(visual, vertices, faces, kind)
     if visual.kind == "face":
         # Faces of different colours cannot share vertices: each face gets its own three.
-        light = np.repeat(_reflectance(visual.face_colors, kind), 3)
+        colours = np.repeat(np.asarray(visual.face_colors), 3, axis=0)
         own_vertices = vertices[faces.ravel()]
         own_faces = np.arange(faces.size).reshape(-1, 3)
-        return (own_vertices, own_faces, None, light, None), 1.0
+        return (own_vertices, own_faces, None, *_lights(colours, kind), None, None), 1.0
     if visual.kind == "vertex":
-        return (vertices, faces, None, _reflectance(visual.vertex_colors, kind), None), 1.0
-    return (vertices, faces, None, None, None), DEFAULT_REFLECTANCE
+        lights = _lights(visual.vertex_colors, kind)
+        return (vertices, faces, None, *lights, None, None), 1.0
+    return (vertices, faces, None, None, None, None, None), DEFAULT_REFLECTANCE
 
 
 def _textured(
@@ -287,39 +292,66 @@ def _textured(
     pbr = hasattr(material, "baseColorFactor")
     picture = material.baseColorTexture if pbr else material.image
     colour = material.baseColorFactor if pbr else material.diffuse
-    factor = 1.0 if pbr and colour is None else float(_reflectance(np.atleast_2d(colour), kind)[0])
+    factor = 1.0
+    tint: NDArray[Any] | None = None
+    if colour is not None or not pbr:
+        factors, tints = _lights(np.atleast_2d(colour), kind)
+        factor = float(factors[0])
+        tint = None if tints is None else tints[0]
     shade = visual.vertex_attributes.get("color")
-    light = None if shade is None else _reflectance(shade, kind)
+    lights = (None, None) if shade is None else _lights(shade, kind)
     if picture is None or visual.uv is None:
-        return (vertices, faces, None, light, None), factor
+        return (vertices, faces, None, *lights, None, tint), factor
     if not pbr:
-        factor = 1.0  # in OBJ files, a texture replaces the diffuse colour
-    return (vertices, faces, np.asarray(visual.uv)[:, :2], light, _luminance(picture)), factor
+        # in OBJ files, a texture replaces the diffuse colour
+        factor = 1.0
+        tint = None
+    texture, texture_colour = _luminance(picture)
+    uv = np.asarray(visual.uv)[:, :2]
+    return (vertices, faces, uv, *lights, texture, _tinted(texture_colour, tint)), factor
 
 
-def _luminance(picture: Any) -> NDArray[np.float32]:
-    """Return the linear luminance of a Pillow picture. A single row or column is duplicated."""
+def _luminance(picture: Any) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Return the linear luminance of a Pillow picture, and its colours relative to it, or None for a grey picture.
+
+    A single row or column is duplicated.
+    """
     if picture.width * picture.height > MOST_PIXELS:
         raise AmiwarpError(
             f"a texture has {picture.width}x{picture.height} pixels, more than {MOST_PIXELS}; give a smaller picture"
         )
     table = srgb_to_linear(np.arange(256, dtype=np.float32) / 255)
     light = np.empty((picture.height, picture.width), np.float32)
+    colour = np.empty((*light.shape, 3), np.float32)
     rows = max(1, BAND // (3 * picture.width))
     # In bands, because a large picture as a whole would need four times its memory
     for top in range(0, picture.height, rows):
         bottom = min(top + rows, picture.height)
         band = picture.crop((0, top, picture.width, bottom)).convert("RGB")
-        light[top:bottom] = table[np.asarray(band)] @ np.array(LUMINANCE, np.float32)
-    if light.shape[0] < 2:
-        light = np.repeat(light, 2, axis=0)
-    if light.shape[1] < 2:
-        light = np.repeat(light, 2, axis=1)
-    return light
+        linear = table[np.asarray(band)]
+        light[top:bottom] = linear @ np.array(LUMINANCE, np.float32)
+        _, colour[top:bottom] = split_colours(linear)
+    for axis in (0, 1):
+        if light.shape[axis] < 2:
+            light = np.repeat(light, 2, axis=axis)
+            colour = np.repeat(colour, 2, axis=axis)
+    return light, None if is_grey(colour) else colour
 
 
-def _reflectance(colours: Any, kind: str) -> NDArray[np.float64]:
-    """Return the luminance of colours (integers, or floats from 0 to 1), shape (n,).
+def _tinted(
+    colour: NDArray[np.float32] | None, tint: NDArray[Any] | None
+) -> NDArray[np.float32] | None:
+    """Return relative colours of texels, shape (height, width, 3), multiplied by a relative colour, shape (3,)."""
+    if colour is None or tint is None:
+        return tint if colour is None else colour
+    _, tinted = split_colours(colour * tint)
+    return tinted
+
+
+def _lights(colours: Any, kind: str) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+    """Return the luminance of colours (integers, or floats from 0 to 1), shape (n,), and the colours relative to it.
+
+    The relative colours have the shape (n, 3); they are None for grey.
 
     Colours are linear in glTF and GLB files, and sRGB in other files.
     """
@@ -327,4 +359,6 @@ def _reflectance(colours: Any, kind: str) -> NDArray[np.float64]:
     white = np.iinfo(given.dtype).max if given.dtype.kind in "iu" else 1.0
     values = given[:, :3].astype(np.float64) / white
     linear = values if kind in Y_UP else srgb_to_linear(values)
-    return np.asarray(np.clip(linear @ np.array(LUMINANCE), 0.0, 1.0), np.float64)
+    light = np.asarray(np.clip(linear @ np.array(LUMINANCE), 0.0, 1.0), np.float64)
+    _, colour = split_colours(linear)
+    return light, None if is_grey(colour) else colour
