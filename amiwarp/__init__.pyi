@@ -52,6 +52,9 @@ from .events.recording import EventSource as EventSource
 from .events.recording import MemoryEvents as MemoryEvents
 from .events.recording import MetadataValue as MetadataValue
 from .events.recording import Recording as Recording
+from .events.rig_recording import RigRecording as RigRecording
+from .events.rig_recording import RigSensor as RigSensor
+from .events.rig_recording import SensorKind as SensorKind
 from .events.truth import Cause as Cause
 from .events.truth import EventTruth as EventTruth
 from .events.truth import EventValues as EventValues
@@ -105,6 +108,9 @@ from .io.output_formats import Rounding as Rounding
 from .io.prophesee.evt_decoder import EvtDecoder as EvtDecoder
 from .io.prophesee.evt_decoder import Triggers as Triggers
 from .io.recorded_dataset import RecordedDataset as RecordedDataset
+from .io.rig_files import RigWriter as RigWriter
+from .io.rig_files import open_rig as open_rig
+from .io.rig_files import save_rig as save_rig
 from .io.truth_files import save_flow_dsec as save_flow_dsec
 from .io.truth_files import save_flow_mvsec as save_flow_mvsec
 from .io.truth_files import save_poses_tum as save_poses_tum

@@ -93,6 +93,8 @@ FRAMES = IN_WORLD.run(truth_times_us=[0, 1000]).truth.frames
 POSES = aw.Poses(np.array([0]), np.array([[0.0, 0, 0, 0, 0, 0, 1]]))
 IMU = aw.ImuSamples(np.array([0, 5]), np.zeros((2, 3)), np.zeros((2, 3)))
 IMAGES = aw.MemoryImages(np.array([0, 5]), np.zeros((2, 3, 4), np.uint8))
+RIG_SENSOR = aw.RigSensor("events", RECORDING, np.eye(3, 4))
+RIG = aw.RigRecording({"left": RIG_SENSOR})
 STAGE = aw.SearchStage(
     algorithm="a",
     x=np.zeros(1),
@@ -391,6 +393,13 @@ OWN: dict[str, dict[str, Any]] = {
     "PhaseImage.save": {"path": _new(".npz")},
     "PhaseReconstruction": {"recording": RECORDING, "calibration": CALIBRATION},
     "open_recording": {"path": "in.h5"},
+    "open_rig": {"path": "in_rig"},
+    "save_rig": {"folder": _new(""), "rig": RIG},
+    "RigSensor": _all(RIG_SENSOR),
+    "RigRecording": {"sensors": {"left": RIG_SENSOR}},
+    "RigRecording.between": {"source": "left", "target": "left"},
+    "RigWriter": {"folder": _new("")},
+    "RigWriter.add": {"name": "left", "kind": "events", "to_rig": np.eye(3, 4)},
     "RecordingWriter.append_frame": {"frame": FRAME},
     "RecordingWriter.append_image": {"t_us": 0, "image": np.zeros((3, 4), np.uint8)},
     "RecordingWriter.append_imu": {"samples": IMU},
@@ -589,6 +598,7 @@ OBJECTS: dict[str, Any] = {
     "TruthRenderer": aw.TruthRenderer(IN_WORLD),
     "Trajectory": STILL,
     "MemoryImages": IMAGES,
+    "RigRecording": RIG,
     "EventFilter": aw.EventFilter(every=2),
     "BytesDecoder": aw.BytesDecoder("dat2"),
     "EvtDecoder": aw.EvtDecoder("3.0"),
@@ -604,6 +614,7 @@ MADE: dict[str, Callable[[], Any]] = {
     "EventSensor": lambda: aw.EventSensor(2, 3, 4),
     "CornerDetector": lambda: aw.CornerDetector((4, 3)),
     "RecordingWriter": _writer,
+    "RigWriter": lambda: aw.RigWriter(_new("")()).__enter__(),
     "Network": lambda: aw.Network("sum.onnx"),
     "Reconstruction": lambda: aw.Reconstruction(RECORDING, model=MODEL),
 }
@@ -721,6 +732,7 @@ def public_calls() -> Iterator[PublicCall]:
 def write_files() -> None:
     """Write the files that the calls read, to the current folder."""
     aw.save_recording("in.h5", RECORDING)
+    aw.save_rig("in_rig", RIG)
     CALIBRATION.save("calibration.json")
     STILL.save_tum("poses.tum")
     write_network(Path("sum.onnx"))

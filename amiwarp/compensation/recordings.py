@@ -287,6 +287,8 @@ def _left_out_of_native(recording: Recording) -> tuple[str, ...]:
             missing.append("ground truth of events")
     if recording.frames is not None:
         missing.append("frames")
+    if recording.depth is not None:
+        missing.append("depth maps")
     return tuple(missing)
 
 

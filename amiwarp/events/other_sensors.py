@@ -1,4 +1,4 @@
-"""Records of other sensors in a recording: samples of an inertial measurement unit (IMU), and frames."""
+"""Records of other sensors in a recording: samples of an inertial measurement unit (IMU), frames and depth maps."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from amiwarp.schema.type_names import not_called
 
 LARGEST_ROTATION_ERROR = 1e-3
 """Largest deviation of a rotation matrix times its transpose from the identity."""
+
+DEPTH_DTYPE = np.dtype(np.float32)
+"""Data type of depth maps."""
 
 
 @guarded
@@ -118,31 +121,40 @@ def mean_rate(t: NDArray[np.int64]) -> float | None:
 
 @not_called("wrap frames as amiwarp.MemoryImages(t, images)")
 class ImageStore(StoredInstants[NDArray[Any]], Protocol):
-    """Protocol of the frames of a recording: grey levels, uint8 or uint16, shape ``(height, width)``.
+    """Protocol of the frames or depth maps of a recording, in order of time.
 
-    All frames have the same size and data type. Their times do not decrease.
+    A frame has grey levels of shape ``(height, width)``, or RGB colours of shape ``(height, width, 3)``, as uint8 or
+    uint16. A depth map is float32 of shape ``(height, width)``: metres along the camera's axis, infinite for the sky,
+    and NaN if the depth is unknown. All have the same shape and data type.
     """
 
     @property
     def size(self) -> tuple[int, int]:
         """Size (width, height) of the frames [px]."""
 
+    @property
+    def exposure(self) -> NDArray[np.int64] | None:
+        """Begin and end of each exposure, of the middle row of a rolling shutter [us], shape ``(k, 2)``, or None."""
+
 
 @guarded
 class MemoryImages(Instants[NDArray[Any]]):
-    """Frames of a recording that are held in memory.
+    """Frames or depth maps of a recording that are held in memory.
 
     Parameters
     ----------
     t : numpy.ndarray
-        Times of the frames [us], int64, not decreasing, shape ``(k,)``.
+        Times of the frames [us], int64, not decreasing, shape ``(k,)``: the middles of the exposures.
     images : sequence of numpy.ndarray
-        At least one frame: grey levels, uint8 or uint16, shape ``(height, width)``.
+        At least one frame. Grey levels of shape ``(height, width)`` or RGB colours of shape ``(height, width, 3)`` are
+        uint8 or uint16. Depth maps [m] are float32 of shape ``(height, width)``.
+    exposure : numpy.ndarray, optional
+        Begin and end of each exposure [us], int64, shape ``(k, 2)``.
 
     Raises
     ------
     AmiwarpError
-        If the arrays have other shapes or data types, or the times decrease.
+        If the arrays have other shapes or data types, the times decrease, or an exposure does not hold its time.
 
     Examples
     --------
@@ -152,7 +164,12 @@ class MemoryImages(Instants[NDArray[Any]]):
     ((4, 3), 2, (3, 4), [40000])
     """
 
-    def __init__(self, t: NDArray[np.int64], images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
+    def __init__(
+        self,
+        t: NDArray[np.int64],
+        images: Sequence[NDArray[Any]] | NDArray[Any],
+        exposure: NDArray[np.int64] | None = None,
+    ) -> None:
         if isinstance(images, np.ndarray) and not images.ndim:
             images = []
         fit = t.dtype == np.int64 and t.shape == (len(images),) and len(t) > 0
@@ -163,27 +180,71 @@ class MemoryImages(Instants[NDArray[Any]]):
             )
         first = images[0]
         for image in images:
-            check_image(image, first.shape, first.dtype)
+            check_frame(image, first.shape, first.dtype)
+        if exposure is not None:
+            check_exposure(exposure, t)
         super().__init__(t)
         self._images = images
+        self.exposure = exposure
+        """Begin and end of each exposure [us], shape ``(k, 2)``, or None."""
 
     @property
     def size(self) -> tuple[int, int]:
         """Size (width, height) of the frames [px]."""
-        height, width = self._images[0].shape
+        height, width = self._images[0].shape[:2]
         return width, height
 
     def _read(self, index: int) -> NDArray[Any]:
         return self._images[index]
 
 
+def check_frame(image: NDArray[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    """Raise :class:`AmiwarpError` for neither an image nor a depth map, or for another shape or data type."""
+    if image.dtype == DEPTH_DTYPE:
+        check_depth(image, shape)
+    else:
+        check_image(image, shape, dtype)
+
+
 def check_image(image: NDArray[Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-    """Raise :class:`AmiwarpError` for an image that is no grey image, or not of the given shape and data type."""
-    if image.ndim != 2 or not image.size or image.dtype not in (np.uint8, np.uint16):
+    """Raise :class:`AmiwarpError` for no grey or colour image, or not of the given shape and data type."""
+    has_shape = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
+    if not has_shape or not image.size or image.dtype not in (np.uint8, np.uint16):
         raise AmiwarpError(
-            f"frame is {image.dtype} of shape {image.shape}; give uint8 or uint16 of shape (height, width)"
+            f"frame is {image.dtype} of shape {image.shape}; give uint8 or uint16 of shape (height, width), or "
+            "(height, width, 3) for RGB"
         )
     if image.shape != shape or image.dtype != dtype:
         raise AmiwarpError(
             f"frame is {image.dtype} of shape {image.shape}, earlier ones are {dtype} of {shape}"
+        )
+
+
+def check_depth(depth: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Raise :class:`AmiwarpError` for an array that is no depth map, or not of the given shape."""
+    if depth.ndim != 2 or not depth.size or depth.dtype != DEPTH_DTYPE:
+        raise AmiwarpError(
+            f"depth is {depth.dtype} of shape {depth.shape}; give float32 [m] of shape (height, width)"
+        )
+    if depth.shape != shape:
+        raise AmiwarpError(f"depth has shape {depth.shape}; expected {shape}")
+    if (depth <= 0.0).any():
+        raise AmiwarpError(
+            "depth holds a value that is not above 0 m; give infinity for the sky, and NaN for unknown"
+        )
+
+
+def check_exposure(exposure: NDArray[Any], t: NDArray[np.int64]) -> None:
+    """Raise :class:`AmiwarpError` if exposures [us] are no pairs of times around the times ``t`` of their frames."""
+    if exposure.dtype != np.int64 or exposure.shape != (len(t), 2):
+        raise AmiwarpError(
+            f"exposures are {exposure.dtype} of shape {exposure.shape}; give int64 [us] of shape {(len(t), 2)}"
+        )
+    outside = (exposure[:, 0] > t) | (exposure[:, 1] < t)
+    if outside.any():
+        first = int(np.argmax(outside))
+        begin, end = exposure[first].tolist()
+        raise AmiwarpError(
+            f"exposure {first} from {begin} to {end} us does not hold the time of its frame, {t[first]} us; "
+            "a frame's time is the middle of its exposure"
         )

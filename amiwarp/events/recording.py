@@ -793,6 +793,9 @@ class Recording:
     """Samples of the camera's inertial measurement unit, or None."""
     frames: ImageStore | None = None
     """Frames that the camera recorded with the events, read on demand, or None."""
+    depth: ImageStore | None = None
+    """Depth maps that the camera recorded [m], read on demand, or None. A depth camera with frames has both at the same
+    times."""
 
     def __init__(
         self,
@@ -805,6 +808,7 @@ class Recording:
         name: str = "recording",
         imu: ImuSamples | None = None,
         frames: ImageStore | None = None,
+        depth: ImageStore | None = None,
     ) -> None:
         """Store the fields. Events in memory become :class:`amiwarp.MemoryEvents` of the camera's size."""
         if isinstance(events, Events):
@@ -815,12 +819,12 @@ class Recording:
                 )
             events = MemoryEvents(events, camera.width, camera.height)
         metadata = {} if metadata is None else metadata
-        values = (events, camera, encoder, prism, truth, metadata, name, imu, frames)
+        values = (events, camera, encoder, prism, truth, metadata, name, imu, frames, depth)
         for own_field, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, own_field.name, value)
 
     def __repr__(self) -> str:
-        others = ("camera", "encoder", "prism", "truth", "imu", "frames")
+        others = ("camera", "encoder", "prism", "truth", "imu", "frames", "depth")
         held = [name for name in others if getattr(self, name) is not None]
         parts = f"with {', '.join(held)}" if held else "events only"
         return f"Recording({self.name!r}, {self.events!r}, {parts})"

@@ -108,5 +108,11 @@ class _Slice(Instants[Item]):
         size: tuple[int, int] = self._store.size  # type: ignore[attr-defined]
         return size
 
+    @property
+    def exposure(self) -> NDArray[np.int64] | None:
+        """Begin and end of each exposure of the frames [us], shape ``(k, 2)``, or None."""
+        exposure: NDArray[np.int64] | None = getattr(self._store, "exposure", None)
+        return None if exposure is None else exposure[np.array(self._which, np.int64)]
+
     def _read(self, index: int) -> Item:
         return self._store._read(self._which[index])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import check_sensor
-from amiwarp.events.other_sensors import ImuSamples
+from amiwarp.events.other_sensors import ImageStore, ImuSamples
 from amiwarp.events.recording import (
     Events,
     EventSource,
@@ -21,12 +21,11 @@ from amiwarp.events.recording import (
     Recording,
     check_events,
 )
-from amiwarp.events.stores import StoredInstants
 from amiwarp.events.truth import EventTruth
 from amiwarp.io import output_formats
 from amiwarp.io.conversion import convert
 from amiwarp.io.file_scan import RECORDS
-from amiwarp.io.native.copying import copy_sensors_and_truth
+from amiwarp.io.native.copying import copy_frames, copy_sensors_and_truth
 from amiwarp.io.native.writer import RecordingWriter
 from amiwarp.io.output_formats import OutputFormat
 from amiwarp.io.outputs import check_output
@@ -500,9 +499,7 @@ def _write_kept(
     ) as writer:
         kept_us = _write_kept_events(recording, running, writer, progress)
         copy_sensors_and_truth(replace(recording, imu=records.imu), writer)
-        if records.frames is not None:
-            for t, image in zip(records.frames.t.tolist(), records.frames, strict=True):
-                writer.append_image(t, image)
+        copy_frames(records.frames, records.depth, writer)
         kept = len(writer)
     return FilterSummary(
         events=len(source),
@@ -558,8 +555,10 @@ class _Records:
 
     imu: ImuSamples | None
     """IMU samples."""
-    frames: StoredInstants[NDArray[Any]] | None
+    frames: ImageStore | None
     """Frames."""
+    depth: ImageStore | None
+    """Depth maps."""
     metadata: dict[str, MetadataValue]
     """Metadata, with the numbers of the kept records."""
     removed: dict[str, int]
@@ -572,9 +571,10 @@ def _records_within(recording: Recording, window: tuple[int, int] | None) -> _Re
     """Return the records of a recording within a time window [us], whose end is exclusive; all without a window."""
     metadata = {name: value for name, value in recording.metadata.items() if name != "format"}
     if window is None:
-        return _Records(recording.imu, recording.frames, metadata, {}, ())
+        return _Records(recording.imu, recording.frames, recording.depth, metadata, {}, ())
     imu = _imu_within(recording.imu, window)
     frames = _frames_within(recording.frames, window)
+    depth = _frames_within(recording.depth, window)
 
     # The counts in the metadata are of the whole recording. How many triggers the window has is not known.
     left_out: tuple[str, ...] = ()
@@ -585,12 +585,13 @@ def _records_within(recording: Recording, window: tuple[int, int] | None) -> _Re
     for name, before, kept in (
         ("imu_samples", recording.imu, imu),
         ("frames", recording.frames, frames),
+        ("depth_maps", recording.depth, depth),
     ):
         if before is not None:
             removed[name] = len(before) - len(kept or ())
         if kept is not None:
             metadata[name] = len(kept)
-    return _Records(imu, frames, metadata, removed, left_out)
+    return _Records(imu, frames, depth, metadata, removed, left_out)
 
 
 def _imu_within(imu: ImuSamples | None, window: tuple[int, int]) -> ImuSamples | None:
@@ -608,14 +609,15 @@ def _imu_within(imu: ImuSamples | None, window: tuple[int, int]) -> ImuSamples |
     )
 
 
-def _frames_within(
-    frames: StoredInstants[NDArray[Any]] | None, window: tuple[int, int]
-) -> StoredInstants[NDArray[Any]] | None:
+def _frames_within(frames: ImageStore | None, window: tuple[int, int]) -> ImageStore | None:
     """Return the frames within a time window [us], whose end is exclusive; None if there are none."""
     if frames is None:
         return None
     start, stop = np.searchsorted(frames.t, window).tolist()
-    return frames[start:stop] if start < stop else None
+    if start == stop:
+        return None
+    # A slice of frames has a size and exposures, too.
+    return cast(ImageStore, frames[start:stop])
 
 
 def _truth_of_kept(truth: EventTruth, is_kept: NDArray[np.bool_]) -> EventTruth:

@@ -18,6 +18,9 @@ from .output_formats import Rounding as Rounding
 from .prophesee.evt_decoder import EvtDecoder as EvtDecoder
 from .prophesee.evt_decoder import Triggers as Triggers
 from .recorded_dataset import RecordedDataset as RecordedDataset
+from .rig_files import RigWriter as RigWriter
+from .rig_files import open_rig as open_rig
+from .rig_files import save_rig as save_rig
 from .truth_files import save_flow_dsec as save_flow_dsec
 from .truth_files import save_flow_mvsec as save_flow_mvsec
 from .truth_files import save_poses_tum as save_poses_tum

@@ -337,6 +337,7 @@ def left_out(recording: Recording, chosen: OutputFormat) -> tuple[str, ...]:
         "ground truth": recording.truth is not None,
         "IMU samples": recording.imu is not None and not is_copied,
         "frames": recording.frames is not None and not is_copied,
+        "depth maps": recording.depth is not None,
         "triggers": bool(about.get("triggers")),
         "other topics": bool(about.get("other_topics")) and is_from_bag and not is_copied,
         "metadata": not set(about) <= of_input,

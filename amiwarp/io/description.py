@@ -79,6 +79,7 @@ def describe(
         "prism": None if prism is None else _glass(prism),
         "imu": None if imu is None else _imu(imu),
         "frames": None if frames is None else _frames(frames),
+        "depth_maps": None if recording.depth is None else _frames(recording.depth),
         "truth": None if truth is None else _in_degrees(truth.parameters),
         "truth_points": truth is not None and truth.points(0, 1) is not None,
         "world": None if truth is None else _world(truth, None if head else len(source)),

@@ -138,10 +138,11 @@ def _sensor_rows(about: dict[str, Any]) -> Rows:
     imu = about["imu"]
     if imu is not None:
         rows.append(("IMU", f"{imu['samples']:,} samples{_rate_text(imu)}"))
-    frames = about["frames"]
-    if frames is not None:
-        size = f"{frames['width']} x {frames['height']} px"
-        rows.append(("frames", f"{frames['count']:,} of {size}{_rate_text(frames)}"))
+    for name in ("frames", "depth_maps"):
+        images = about[name]
+        if images is not None:
+            size = f"{images['width']} x {images['height']} px"
+            rows.append((_spaced(name), f"{images['count']:,} of {size}{_rate_text(images)}"))
     if imu is not None:
         rows.append(("gyroscope", _gyroscope_text(imu)))
     return rows

@@ -44,7 +44,7 @@ SMALL_STEP_US = 1000
 KEEP_EVENTS = 1 << 22
 """Largest recording that stays in memory after the first pass [events], 55 MB."""
 
-RECORDS = ("triggers", "frames", "imu_samples")
+RECORDS = ("triggers", "frames", "depth_maps", "imu_samples")
 """Names of the counts of other records than events. They are shown, but are no repairs."""
 
 PROGRESS = ("read", "total")

@@ -60,6 +60,9 @@ class StreamedImages(Instants[NDArray[Any]]):
     Frames that are read in order take one pass over the file. An earlier frame starts a new pass.
     """
 
+    exposure: NDArray[np.int64] | None = None
+    """Exposures, which are not read from these files."""
+
     def __init__(
         self,
         path: Path,

@@ -30,6 +30,7 @@ from amiwarp import (
     MemoryEvents,
     Prism,
     RecordingWriter,
+    RigWriter,
     UnsizedPrism,
     open_recording,
 )
@@ -108,7 +109,7 @@ def outcome(call: PublicCall, **changed: Any) -> str:
     except AmiwarpError as error:
         return str(error)
     finally:
-        if isinstance(thing, RecordingWriter):
+        if isinstance(thing, RecordingWriter | RigWriter):
             thing.__exit__(ValueError, None, None)
     return ""
 
@@ -130,7 +131,10 @@ def folder(files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     """Make a folder with copies of the files that the calls read the current one."""
     monkeypatch.chdir(tmp_path)
     for file in files:
-        shutil.copy(file, tmp_path)
+        if file.is_dir():
+            shutil.copytree(file, tmp_path / file.name)
+        else:
+            shutil.copy(file, tmp_path)
 
     def no_display(remedy: str) -> None:
         raise AmiwarpError(remedy)
@@ -221,7 +225,7 @@ def spoiled(value: Any, bad: float) -> Iterator[Any]:
 def described(call: PublicCall) -> str:
     """Return the description of a public function, method or class, with those of a class's fields."""
     thing, function = call.target()
-    if isinstance(thing, RecordingWriter):
+    if isinstance(thing, RecordingWriter | RigWriter):
         thing.__exit__(ValueError, None, None)
     return (
         inspect.getsource(function) if inspect.isclass(function) else str(inspect.getdoc(function))
@@ -237,7 +241,7 @@ def test_nan_and_infinity_are_refused_or_have_a_meaning(call: PublicCall) -> Non
         pytest.importorskip("torch")
     thing, function = call.target()
     given = call.arguments()
-    if isinstance(thing, RecordingWriter):
+    if isinstance(thing, RecordingWriter | RigWriter):
         thing.__exit__(ValueError, None, None)
     for name, one in inspect.signature(function).parameters.items():
         for bad in (math.nan, math.inf, -math.inf):
@@ -276,7 +280,7 @@ FRACTIONS = {"PrismMotion.angle", "PrismMotion.angles", "Trajectory", "Trajector
 def test_masked_values_and_times_in_seconds_are_refused(call: PublicCall) -> None:
     thing, _ = call.target()
     given = call.arguments()
-    if isinstance(thing, RecordingWriter):
+    if isinstance(thing, RecordingWriter | RigWriter):
         thing.__exit__(ValueError, None, None)
     for name, annotation in call.parameters().items():
         if "Array" not in annotation or name not in given:

@@ -50,6 +50,8 @@ COLUMNS = {
     "imu/angular_velocity": "f",
     "imu/acceleration": "f",
     "frames/image": "u",
+    "frames/exposure": "i",
+    "frames/depth": "f",
     "truth/world/instances": "S",
     "truth/world/categories": "S",
     "truth/poses/body_names": "S",
@@ -78,9 +80,13 @@ DIMENSIONS = {
     "truth/known/mask": 3,
     "imu/angular_velocity": 2,
     "imu/acceleration": 2,
-    "frames/image": 3,
+    "frames/exposure": 2,
+    "frames/depth": 3,
 }
 """Numbers of dimensions of the datasets. Datasets that are not listed have one."""
+
+IMAGE = "frames/image"
+"""Dataset of frames: three dimensions with grey levels, four with colours."""
 
 READ_AT_ONCE = (
     "t_offset",
@@ -100,6 +106,7 @@ READ_AT_ONCE = (
     "imu/angular_velocity",
     "imu/acceleration",
     "frames/t",
+    "frames/exposure",
 )
 """Datasets that are read into memory at once, and therefore have stricter size limits."""
 
@@ -202,13 +209,15 @@ def _in_words(kinds: str) -> str:
 
 def _opened(stored: Any, name: str) -> _Dataset:
     """Return a dataset with its properties, after checking its number of dimensions."""
-    dimensions = DIMENSIONS.get(name, 1)
-    wanted = "one-dimensional" if dimensions == 1 else f"{dimensions}-dimensional"
+    dimensions = (3, 4) if name == IMAGE else (DIMENSIONS.get(name, 1),)
+    wanted = "one-dimensional"
+    if dimensions != (1,):
+        wanted = f"{' or '.join(map(str, dimensions))}-dimensional"
     if not isinstance(stored, h5py.h5d.DatasetID) or stored.shape is None:
         raise AmiwarpError(
             f"no {wanted} dataset '{name}'; the file is incomplete", ErrorCode.FILE_DAMAGED
         )
-    if len(stored.shape) != dimensions:
+    if len(stored.shape) not in dimensions:
         raise AmiwarpError(
             f"dataset '{name}' has the shape {stored.shape}; expected a {wanted} one, see "
             "docs/reference/recording-format.md",

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import os
 
+import numpy as np
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.other_sensors import ImageStore
 from amiwarp.events.recording import Recording, inside_image
 from amiwarp.io.native.layout import FLAGS
 from amiwarp.io.native.writer import RecordingWriter
@@ -42,11 +46,19 @@ def write_recording(
         truth_parameters=None if truth is None else truth.parameters,
         truth_labels=None if truth is None else truth.labels,
     ) as writer:
-        _copy_events(recording, writer, size, progress)
-        copy_sensors_and_truth(recording, writer)
-        if recording.frames is not None:
-            for index, t in enumerate(recording.frames.t.tolist()):
-                writer.append_image(t, recording.frames[index])
+        copy_recording(recording, writer, size, progress)
+
+
+def copy_recording(
+    recording: Recording, writer: RecordingWriter, size: tuple[int, int], progress: Progress | None
+) -> None:
+    """Append the events of a recording to a writer, and all records beside them.
+
+    ``size``: size of the output's image [px].
+    """
+    _copy_events(recording, writer, size, progress)
+    copy_sensors_and_truth(recording, writer)
+    copy_frames(recording.frames, recording.depth, writer)
 
 
 def _copy_events(
@@ -91,6 +103,34 @@ def copy_sensors_and_truth(recording: Recording, writer: RecordingWriter) -> Non
     if truth.poses is not None:
         for start in range(0, len(truth.poses), POSE_BLOCK):
             writer.append_poses(truth.poses[start : start + POSE_BLOCK])
+
+
+def copy_frames(
+    frames: ImageStore | None, depth: ImageStore | None, writer: RecordingWriter
+) -> None:
+    """Append frames and depth maps to a writer.
+
+    Raises :class:`AmiwarpError` if both are given with other times, because a file has one time for both.
+    """
+    given = [store for store in (frames, depth) if store is not None]
+    if not given:
+        return
+    first = given[0]
+    if not all(np.array_equal(first.t, store.t) for store in given):
+        raise AmiwarpError(
+            f"{writer.path}: frames and depth maps have other times; save them as two recordings of a rig"
+        )
+    for index, t in enumerate(first.t.tolist()):
+        exposure_us = None
+        if first.exposure is not None:
+            begin, end = first.exposure[index].tolist()
+            exposure_us = begin, end
+        writer.append_image(
+            t,
+            None if frames is None else frames[index],
+            exposure_us=exposure_us,
+            depth=None if depth is None else depth[index],
+        )
 
 
 @guarded

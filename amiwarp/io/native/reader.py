@@ -6,13 +6,14 @@ The format is described in ``docs/reference/recording-format.md``.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.other_sensors import ImuSamples
+from amiwarp.events.other_sensors import DEPTH_DTYPE, ImuSamples, check_exposure
 from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.io.assumptions import ASSUMED_SIZE, assumed_size
 from amiwarp.io.columns import served as served_columns
@@ -20,7 +21,7 @@ from amiwarp.io.columns.layout import SAMPLE, is_plain_polarity
 from amiwarp.io.columns.options import GivenLayout
 from amiwarp.io.columns.units import are_microseconds
 from amiwarp.io.hdf5.chunks import CHUNK
-from amiwarp.io.hdf5.file import Hdf5File
+from amiwarp.io.hdf5.file import Column, Hdf5File
 from amiwarp.io.hdf5.rows import open_rows
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.native.attributes import attribute, read_camera, read_prism
@@ -106,6 +107,7 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
     if "truth" in file.attributes:
         truth = read_truth(path, file, len(events), events.size)
 
+    frames, depth = _read_frames(path, file)
     return Recording(
         events=events,
         camera=camera,
@@ -115,7 +117,8 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
         metadata=metadata,
         name=path.stem,
         imu=_read_imu(path, file),
-        frames=_read_frames(path, file),
+        frames=frames,
+        depth=depth,
     )
 
 
@@ -225,22 +228,53 @@ def _rotation_of_imu(file: Hdf5File) -> NDArray[np.float64] | None:
     return np.asarray(rotation.reshape(3, 3))
 
 
-def _read_frames(path: Path, file: Hdf5File) -> StoredImages | None:
-    """Return the frames of a file, or None if it has none."""
+def _read_frames(path: Path, file: Hdf5File) -> tuple[StoredImages | None, StoredImages | None]:
+    """Return the frames and the depth maps of a file, each None if it has none."""
     if "frames/t" not in file.columns:
-        return None
+        return None, None
     with errors_name(path, lambda: "frames"):
         times = file.columns["frames/t"]
-        image = dataset_of(file, "frames/image", len(times))
-        if image.dtype not in (np.uint8, np.uint16) or not all(image.row):
-            raise AmiwarpError(
-                f"frames are {image.dtype} of shape {image.row}; expected uint8 or uint16",
-                ErrorCode.FILE_DAMAGED,
-            )
-        t = rounded_times(times.read(0, len(times)))
+        count = len(times)
+        t = rounded_times(times.read(0, count))
         if (t[1:] < t[:-1]).any():
             raise AmiwarpError("frames/t decreases; the file is damaged", ErrorCode.FILE_DAMAGED)
-        height, width = image.row
-        return StoredImages(
-            path, "frames", t, (width, height), lambda index: image.read(index, index + 1)[0], file
-        )
+        exposure = None
+        if "frames/exposure" in file.columns:
+            pairs = dataset_of(file, "frames/exposure", count, (2,))
+            exposure = pairs.read(0, count).astype(np.int64)
+            check_exposure(exposure, t)
+        frames = depth = None
+        if "frames/depth" not in file.columns or "frames/image" in file.columns:
+            image = dataset_of(file, "frames/image", count)
+            has_shape = len(image.row) == 2 or image.row[2:] == (3,)
+            if image.dtype not in (np.uint8, np.uint16) or not has_shape or not all(image.row):
+                raise AmiwarpError(
+                    f"frames are {image.dtype} of shape {image.row}; expected uint8 or uint16, grey or RGB",
+                    ErrorCode.FILE_DAMAGED,
+                )
+            frames = _images_of(path, file, image, t, exposure)
+        if "frames/depth" in file.columns:
+            maps = dataset_of(file, "frames/depth", count)
+            if maps.dtype != DEPTH_DTYPE or not all(maps.row):
+                raise AmiwarpError(
+                    f"frames/depth is {maps.dtype} of shape {maps.row}; expected float32",
+                    ErrorCode.FILE_DAMAGED,
+                )
+            depth = _images_of(path, file, maps, t, exposure)
+        return frames, depth
+
+
+def _images_of(
+    path: Path,
+    file: Hdf5File,
+    stored: Column,
+    t: NDArray[np.int64],
+    exposure: NDArray[np.int64] | None,
+) -> StoredImages:
+    """Return the images of a dataset, which are read on demand."""
+    height, width = stored.row[:2]
+
+    def read(index: int) -> Any:
+        return stored.read(index, index + 1)[0]
+
+    return StoredImages(path, stored.name, t, (width, height), read, file, exposure)

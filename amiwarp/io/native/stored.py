@@ -72,6 +72,7 @@ class StoredImages(Instants[Any]):
         size: tuple[int, int],
         read: Callable[[int], Any],
         file: Hdf5File,
+        exposure: NDArray[np.int64] | None = None,
     ) -> None:
         super().__init__(t)
         self._path = path
@@ -80,6 +81,8 @@ class StoredImages(Instants[Any]):
         self._file = file
         self.size = size
         """Size (width, height) of the images [px]."""
+        self.exposure = exposure
+        """Begin and end of each exposure of frames [us], shape ``(k, 2)``, or None."""
 
     def _read(self, index: int) -> Any:
         with errors_name(self._path, lambda: f"{self._name} {index}"):

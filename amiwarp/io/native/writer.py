@@ -314,29 +314,60 @@ class RecordingWriter:
             if samples.to_camera is not None:
                 self._chunks.hdf5["imu"].attrs["to_camera"] = samples.to_camera.ravel()
 
-    def append_image(self, t_us: int, image: NDArray[Any]) -> None:
-        """Append a frame.
+    def append_image(
+        self,
+        t_us: int,
+        image: NDArray[Any] | None = None,
+        *,
+        exposure_us: tuple[int, int] | None = None,
+        depth: NDArray[np.float32] | None = None,
+    ) -> None:
+        """Append a frame, a depth map, or both of one time. All calls must give the same optional arrays.
 
         Parameters
         ----------
         t_us : int
-            Time of the frame [us], not earlier than the frame before.
-        image : numpy.ndarray
-            Grey levels, uint8 or uint16, shape ``(height, width)``, of the type and shape of the frames before.
+            Time of the frame [us], not earlier than the frame before: the middle of its exposure.
+        image : numpy.ndarray, optional
+            Grey levels of shape ``(height, width)`` or RGB colours of shape ``(height, width, 3)``, uint8 or uint16, of
+            the type and shape of the frames before.
+        exposure_us : tuple of int, optional
+            Begin and end of the exposure, of the middle row of a rolling shutter [us].
+        depth : numpy.ndarray, optional
+            Depth along the camera's axis [m], float32 of shape ``(height, width)``: infinite for the sky, and NaN if it
+            is unknown.
+
+        Raises
+        ------
+        AmiwarpError
+            If the arrays have other types or shapes, neither an image nor a depth is given, the exposure does not hold
+            the time, or the time is earlier than the time before.
         """
         with self._appending(lambda: f"frame at {t_us} us"):
-            shape = image.shape
-            dtype = image.dtype
-            stored = self._datasets.find("frames/image")
-            if stored is not None:
-                shape = stored.shape[1:]
-                dtype = stored.dtype
+            t = np.array([t_us], np.int64)
+            rows: Columns = {"frames/t": t}
+            images: Columns = {}
+            if image is None and depth is None:
+                raise AmiwarpError(
+                    f"{self.path}: frame at {t_us} us: give an image, a depth map or both"
+                )
             try:
-                other_sensors.check_image(image, shape, dtype)
+                if image is not None:
+                    stored = self._datasets.find("frames/image")
+                    shape = image.shape if stored is None else stored.shape[1:]
+                    dtype = image.dtype if stored is None else stored.dtype
+                    other_sensors.check_image(image, shape, dtype)
+                    images["frames/image"] = image[None]
+                if depth is not None:
+                    of_image = depth.shape if image is None else image.shape[:2]
+                    other_sensors.check_depth(depth, of_image)
+                    images["frames/depth"] = depth[None]
+                if exposure_us is not None:
+                    rows["frames/exposure"] = np.array([exposure_us], np.int64)
+                    other_sensors.check_exposure(rows["frames/exposure"], t)
             except AmiwarpError as error:
                 raise AmiwarpError(f"{self.path}: {error}") from error
-            rows = {"frames/t": np.array([t_us], np.int64)}
-            self._records.append(rows, {"frames/image": image[None]})
+            self._records.append(rows, images)
 
     @contextlib.contextmanager
     def _appending(self, place: Callable[[], str]) -> Iterator[None]:
