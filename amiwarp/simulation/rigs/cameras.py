@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.rig_recording import check_to_rig
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Plate, Prism
 from amiwarp.results.pixel_map import PixelMap
@@ -21,8 +22,6 @@ from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.world_scene import BLUR_PX
 from amiwarp.validation import array, choice, instance, real, whole
 
-LARGEST_ROTATION_ERROR = 1e-3
-"""Largest deviation of a rotation matrix times its transpose from the identity."""
 FARTHEST_M = 100.0
 """Largest distance of a camera from the origin of its rig, along each axis [m]."""
 FASTEST_HZ = 1e5
@@ -46,22 +45,13 @@ def checked_place(to_rig: ArrayLike) -> NDArray[np.float64]:
     from scipy.spatial.transform import Rotation
 
     matrix = array(to_rig, "to_rig").astype(np.float64)
-    if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
-        raise AmiwarpError(
-            f"to_rig has shape {matrix.shape}; give 3 rows of 4 finite numbers: rotation and place in m"
-        )
-    turn = matrix[:, :3]
-    off = float(np.abs(turn @ turn.T - np.eye(3)).max())
-    if off > LARGEST_ROTATION_ERROR or np.linalg.det(turn) < 0.0:
-        raise AmiwarpError(
-            f"to_rig begins with {turn.tolist()}, which is no rotation: its rows must be at right angles, of length 1 "
-            "and right-handed; check the signs"
-        )
+    check_to_rig(matrix)
     if np.abs(matrix[:, 3]).max() > FARTHEST_M:
         raise AmiwarpError(
             f"to_rig places the camera at {matrix[:, 3].tolist()} m; give at most {FARTHEST_M:g} m along each axis"
         )
-    return np.column_stack([Rotation.from_matrix(turn).as_matrix(), matrix[:, 3]])
+    turn = Rotation.from_matrix(matrix[:, :3]).as_matrix()
+    return np.column_stack([turn, matrix[:, 3]])
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,29 +3,48 @@
 from __future__ import annotations
 
 import hashlib
-import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import MetadataValue
+from amiwarp.events.other_sensors import MemoryImages
+from amiwarp.events.poses import Poses
+from amiwarp.events.recording import Events, MemoryEvents, MetadataValue, Recording
+from amiwarp.events.rig_recording import RigRecording, RigSensor, SensorKind, check_sensor_name
+from amiwarp.events.truth import Truth
+from amiwarp.io import RigWriter
 from amiwarp.optics.prism import Prism
 from amiwarp.schema.calls import guarded
 from amiwarp.simulation.motion import LONGEST_S
-from amiwarp.simulation.rigs.cameras import RigCamera, RigEventCamera
+from amiwarp.simulation.recorded_simulation import header_of, write_recording
+from amiwarp.simulation.recorded_truth import RecordedTruth, chosen_instants, labels_of, poses_at
+from amiwarp.simulation.rigs.cameras import (
+    RigCamera,
+    RigDepthCamera,
+    RigEventCamera,
+    RigFrameCamera,
+)
 from amiwarp.simulation.rigs.paper_platform import APEX, VGA, paper_platform
+from amiwarp.simulation.rigs.taken_frames import TakenFrame, taken_frames
 from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.worlds.device_world import device_world
 from amiwarp.simulation.worlds.mounted_trajectory import MountedTrajectory
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world import World
 from amiwarp.simulation.worlds.world_choice import open_world
 from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.tasks import Progress, part, silent
 from amiwarp.validation import instance, real, shown, whole
 
-SENSOR_NAME = r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
-"""Names of sensors, as they are also names of files."""
+KINDS: dict[type, SensorKind] = {
+    RigEventCamera: SensorKind.EVENTS,
+    RigFrameCamera: SensorKind.FRAMES,
+    RigDepthCamera: SensorKind.DEPTH,
+}
+"""What each kind of camera records."""
 
 
 @guarded
@@ -73,10 +92,7 @@ class Rig:
             raise AmiwarpError("the rig has no sensors; give at least one camera")
         known: dict[str, str] = {}
         for name, sensor in self.sensors.items():
-            if not isinstance(name, str) or not re.fullmatch(SENSOR_NAME, name):
-                raise AmiwarpError(
-                    f"rig has a sensor named {shown(name)}; give up to 64 letters, digits, '-' and '_'"
-                )
+            check_sensor_name(name)
             other = known.setdefault(name.lower(), name)
             if other != name:
                 raise AmiwarpError(
@@ -89,6 +105,10 @@ class Rig:
                 )
             if isinstance(sensor, RigEventCamera):
                 self._check_simulation(name)
+            elif not len(sensor.times(self.duration_s)):
+                raise AmiwarpError(
+                    f"rig's sensor {name!r} takes no frame within {self.duration_s:g} s; give a longer duration"
+                )
 
     def _check_simulation(self, name: str) -> None:
         """Raise :class:`AmiwarpError`, which names the sensor, if it cannot be simulated."""
@@ -238,6 +258,154 @@ class Rig:
             source=self.source,
             pixels=sensor.pixels,
             imu=sensor.imu,
+        )
+
+    def run(self, *, progress: Progress | None = None) -> RigRecording:
+        """Simulate all cameras in memory.
+
+        Parameters
+        ----------
+        progress : Progress, optional
+            Called with the finished share.
+
+        Returns
+        -------
+        RigRecording
+            Recordings of the cameras by name, with ground truth.
+        """
+        _shared = device_world(self.world, self.device)  # all cameras use it
+        sensors: dict[str, RigSensor] = {}
+        for name, sensor in self.sensors.items():
+            advance = self._part_of(name, progress)
+            if isinstance(sensor, RigEventCamera):
+                recording = self.simulation(name).run(truth_hz=sensor.truth_hz, progress=advance)
+            else:
+                recording = self._frames_in_memory(name, sensor, advance)
+            sensors[name] = RigSensor(KINDS[type(sensor)], recording, np.asarray(sensor.to_rig))
+        return RigRecording(sensors, self.metadata(), self.world.name)
+
+    def write(
+        self,
+        folder: str | Path,
+        *,
+        progress: Progress | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """Simulate all cameras to a folder, in constant memory.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Folder of the recorded rig, which is made if it does not exist.
+        progress : Progress, optional
+            Called with the finished share.
+        overwrite : bool, optional
+            Replace existing files of a rig.
+        """
+        _shared = device_world(self.world, self.device)  # all cameras use it
+        with RigWriter(folder, metadata=self.metadata(), overwrite=overwrite) as rig_writer:
+            for name, sensor in self.sensors.items():
+                advance = self._part_of(name, progress)
+                place = np.asarray(sensor.to_rig)
+                if isinstance(sensor, RigEventCamera):
+                    simulation = self.simulation(name)
+                    instants = chosen_instants(simulation.duration_us, sensor.truth_hz)
+                    recorded = RecordedTruth(simulation, instants)
+                    header = header_of(simulation, recorded)
+                    writer = rig_writer.add(name, KINDS[type(sensor)], place, **header)
+                    write_recording(simulation, recorded, writer, advance)
+                else:
+                    writer = rig_writer.add(
+                        name,
+                        KINDS[type(sensor)],
+                        place,
+                        width=sensor.camera.width,
+                        height=sensor.camera.height,
+                        camera=sensor.camera,
+                        truth_labels=labels_of(self.world),
+                        metadata=self._metadata_of(name),
+                    )
+                    for frame in self._frames(name, sensor, advance):
+                        frame.append_to(writer)
+                    writer.append_poses(self._poses_of_frames(name, sensor))
+
+    def metadata(self) -> dict[str, MetadataValue]:
+        """Return the metadata that the recorded rig stores.
+
+        Returns
+        -------
+        dict
+            World, seed and duration, and :attr:`source`.
+        """
+        return {
+            "simulated": True,
+            "world": self.world.name,
+            "seed": self.seed,
+            "duration_us": self._duration_us,
+            **self.source,
+        }
+
+    @property
+    def _duration_us(self) -> int:
+        """Duration of the recording, rounded [us]."""
+        return round(1e6 * self.duration_s)
+
+    def _part_of(self, name: str, progress: Progress | None) -> Progress:
+        """Return the callback of a camera's part of the work, which is as large as any other's."""
+        place = list(self.sensors).index(name)
+        count = len(self.sensors)
+        return part(progress or silent, place / count, (place + 1) / count)
+
+    def _metadata_of(self, name: str) -> dict[str, MetadataValue]:
+        """Return the metadata of the recording of a camera without events."""
+        return {**self.metadata(), "seed": self.seed_of(name)}
+
+    def _scene_of(self, name: str) -> WorldScene:
+        """Return the scene of a camera without events."""
+        sensor = self._sensor(name)
+        samples = sensor.samples if isinstance(sensor, RigFrameCamera) else None
+        return WorldScene(self.world, self.trajectory_of(name), sensor.blur, samples=samples)
+
+    def _frames(
+        self, name: str, sensor: RigFrameCamera | RigDepthCamera, progress: Progress
+    ) -> Iterator[TakenFrame]:
+        """Yield the frames or depth images of a camera."""
+        return taken_frames(
+            sensor,
+            self._scene_of(name),
+            self.duration_s,
+            seed=self.seed_of(name),
+            device=self.device,
+            progress=progress,
+        )
+
+    def _poses_of_frames(self, name: str, sensor: RigFrameCamera | RigDepthCamera) -> Poses:
+        """Return the poses of a camera, the bodies and the joints at the times of its frames."""
+        return poses_at(self._scene_of(name), sensor.times(self.duration_s))
+
+    def _frames_in_memory(
+        self, name: str, sensor: RigFrameCamera | RigDepthCamera, progress: Progress
+    ) -> Recording:
+        """Return the recording of a camera without events."""
+        taken = list(self._frames(name, sensor, progress))
+        times = sensor.times(self.duration_s)
+        frames = None
+        depth = None
+        if isinstance(sensor, RigFrameCamera):
+            images = [frame.image for frame in taken if frame.image is not None]
+            frames = MemoryImages(times, images, sensor.exposures(self.duration_s))
+        else:
+            depth = MemoryImages(times, [frame.depth for frame in taken if frame.depth is not None])
+        camera = sensor.camera
+        truth = Truth({}, labels=labels_of(self.world), poses=self._poses_of_frames(name, sensor))
+        return Recording(
+            MemoryEvents(Events.from_arrays([], [], [], []), camera.width, camera.height),
+            camera,
+            truth=truth,
+            metadata=self._metadata_of(name),
+            name=name,
+            frames=frames,
+            depth=depth,
         )
 
     def _sensor(self, name: str) -> RigCamera:
