@@ -268,8 +268,8 @@ def write_rig(rig_file: Path, out: Path, chosen: Mapping[str, Any], common: cli.
         "device": rig.device,
     }
     lines = [
-        f"{out}: {len(counts)} sensors in the world {rig.world.name}, seed {rig.seed}, {rig.duration_s:.6g} s simulated "
-        f"in {seconds:.2f} s on {rig.device}"
+        f"{out}: {len(counts)} sensors in the world {rig.world.name}, seed {rig.seed}, {rig.duration_s:.6g} s "
+        f"simulated in {seconds:.2f} s on {rig.device}"
     ]
     for name, kept in counts.items():
         what = UNITS[kept["kind"]]

@@ -69,6 +69,11 @@ class PlaceEntry:
             )
         turn = Rotation.identity()
         if self.look is not None:
+            if not any(self.look):
+                raise AmiwarpError(
+                    "look is a vector of length 0; give the direction that the camera looks along",
+                    ErrorCode.FIELD,
+                )
             turn = looking_at((0.0, 0.0, 0.0), self.look, UP_ON_RIG)
         if self.rotation is not None:
             turn = Rotation.from_quat(_unit(self.rotation))

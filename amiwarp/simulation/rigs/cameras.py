@@ -109,6 +109,11 @@ class RigEventCamera(_OnRig):
     truth_hz: float | None = field(default=None, kw_only=True)
     """Rate of the instants whose ground truth is recorded [1/s]; None for none."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.truth_hz is not None:
+            real(self.truth_hz, "truth_hz", 1e-3, 1e6, " 1/s")
+
 
 @guarded
 @dataclass(frozen=True, eq=False)

@@ -111,7 +111,7 @@ def load_rig(
         sensors = _sensors(entry, folder)
         world_name = world or _in_folder(entry.world, WORLD_FILES, folder)
         way = trajectory
-        if way is None and entry.trajectory is not None and world is None:
+        if way is None and entry.trajectory is not None:
             way = _in_folder(entry.trajectory, POSE_FILES, folder)
         of_world, of_rig = open_world(world_name, way, seed=entry.seed, duration_s=entry.duration_s)
         return Rig(of_world, of_rig, sensors, entry.duration_s, entry.seed, device)
