@@ -20,8 +20,8 @@ from amiwarp.simulation.worlds.world_scene import WorldScene
 
 MOTION_PX = 0.5
 """Largest motion of the image between two instants of an exposure [px]."""
-MOST_INSTANTS = 512
-"""Largest number of instants of an exposure."""
+MOST_INSTANTS = 128
+"""Largest number of instants of an exposure. If the image moves by over 64 px, the instants are further apart."""
 
 
 class FrameRenderer:
