@@ -18,6 +18,8 @@ from amiwarp.simulation.picture_light import (
 )
 from amiwarp.validation import array
 
+MOST_COLOURED = 1 << 24
+"""Largest picture whose colours are kept [px]. They take three times the memory of its luminance."""
 LARGEST_DEVIATION = 1e-3
 """Largest deviation of the luminance of a relative colour from 1."""
 
@@ -35,21 +37,40 @@ def split_colours(colours: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[n
 
 
 def read_colours(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Return the linear luminance of a picture file, and its colours relative to it; None for a grey picture.
+    """Return the linear luminance of a picture file, and its colours relative to it.
 
+    The colours are None for a grey picture, and for one of more than :data:`MOST_COLOURED` pixels.
     Raises :class:`AmiwarpError` if the file cannot be read.
     """
     pixels = read_pixels(path)
     light = linear_luminance(pixels, name=str(path))
-    if pixels.ndim == 2 or pixels.dtype != np.uint8:
+    if pixels.ndim == 2 or pixels.dtype != np.uint8 or light.size > MOST_COLOURED:
         return light, None
+    if has_no_colour(pixels):
+        return light, None
+    return light, colours_of_pixels(pixels)
+
+
+def has_no_colour(pixels: NDArray[np.uint8]) -> bool:
+    """Return whether red, green and blue of all pixels are equal. Their shape is (height, width, 3)."""
+    red = pixels[..., 0]
+    return np.array_equal(red, pixels[..., 1]) and np.array_equal(red, pixels[..., 2])
+
+
+def colours_of_pixels(
+    pixels: NDArray[np.uint8], tint: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """Return the relative colours of sRGB values, shape (height, width, 3), multiplied by a relative colour, (3,)."""
     table = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0)
-    colour = np.empty((*light.shape, 3), np.float32)
+    colour = np.empty(pixels.shape, np.float32)
     rows = max(1, BAND // pixels[0].size)
+    # In bands, because a large picture as a whole would need several times its memory
     for start in range(0, len(pixels), rows):
-        part = pixels[start : start + rows, :, :3]
-        _, colour[start : start + rows] = split_colours(table[part])
-    return light, None if is_grey(colour) else colour
+        linear = table[pixels[start : start + rows]]
+        if tint is not None:
+            linear = linear * tint
+        _, colour[start : start + rows] = split_colours(linear)
+    return colour
 
 
 def relative_colour(colour: tuple[float, float, float], what: str) -> NDArray[np.float32]:

@@ -28,7 +28,13 @@ from amiwarp.simulation.picture_light import (
     srgb_to_linear,
 )
 from amiwarp.simulation.worlds.bodies import Material, Mesh
-from amiwarp.simulation.worlds.colours import is_grey, split_colours
+from amiwarp.simulation.worlds.colours import (
+    MOST_COLOURED,
+    colours_of_pixels,
+    has_no_colour,
+    is_grey,
+    split_colours,
+)
 from amiwarp.validation import one_of, real
 
 if TYPE_CHECKING:
@@ -56,12 +62,14 @@ PICTURES = (
 """Suffixes of picture files that a mesh file may use as textures."""
 TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation matrix from a frame in which y points up to a frame in which z points up."""
+GREY_MODES = ("1", "L", "LA", "La", "I", "I;16", "F")
+"""Pillow's names of the kinds of pictures without colour."""
 DEFAULT_REFLECTANCE = 0.5
 """Reflectance of meshes whose file gives neither colours nor a material."""
 
 Arrays = tuple[NDArray[Any] | None, ...]
-"""Vertices, faces, texture coordinates, light and its colour, texture, and the material's colour of a part; None for
-an array that it has not."""
+"""Vertices, faces, texture coordinates, light and its colour, texture and its pixels in colour, and relative colour of
+the material of a part; None for an array that it has not."""
 
 
 class LoadedMesh(NamedTuple):
@@ -168,8 +176,10 @@ def _received(about: dict[str, Any], arrays: list[NDArray[Any]]) -> LoadedMesh:
     values: list[Any] = [
         None if shape is None else arrays.pop(0).reshape(shape) for shape in about["shapes"]
     ]
-    vertices, faces, uv, light, light_colour, texture, colour = values
+    vertices, faces, uv, light, light_colour, texture, pixels, colour = values
     mesh = Mesh(vertices, faces, uv, light, light_colour)
+    if pixels is not None and not has_no_colour(pixels):
+        colour = colours_of_pixels(pixels, colour)
     material = Material(about["reflectance"], texture, colour=colour)
     return LoadedMesh(mesh, material, about["name"])
 
@@ -277,11 +287,11 @@ def _part(
         colours = np.repeat(np.asarray(visual.face_colors), 3, axis=0)
         own_vertices = vertices[faces.ravel()]
         own_faces = np.arange(faces.size).reshape(-1, 3)
-        return (own_vertices, own_faces, None, *_lights(colours, kind), None, None), 1.0
+        return (own_vertices, own_faces, None, *_lights(colours, kind), None, None, None), 1.0
     if visual.kind == "vertex":
         lights = _lights(visual.vertex_colors, kind)
-        return (vertices, faces, None, *lights, None, None), 1.0
-    return (vertices, faces, None, None, None, None, None), DEFAULT_REFLECTANCE
+        return (vertices, faces, None, *lights, None, None, None), 1.0
+    return (vertices, faces, None, None, None, None, None, None), DEFAULT_REFLECTANCE
 
 
 def _textured(
@@ -301,18 +311,17 @@ def _textured(
     shade = visual.vertex_attributes.get("color")
     lights = (None, None) if shade is None else _lights(shade, kind)
     if picture is None or visual.uv is None:
-        return (vertices, faces, None, *lights, None, tint), factor
+        return (vertices, faces, None, *lights, None, None, tint), factor
     if not pbr:
         # in OBJ files, a texture replaces the diffuse colour
         factor = 1.0
         tint = None
-    texture, texture_colour = _luminance(picture)
     uv = np.asarray(visual.uv)[:, :2]
-    return (vertices, faces, uv, *lights, texture, _tinted(texture_colour, tint)), factor
+    return (vertices, faces, uv, *lights, *_luminance(picture), tint), factor
 
 
-def _luminance(picture: Any) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Return the linear luminance of a Pillow picture, and its colours relative to it, or None for a grey picture.
+def _luminance(picture: Any) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    """Return the linear luminance of a Pillow picture, and its pixels, or None for a grey or a very large picture.
 
     A single row or column is duplicated.
     """
@@ -322,30 +331,21 @@ def _luminance(picture: Any) -> tuple[NDArray[np.float32], NDArray[np.float32] |
         )
     table = srgb_to_linear(np.arange(256, dtype=np.float32) / 255)
     light = np.empty((picture.height, picture.width), np.float32)
-    colour = np.empty((*light.shape, 3), np.float32)
+    has_colour = picture.mode not in GREY_MODES and light.size <= MOST_COLOURED
+    pixels = np.empty((*light.shape, 3) if has_colour else (0, 0, 3), np.uint8)
     rows = max(1, BAND // (3 * picture.width))
     # In bands, because a large picture as a whole would need four times its memory
     for top in range(0, picture.height, rows):
         bottom = min(top + rows, picture.height)
         band = picture.crop((0, top, picture.width, bottom)).convert("RGB")
-        linear = table[np.asarray(band)]
-        light[top:bottom] = linear @ np.array(LUMINANCE, np.float32)
-        _, colour[top:bottom] = split_colours(linear)
+        light[top:bottom] = table[np.asarray(band)] @ np.array(LUMINANCE, np.float32)
+        if has_colour:
+            pixels[top:bottom] = band
     for axis in (0, 1):
         if light.shape[axis] < 2:
             light = np.repeat(light, 2, axis=axis)
-            colour = np.repeat(colour, 2, axis=axis)
-    return light, None if is_grey(colour) else colour
-
-
-def _tinted(
-    colour: NDArray[np.float32] | None, tint: NDArray[Any] | None
-) -> NDArray[np.float32] | None:
-    """Return relative colours of texels, shape (height, width, 3), multiplied by a relative colour, shape (3,)."""
-    if colour is None or tint is None:
-        return tint if colour is None else colour
-    _, tinted = split_colours(colour * tint)
-    return tinted
+            pixels = np.repeat(pixels, 2, axis=axis)
+    return light, pixels if has_colour else None
 
 
 def _lights(colours: Any, kind: str) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
