@@ -111,6 +111,9 @@ from .io.recorded_dataset import RecordedDataset as RecordedDataset
 from .io.rig_files import RigWriter as RigWriter
 from .io.rig_files import open_rig as open_rig
 from .io.rig_files import save_rig as save_rig
+from .io.rig_formats.conversion import RigConversionSummary as RigConversionSummary
+from .io.rig_formats.conversion import RigFormat as RigFormat
+from .io.rig_formats.conversion import convert_rig as convert_rig
 from .io.truth_files import save_flow_dsec as save_flow_dsec
 from .io.truth_files import save_flow_mvsec as save_flow_mvsec
 from .io.truth_files import save_poses_tum as save_poses_tum

@@ -399,6 +399,8 @@ OWN: dict[str, dict[str, Any]] = {
     "RigRecording": {"sensors": {"left": RIG_SENSOR}},
     "RigRecording.between": {"source": "left", "target": "left"},
     "RigWriter": {"folder": _new("")},
+    "RigConversionSummary": {"format": "ros1", "files": 1, "roles": {}, "notes": (), "left_out": ()},
+    "convert_rig": {"rig": RIG, "out": _new(".bag")},
     "RigWriter.add": {"name": "left", "kind": "events", "to_rig": np.eye(3, 4)},
     "RecordingWriter.append_frame": {"frame": FRAME},
     "RecordingWriter.append_image": {"t_us": 0, "image": np.zeros((3, 4), np.uint8)},

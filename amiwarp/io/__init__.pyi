@@ -21,6 +21,9 @@ from .recorded_dataset import RecordedDataset as RecordedDataset
 from .rig_files import RigWriter as RigWriter
 from .rig_files import open_rig as open_rig
 from .rig_files import save_rig as save_rig
+from .rig_formats.conversion import RigConversionSummary as RigConversionSummary
+from .rig_formats.conversion import RigFormat as RigFormat
+from .rig_formats.conversion import convert_rig as convert_rig
 from .truth_files import save_flow_dsec as save_flow_dsec
 from .truth_files import save_flow_mvsec as save_flow_mvsec
 from .truth_files import save_poses_tum as save_poses_tum

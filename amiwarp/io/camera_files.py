@@ -118,7 +118,7 @@ def save_camera(
     else:
         import yaml
 
-        data = _to_ros(camera, path.stem) if layout == "ros" else _to_kalibr(camera)
+        data = _to_ros(camera, path.stem) if layout == "ros" else {"cam0": kalibr_camera(camera)}
         text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120)
     write_text(path, text, overwrite=overwrite)
 
@@ -253,7 +253,8 @@ def _to_ros(camera: Camera, name: str) -> dict[str, Any]:
     }
 
 
-def _to_kalibr(camera: Camera) -> dict[str, Any]:
+def kalibr_camera(camera: Camera) -> dict[str, Any]:
+    """Return a camera as the fields of Kalibr. Raises :class:`AmiwarpError` for a lens that it does not have."""
     lens = camera.distortion
     model = "none"
     coefficients: list[float] = []
@@ -263,16 +264,14 @@ def _to_kalibr(camera: Camera) -> dict[str, Any]:
         coefficients = opencv_coefficients.tolist()
     if isinstance(lens, RadialTangential) and any(coefficients[4:]):
         raise AmiwarpError(
-            f"Kalibr's radtan has no coefficients after p2, the lens has {lens}; write layout='ros'"
+            f"Kalibr's radtan has no coefficients after p2, the lens has {lens}; write ROS's layout"
         )
     return {
-        "cam0": {
-            "camera_model": "pinhole",
-            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-            "distortion_model": model,
-            "distortion_coeffs": coefficients[:4],
-            "resolution": [camera.width, camera.height],
-        }
+        "camera_model": "pinhole",
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "distortion_model": model,
+        "distortion_coeffs": coefficients[:4],
+        "resolution": [camera.width, camera.height],
     }
 
 

@@ -22,6 +22,9 @@ from amiwarp.io import convert, description, open_recording
 from amiwarp.io.description_table import table_rows
 from amiwarp.io.opening import head_only
 from amiwarp.io.output_formats import EXTENSION_HELP, Codec, make_folder
+from amiwarp.io.rig_description import describe_rig, rig_rows
+from amiwarp.io.rig_files import is_rig, open_rig
+from amiwarp.io.rig_formats.conversion import convert_rig
 from amiwarp.io.truth_files import save_flow_dsec, save_flow_mvsec, save_poses_tum
 
 LARGE_BYTES = 1 << 28
@@ -32,7 +35,7 @@ def run_info(
     file: Annotated[
         Path,
         typer.Argument(
-            help="Recording in any supported format, or camera: to list the connected cameras."
+            help="Recording in any supported format, folder of a rig, or camera: to list the connected cameras."
         ),
     ],
     *,
@@ -49,11 +52,17 @@ def run_info(
 ) -> None:
     """Show a recording's format, events, encoder, camera, prism, IMU, frames, truth, repairs and assumptions.
 
+    Of a rig it shows the sensors, their places, and whether their times overlap.
+
     Files of up to 256 MiB are read once, in blocks. Of larger files only the first 4 million events and the end are
     read, unless --count is given. Figures that are then estimates are marked as such.
     """
     if str(file) == "camera:":
         _report_cameras(common)
+        return
+    if is_rig(file):
+        of_rig = describe_rig(open_rig(file), str(file))
+        cli.report(common, of_rig, [cli.table(rig_rows(of_rig))])
         return
     is_large = not count and _file_bytes(file) > LARGE_BYTES
     with contextlib.ExitStack() as reading:
@@ -135,24 +144,81 @@ class ViewerOptions:
         return False
 
 
+_in_rigs = partial(typer.Option, rich_help_panel="Rigs")
+
+
+@dataclass(frozen=True)
+class RigConversionOptions:
+    """Options for the conversion of a rig."""
+
+    left: Annotated[
+        str | None,
+        _in_rigs(
+            help="Sensor that is the left camera. Default: the one called left, or the outermost one."
+        ),
+    ] = None
+    right: Annotated[
+        str | None,
+        _in_rigs(
+            help="Sensor that is the right camera. Default: the one called right, or the outermost one."
+        ),
+    ] = None
+    imu_noise: Annotated[
+        str | None,
+        _in_rigs(
+            help="Noise of the IMU for EuRoC and Kalibr: density and random walk of the gyroscope, then of the "
+            "accelerometer (SI units).",
+            metavar="G,GW,A,AW",
+        ),
+    ] = None
+    imu_position: Annotated[
+        str | None,
+        _in_rigs(
+            help="Place of the IMU in the frame of the camera that carries it (m). Default: 0,0,0.",
+            metavar="X,Y,Z",
+        ),
+    ] = None
+
+    def given(self) -> dict[str, Any]:
+        """Return the arguments of :func:`amiwarp.convert_rig`."""
+        noise = self.imu_noise
+        place = self.imu_position
+        return {
+            "left": self.left,
+            "right": self.right,
+            "imu_noise": None if noise is None else cli.numbers(noise, 4, "--imu-noise"),
+            "imu_position": None if place is None else cli.numbers(place, 3, "--imu-position"),
+        }
+
+
 def run_convert(
-    source: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
+    source: Annotated[
+        Path, typer.Argument(help="Recording in any supported format, or the folder of a rig.")
+    ],
     out: Annotated[
         Path,
         typer.Argument(
             help=f"File to write. Its extension gives the format: {EXTENSION_HELP}; .rrd (Rerun), or .mcap with "
-            "--foxglove, for viewers."
+            "--foxglove, for viewers. Of a rig, a bag (.bag, .mcap, .db3), or with --format a new folder."
         ),
         cli.OUTPUT,
     ],
     *,
-    format: cli.Format = None,
+    format: Annotated[
+        str | None,
+        typer.Option(
+            help="Format to write, if the extension means another one: dsec (.h5), evt21 (.raw). Of a rig, the layout "
+            "of the folder: dsec, mvsec, euroc or kalibr.",
+            show_default=False,
+        ),
+    ] = None,
     codec: cli.HdfCodec = Codec.BLOSC,
     round: cli.Round = None,
     encoder: cli.EncoderOptions,
     camera: cli.CameraOptions,
     prism: cli.NominalPrismOptions,
     viewers: ViewerOptions,
+    rigs: RigConversionOptions,
     topic: cli.Topic = None,
     layout: cli.FileOptions,
     common: cli.Common,
@@ -164,9 +230,30 @@ def run_convert(
 
     Files for the viewers Rerun and Foxglove show images of the events, recorded and, with --calibration, compensated,
     and the prism's angle.
+
+    A rig is converted to the folders of DSEC, MVSEC, EuRoC and Kalibr, and to bags with the topics of all sensors.
     """
     began = time.perf_counter()
     has_optics = camera != cli.CameraOptions() or prism != cli.NominalPrismOptions()
+    if is_rig(source):
+        others = (encoder, viewers, layout) == (
+            cli.EncoderOptions(),
+            ViewerOptions(),
+            cli.FileOptions(),
+        )
+        if has_optics or not others or (round, topic) != (None, None):
+            raise AmiwarpError(
+                f"{source}: is a rig; give only --format, --codec and the options of rigs, or convert one of its "
+                "recordings",
+                ErrorCode.OPTIONS,
+            )
+        _convert_rig(source, out, format, codec, rigs, common)
+        return
+    if rigs != RigConversionOptions():
+        raise AmiwarpError(
+            f"{source}: is no rig; leave out --left, --right, --imu-noise and --imu-position",
+            ErrorCode.OPTIONS,
+        )
     if viewers.chosen(out):
         if (format, codec, round) != (None, Codec.BLOSC, None) or has_optics:
             raise AmiwarpError(
@@ -212,6 +299,32 @@ def run_convert(
     slip = data.pop("index_slip")
     data["slip_deg"] = None if slip is None else math.degrees(slip)
     cli.report(common, data, _convert_lines(data))
+
+
+def _convert_rig(
+    source: Path,
+    out: Path,
+    format: str | None,
+    codec: Codec,
+    options: RigConversionOptions,
+    common: cli.Common,
+) -> None:
+    """Convert a rig, and report which sensor is which, what was assumed, and what was left out."""
+    began = time.perf_counter()
+    with cli.progress("converting") as advance:
+        summary = convert_rig(
+            source, out, format=format, codec=codec, progress=advance, **options.given()
+        )
+    seconds = time.perf_counter() - began
+    data = {"file": str(out), **asdict(summary), "seconds": seconds}
+    lines = [f"{out}: {summary.format.value}, {summary.files:,} files, {seconds:.2f} s"]
+    if summary.roles:
+        roles = ", ".join(f"{role} is {name}" for role, name in summary.roles.items())
+        lines.append(f"{roles} (--left, --right)")
+    lines += [f"note: {note}" for note in summary.notes]
+    if summary.left_out:
+        lines.append(f"note: left out: {', '.join(summary.left_out)}")
+    cli.report(common, data, lines)
 
 
 def _write_for_viewer(

@@ -135,6 +135,10 @@ def io_function(place: str) -> Callable[..., Any]:
     return function
 
 
+RIG_FILE = "rig.json"
+"""Name of the file that makes a folder of recordings a rig."""
+
+
 def _folder_format(path: Path) -> Format | None:
     """Return the format of a folder, or None if the path is a file or an unknown folder."""
     if not path.is_dir():
@@ -152,6 +156,11 @@ def detect_format(path: Path) -> Format:
             f"{path}: is the folder of a ROS 2 bag without its metadata.yaml; "
             "run ros2 bag reindex, or give one of its files",
             ErrorCode.CONTENT_MISSING,
+        )
+    if path.name == RIG_FILE or (path / RIG_FILE).is_file():
+        raise AmiwarpError(
+            f"{path}: is a rig of several recordings; give one of them, or open the rig with amiwarp.open_rig",
+            ErrorCode.AMBIGUOUS,
         )
     with errors_name(path, lambda: "opening"), open_input(path) as file:
         head = file.read(HEAD_BYTES)

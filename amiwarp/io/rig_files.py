@@ -28,7 +28,7 @@ from amiwarp.events.rig_recording import (
     check_to_rig,
 )
 from amiwarp.events.truth import WorldLabels
-from amiwarp.io.formats import open_recording
+from amiwarp.io.formats import RIG_FILE, open_recording
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.json_files import read_json
 from amiwarp.io.native.copying import copy_recording
@@ -41,9 +41,6 @@ from amiwarp.schema.calls import guarded
 from amiwarp.schema.records import at_field, check_given, fields_of, value_of
 from amiwarp.tasks import Progress, part, silent
 from amiwarp.validation import choice, shown
-
-RIG_FILE = "rig.json"
-"""Name of the file of a rig in its folder."""
 
 FORMAT = "amiwarp-rig"
 """Value of the field ``format``."""
@@ -69,6 +66,11 @@ class _StoredRig:
 
     sensors: Mapping[str, Any]
     metadata: Mapping[str, Any] = field(default_factory=dict)
+
+
+def is_rig(path: Path) -> bool:
+    """Return whether a path is the folder of a rig, or the file of a rig."""
+    return path.name == RIG_FILE or (path / RIG_FILE).is_file()
 
 
 @guarded

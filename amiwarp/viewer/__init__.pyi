@@ -15,6 +15,8 @@ from .inspector import Inspector as Inspector
 from .library import Library as Library
 from .look import Look as Look
 from .panel import Panel as Panel
+from .rig_pictures import ShownRig as ShownRig
+from .rig_pictures import main_sensor as main_sensor
 from .view_state import ViewState as ViewState
 from .view_state import apply_state as apply_state
 from .view_state import current_state as current_state

@@ -19,6 +19,7 @@ from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
 from amiwarp.io.output_formats import check_ending
+from amiwarp.io.rig_files import is_rig, open_rig
 from amiwarp.live.commands.session import SourceOptions, check_angles
 from amiwarp.viewer.host_names import is_local
 from amiwarp.viewer.look import PICTURE_PX
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from amiwarp.viewer.library import Library
     from amiwarp.viewer.look import Look
     from amiwarp.viewer.publish import Page
+    from amiwarp.viewer.rig_pictures import ShownRig
     from amiwarp.viewer.view_state import ViewState
 
 _LOOK = "Window and picture"
@@ -399,6 +401,12 @@ class StartOptions:
             "Default: none."
         ),
     ] = None
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            help="Sensor of a rig that is shown in full. Default: the one called left, or the first with events."
+        ),
+    ] = None
     depth: Annotated[
         Path | None,
         typer.Option(
@@ -485,7 +493,8 @@ def run_view(
     recording: Annotated[
         Path,
         typer.Argument(
-            help="Recording in any supported format. With --live: a source as for 'amiwarp live'."
+            help="Recording in any supported format, or the folder of a rig. With --live: a source as for 'amiwarp "
+            "live'."
         ),
     ],
     *,
@@ -498,27 +507,43 @@ def run_view(
     layout: cli.LayoutOptions,
     common: cli.Common,
 ) -> None:
-    """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
+    """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand.
+
+    Of a rig, one event camera is shown so, the others next to it. With --web, the page shows the frames, depth maps and
+    events of all sensors at the time of the window, too.
+    """
     from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector
     from amiwarp.viewer.library import Library
     from amiwarp.viewer.serve import check_libraries
 
     _check_together(stream, start, page, look, layout)
+    rig = None
+    if not stream.live and is_rig(recording):
+        rig = _rig_of(recording, start, layout)
+    elif start.sensor is not None:
+        raise AmiwarpError(f"{recording}: is no rig; leave out --sensor", ErrorCode.OPTIONS)
     if page.web:
         check_libraries()
-    bookmark = "" if stream.live else start.chosen_bookmark(recording)
+    bookmark = "" if stream.live or rig is not None else start.chosen_bookmark(recording)
     device = cli.choose_device(common.device)
     with stream.follow(str(recording)) as latest:
 
         def new_inspector() -> Inspector:
-            opened = open_recording(recording, **layout.given()) if latest is None else latest()
+            if rig is not None:
+                opened = rig.rig[rig.main].recording
+            elif latest is None:
+                opened = open_recording(recording, **layout.given())
+            else:
+                opened = latest()
             inspector = start.build(
                 cli.complete(opened, camera, prism),
                 device,
                 latest,
                 None if page.web else WINDOW_POINTS,
             )
-            inspector.path = None if stream.live else recording
+            inspector.path = None if stream.live or rig is not None else recording
+            if rig is not None:
+                inspector.show_rig(rig)
             inspector.bookmark = bookmark
             return inspector
 
@@ -536,13 +561,26 @@ def run_view(
             opened = open_recording(path, **(layout.given() if path == recording else {}))
             return Inspector(cli.complete(opened, camera, prism), device=device)
 
-        library = None if stream.live else Library(recording.parent, open_other)
+        library = None if stream.live or rig is not None else Library(recording.parent, open_other)
         unused = [first]
 
         def inspector_of_tab() -> Inspector:
             return unused.pop() if unused else new_inspector()
 
         page.serve(inspector_of_tab, library, name=recording.name, common=common)
+
+
+def _rig_of(folder: Path, start: StartOptions, layout: cli.LayoutOptions) -> ShownRig:
+    """Return the rig of a folder with the sensor to show. Raises :class:`AmiwarpError` for options of recordings."""
+    from amiwarp.viewer.rig_pictures import ShownRig, main_sensor
+
+    if start.beside or start.bookmark is not None or layout.given():
+        raise AmiwarpError(
+            f"{folder}: is a rig; leave out --beside, --bookmark and the options for the layout of a file",
+            ErrorCode.OPTIONS,
+        )
+    rig = open_rig(folder)
+    return ShownRig(rig, main_sensor(rig, start.sensor))
 
 
 def _check_together(

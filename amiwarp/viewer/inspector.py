@@ -53,6 +53,7 @@ from amiwarp.viewer.knobs import (
     foreign_names,
     size_name,
 )
+from amiwarp.viewer.rig_pictures import ShownRig
 from amiwarp.viewer.shown_window import DisplayedWindow, LoadedWindow
 from amiwarp.viewer.window_statistics import window_statistics
 
@@ -169,6 +170,8 @@ class Inspector:
         """Other recordings on the time axis of this one, see :meth:`put_beside`."""
         self.beside: Inspector | None = None
         """The recording of :attr:`besides` that is shown beside this one."""
+        self.shown_rig: ShownRig | None = None
+        """The rig that this recording is a part of, whose other sensors are shown too."""
         self.offset_us = 0
         """If this recording is beside another one: its first event's time after the other one's first event [us]."""
         self._angles_are_lent = False
@@ -667,6 +670,13 @@ class Inspector:
         other.zero_us = source.t_first + self.zero_us - self.recording.events.t_first - offset_us
         self.besides = (*self.besides, other)
         self.beside = self.beside or other
+
+    def show_rig(self, shown_rig: ShownRig) -> None:
+        """Show the other sensors of a rig at the times of this recording, which is its main one."""
+        self.shown_rig = shown_rig
+        first_us = self.recording.events.t_first
+        for other in shown_rig.others():
+            self.put_beside(other, other.events.t_first - first_us)
 
     @property
     def angles_lent(self) -> bool:

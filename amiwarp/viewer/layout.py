@@ -156,6 +156,7 @@ CLIENT_ONLY = (
     "marked",
     "picture_scale",
     "view_name",
+    "rig_hidden",
 )
 """State variables that the browser keeps to itself."""
 TEXTS = (
@@ -234,6 +235,8 @@ ROWS = (
     "views",
     "rate_rows",
     "beside_counts",
+    "rig_pictures",
+    "rig_hidden",
 )
 """State variables that are rows of texts, names or numbers."""
 EMPTY: dict[str, Any] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +22,7 @@ from amiwarp.viewer.cloud_colours import (
     unknown_rows,
 )
 from amiwarp.viewer.look import Look
+from amiwarp.viewer.rig_pictures import SensorPicture
 from amiwarp.viewer.shown_window import DisplayedWindow
 
 LEGEND_ROWS = 8
@@ -159,6 +161,38 @@ def picture_state(values: NDArray[Any], scale: Scale) -> dict[str, Any]:
         "pair": [list(OFF_ON_BLACK), list(ON_ON_BLACK)] if two else None,
         "missing": [*as_bytes(scale.missing).tolist(), scale.missing_text],
         "table": b"" if two else _pixels(table_of(scale.colours)),
+    }
+
+
+def rig_state(pictures: Sequence[SensorPicture]) -> list[dict[str, Any]]:
+    """Return pictures of the sensors of a rig as the browser draws them, with their colour bars."""
+    rows = []
+    for each in pictures:
+        height, width = each.values.shape[:2]
+        row: dict[str, Any] = {"name": each.name, "text": each.text, "size": [width, height]}
+        if each.scale is None:
+            row["picture"] = _colour_state(each.values)
+            row["scale"] = None
+        else:
+            row["picture"] = picture_state(each.values, each.scale)
+            row["scale"] = scale_state(each.scale)
+        rows.append(row)
+    return rows
+
+
+def _colour_state(colours: NDArray[np.uint8]) -> dict[str, Any]:
+    """Return an image in colour, shape ``(height, width, 3)``, as the browser draws it.
+
+    Of an image with more than :data:`MOST_SENT` pixels, the browser gets every n-th one.
+    """
+    step = math.ceil(math.sqrt(math.prod(colours.shape[:2]) / MOST_SENT))
+    sent = colours[::step, ::step]
+    height, width = sent.shape[:2]
+    return {
+        "rgba": _pixels(sent.reshape(-1, 3)),
+        "width": width,
+        "height": height,
+        "step": step,
     }
 
 

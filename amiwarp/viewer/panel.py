@@ -1210,7 +1210,13 @@ class Panel(Actions):
         return {
             "overview": page_state.picture_state(counts, count_scale([counts])),
             "beside_counts": self.inspector.counts_beside(shown.span),
+            "rig_pictures": self._rig_state(shown),
         }
+
+    def _rig_state(self, shown: DisplayedWindow) -> list[dict[str, Any]]:
+        """Return the pictures of the sensors of a rig at the time of the window; none for a single recording."""
+        shown_rig = self.inspector.shown_rig
+        return [] if shown_rig is None else page_state.rig_state(shown_rig.pictures(shown.span))
 
     def _after_title(self, shown: DisplayedWindow) -> str:
         """Return the title of the second image."""

@@ -43,8 +43,8 @@ EARLIEST_NS = 1
 class ArrayEncoder:
     """Encoder of events, in order of time, to serialised messages of the type :data:`ARRAY` of ROS 1."""
 
-    def __init__(self, about: Outline) -> None:
-        """Load rosbags. Raises :class:`AmiwarpError` if it is missing."""
+    def __init__(self, about: Outline, frame_id: str = "event_camera") -> None:
+        """Load rosbags. Raises :class:`AmiwarpError` if it is missing. ``frame_id``: name of the camera's frame."""
         types = optional_module("rosbags.typesys", "ros", f"{about.path}: ROS bags need rosbags")
         self.store = types.get_typestore(types.Stores.ROS1_NOETIC)
         """Definitions of the message and of its parts."""
@@ -53,11 +53,12 @@ class ArrayEncoder:
         self._about = about
         self._clock = MessageClock(about.bag)
         self._count = 0
+        self._frame_id = frame_id.encode()
 
     def __call__(self, block: Events) -> Iterator[tuple[int, bytes]]:
         """Yield the arrays of a block: the time of the recording of each [ns], and the serialised message."""
         about = self._about
-        frame = b"event_camera"
+        frame = self._frame_id
         for events in self._clock.packets(block):
             recorded, stamp = self._clock.times(int(events.t[0]))
             seconds, nanoseconds = divmod(stamp, 10**9)

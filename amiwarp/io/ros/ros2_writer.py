@@ -4,6 +4,7 @@ Drivers of Prophesee cameras record such packets, and event_camera_msgs is part 
 single file, MCAP or SQLite, which holds the definition of its messages.
 """
 
+import contextlib
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -29,8 +30,8 @@ MESSAGE = "event_camera_msgs/msg/EventPacket"
 class PacketEncoder:
     """Encoder of events, in order of time, to serialised messages of the type :data:`MESSAGE` in EVT 3.0."""
 
-    def __init__(self, about: Outline) -> None:
-        """Load rosbags. Raises :class:`AmiwarpError` if it is missing."""
+    def __init__(self, about: Outline, frame_id: str = "event_camera") -> None:
+        """Load rosbags. Raises :class:`AmiwarpError` if it is missing. ``frame_id``: name of the camera's frame."""
         types = optional_module("rosbags.typesys", "ros", f"{about.path}: ROS bags need rosbags")
         self.store = types.get_typestore(types.Stores.ROS2_HUMBLE)
         """Definitions of the message and of its parts."""
@@ -38,6 +39,7 @@ class PacketEncoder:
         self._about = about
         self._clock = MessageClock(about.bag)
         self._count = 0
+        self._frame_id = frame_id
         self._encoder = Evt3Encoder(origin_of(about))
 
     def __call__(self, block: Events) -> Iterator[tuple[int, Any]]:
@@ -50,7 +52,7 @@ class PacketEncoder:
             seconds, nanoseconds = divmod(stamp, 10**9)
             time = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
             message = types[MESSAGE](
-                header=types["std_msgs/msg/Header"](stamp=time, frame_id="event_camera"),
+                header=types["std_msgs/msg/Header"](stamp=time, frame_id=self._frame_id),
                 height=about.height,
                 width=about.width,
                 seq=self._count,
@@ -65,18 +67,25 @@ class PacketEncoder:
 
 def write_ros2(part: Path, blocks: Iterable[Events], about: Outline) -> None:
     """Write all events. The extension of the file decides between MCAP and SQLite."""
-    kind = about.path.suffix.lower()
-    with scratch_folder(part.parent) as folder, plain_bag(about) as about:
+    with plain_bag(about) as about:
         encoder = PacketEncoder(about)
-        from rosbags.rosbag2 import StoragePlugin, Writer
-
-        storage = StoragePlugin.MCAP if kind == ".mcap" else StoragePlugin.SQLITE3
-        bag = folder / "bag"
-        # Older programs read version 8 too, the earliest that rosbags writes.
-        with Writer(bag, version=8, storage_plugin=storage) as writer:
+        with ros2_file(part, about.path.suffix.lower()) as writer:
             topic = about.bag.topic if about.bag else TOPIC
             connection = writer.add_connection(topic, MESSAGE, typestore=encoder.store)
             write_messages(writer, connection, encoder, blocks, about.bag, _add_topic)
+
+
+@contextlib.contextmanager
+def ros2_file(part: Path, kind: str) -> Iterator[Any]:
+    """Yield the library's writer of a bag that is a single file, with the extension ``kind``: ``.mcap`` or ``.db3``."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    storage = StoragePlugin.MCAP if kind == ".mcap" else StoragePlugin.SQLITE3
+    with scratch_folder(part.parent) as folder:
+        bag = folder / "bag"
+        # Older programs read version 8 too, the earliest that rosbags writes.
+        with Writer(bag, version=8, storage_plugin=storage) as writer:
+            yield writer
         os.replace(bag / f"bag{kind}", part)
 
 

@@ -13,6 +13,7 @@ const clamp = (value, low, high) => Math.max(low, Math.min(high, value));
 // Return a canvas with a picture of the server: each value's place on its scale gives its colour.
 export function painted(picture) {
   const { width, height, low, high, gamma, pair, missing } = picture;
+  if (picture.rgba) return coloured(picture);
   const values = numbers(picture.values, ARRAYS[picture.kind]);
   const canvas = Object.assign(document.createElement('canvas'), { width, height });
   const image = new ImageData(width, height);
@@ -36,13 +37,23 @@ export function painted(picture) {
   return canvas;
 }
 
+// Return a canvas with a picture whose pixels are colours.
+function coloured({ width, height, rgba }) {
+  const canvas = Object.assign(document.createElement('canvas'), { width, height });
+  const image = new ImageData(width, height);
+  image.data.set(numbers(rgba, Uint8Array));
+  canvas.getContext('2d').putImageData(image, 0, 0);
+  return canvas;
+}
+
 // Return the value of a picture at a pixel as text.
 function valueAt(picture, x, y) {
-  const values = numbers(picture.values, ARRAYS[picture.kind]);
   const { width, height, unit, pair, step } = picture;
   const [column, row] = [x, y].map((each) => Math.floor(each / step));
   if (column < 0 || row < 0 || column >= width || row >= height) return '';
   const k = row * width + column;
+  if (picture.rgba) return numbers(picture.rgba, Uint8Array).slice(4 * k, 4 * k + 3).join(', ');
+  const values = numbers(picture.values, ARRAYS[picture.kind]);
   if (pair) return `${values[k]} OFF, ${values[width * height + k]} ON`;
   return Number.isNaN(values[k]) ? picture.missing[3] : `${round(values[k])} ${unit}`;
 }

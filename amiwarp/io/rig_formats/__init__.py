@@ -1,0 +1,1 @@
+"""Recorded rigs in the layouts of public data sets, of Kalibr and of ROS."""
