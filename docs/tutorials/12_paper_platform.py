@@ -64,9 +64,9 @@ for name, sensor in recorded.sensors.items():
 # -------------------------
 #
 # All times are on one clock. The middle of a colour frame's exposure is the instant;
-# the events are those of one turn of the wedge, 83 ms, around it. Only at the wedge's own angle do they move
-# back to where a camera without the wedge would have seen them, which
-# :func:`amiwarp.compensate_events` does.
+# the events are those of one turn of the wedge, 83 ms, around it.
+# :func:`amiwarp.compensate_events` moves each event of the AMI-EV back to where a
+# camera without the wedge would have seen it.
 
 colour = recorded["colour"].recording.frames
 index = 2
