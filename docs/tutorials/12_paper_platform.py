@@ -64,7 +64,7 @@ for name, sensor in recorded.sensors.items():
 # -------------------------
 #
 # All times are on one clock. The middle of a colour frame's exposure is the instant;
-# the events are those of one turn of the wedge, 83 ms, around it.
+# the events of one turn of the wedge, 83 ms, lie around it.
 # :func:`amiwarp.compensate_events` moves each event of the AMI-EV back to where a
 # camera without the wedge would have seen it.
 

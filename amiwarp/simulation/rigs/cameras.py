@@ -140,7 +140,7 @@ class RigFrameCamera(_OnRig):
     exposure_us: int = field(default=5000, kw_only=True)
     """Exposure time of each row [us]."""
     readout_us: int = field(default=0, kw_only=True)
-    """Time from the begin of the top row's exposure to that of the bottom row [us]; 0 for a global shutter."""
+    """Time between the begins of the top row's and the bottom row's exposure [us]; 0 for a global shutter."""
     colour: bool = field(default=False, kw_only=True)
     """Whether the frames have red, green and blue; otherwise they are grey."""
     bits: int = field(default=8, kw_only=True)

@@ -69,7 +69,10 @@ class FrameRenderer:
         return mean.reshape(camera.height, camera.width, *channels)
 
     def _row_delays(self) -> NDArray[np.float64]:
-        """Return the begins of the rows' exposures after that of the middle row [us]; one for all with a global one."""
+        """Return how much later than the middle row's each row's exposure begins [us].
+
+        With a global shutter, there is one for all rows.
+        """
         readout_us = self._frames.readout_us
         height = self._frames.camera.height
         if not readout_us or height == 1:

@@ -116,7 +116,7 @@ def checked_colour(
 def in_channel(values: NDArray[Any], colour: Any, channel: int | None) -> NDArray[Any]:
     """Return luminances in a colour channel (0, 1, 2: red, green, blue); for None as they are.
 
-    ``colour``: relative colours, shape (3,) or that of ``values`` with a last axis of 3; None for grey.
+    ``colour``: relative colours, shape (3,), or the shape of ``values`` with a last axis of 3; None for grey.
     """
     if channel is None or colour is None:
         return values

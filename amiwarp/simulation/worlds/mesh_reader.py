@@ -190,8 +190,8 @@ def read_parts(
     """Read the parts of a mesh file, in the reading process.
 
     ``kind``: suffix of the file; ``turn``: matrix (3, 3) by which vertices are multiplied. The first value holds the
-    files that the mesh file refers to, and of each part the name, the reflectance and the shapes of its arrays:
-    those of :data:`Arrays`. A shape is None if the part has no such array.
+    files that the mesh file refers to, and of each part the name, the reflectance and the shapes of its arrays,
+    which :data:`Arrays` lists. A shape is None if the part has no such array.
     """
     scene, files = _open(Path(path), kind)
     parts: list[dict[str, Any]] = []
