@@ -124,7 +124,7 @@ class DepthEntry:
 
     rate_hz: float = 30.0
     nearest_m: float = 0.0
-    farthest_m: float = math.inf
+    farthest_m: float | None = None
 
 
 _PLACE = tuple(PlaceEntry.__dataclass_fields__)

@@ -17,7 +17,7 @@ from amiwarp.schema.calls import guarded
 from amiwarp.simulation.choices import FrameEncoding, Seeing
 from amiwarp.simulation.encoder_model import EncoderModel
 from amiwarp.simulation.imu_model import ImuModel
-from amiwarp.simulation.motion import Mirror, PrismMotion, Steerer, Vibration
+from amiwarp.simulation.motion import LONGEST_S, Mirror, PrismMotion, Steerer, Vibration
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.world_scene import BLUR_PX
 from amiwarp.validation import array, choice, instance, real, whole
@@ -28,6 +28,8 @@ FASTEST_HZ = 1e5
 """Largest rate of frames [1/s]."""
 LONGEST_US = 10_000_000
 """Longest exposure or readout [us]."""
+MOST_FRAMES = 1_000_000
+"""Largest number of frames of a recording."""
 MOST_ELECTRONS = 1e9
 """Largest number of electrons of a pixel."""
 
@@ -111,6 +113,8 @@ class RigEventCamera(_OnRig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "seeing", choice(Seeing, self.seeing, "seeing"))
+        real(self.motion_px, "motion_px", 0.01, 2.0, " px")
         if self.truth_hz is not None:
             real(self.truth_hz, "truth_hz", 1e-3, 1e6, " 1/s")
 
@@ -163,13 +167,15 @@ class RigFrameCamera(_OnRig):
         hint = " us, at most the time between two frames"
         whole(self.exposure_us, "exposure_us", 1, longest, hint)
         whole(self.readout_us, "readout_us", 0, longest, hint)
-        if self.bits not in (8, 16):
+        if whole(self.bits, "bits", 8, 16) not in (8, 16):
             raise AmiwarpError(f"bits is {self.bits}; give 8 or 16")
         object.__setattr__(self, "encoding", choice(FrameEncoding, self.encoding, "encoding"))
         object.__setattr__(self, "white", real(self.white, "white", 1e-6, 1e6))
         if self.electrons is not None:
-            real(self.electrons, "electrons", 1.0, MOST_ELECTRONS)
-        real(self.read_noise, "read_noise", 0.0, MOST_ELECTRONS, " electrons")
+            electrons = real(self.electrons, "electrons", 1.0, MOST_ELECTRONS)
+            object.__setattr__(self, "electrons", electrons)
+        read_noise = real(self.read_noise, "read_noise", 0.0, MOST_ELECTRONS, " electrons")
+        object.__setattr__(self, "read_noise", read_noise)
         if self.read_noise and self.electrons is None:
             raise AmiwarpError(
                 f"read_noise is {self.read_noise:g}, but electrons is not given; give electrons, the number at white"
@@ -188,7 +194,7 @@ class RigFrameCamera(_OnRig):
         ndarray
             Begin and end [us], int64, shape ``(k, 2)``.
         """
-        free_us = round(1e6 * duration_s) - self.exposure_us - self.readout_us
+        free_us = duration_us_of(duration_s) - self.exposure_us - self.readout_us
         starts = starts_at(self.rate_hz, free_us) + self.readout_us // 2
         return np.stack([starts, starts + self.exposure_us], axis=1)
 
@@ -225,20 +231,20 @@ class RigDepthCamera(_OnRig):
     """Images per second. The first one is at 0."""
     nearest_m: float = field(default=0.0, kw_only=True)
     """Smallest depth that is measured [m]."""
-    farthest_m: float = field(default=math.inf, kw_only=True)
-    """Largest depth that is measured [m]."""
+    farthest_m: float | None = field(default=None, kw_only=True)
+    """Largest depth that is measured [m]; None for any."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "rate_hz", checked_rate(self.rate_hz))
         real(self.nearest_m, "nearest_m", 0.0, 1e6, " m")
-        if math.isfinite(self.farthest_m):
+        if self.farthest_m is not None:
             real(self.farthest_m, "farthest_m", 0.0, 1e6, " m")
-        if not self.nearest_m < self.farthest_m:
-            raise AmiwarpError(
-                f"nearest_m is {self.nearest_m:g} and farthest_m {self.farthest_m:g}; give a nearer limit that is "
-                "smaller"
-            )
+            if not self.nearest_m < self.farthest_m:
+                raise AmiwarpError(
+                    f"nearest_m is {self.nearest_m:g} and farthest_m {self.farthest_m:g}; give a nearer limit that is "
+                    "smaller"
+                )
 
     def times(self, duration_s: float) -> NDArray[np.int64]:
         """Return the times of the images.
@@ -253,7 +259,7 @@ class RigDepthCamera(_OnRig):
         ndarray
             Times [us], int64, shape ``(k,)``.
         """
-        return starts_at(self.rate_hz, round(1e6 * duration_s))
+        return starts_at(self.rate_hz, duration_us_of(duration_s))
 
 
 RigCamera = RigEventCamera | RigFrameCamera | RigDepthCamera
@@ -265,10 +271,19 @@ def checked_rate(rate_hz: float) -> float:
     return real(rate_hz, "rate_hz", 1e-3, FASTEST_HZ, " 1/s")
 
 
+def duration_us_of(duration_s: float) -> int:
+    """Return a duration [us]. Raises :class:`AmiwarpError` if it is out of range."""
+    return round(1e6 * real(duration_s, "duration_s", 0.0, LONGEST_S, " s"))
+
+
 def starts_at(rate_hz: float, latest_us: int) -> NDArray[np.int64]:
     """Return the times k / ``rate_hz`` from 0 to ``latest_us``, rounded [us], shape (n,); none if it is negative."""
     if latest_us < 0:
         return np.zeros(0, np.int64)
     count = math.floor(latest_us * rate_hz / 1e6 + 1e-9) + 1  # rounding must not lose the last
+    if count > MOST_FRAMES:
+        raise AmiwarpError(
+            f"rate_hz {rate_hz:g} gives {count:,} frames; the limit is {MOST_FRAMES:,}; give a lower rate"
+        )
     times = np.rint(np.arange(count) * (1e6 / rate_hz)).astype(np.int64)
     return times[times <= latest_us]

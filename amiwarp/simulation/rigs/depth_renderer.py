@@ -31,7 +31,9 @@ class DepthRenderer:
         self._world.set_instants(t)
         depth = surfaces_at(self._world, self._rays, rotation, position).depth.copy()
         is_sky = np.isinf(depth)
-        out_of_range = (depth < self._depths.nearest_m) | (depth > self._depths.farthest_m)
+        out_of_range = depth < self._depths.nearest_m
+        if self._depths.farthest_m is not None:
+            out_of_range |= depth > self._depths.farthest_m
         depth[(out_of_range & ~is_sky) | self._no_ray] = np.nan
         camera = self._depths.camera
         return depth.reshape(camera.height, camera.width)

@@ -173,7 +173,9 @@ class Rig:
         >>> list(rig.sensors)
         ['ami', 'plain', 'colour', 'grey', 'depth']
         """
-        of_world, way = open_world(world, trajectory, seed=seed, duration_s=duration_s)
+        of_world, way = open_world(
+            instance(world, str, "world"), trajectory, seed=seed, duration_s=duration_s
+        )
         return cls(of_world, way, paper_platform(size, apex), duration_s, seed, device)
 
     def trajectory_of(self, name: str) -> Trajectory:
@@ -209,6 +211,7 @@ class Rig:
         int
             Seed, which depends on the name and :attr:`seed` only.
         """
+        self._sensor(name)  # its check
         digest = hashlib.sha256(f"{self.seed} {name}".encode()).digest()
         return int.from_bytes(digest[:4], "big") >> 1
 
@@ -410,7 +413,7 @@ class Rig:
 
     def _sensor(self, name: str) -> RigCamera:
         """Return a sensor by name. Raises :class:`AmiwarpError` if the rig has no such sensor."""
-        sensor = self.sensors.get(name)
+        sensor = self.sensors.get(instance(name, str, "name of a sensor"))
         if sensor is None:
             raise AmiwarpError(
                 f"rig has no sensor {shown(name)}; choose among {', '.join(self.sensors)}"

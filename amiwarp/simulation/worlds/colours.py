@@ -99,7 +99,8 @@ def checked_colour(
 
     Raises :class:`AmiwarpError` for other shapes, and for colours whose luminance is not 1.
     """
-    values = array(colour, what).astype(np.float32)
+    with np.errstate(over="ignore"):  # infinity is refused
+        values = array(colour, what).astype(np.float32)
     if values.shape not in shapes or not (np.isfinite(values).all() and values.min() >= 0.0):
         allowed = " or ".join(str(shape) for shape in shapes)
         raise AmiwarpError(f"{what} has shape {values.shape}; give values >= 0, {allowed}")
