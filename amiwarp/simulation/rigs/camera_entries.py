@@ -127,6 +127,12 @@ class DepthEntry:
     farthest_m: float | None = None
 
 
+_OWN: dict[SensorKind, type[Any]] = {
+    SensorKind.EVENTS: EventEntry,
+    SensorKind.FRAMES: FrameEntry,
+    SensorKind.DEPTH: DepthEntry,
+}
+"""Fields of each kind of camera."""
 _PLACE = tuple(PlaceEntry.__dataclass_fields__)
 _PARTS = ("optic", "sensor", "encoder", "imu")
 """Fields of an event camera that are tables."""
@@ -136,7 +142,7 @@ def read_camera(data: dict[str, Any], where: str, folder: Path) -> RigCamera:
     """Return the camera of an entry of ``sensors``, without its name. ``folder``: folder of the files that it names."""
     check_given(data, where, "kind")
     kind = value_of(SensorKind, data["kind"], f"{where}.kind")
-    own = {SensorKind.EVENTS: EventEntry, SensorKind.FRAMES: FrameEntry}.get(kind, DepthEntry)
+    own = _OWN[kind]
     names = tuple(own.__dataclass_fields__)
     parts = _PARTS if kind is SensorKind.EVENTS else ()
     fields_of(data, where, "kind", optional=("camera", *_PLACE, *names, *parts))
@@ -145,7 +151,7 @@ def read_camera(data: dict[str, Any], where: str, folder: Path) -> RigCamera:
         return {name: data[name] for name in known if name in data}
 
     place = build(PlaceEntry, given(_PLACE), where)
-    shared = {
+    shared: dict[str, Any] = {
         "camera": _intrinsics(data.get("camera", {}), f"{where}.camera", folder),
         "to_rig": at_field(where, place.matrix),
     }

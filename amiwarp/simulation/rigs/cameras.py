@@ -65,13 +65,10 @@ class _OnRig:
     to_rig: ArrayLike = field(default_factory=at_origin, kw_only=True)
     """Matrix that turns points in the camera's frame (x right, y down, z forward) into the rig's frame, shape ``(3,
     4)``: rotation, and place [m] in the last column."""
-    blur: float = field(default=BLUR_PX, kw_only=True)
-    """Standard deviation of the optical blur, including the area of the pixel [px]."""
 
     def __post_init__(self) -> None:
         instance(self.camera, Camera, "rig's camera")
         object.__setattr__(self, "to_rig", checked_place(self.to_rig))
-        object.__setattr__(self, "blur", real(self.blur, "blur", 0.0, 20.0, " px"))
 
 
 @guarded
@@ -102,6 +99,8 @@ class RigEventCamera(_OnRig):
     """Thresholds and hot and dead pixels; None to draw them by the sensor's model."""
     imu: ImuModel | None = field(default=None, kw_only=True)
     """Gyroscope and accelerometer that move with the camera; None for a recording without."""
+    blur: float = field(default=BLUR_PX, kw_only=True)
+    """Standard deviation of the optical blur, including the area of the pixel [px]."""
     seeing: Seeing = field(default=Seeing.MAPS, kw_only=True)
     """Method by which the light that each pixel receives is computed."""
     samples: int | None = field(default=None, kw_only=True)
@@ -113,6 +112,7 @@ class RigEventCamera(_OnRig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "blur", real(self.blur, "blur", 0.0, 20.0, " px"))
         object.__setattr__(self, "seeing", choice(Seeing, self.seeing, "seeing"))
         real(self.motion_px, "motion_px", 0.01, 2.0, " px")
         if self.truth_hz is not None:
@@ -157,11 +157,14 @@ class RigFrameCamera(_OnRig):
     """Electrons of a pixel at ``white``, which determine the shot noise; None for frames without noise."""
     read_noise: float = field(default=0.0, kw_only=True)
     """Standard deviation of the readout noise [electrons]. Needs ``electrons``."""
+    blur: float = field(default=BLUR_PX, kw_only=True)
+    """Standard deviation of the optical blur, including the area of the pixel [px]."""
     samples: int | None = field(default=None, kw_only=True)
     """Number of rays per pixel and instant: 1, 4, 9 or 16; None stands for 4."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        object.__setattr__(self, "blur", real(self.blur, "blur", 0.0, 20.0, " px"))
         object.__setattr__(self, "rate_hz", checked_rate(self.rate_hz))
         longest = min(LONGEST_US, math.floor(1e6 / self.rate_hz))
         hint = " us, at most the time between two frames"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -173,9 +173,9 @@ class Rig:
         >>> list(rig.sensors)
         ['ami', 'plain', 'colour', 'grey', 'depth']
         """
-        of_world, way = open_world(
-            instance(world, str, "world"), trajectory, seed=seed, duration_s=duration_s
-        )
+        for what, name in (("world", world), ("trajectory", trajectory)):
+            instance(name, str, what)
+        of_world, way = open_world(world, trajectory, seed=seed, duration_s=duration_s)
         return cls(of_world, way, paper_platform(size, apex), duration_s, seed, device)
 
     def trajectory_of(self, name: str) -> Trajectory:
@@ -366,8 +366,10 @@ class Rig:
     def _scene_of(self, name: str) -> WorldScene:
         """Return the scene of a camera without events."""
         sensor = self._sensor(name)
-        samples = sensor.samples if isinstance(sensor, RigFrameCamera) else None
-        return WorldScene(self.world, self.trajectory_of(name), sensor.blur, samples=samples)
+        scene = WorldScene(self.world, self.trajectory_of(name))
+        if isinstance(sensor, RigFrameCamera):
+            return replace(scene, blur=sensor.blur, samples=sensor.samples)
+        return scene
 
     def _frames(
         self, name: str, sensor: RigFrameCamera | RigDepthCamera, progress: Progress

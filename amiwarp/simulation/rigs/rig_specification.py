@@ -101,7 +101,7 @@ def load_rig(
     """
     path = Path(path)
     data = read_toml(path, "a rig")
-    overriding = {"duration_s": duration_s, "seed": seed}
+    overriding: dict[str, Any] = {"duration_s": duration_s, "seed": seed}
     given = {name: value for name, value in overriding.items() if value is not None}
     with errors_name(path, lambda: "is no file of a rig"):
         check_given(data, "", "format", "version")
