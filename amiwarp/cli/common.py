@@ -663,8 +663,12 @@ def _option_parameters(group: type) -> list[inspect.Parameter]:
 
 def given_options(context: typer.Context) -> list[str]:
     """Return the names of the parameters that the command line gives. ``context``: parameter of the command."""
-    names = list(context.params)
-    return [name for name in names if context.get_parameter_source(name).name != "DEFAULT"]
+    given = []
+    for name in context.params:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name != "DEFAULT":
+            given.append(name)
+    return given
 
 
 def choose_device(name: str | None) -> str:

@@ -44,7 +44,11 @@ AVERAGE_S = 600.0
 minutes."""
 WITH_RIG = ("out", "rig_file", "world", "trajectory", "duration", "seed", "json", "device", "force")
 """Parameters that may be given with ``--rig``; all others are in its file."""
-UNITS = {"events": "events", "frames": "frames", "depth": "depth images"}
+UNITS = {
+    SensorKind.EVENTS: "events",
+    SensorKind.FRAMES: "frames",
+    SensorKind.DEPTH: "depth images",
+}
 """What each kind of sensor records."""
 _in_scene = partial(typer.Option, rich_help_panel="Scene")
 
@@ -271,9 +275,8 @@ def write_rig(rig_file: Path, out: Path, chosen: Mapping[str, Any], common: cli.
         f"{out}: {len(counts)} sensors in the world {rig.world.name}, seed {rig.seed}, {rig.duration_s:.6g} s "
         f"simulated in {seconds:.2f} s on {rig.device}"
     ]
-    for name, kept in counts.items():
-        what = UNITS[kept["kind"]]
-        lines.append(f"  {name}: {kept['count']:,} {what}")
+    for name, sensor in recorded.sensors.items():
+        lines.append(f"  {name}: {counts[name]['count']:,} {UNITS[sensor.kind]}")
     cli.report(common, data, lines)
 
 

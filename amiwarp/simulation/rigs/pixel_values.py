@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,8 +14,11 @@ from amiwarp.simulation.rigs.cameras import RigFrameCamera
 
 def pixel_values(
     frames: RigFrameCamera, light: NDArray[np.float32], rng: np.random.Generator
-) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Return the values of a frame as its camera gives them, of the shape of ``light``, the luminance of its pixels."""
+) -> NDArray[Any]:
+    """Return the values of a frame as its camera gives them, uint8 or uint16, of the shape of ``light``.
+
+    ``light``: luminance of the pixels.
+    """
     share = light.astype(np.float64) / frames.white
     if frames.electrons is not None:
         # More electrons than at white are clipped below in any case.

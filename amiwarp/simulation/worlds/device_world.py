@@ -76,8 +76,9 @@ class DeviceWorld:
     def sharing(self) -> DeviceWorld:
         """Return the same world with instants of its own, which shares everything else."""
         other = copy(self)
-        other.params = kernels.World()
-        other.params.assign(self.params)
+        params: Any = kernels.World()
+        params.assign(self.params)
+        other.params = params
         other._shared = self  # keeps it in use
         return other
 
