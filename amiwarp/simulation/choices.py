@@ -41,7 +41,7 @@ class FrameEncoding(Option):
 
     Examples
     --------
-    >>> FrameEncoding("linear")
+    >>> amiwarp.FrameEncoding("linear")
     <FrameEncoding.LINEAR: 'linear'>
     """
 

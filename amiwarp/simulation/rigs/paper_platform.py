@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.imu_model import ImuModel
 from amiwarp.simulation.rigs.cameras import (
@@ -17,6 +18,7 @@ from amiwarp.simulation.rigs.cameras import (
     RigFrameCamera,
 )
 from amiwarp.simulation.sensor_model import SensorModel
+from amiwarp.validation import vector, whole
 
 PAPER_PLATFORM = "paper-platform"
 """Name of the platform in rig files."""
@@ -39,14 +41,15 @@ def paper_platform(size: tuple[int, int] = VGA, apex: float = APEX) -> dict[str,
     """
     dvxplorer = SensorModel.preset("dvxplorer")
     imu = ImuModel.preset("bmi160")
-    events = Camera.from_fov(*size, EVENT_FOV)
-    stereo = Camera.from_fov(*size, STEREO_FOV)
+    width, height = vector(size, 2, "size", partial(whole, low=1, high=LARGEST_SIZE, hint=" px"))
+    events = Camera.from_fov(width, height, EVENT_FOV)
+    stereo = Camera.from_fov(width, height, STEREO_FOV)
     d435 = _placed(0.035, -0.06)  # its left imager, the origin of its depth
     return {
         "ami": RigEventCamera(events, Prism(apex), motion=RPM, sensor=dvxplorer, imu=imu),
         "plain": RigEventCamera(events, to_rig=_placed(0.07, 0.0), sensor=dvxplorer, imu=imu),
         "colour": RigFrameCamera(
-            Camera.from_fov(*size, COLOUR_FOV),
+            Camera.from_fov(width, height, COLOUR_FOV),
             to_rig=_placed(0.05, -0.06),
             colour=True,
             exposure_us=8000,
