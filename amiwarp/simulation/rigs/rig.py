@@ -175,8 +175,9 @@ class Rig:
         """
         for what, name in (("world", world), ("trajectory", trajectory)):
             instance(name, str, what)
+        sensors = paper_platform(size, apex)  # first, because its checks are fast
         of_world, way = open_world(world, trajectory, seed=seed, duration_s=duration_s)
-        return cls(of_world, way, paper_platform(size, apex), duration_s, seed, device)
+        return cls(of_world, way, sensors, duration_s, seed, device)
 
     def trajectory_of(self, name: str) -> Trajectory:
         """Return the trajectory of a camera: the rig's, composed with the place of the camera at every instant.
