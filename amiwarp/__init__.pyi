@@ -201,6 +201,7 @@ from .sensors.event_camera import EventCamera as EventCamera
 from .sensors.rays import Rays as Rays
 from .sensors.renderer import Renderer as Renderer
 from .sensors.renderer import Surfaces as Surfaces
+from .simulation.choices import FrameEncoding as FrameEncoding
 from .simulation.choices import Seeing as Seeing
 from .simulation.description import Frames as Frames
 from .simulation.description import Scene as Scene
@@ -220,6 +221,11 @@ from .simulation.pictures import PictureFolder as PictureFolder
 from .simulation.pictures import Pictures as Pictures
 from .simulation.pictures import PictureStack as PictureStack
 from .simulation.pictures import VideoFile as VideoFile
+from .simulation.rigs.cameras import RigDepthCamera as RigDepthCamera
+from .simulation.rigs.cameras import RigEventCamera as RigEventCamera
+from .simulation.rigs.cameras import RigFrameCamera as RigFrameCamera
+from .simulation.rigs.rig import Rig as Rig
+from .simulation.rigs.rig_specification import load_rig as load_rig
 from .simulation.sensor_model import SensorModel as SensorModel
 from .simulation.simulator import Simulation as Simulation
 from .simulation.simulator import simulate as simulate

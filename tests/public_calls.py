@@ -96,6 +96,7 @@ POSES = aw.Poses(np.array([0]), np.array([[0.0, 0, 0, 0, 0, 0, 1]]))
 IMU = aw.ImuSamples(np.array([0, 5]), np.zeros((2, 3)), np.zeros((2, 3)))
 IMAGES = aw.MemoryImages(np.array([0, 5]), np.zeros((2, 3, 4), np.uint8))
 RIG_SENSOR = aw.RigSensor("events", RECORDING, np.eye(3, 4))
+SIMULATED_RIG = aw.Rig(WORLD, STILL, {"left": aw.RigEventCamera(CAMERA)}, 0.001)
 RIG = aw.RigRecording({"left": RIG_SENSOR})
 STAGE = aw.SearchStage(
     algorithm="a",
@@ -522,6 +523,16 @@ OWN: dict[str, dict[str, Any]] = {
     "Trajectory.still": {"position": (0, 0, 0)},
     "Trajectory.save_tum": {"path": _new(".tum")},
     "load_world": {"path": "none.toml"},
+    "load_rig": {"path": "none.toml"},
+    "Rig": {"sensors": SIMULATED_RIG.sensors, "trajectory": STILL, "duration_s": 0.001},
+    "Rig.paper_platform": {"size": (4, 3), "duration_s": 0.1},
+    "Rig.seed_of": {"name": "left"},
+    "Rig.simulation": {"name": "left"},
+    "Rig.trajectory_of": {"name": "left"},
+    "Rig.write": {"folder": _new("")},
+    "RigDepthCamera.times": {"duration_s": 0.1},
+    "RigFrameCamera.exposures": {"duration_s": 0.1},
+    "RigFrameCamera.times": {"duration_s": 0.1},
     "DatasetPlan": {
         "recordings": 1,
         "missing": 0,
@@ -616,6 +627,9 @@ OBJECTS: dict[str, Any] = {
     "TruthRenderer": aw.TruthRenderer(IN_WORLD),
     "Trajectory": STILL,
     "MemoryImages": IMAGES,
+    "Rig": SIMULATED_RIG,
+    "RigDepthCamera": aw.RigDepthCamera(CAMERA),
+    "RigFrameCamera": aw.RigFrameCamera(CAMERA),
     "RigRecording": RIG,
     "EventFilter": aw.EventFilter(every=2),
     "BytesDecoder": aw.BytesDecoder("dat2"),
@@ -660,6 +674,7 @@ REFUSED = {
     "depth": "depth is not determined",
     "pixel_thresholds": "no pixel fires twice",
     "load_world": "no such file",
+    "load_rig": "no such file",
     "export_dataset": "has no manifest.json",
     "plan_dataset": "no such file",
     "make_dataset": "no such file",

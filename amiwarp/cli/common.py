@@ -550,6 +550,9 @@ OUTPUT = "output"
 OUTPUT_FOLDER = "output folder"
 """Mark in ``Annotated`` of an option that names a folder to write to. The command itself checks the files in it."""
 
+OUTPUT_EITHER = "output file or folder"
+"""Mark in ``Annotated`` of an option that names a file to write, or a folder, in which the command checks the files."""
+
 NO_FILE = "no file"
 """Mark in ``Annotated`` of an option with a path that is neither read nor written as a file."""
 
@@ -594,7 +597,7 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
     marks = {}
     for parameter in parameters:
         marks[parameter.name] = getattr(parameter.annotation, "__metadata__", ())
-    writes = any(OUTPUT in mark or OUTPUT_FOLDER in mark for mark in marks.values())
+    writes = any(_WRITTEN & set(mark) for mark in marks.values())
     if writes:
         parameters.append(
             inspect.Parameter(
@@ -608,14 +611,12 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
         paths = list(_paths(values))
         for _, path in paths:
             check_name_lengths(path)
-        inputs = [
-            path for name, path in paths if not {OUTPUT, OUTPUT_FOLDER, NO_FILE} & set(marks[name])
-        ]
+        inputs = [path for name, path in paths if not {*_WRITTEN, NO_FILE} & set(marks[name])]
         for path in inputs:
             # The command itself reports missing files and folders.
             if path.exists() and not path.is_dir():
                 check_regular(path)
-        outputs = [path for name, path in paths if OUTPUT in marks[name]]
+        outputs = [path for name, path in paths if _is_written_file(path, marks[name])]
         for group_name, (group, names) in groups.items():
             values[group_name] = group(**{name: values.pop(name) for name in names})
         with protecting_files(inputs, outputs, overwrite=force):
@@ -625,6 +626,15 @@ def command(app: typer.Typer, function: Callable[..., None], *, name: str, examp
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     app.command(name, epilog=f"[bold]Example:[/bold] {example}", help=inspect.getdoc(function))(run)
+
+
+_WRITTEN = {OUTPUT, OUTPUT_FOLDER, OUTPUT_EITHER}
+"""Marks of options that name what is written."""
+
+
+def _is_written_file(path: Path, marks: Sequence[object]) -> bool:
+    """Return whether a path of an option with these marks is a file to write, as far as it is known."""
+    return OUTPUT in marks or (OUTPUT_EITHER in marks and not path.is_dir())
 
 
 def _paths(values: Mapping[str, Any]) -> Iterator[tuple[str, Path]]:
@@ -648,7 +658,17 @@ def _option_parameters(group: type) -> list[inspect.Parameter]:
     return parameters
 
 
-# What commands do alike: choice of the device, progress bar, printed result.
+# What commands do alike: given options, choice of the device, progress bar, printed result.
+
+
+def given_options(context: typer.Context) -> list[str]:
+    """Return the names of the parameters that the command line gives. ``context``: parameter of the command."""
+    given = []
+    for name in context.params:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name != "DEFAULT":
+            given.append(name)
+    return given
 
 
 def choose_device(name: str | None) -> str:

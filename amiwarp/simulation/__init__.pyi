@@ -1,5 +1,6 @@
 # Public names of this room. Written by .ci/public_names.py from the front door's.
 
+from .choices import FrameEncoding as FrameEncoding
 from .choices import Seeing as Seeing
 from .description import Frames as Frames
 from .description import Scene as Scene
@@ -19,6 +20,11 @@ from .pictures import PictureFolder as PictureFolder
 from .pictures import PictureStack as PictureStack
 from .pictures import Pictures as Pictures
 from .pictures import VideoFile as VideoFile
+from .rigs.cameras import RigDepthCamera as RigDepthCamera
+from .rigs.cameras import RigEventCamera as RigEventCamera
+from .rigs.cameras import RigFrameCamera as RigFrameCamera
+from .rigs.rig import Rig as Rig
+from .rigs.rig_specification import load_rig as load_rig
 from .sensor_model import SensorModel as SensorModel
 from .simulator import Simulation as Simulation
 from .simulator import simulate as simulate

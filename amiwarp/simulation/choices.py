@@ -34,3 +34,18 @@ class Seeing(Option):
     """
     RAYS = "rays"
     """Cast rays from every pixel through the prism into the world at every time step: exact, but slow on a CPU."""
+
+
+class FrameEncoding(Option):
+    """Relation between the values of a simulated camera's frames and the light.
+
+    Examples
+    --------
+    >>> amiwarp.FrameEncoding("linear")
+    <FrameEncoding.LINEAR: 'linear'>
+    """
+
+    SRGB = "srgb"
+    """Values as in picture files and on screens (sRGB, IEC 61966-2-1)."""
+    LINEAR = "linear"
+    """Values proportional to the light."""

@@ -34,7 +34,7 @@ from amiwarp.simulation.picture_maps import MapRing, place_scene
 from amiwarp.simulation.readout import Readout
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.view import prism_view_of, seen_bearings, shake
-from amiwarp.simulation.worlds.device_world import DeviceWorld
+from amiwarp.simulation.worlds.device_world import device_world
 from amiwarp.simulation.worlds.image_speed import (
     flicker_interval_s,
     image_speed,
@@ -87,7 +87,7 @@ def surroundings(simulation: SimulationValues, device: Any) -> Surroundings:
 
 def world_around(simulation: SimulationValues, scene: WorldScene, device: Any) -> Surroundings:
     """Place the world of a simulation around its camera."""
-    world = DeviceWorld(scene.world, device)
+    world = device_world(scene.world, device)
     speed = image_speed(world, simulation, scene)
     flicker_s = flicker_interval_s(scene.world)
     inverse_depth = 0.0
@@ -390,6 +390,17 @@ def empty_block(count: int, device: Any) -> Any:
     block.points = wp.empty(count, dtype=wp.vec2, device=device)
     block.ticks = wp.empty(count, dtype=int, device=device)
     return block
+
+
+def steps_of(simulation: SimulationValues, t_us: NDArray[np.float64], device: Any) -> Any:
+    """Return the kernels' instants at times [us], for all that only looks through the optic."""
+    first, second = true_angles(simulation.prism_motion, t_us)
+    table: NDArray[Any] = np.zeros(len(t_us), cast("Any", prism_view.Step).numpy_dtype())
+    table["azimuth"] = azimuths_of(first)
+    table["second"] = second_bends(simulation, t_us, second)
+    steps = prism_view.Steps()
+    steps.at = wp.array(table, dtype=prism_view.Step, device=device)
+    return steps
 
 
 def true_angles(

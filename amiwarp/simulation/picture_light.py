@@ -37,6 +37,14 @@ def read_picture(path: str | Path) -> NDArray[np.float32]:
 
     Raises :class:`AmiwarpError` if the file cannot be read.
     """
+    return linear_luminance(read_pixels(path), name=str(path))
+
+
+def read_pixels(path: str | Path) -> NDArray[Any]:
+    """Return the pixel values of a picture file, as :func:`linear_luminance` takes them.
+
+    Raises :class:`AmiwarpError` if the file cannot be read.
+    """
     from PIL import Image
 
     try:
@@ -64,7 +72,7 @@ def read_picture(path: str | Path) -> NDArray[np.float32]:
                 f"{path} has values from {pixels.min()} to {pixels.max()}; save it with 16 bits, 0 to 65535"
             )
         pixels = pixels.astype(np.uint16)
-    return linear_luminance(pixels, name=str(path))
+    return pixels
 
 
 def linear_luminance(pixels: NDArray[Any], *, name: str = "picture") -> NDArray[np.float32]:
@@ -109,3 +117,8 @@ def srgb_to_linear(value: NDArray[Any]) -> NDArray[np.float32]:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(
         np.float32
     )
+
+
+def linear_to_srgb(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Convert linear intensity 0 .. 1 to sRGB values 0 .. 1 (IEC 61966-2-1)."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)

@@ -12,6 +12,7 @@ from amiwarp.events.truth import EventValues, FrameTruth, Truth
 from amiwarp.simulation.description import SimulationValues
 from amiwarp.simulation.known_pixels import KnownPixels
 from amiwarp.simulation.truth_renderer import TruthRenderer
+from amiwarp.simulation.worlds.world import World
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.validation import TIME_LIMIT, array, real, shown
 
@@ -79,10 +80,7 @@ class RecordedTruth:
     @property
     def labels(self) -> truth.WorldLabels | None:
         """Names and classes of the instances in the world; None for a picture scene."""
-        if self._scene is None:
-            return None
-        world = self._scene.world
-        return truth.WorldLabels(world.name, world.instances, world.categories)
+        return None if self._scene is None else labels_of(self._scene.world)
 
     def frames_before(self, t_us: int) -> Iterator[FrameTruth]:
         """Yield the ground truth of the remaining instants before ``t_us`` [us].
@@ -149,6 +147,11 @@ class RecordedTruth:
             poses=poses,
             known=masks,
         )
+
+
+def labels_of(world: World) -> truth.WorldLabels:
+    """Return the names and classes of the instances in a world."""
+    return truth.WorldLabels(world.name, world.instances, world.categories)
 
 
 def poses_at(scene: WorldScene, t_us: NDArray[np.int64]) -> Poses:

@@ -297,3 +297,12 @@ def _real_or_none(value: float | None, what: str, least: float, limit: float) ->
     """Return a value that must lie between ``least`` and ``limit``; return 0.0 if the value is None or 0."""
     number = 0.0 if value is None else real(value, what, 0.0, limit)
     return number if number == 0.0 else real(number, what, least, limit, " (or 0 for none)")
+
+
+def named_sensor(name: str) -> SensorModel:
+    """Return the sensor of a name in a file: ``default``, ``ideal``, or a preset of :class:`SensorModel`."""
+    if name == "default":
+        return SensorModel()
+    if name == "ideal":
+        return SensorModel.ideal()
+    return SensorModel.preset(name)

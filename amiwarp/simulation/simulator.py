@@ -21,20 +21,24 @@ from amiwarp.optics.prism import Plate, Prism
 from amiwarp.results.pixel_map import PixelMap
 from amiwarp.schema.calls import guarded
 from amiwarp.simulation.description import Scene, SimulationValues
-from amiwarp.simulation.device_block import CollectedEvents, DeviceBlock
+from amiwarp.simulation.device_block import CollectedEvents
 from amiwarp.simulation.encoder_model import EncoderModel
-from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.imu_model import ImuModel
 from amiwarp.simulation.motion import (
     CameraMotion,
     Commanded,
     Mirror,
-    Moved,
     PrismMotion,
     Steerer,
     Vibration,
 )
 from amiwarp.simulation.picture_maps import log_view
+from amiwarp.simulation.recorded_simulation import (
+    blocks_of,
+    header_of,
+    stored_prism,
+    write_recording,
+)
 from amiwarp.simulation.recorded_truth import RecordedTruth, chosen_instants
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.true_parameters import true_parameters
@@ -148,7 +152,7 @@ class Simulation(SimulationValues):
             Events, and the scene point of each event: its pixel without prism and vibration [px], shape ``(n, 2)``, NaN
             if its ray misses the image plane.
         """
-        for block, _ in self._run_engine(chunk_us, progress):
+        for block, _ in blocks_of(self, chunk_us, progress):
             yield block.events(), block.points()
 
     def device_blocks(
@@ -171,18 +175,8 @@ class Simulation(SimulationValues):
             Events, and the scene point of each event, as in :meth:`blocks`: a Warp array of vec2, shape ``(n,)``, which
             other libraries read as ``(n, 2)``.
         """
-        for block, _ in self._run_engine(chunk_us, progress):
+        for block, _ in blocks_of(self, chunk_us, progress):
             yield block.on_device()
-
-    def _run_engine(
-        self, chunk_us: int | None, progress: Progress | None
-    ) -> Iterator[tuple[DeviceBlock, int]]:
-        """Yield the blocks of successive time spans, each with the end of its span [us]."""
-        engine = Engine(self, chunk_us)
-        for block in engine.run():
-            yield block, engine.now_us
-            if progress is not None:
-                progress("simulating", min(1.0, engine.now_us / self.duration_us))
 
     def log_view(self) -> NDArray[np.float32]:
         """Return the first picture as the camera sees it at t = 0 without the prism.
@@ -266,7 +260,7 @@ class Simulation(SimulationValues):
         """
         recorded = RecordedTruth(self, chosen_instants(self.duration_us, truth_hz, truth_times_us))
         collected = CollectedEvents(on_device=on_device)
-        for block, now_us in self._run_engine(None, progress):
+        for block, now_us in blocks_of(self, progress=progress):
             collected.add(block)
             recorded.keep(now_us)
         events, of_events = collected.take(self.camera.width, self.camera.height)
@@ -277,19 +271,12 @@ class Simulation(SimulationValues):
             events,
             camera,
             encoder,
-            self._stored_prism,
+            stored_prism(self),
             known,
             self.metadata(),
             "simulation",
             imu=self.imu_samples(),
         )
-
-    @property
-    def _stored_prism(self) -> Prism | Plate | None:
-        """Nominal prism or plate to store with the recording, or None for a camera without glass."""
-        glass = self.prism if isinstance(self.prism, Plate) else self.glass
-        moved = self.encoder_model is None or isinstance(self.prism, Moved)
-        return None if moved else self.nominal_prism or glass
 
     def write(
         self,
@@ -322,30 +309,9 @@ class Simulation(SimulationValues):
             Number of events.
         """
         recorded = RecordedTruth(self, chosen_instants(self.duration_us, truth_hz, truth_times_us))
-        with RecordingWriter(
-            path,
-            width=self.camera.width,
-            height=self.camera.height,
-            camera=self.camera,
-            prism=self._stored_prism,
-            encoder=self.encoder(),
-            truth_parameters=self.truth_parameters(),
-            truth_labels=recorded.labels,
-            metadata=self.metadata(),
-            overwrite=overwrite,
-        ) as writer:
-            imu = self.imu_samples()
-            if imu is not None:
-                writer.append_imu(imu)
-            for block, now_us in self._run_engine(None, progress):
-                writer.append(block.events(), truth=block.truth())
-                for frame in recorded.frames_before(now_us):
-                    writer.append_frame(frame)
-                for t_us, mask in recorded.known.take():
-                    writer.append_known(t_us, mask)
-                poses = recorded.poses_before(now_us)
-                if poses is not None:
-                    writer.append_poses(poses)
+        header = header_of(self, recorded)
+        with RecordingWriter(path, overwrite=overwrite, **header) as writer:
+            write_recording(self, recorded, writer, progress)
         return len(writer)
 
 

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, cast
 
 import numpy as np
-import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import OUTSIDE, FrameTruth
-from amiwarp.kernels import prism_view
 from amiwarp.optics.models.angles import wrap_angle
 from amiwarp.optics.models.plate import PlateModel
 from amiwarp.schema.calls import guarded
 from amiwarp.simulation.description import SimulationValues
-from amiwarp.simulation.engine import azimuths_of, second_bends, true_angles
+from amiwarp.simulation.engine import steps_of
 from amiwarp.simulation.motion import Moved
 from amiwarp.simulation.view import mirrored, prism_view_of
-from amiwarp.simulation.worlds.device_world import DeviceWorld
+from amiwarp.simulation.worlds.device_world import device_world
 from amiwarp.simulation.worlds.sight import WorldSight
 from amiwarp.simulation.worlds.surfaces import SurfaceView, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.world_scene import WorldScene
@@ -94,7 +91,7 @@ class TruthRenderer:
             )
         self._simulation = simulation
         self._scene = simulation.scene
-        self._world = DeviceWorld(self._scene.world, simulation.device)
+        self._world = device_world(self._scene.world, simulation.device)
         self._sight = WorldSight(simulation, self._scene, self._world)
         self._sight_at_rest = self._sight
         if isinstance(simulation.prism, Moved):
@@ -447,10 +444,5 @@ class TruthRenderer:
         sight.set_plate(self._simulation.plate if prism else None)
         instant = np.array([float(t_us)])
         sight.set_instants(instant, prism_view_of(simulation, device))
-        first, second = true_angles(simulation.prism_motion, instant)
-        table: NDArray[Any] = np.zeros(1, cast("Any", prism_view.Step).numpy_dtype())
-        table["azimuth"] = azimuths_of(first)
-        table["second"] = second_bends(simulation, instant, second)
-        steps = prism_view.Steps()
-        steps.at = wp.array(table, dtype=prism_view.Step, device=device)
+        steps = steps_of(simulation, instant, device)
         return np.array(sight.light(steps, 0, 1).numpy()[0])

@@ -27,7 +27,7 @@ from amiwarp.schema.records import (
     with_fields,
 )
 from amiwarp.simulation.motion import LONGEST_S, PrismMotion
-from amiwarp.simulation.sensor_model import SensorModel
+from amiwarp.simulation.sensor_model import SensorModel, named_sensor
 from amiwarp.validation import real, shown, whole
 
 FORMAT = "amiwarp-dataset-specification"
@@ -84,10 +84,6 @@ def _stratify(value: Any, name: str) -> str | Literal[False]:
     )
 
 
-_MAKERS: dict[str, Callable[[], SensorModel]] = {"default": SensorModel, "ideal": SensorModel.ideal}
-"""Sensors by name, in addition to the presets of :class:`SensorModel`."""
-
-
 def _sensors(value: Any, name: str) -> dict[str, SensorModel]:
     """Return the sensors by name. An entry is a name, or a table with a name, and optionally a preset and values."""
     if not isinstance(value, list) or not value:
@@ -112,13 +108,9 @@ def _sensors(value: Any, name: str) -> dict[str, SensorModel]:
                 f"field {where} has the name {world_name!r} of another sensor; give it its own name",
                 ErrorCode.FIELD,
             )
-        base = at_field(where, partial(_sensor, preset))
+        base = at_field(where, partial(named_sensor, preset))
         sensors[world_name] = with_fields(base, given, where)
     return sensors
-
-
-def _sensor(preset: str) -> SensorModel:
-    return _MAKERS[preset]() if preset in _MAKERS else SensorModel.preset(preset)
 
 
 def _label(value: Any, name: str) -> Any:

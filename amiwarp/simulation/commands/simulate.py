@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,8 @@ import typer
 
 from amiwarp.cli import common as cli
 from amiwarp.errors import AmiwarpError, ErrorCode
-from amiwarp.io import open_recording
+from amiwarp.events import SensorKind
+from amiwarp.io import open_recording, open_rig
 from amiwarp.results.pixel_map import PixelMap
 from amiwarp.simulation.choices import Optic
 from amiwarp.simulation.commands.rig_options import (
@@ -40,6 +42,14 @@ if TYPE_CHECKING:
 AVERAGE_S = 600.0
 """Time over which the speed of a simulation is averaged to predict its end [s]. A block of a slow world may take
 minutes."""
+WITH_RIG = ("out", "rig_file", "world", "trajectory", "duration", "seed", "json", "device", "force")
+"""Parameters that may be given with ``--rig``; all others are in its file."""
+UNITS = {
+    SensorKind.EVENTS: "events",
+    SensorKind.FRAMES: "frames",
+    SensorKind.DEPTH: "depth images",
+}
+"""What each kind of sensor records."""
 _in_scene = partial(typer.Option, rich_help_panel="Scene")
 
 
@@ -81,12 +91,27 @@ class SceneOptions:
 
 
 def run_simulate(
-    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), cli.OUTPUT],
+    context: typer.Context,
+    out: Annotated[
+        Path,
+        typer.Argument(help="Recording to write (.h5), or with --rig the folder of the rig."),
+        cli.OUTPUT_EITHER,
+    ],
     *,
     picture: Annotated[
         Path | None, typer.Option(help="Picture of the scene: JPEG, PNG, TIFF ...")
     ] = None,
-    duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 1.0,
+    rig_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--rig",
+            help="Rig of several cameras to simulate instead: a file (.toml) with its world, its motion and its "
+            "cameras. --world, --trajectory, --duration and --seed replace what it says.",
+        ),
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Length of the recording (s). Default: 1, or the rig's.")
+    ] = None,
     world: WorldOptions,
     scene: SceneOptions,
     vibration: VibrationOptions,
@@ -116,15 +141,24 @@ def run_simulate(
 ) -> None:
     """Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth.
 
+    With --rig, several cameras see a world at the same time.
     A picture lies at infinity. A world is three-dimensional, and the camera moves through it: give --world room.
     With --optic vibration, the camera vibrates instead of the prism; with --optic mirror, it looks at
     a mirror; with --optic steerer, through a beam steerer.
     """
     from amiwarp.simulation.simulator import Simulation
 
+    if rig_file is not None:
+        check_options_of_rig(context, rig_file)
+        chosen = {"duration_s": duration, "world": world.world, "trajectory": world.trajectory}
+        if "seed" in cli.given_options(context):
+            chosen["seed"] = common.seed
+        write_rig(rig_file, out, chosen, common)
+        return
     if (picture is None) == (world.world is None):
         raise typer.BadParameter("give one of them", param_hint="--picture, --world")
     world.check()
+    duration = 1.0 if duration is None else duration
     device = cli.choose_device(common.device)
     simulation = Simulation(
         _scene(picture, world, scene, duration, common.seed),
@@ -200,6 +234,56 @@ def write(
         "device": simulation.device,
     }
     cli.report(common, data, [_line(data)])
+
+
+def check_options_of_rig(context: typer.Context, rig_file: Path) -> None:
+    """Raise :class:`AmiwarpError` for an option that does not apply to a rig."""
+    for name in cli.given_options(context):
+        if name not in WITH_RIG:
+            option = f"--{name.replace('_', '-')}"
+            raise AmiwarpError(
+                f"{option} does not apply to --rig; write it into {rig_file}, or remove {option}",
+                ErrorCode.OPTIONS,
+            )
+
+
+def write_rig(rig_file: Path, out: Path, chosen: Mapping[str, Any], common: cli.Common) -> None:
+    """Simulate the rig of a file to the folder ``out`` and print the result.
+
+    ``chosen``: arguments of :func:`load_rig` that replace what the file says.
+    """
+    from amiwarp.simulation.rigs.rig_specification import load_rig
+
+    rig = load_rig(rig_file, device=cli.choose_device(common.device), **chosen)
+    began = time.perf_counter()
+    with cli.progress("simulating", average_s=AVERAGE_S) as advance:
+        rig.write(out, progress=advance)
+    recorded = open_rig(out)
+    counts = {}
+    for name, sensor in recorded.sensors.items():
+        kept = {
+            SensorKind.EVENTS: sensor.recording.events,
+            SensorKind.FRAMES: sensor.recording.frames,
+            SensorKind.DEPTH: sensor.recording.depth,
+        }
+        counts[name] = {"kind": sensor.kind.value, "count": len(kept[sensor.kind] or ())}
+    seconds = time.perf_counter() - began
+    data: dict[str, Any] = {
+        "folder": str(out),
+        "world": rig.world.name,
+        "seed": rig.seed,
+        "duration_s": rig.duration_s,
+        "sensors": counts,
+        "seconds": seconds,
+        "device": rig.device,
+    }
+    lines = [
+        f"{out}: {len(counts)} sensors in the world {rig.world.name}, seed {rig.seed}, {rig.duration_s:.6g} s "
+        f"simulated in {seconds:.2f} s on {rig.device}"
+    ]
+    for name, sensor in recorded.sensors.items():
+        lines.append(f"  {name}: {counts[name]['count']:,} {UNITS[sensor.kind]}")
+    cli.report(common, data, lines)
 
 
 def _line(data: dict[str, Any]) -> str:

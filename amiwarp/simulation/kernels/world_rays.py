@@ -58,8 +58,11 @@ class Batch:
     Arrays of a batch hold all pixels of one instant, row by row, after the pixels of the instant before.
     """
 
-    first: int  # index of the first instant in :class:`Steps`
+    first: int  # number of the first instant
     count: int  # number of instants
+    # Number of instants in :class:`Steps` for each instant of the batch: 1, or the height of the image if each of its
+    # rows has its own
+    rows: int
     hits: FirstHits  # result of the ray through the centre of each pixel
 
 
@@ -80,9 +83,9 @@ def sample_at(view: RayView, batch: Batch, j: int, i: int) -> Sample:
     s = Sample()
     s.base = j * (view.camera.width * view.camera.height)
     s.at = s.base + i
-    s.k = batch.first + j
     s.row = i / view.camera.width
     s.col = i - s.row * view.camera.width
+    s.k = (batch.first + j) * batch.rows + wp.min(s.row, batch.rows - 1)
     return s
 
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.schema.calls import guarded
+from amiwarp.simulation.worlds.colours import checked_colour
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.validation import array, real
 
@@ -37,6 +38,9 @@ class Mesh:
     """
     light: ArrayLike | None = None
     """Factor by which the reflectance is multiplied at each vertex, 0 to 1, shape ``(n,)``. None stands for 1."""
+    colour: ArrayLike | None = None
+    """Linear red, green and blue of ``light`` at each vertex, relative to it, shape ``(n, 3)``, as
+    :attr:`Material.colour`."""
 
     def __post_init__(self) -> None:
         vertices = array(self.vertices, "mesh's vertices").astype(np.float64)
@@ -67,6 +71,9 @@ class Mesh:
                         f"mesh's light is {values.min():g} .. {values.max():g}; give factors in 0 .. 1"
                     )
                 object.__setattr__(self, name, values)
+        if self.colour is not None:
+            colour = checked_colour(self.colour, ((len(vertices), 3),), "mesh's colour")
+            object.__setattr__(self, "colour", colour)
 
     @cached_property
     def bounding_sphere(self) -> tuple[NDArray[np.float64], float]:
@@ -89,7 +96,13 @@ class Material:
     The texture repeats beyond the range 0 to 1 of ``Mesh.uv``. None stands for the factor 1.
     """
     emission: float = 0.0
-    """Luminance that the surface emits, relative to a white surface in full light."""
+    """Luminance that the surface emits, relative to a white surface in full light. It is white."""
+    colour: ArrayLike | None = None
+    """Linear red, green and blue that the surface reflects, relative to its luminance, shape ``(3,)``, or ``(height,
+    width, 3)`` for each texel of the texture. None stands for grey.
+
+    Their luminance, ``0.2126 R + 0.7152 G + 0.0722 B``, is 1, so that event cameras see no colours.
+    """
 
     def __post_init__(self) -> None:
         object.__setattr__(
@@ -108,6 +121,12 @@ class Material:
                     f"material texture has shape {texture.shape}; give values >= 0, (height, width)"
                 )
             object.__setattr__(self, "texture", texture)
+        if self.colour is not None:
+            shapes: tuple[tuple[int, ...], ...] = ((3,),)
+            if self.texture is not None:
+                shapes = (*shapes, (*self.texture.shape, 3))
+            colour = checked_colour(self.colour, shapes, "material colour")
+            object.__setattr__(self, "colour", colour)
 
 
 @guarded

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from typing import Any, cast
+from weakref import WeakValueDictionary
 
 import numpy as np
 import warp as wp
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 
 from amiwarp.simulation.kernels import world as kernels
 from amiwarp.simulation.worlds.bodies import Body
+from amiwarp.simulation.worlds.colours import in_channel
 from amiwarp.simulation.worlds.world import World
 
 CUDA_TREE = "cubql"
@@ -21,6 +24,19 @@ Compared with Warp's default constructor, rays take 0.5 to 0.65 of the time on a
 """
 LARGEST_PYRAMID = 14
 """Largest number of levels (the texture and its halved copies) of a texture pyramid."""
+
+
+def device_world(world: World, device: Any) -> DeviceWorld:
+    """Return a world on a device, with instants of its own.
+
+    All that the device holds of a world is uploaded once, and shared as long as it is in use.
+    """
+    key = (id(world), str(wp.get_device(device)))
+    uploaded = _uploaded.get(key)
+    if uploaded is None:
+        uploaded = DeviceWorld(world, device)
+        _uploaded[key] = uploaded
+    return uploaded.sharing()
 
 
 class DeviceWorld:
@@ -37,15 +53,10 @@ class DeviceWorld:
         still = [body for body in world.bodies if body.name not in names]
         bodies = [*still, *self.movers]  # the kernels number the bodies in this order
 
-        # Materials. Their textures, and then the sky's, lie in one array.
-        texels = _Texels()
-        numbers = {label: k + 1 for k, label in enumerate(world.instances)}
-        surfaces = [_surface(body, numbers[body.instance or body.name], texels) for body in bodies]
+        self._bodies = bodies
         self.params = kernels.World()
         self.params.first_mover = len(still)
-        self._set_sky(texels)
-        self.params.surfaces = wp.array(surfaces, dtype=kernels.Surface, device=self.device)
-        self.params.texels = wp.array(texels.joined(), dtype=float, device=self.device)
+        surfaces = self._upload_materials(None)
         self._upload_light()
 
         # Shapes. Bodies at rest are given in the world's frame, moving bodies in their own.
@@ -59,15 +70,50 @@ class DeviceWorld:
             self.params.still = self._mesh(resting, still).id
         faces_at_rest = sum(len(np.asarray(body.mesh.faces)) for body in still)
         self._upload_movers(faces_at_rest)
+        self._shared: DeviceWorld | None = None
         self.set_instants(np.zeros(1))
+
+    def sharing(self) -> DeviceWorld:
+        """Return the same world with instants of its own, which shares everything else."""
+        other = copy(self)
+        params: Any = kernels.World()
+        params.assign(self.params)
+        other.params = params
+        other._shared = self  # keeps it in use
+        return other
+
+    def in_colour(self, channel: int) -> DeviceWorld:
+        """Return the same world as its red, green or blue light (0, 1, 2), with instants of its own."""
+        other = self.sharing()
+        other._upload_materials(channel)
+        return other
+
+    def _upload_materials(self, channel: int | None) -> list[Any]:
+        """Upload the materials of all bodies and the sky, and return the materials.
+
+        ``channel``: colour channel (0, 1, 2: red, green, blue), or None for the luminance.
+        """
+        # The textures, and then the sky's panorama, lie in one array.
+        texels = _Texels(channel)
+        numbers = {label: k + 1 for k, label in enumerate(self.world.instances)}
+        surfaces = []
+        shade = []
+        for body in self._bodies:
+            surfaces.append(_surface(body, numbers[body.instance or body.name], texels))
+            shade.append(_shade(body, channel))
+        self._set_sky(texels)
+        self.params.surfaces = wp.array(surfaces, dtype=kernels.Surface, device=self.device)
+        self.params.texels = wp.array(texels.joined(), dtype=float, device=self.device)
+        self.params.shade = self._floats(np.concatenate(shade))
+        return surfaces
 
     def _set_sky(self, texels: _Texels) -> None:
         """Describe the sky, and add its panorama to ``texels``."""
         sky = self.world.sky
-        self.params.sky = sky.luminance
+        self.params.sky = sky.luminance * texels.factor(sky.colour)
         self.params.panorama = -1
         if sky.panorama is not None:
-            self.params.panorama = texels.add(sky.panorama, 1)
+            self.params.panorama = texels.add(sky.panorama, sky.colour, 1)
             self.params.panorama_height, self.params.panorama_width = sky.panorama.shape
 
     def _mesh(self, vertices: Sequence[NDArray[np.float64]], bodies: Sequence[Body]) -> Any:
@@ -91,14 +137,13 @@ class DeviceWorld:
         vertices: Sequence[NDArray[np.float64]],
         surfaces: Sequence[Any],
     ) -> None:
-        """Upload the body number, corners, texture coordinates and reflectance factors of each face.
+        """Upload the body number, corners and texture coordinates of each face.
 
         ``vertices``: vertices of each body in the frame of its mesh on the device [m].
         """
         number = []
         corners = []
         uv = []
-        shade = []
         density = []
         for k, body in enumerate(bodies):
             mesh = body.mesh
@@ -106,17 +151,14 @@ class DeviceWorld:
             corner = faces.ravel()  # index of each corner's vertex
             count = len(np.asarray(mesh.vertices))
             place = np.zeros((count, 2)) if mesh.uv is None else np.asarray(mesh.uv)
-            light = np.ones(count) if mesh.light is None else np.asarray(mesh.light)
             number.append(np.full(len(faces), k, np.int32))
             corners.append(vertices[k][corner])
             uv.append(place[corner])
-            shade.append(light[corner])
             density.append(_density(mesh, place, surfaces[k]))
         places = np.concatenate(uv).astype(np.float32)
         self.params.body = wp.array(np.concatenate(number), dtype=int, device=self.device)
         self.params.corners = self._vectors(np.concatenate(corners))
         self.params.uv = wp.array(places, dtype=wp.vec2, device=self.device)
-        self.params.shade = self._floats(np.concatenate(shade))
         self.params.density = self._floats(np.concatenate(density))
 
     def _floats(self, values: NDArray[Any]) -> wp.array:
@@ -184,20 +226,38 @@ class DeviceWorld:
         self.params.lamp_light = self._floats(lights)
 
 
-class _Texels:
-    """Texels of all texture pyramids in one array."""
+_uploaded: WeakValueDictionary[tuple[int, str], DeviceWorld] = WeakValueDictionary()
+"""Worlds on devices that are in use, by the number of the world and the name of the device."""
 
-    def __init__(self) -> None:
+
+class _Texels:
+    """Texels of all texture pyramids in one array, as luminance or in one colour channel."""
+
+    def __init__(self, channel: int | None) -> None:
+        """Begin without textures. ``channel``: 0, 1, 2 for red, green, blue; None for the luminance."""
+        self._channel = channel
         self._parts: list[NDArray[np.float32]] = [np.zeros(1, np.float32)]
         self._count = 1
-        self._known: dict[int, int] = {}
+        self._known: dict[tuple[int, int], int] = {}
 
-    def add(self, texture: NDArray[np.float32], levels: int) -> int:
-        """Append a texture and its halved copies, ``levels`` in total; return the index of the first texel."""
-        if id(texture) in self._known:
-            return self._known[id(texture)]
+    def factor(self, colour: Any) -> float:
+        """Return the factor of the luminance of what has one colour; 1 for colours of texels."""
+        if colour is None or colour.ndim > 1:
+            return 1.0
+        return float(in_channel(np.ones(()), colour, self._channel))
+
+    def add(self, texture: NDArray[np.float32], colour: Any, levels: int) -> int:
+        """Append a texture and its halved copies, ``levels`` in total; return the index of the first texel.
+
+        ``colour``: relative colours of the texels, or one colour, which does not count here.
+        """
+        key = (id(texture), id(colour))
+        if key in self._known:
+            return self._known[key]
         first = self._count
-        self._known[id(texture)] = first
+        self._known[key] = first
+        if colour is not None and colour.ndim > 1:
+            texture = in_channel(texture, colour, self._channel)
         for level in range(levels):
             self._parts.append(np.ascontiguousarray(texture, np.float32).ravel())
             self._count += texture.size
@@ -230,15 +290,24 @@ def _surface(body: Body, number: int, texels: _Texels) -> Any:
     """
     material = body.material
     surface = kernels.Surface()
-    surface.reflectance = material.reflectance
+    surface.reflectance = material.reflectance * texels.factor(material.colour)
     surface.emission = material.emission
     surface.instance = number
     surface.texel = -1
     if material.texture is not None:
         surface.levels = min(LARGEST_PYRAMID, max(material.texture.shape).bit_length())
-        surface.texel = texels.add(material.texture, surface.levels)
+        surface.texel = texels.add(material.texture, material.colour, surface.levels)
         surface.height, surface.width = material.texture.shape
     return surface
+
+
+def _shade(body: Body, channel: int | None) -> NDArray[np.float64]:
+    """Return the factors of the reflectance at the corners of a body's faces, shape (3 * faces,)."""
+    mesh = body.mesh
+    light = np.ones(len(np.asarray(mesh.vertices)))
+    if mesh.light is not None:
+        light = np.asarray(mesh.light)
+    return in_channel(light, mesh.colour, channel)[np.asarray(mesh.faces).ravel()]
 
 
 def _resting(body: Body) -> NDArray[np.float64]:

@@ -162,8 +162,13 @@ class ImageSpeed:
 def image_speed(world: DeviceWorld, simulation: SimulationValues, scene: WorldScene) -> ImageSpeed:
     """Return the largest speeds of a world's image over the duration of a simulation."""
     t = np.linspace(0.0, simulation.duration_s, MOMENTS)
-    camera = simulation.camera
-    trajectory = scene.trajectory
+    return image_speed_at(world, simulation.camera, scene.trajectory, t)
+
+
+def image_speed_at(
+    world: DeviceWorld, camera: Camera, trajectory: Trajectory, t: NDArray[np.float64]
+) -> ImageSpeed:
+    """Return the largest speeds of a world's image at times [s], shape ``(n,)``."""
     world.set_instants(t)
     speed = movers_speed(world, camera, trajectory, t)
     if trajectory.moves:

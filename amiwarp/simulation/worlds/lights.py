@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.schema.calls import guarded
+from amiwarp.simulation.worlds.colours import checked_colour
 from amiwarp.validation import array, real, vector
 
 if TYPE_CHECKING:
@@ -82,6 +83,9 @@ class Sky:
     The picture is equirectangular with the elevation up: width and height cover 360 and 180 degrees, whatever their
     ratio. Its middle column shows the direction +x, its right half -y.
     """
+    colour: ArrayLike | None = None
+    """Linear red, green and blue relative to the luminance, shape ``(3,)``, or ``(height, width, 3)`` for each texel of
+    the panorama, as :attr:`Material.colour`. None stands for grey."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "luminance", real(self.luminance, "sky luminance", 0.0, 1e6))
@@ -97,3 +101,9 @@ class Sky:
                     f"sky panorama has shape {panorama.shape}; give values >= 0, (height, width)"
                 )
             object.__setattr__(self, "panorama", panorama)
+        if self.colour is not None:
+            shapes: tuple[tuple[int, ...], ...] = ((3,),)
+            if self.panorama is not None:
+                shapes = (*shapes, (*self.panorama.shape, 3))
+            colour = checked_colour(self.colour, shapes, "sky colour")
+            object.__setattr__(self, "colour", colour)

@@ -1,4 +1,6 @@
-"""Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh. Colours become luminance.
+"""Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh.
+
+Colours become luminance, and red, green and blue relative to it.
 
 A file of a few bytes may declare a mesh of many gigabytes, so trimesh runs in the reading process, which has limits
 of memory and processor time (:mod:`amiwarp.io.reading_process`).
@@ -26,6 +28,13 @@ from amiwarp.simulation.picture_light import (
     srgb_to_linear,
 )
 from amiwarp.simulation.worlds.bodies import Material, Mesh
+from amiwarp.simulation.worlds.colours import (
+    MOST_COLOURED,
+    colours_of_pixels,
+    has_no_colour,
+    is_grey,
+    split_colours,
+)
 from amiwarp.validation import one_of, real
 
 if TYPE_CHECKING:
@@ -58,11 +67,14 @@ MESH_SECONDS = 15.0
 
 A small file may refer to a texture of 67 million pixels, which takes 2.5 s to decode and convert on an idle core.
 """
+GREY_MODES = ("1", "L", "LA", "La", "I", "I;16", "F")
+"""Pillow's names of the kinds of pictures without colour."""
 DEFAULT_REFLECTANCE = 0.5
 """Reflectance of meshes whose file gives neither colours nor a material."""
 
 Arrays = tuple[NDArray[Any] | None, ...]
-"""Vertices, faces, texture coordinates, light and texture of a part; None for an array that it has not."""
+"""Vertices, faces, texture coordinates, light and its colour, texture and its pixels in colour, and relative colour of
+the material of a part; None for an array that it has not."""
 
 
 class LoadedMesh(NamedTuple):
@@ -71,7 +83,7 @@ class LoadedMesh(NamedTuple):
     mesh: Mesh
     """Triangles in the frame of the file, turned so that z points up [m]."""
     material: Material
-    """Reflectance and texture that the file gives the mesh."""
+    """Reflectance, texture and colour that the file gives the mesh."""
     name: str
     """Name of the mesh's node in the file."""
 
@@ -170,9 +182,11 @@ def _received(about: dict[str, Any], arrays: list[NDArray[Any]]) -> LoadedMesh:
     values: list[Any] = [
         None if shape is None else arrays.pop(0).reshape(shape) for shape in about["shapes"]
     ]
-    vertices, faces, uv, light, texture = values
-    mesh = Mesh(vertices, faces, uv, light)
-    material = Material(about["reflectance"], texture)
+    vertices, faces, uv, light, light_colour, texture, pixels, colour = values
+    mesh = Mesh(vertices, faces, uv, light, light_colour)
+    if pixels is not None and not has_no_colour(pixels):
+        colour = colours_of_pixels(pixels, colour)
+    material = Material(about["reflectance"], texture, colour=colour)
     return LoadedMesh(mesh, material, about["name"])
 
 
@@ -182,8 +196,8 @@ def read_parts(
     """Read the parts of a mesh file, in the reading process.
 
     ``kind``: suffix of the file; ``turn``: matrix (3, 3) by which vertices are multiplied. The first value holds the
-    files that the mesh file refers to, and of each part the name, the reflectance and the shapes of its arrays:
-    vertices, faces, texture coordinates, light and texture. A shape is None if the part has no such array.
+    files that the mesh file refers to, and of each part the name, the reflectance and the shapes of its arrays,
+    which :data:`Arrays` lists. A shape is None if the part has no such array.
     """
     scene, files = _open(Path(path), kind)
     parts: list[dict[str, Any]] = []
@@ -276,13 +290,14 @@ def _part(
         return _textured(visual, vertices, faces, kind)
     if visual.kind == "face":
         # Faces of different colours cannot share vertices: each face gets its own three.
-        light = np.repeat(_reflectance(visual.face_colors, kind), 3)
+        colours = np.repeat(np.asarray(visual.face_colors), 3, axis=0)
         own_vertices = vertices[faces.ravel()]
         own_faces = np.arange(faces.size).reshape(-1, 3)
-        return (own_vertices, own_faces, None, light, None), 1.0
+        return (own_vertices, own_faces, None, *_lights(colours, kind), None, None, None), 1.0
     if visual.kind == "vertex":
-        return (vertices, faces, None, _reflectance(visual.vertex_colors, kind), None), 1.0
-    return (vertices, faces, None, None, None), DEFAULT_REFLECTANCE
+        lights = _lights(visual.vertex_colors, kind)
+        return (vertices, faces, None, *lights, None, None, None), 1.0
+    return (vertices, faces, None, None, None, None, None, None), DEFAULT_REFLECTANCE
 
 
 def _textured(
@@ -293,39 +308,56 @@ def _textured(
     pbr = hasattr(material, "baseColorFactor")
     picture = material.baseColorTexture if pbr else material.image
     colour = material.baseColorFactor if pbr else material.diffuse
-    factor = 1.0 if pbr and colour is None else float(_reflectance(np.atleast_2d(colour), kind)[0])
+    factor = 1.0
+    tint: NDArray[Any] | None = None
+    if colour is not None or not pbr:
+        factors, tints = _lights(np.atleast_2d(colour), kind)
+        factor = float(factors[0])
+        tint = None if tints is None else tints[0]
     shade = visual.vertex_attributes.get("color")
-    light = None if shade is None else _reflectance(shade, kind)
+    lights = (None, None) if shade is None else _lights(shade, kind)
     if picture is None or visual.uv is None:
-        return (vertices, faces, None, light, None), factor
+        return (vertices, faces, None, *lights, None, None, tint), factor
     if not pbr:
-        factor = 1.0  # in OBJ files, a texture replaces the diffuse colour
-    return (vertices, faces, np.asarray(visual.uv)[:, :2], light, _luminance(picture)), factor
+        # in OBJ files, a texture replaces the diffuse colour
+        factor = 1.0
+        tint = None
+    uv = np.asarray(visual.uv)[:, :2]
+    return (vertices, faces, uv, *lights, *_luminance(picture), tint), factor
 
 
-def _luminance(picture: Any) -> NDArray[np.float32]:
-    """Return the linear luminance of a Pillow picture. A single row or column is duplicated."""
+def _luminance(picture: Any) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    """Return the linear luminance of a Pillow picture, and its pixels, or None for a grey or a very large picture.
+
+    A single row or column is duplicated.
+    """
     if picture.width * picture.height > MOST_PIXELS:
         raise AmiwarpError(
             f"a texture has {picture.width}x{picture.height} pixels, more than {MOST_PIXELS}; give a smaller picture"
         )
     table = srgb_to_linear(np.arange(256, dtype=np.float32) / 255)
     light = np.empty((picture.height, picture.width), np.float32)
+    has_colour = picture.mode not in GREY_MODES and light.size <= MOST_COLOURED
+    pixels = np.empty((*light.shape, 3) if has_colour else (0, 0, 3), np.uint8)
     rows = max(1, BAND // (3 * picture.width))
     # In bands, because a large picture as a whole would need four times its memory
     for top in range(0, picture.height, rows):
         bottom = min(top + rows, picture.height)
         band = picture.crop((0, top, picture.width, bottom)).convert("RGB")
         light[top:bottom] = table[np.asarray(band)] @ np.array(LUMINANCE, np.float32)
-    if light.shape[0] < 2:
-        light = np.repeat(light, 2, axis=0)
-    if light.shape[1] < 2:
-        light = np.repeat(light, 2, axis=1)
-    return light
+        if has_colour:
+            pixels[top:bottom] = band
+    for axis in (0, 1):
+        if light.shape[axis] < 2:
+            light = np.repeat(light, 2, axis=axis)
+            pixels = np.repeat(pixels, 2, axis=axis)
+    return light, pixels if has_colour else None
 
 
-def _reflectance(colours: Any, kind: str) -> NDArray[np.float64]:
-    """Return the luminance of colours (integers, or floats from 0 to 1), shape (n,).
+def _lights(colours: Any, kind: str) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+    """Return the luminance of colours (integers, or floats from 0 to 1), shape (n,), and the colours relative to it.
+
+    The relative colours have the shape (n, 3); they are None for grey.
 
     Colours are linear in glTF and GLB files, and sRGB in other files.
     """
@@ -333,4 +365,6 @@ def _reflectance(colours: Any, kind: str) -> NDArray[np.float64]:
     white = np.iinfo(given.dtype).max if given.dtype.kind in "iu" else 1.0
     values = given[:, :3].astype(np.float64) / white
     linear = values if kind in Y_UP else srgb_to_linear(values)
-    return np.asarray(np.clip(linear @ np.array(LUMINANCE), 0.0, 1.0), np.float64)
+    light = np.asarray(np.clip(linear @ np.array(LUMINANCE), 0.0, 1.0), np.float64)
+    _, colour = split_colours(linear)
+    return light, None if is_grey(colour) else colour

@@ -78,8 +78,13 @@ class WorldSight:
         self._light: wp.array = wp.empty(0, dtype=float, device=device)
         self._cast: wp.array = wp.empty(0, dtype=float, device=device)
         self._batch = world_rays.Batch()
+        self._batch.rows = 1
         self._marks: wp.array = wp.empty(0, dtype=int, device=device)
         self._listed: wp.array = wp.empty(0, dtype=int, device=device)
+
+    def roll(self) -> None:
+        """Give each row of the image its own instants: :meth:`set_instants` then takes them row by row."""
+        self._batch.rows = self._simulation.camera.height
 
     def set_plate(self, plate: PlateModel | None) -> None:
         """Set the plate through which the camera looks; None takes it out."""
@@ -119,6 +124,7 @@ class WorldSight:
     def light(self, steps: Any, first: int, count: int) -> wp.array:
         """Return the luminance that each pixel sees at ``count`` instants, the first of which has the index ``first``.
 
+        After :meth:`roll`, these are the numbers of images, whose rows have their own instants.
         The shape of the array is (count, pixels). The array is valid until the next call.
         """
         pixels = self._pixels

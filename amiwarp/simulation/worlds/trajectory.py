@@ -194,6 +194,23 @@ class Trajectory:
         turn, place = self._splines
         return turn(inside).as_matrix(), np.asarray(place(inside))
 
+    def _derivatives(
+        self, t: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return what :func:`derivatives_of` returns."""
+        from scipy.spatial.transform import Rotation
+
+        times = np.asarray(self.t, np.float64)
+        nothing = np.zeros((len(t), 3))
+        if len(times) == 1:
+            return nothing, nothing.copy(), nothing.copy()
+        if len(times) == 2:
+            ends: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
+            rate = (ends[0].inv() * ends[1]).as_rotvec() / (times[1] - times[0])
+            return nothing, np.tile(rate, (len(t), 1)), nothing.copy()
+        turn, place = self._splines
+        return np.asarray(place(t, 2)), turn(t, 1), turn(t, 2)
+
     @classmethod
     def still(
         cls,
@@ -365,18 +382,7 @@ def derivatives_of(
     They are the acceleration in the world [m/s^2], and the angular velocity [rad/s] and acceleration [rad/s^2] in the
     frame of the camera or body.
     """
-    from scipy.spatial.transform import Rotation
-
-    times = np.asarray(trajectory.t, np.float64)
-    nothing = np.zeros((len(t), 3))
-    if len(times) == 1:
-        return nothing, nothing.copy(), nothing.copy()
-    if len(times) == 2:
-        ends: Any = Rotation.from_quat(np.asarray(trajectory.rotation, np.float64))
-        rate = (ends[0].inv() * ends[1]).as_rotvec() / (times[1] - times[0])
-        return nothing, np.tile(rate, (len(t), 1)), nothing.copy()
-    turn, place = trajectory._splines
-    return np.asarray(place(t, 2)), turn(t, 1), turn(t, 2)
+    return trajectory._derivatives(t)
 
 
 def looking_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Rotation:

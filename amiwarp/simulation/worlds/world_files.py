@@ -13,8 +13,8 @@ from amiwarp.io.inputs import errors_name
 from amiwarp.io.json_files import read_json, read_toml
 from amiwarp.schema.calls import guarded
 from amiwarp.schema.records import at_field, build, check_format, fields_of
-from amiwarp.simulation.picture_light import read_picture
 from amiwarp.simulation.worlds.bodies import Body, Material
+from amiwarp.simulation.worlds.colours import read_colours, relative_colour
 from amiwarp.simulation.worlds.lights import Lamp, Sky, Sun
 from amiwarp.simulation.worlds.mesh_reader import LoadedMesh, load_mesh
 from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
@@ -53,6 +53,7 @@ class MaterialEntry:
     reflectance: float | None = None
     texture: str | None = None
     emission: float | None = None
+    colour: Vector | None = None
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,7 @@ class SkyEntry:
 
     luminance: float | None = None
     panorama: str | None = None
+    colour: Vector | None = None
 
 
 @dataclass(frozen=True)
@@ -173,16 +175,21 @@ class _Reader:
     def _sky(self, data: Any) -> Sky:
         """Return the sky of the field ``sky``."""
         entry = build(SkyEntry, data, "sky")
-        panorama = None if entry.panorama is None else self._picture(entry.panorama)
+        panorama = None
+        colour: Any = None
+        if entry.panorama is not None:
+            panorama, colour = self._picture(entry.panorama)
+        if entry.colour is not None:
+            colour = relative_colour(entry.colour, "sky colour")
         if entry.luminance is not None:
-            return Sky(entry.luminance, panorama)
+            return Sky(entry.luminance, panorama, colour)
         if panorama is not None:
-            return Sky(1.0, panorama)
-        return Sky()
+            return Sky(1.0, panorama, colour)
+        return Sky(colour=colour)
 
-    def _picture(self, name: str) -> Any:
-        """Return the linear luminance of a picture file."""
-        return read_picture(self._folder / name)
+    def _picture(self, name: str) -> tuple[Any, Any]:
+        """Return the linear luminance of a picture file, and its colours relative to it, or None for grey."""
+        return read_colours(self._folder / name)
 
     def _bodies(self, data: Any, where: str) -> list[Body]:
         """Return the bodies of one entry of ``bodies``: one body for each part of the mesh file.
@@ -204,7 +211,7 @@ class _Reader:
             f"{where}.mesh",
             lambda: load_mesh(self._folder / entry.mesh, up=entry.up, scale=entry.scale),
         )
-        texture = None
+        texture = (None, None)
         if material.texture is not None:
             picture_name = material.texture
             texture = at_field(f"{where}.material.texture", lambda: self._picture(picture_name))
@@ -293,12 +300,19 @@ def _part_names(name: str, parts: list[LoadedMesh]) -> list[str]:
     return [f"{name}/{part.name}" for part in parts]
 
 
-def _material(part: LoadedMesh, entry: MaterialEntry, texture: Any, where: str) -> Material:
+def _material(
+    part: LoadedMesh, entry: MaterialEntry, given: tuple[Any, Any], where: str
+) -> Material:
     """Return the material of a part; fields of the world file replace values of the mesh file.
 
-    ``texture``: picture that the world file gives, or None.
+    ``given``: luminance and relative colours of the picture that the world file gives, or None.
     """
     part_material = part.material
+    texture, colour = given
+    if texture is None:
+        colour = part_material.colour
+    if entry.colour is not None:
+        colour = relative_colour(entry.colour, "material colour")
     if texture is not None and part.mesh.uv is None:
         raise AmiwarpError(
             f"field {where}.material.texture needs texture coordinates, but the mesh has none; remove it",
@@ -309,4 +323,5 @@ def _material(part: LoadedMesh, entry: MaterialEntry, texture: Any, where: str) 
         reflectance if entry.reflectance is None else entry.reflectance,
         part_material.texture if texture is None else texture,
         part_material.emission if entry.emission is None else entry.emission,
+        colour,
     )

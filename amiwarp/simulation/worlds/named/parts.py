@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from amiwarp.simulation.worlds.bodies import Body, Material, Mesh
+from amiwarp.simulation.worlds.named.colours import colour_of
 from amiwarp.simulation.worlds.named.shapes import (
     box,
     cylinder,
@@ -32,7 +33,8 @@ def solid(
 ) -> Body:
     """Return a body whose reflectance is given by a texture. Without a texture the reflectance is 0.5."""
     reflectance = 0.5 if texture is None else 1.0
-    material = Material(reflectance, texture, emission)
+    colour = colour_of(name, category, texture)
+    material = Material(reflectance, texture, emission, colour)
     return Body(name, mesh, material, trajectory, category, instance)
 
 

@@ -4,9 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.simulation.worlds.bodies import Body, Mesh
+from amiwarp.simulation.worlds.colours import relative_colour
 from amiwarp.simulation.worlds.lights import Sky, Sun
 from amiwarp.simulation.worlds.named import parts, shapes, textures
 from amiwarp.simulation.worlds.named.camera_paths import Viewpoint
+from amiwarp.simulation.worlds.named.colours import SKY
 from amiwarp.simulation.worlds.named.houses import house, town_hall
 from amiwarp.simulation.worlds.world import World
 
@@ -35,7 +37,7 @@ def build(rng: np.random.Generator, duration_s: float) -> World:
         *_trees(rng),
         *_posts(rng),
     ]
-    sky = Sky(1.0, textures.sky(rng))
+    sky = Sky(1.0, textures.sky(rng), relative_colour(SKY, "colour of the sky"))
     return World("street", tuple(bodies), ambient=0.38, sun=Sun((-0.8, -0.3, 0.62), 0.7), sky=sky)
 
 
