@@ -67,13 +67,14 @@ class Allowance:
     Several requests, also in several processes, share it. Starting a process does not count.
     """
 
-    def __init__(self, *arguments: Any, small_s: float = CPU_SECONDS) -> None:
+    def __init__(self, *arguments: Any, small_s: float | None = None) -> None:
         """Allow the time for the files and folders among the arguments of a request.
 
-        ``small_s``: time for files of at most :data:`SMALL_BYTES` together [s].
+        ``small_s``: time for files of at most :data:`SMALL_BYTES` together [s], by default :data:`CPU_SECONDS`.
         """
         size = sum(_size(value) for value in arguments if isinstance(value, Path))
-        self.seconds = small_s * max(1.0, size / SMALL_BYTES)
+        least = CPU_SECONDS if small_s is None else small_s
+        self.seconds = least * max(1.0, size / SMALL_BYTES)
         """The whole time [s]."""
         self.left = self.seconds
         """The remaining time [s]."""

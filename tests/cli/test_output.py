@@ -25,7 +25,7 @@ from typing import Any, get_type_hints
 import numpy as np
 import pytest
 from PIL import Image
-from typer.models import ArgumentInfo
+from typer.models import ArgumentInfo, OptionInfo
 from typer.testing import CliRunner, Result
 
 import amiwarp
@@ -48,7 +48,7 @@ from amiwarp import (
     save_recording,
 )
 from amiwarp.cli.app import COMMANDS, function_of
-from amiwarp.cli.common import NO_FILE, OUTPUT, OUTPUT_FOLDER
+from amiwarp.cli.common import NO_FILE, OUTPUT, OUTPUT_EITHER, OUTPUT_FOLDER
 from amiwarp.events.truth import MAPS, MemoryFrames
 from amiwarp.imaging.export import IweFiles
 from amiwarp.io import LiveWriter, file_access, outputs, unfinished
@@ -74,6 +74,18 @@ size = [64, 48]
 fov_deg = 40.0
 [[sources]]
 pictures = "pictures/*.png"
+"""
+
+RIG = """
+format = "amiwarp-rig-specification"
+version = 1
+world = "desk"
+trajectory = "still"
+duration_s = 0.01
+[[sensors]]
+name = "plain"
+kind = "events"
+camera = { size = [64, 48], fov_deg = 60 }
 """
 
 SIZE = (64, 48)
@@ -142,6 +154,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         'format = "amiwarp-world"\nversion = 1\nsky = {panorama = "pic.png"}\ncamera = {trajectory = "tr.tum"}\n'
         'bodies = [{name = "tile", mesh = "tile.obj"}]\n'
     )
+    (folder / "rig.toml").write_text(RIG)
     write_network(folder / "sum.onnx")
     return folder
 
@@ -201,6 +214,7 @@ OVER_INPUTS = (
         ("simulate {} --world world.toml --size 64x48 --duration 0.01", read)
         for read in ("world.toml", "tile.obj", "pic.png", "tr.tum")
     ),
+    ("simulate {} --rig rig.toml", "rig.toml"),
     ("translate v.npy {} --fps 100", "v.npy"),
     ("translate pictures {} --fps 100", "pictures/0.png"),
     ("translate pictures {} --fps 100 --camera cam.json", "cam.json"),
@@ -241,9 +255,13 @@ def path_options(name: str) -> Iterator[tuple[str, bool]]:
             marks = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, str)]
             if "Path" in str(getattr(hint, "__origin__", hint)) and NO_FILE not in marks:
                 argument = any(isinstance(mark, ArgumentInfo) for mark in hint.__metadata__)
+                named = [
+                    mark.param_decls for mark in hint.__metadata__ if isinstance(mark, OptionInfo)
+                ]
+                declared = named[0] if named and named[0] else (f"--{one.replace('_', '-')}",)
                 yield (
-                    "" if argument else f"--{one.replace('_', '-')}",
-                    bool({OUTPUT, OUTPUT_FOLDER} & set(marks)),
+                    "" if argument else declared[0],
+                    bool({OUTPUT, OUTPUT_FOLDER, OUTPUT_EITHER} & set(marks)),
                 )
 
 
@@ -434,7 +452,7 @@ def output_options() -> set[tuple[str, str]]:
         hints = get_type_hints(function_of(command), include_extras=True)
         for kind in [hint for hint in hints.values() if is_dataclass(hint)]:
             hints |= get_type_hints(kind, include_extras=True)
-        marked = {OUTPUT, OUTPUT_FOLDER}
+        marked = {OUTPUT, OUTPUT_FOLDER, OUTPUT_EITHER}
         found |= {
             (command, name)
             for name, hint in hints.items()
@@ -531,7 +549,8 @@ def replacing() -> set[str]:
 
 
 def test_functions_refuse_a_name_that_means_another_format(place: Path) -> None:
-    assert replacing() - {"export_dataset"} == set(CALLS)  # that writes a folder
+    folders = {"export_dataset", "Rig.write", "RigWriter", "convert_rig", "save_rig"}
+    assert replacing() - folders == set(CALLS)
     camera, prism = amiwarp.Camera.from_fov(*SIZE, 1.0), Prism(0.01)
     simulation = amiwarp.Simulation(amiwarp.Scene.from_picture("pic.png"), camera, prism, 0.01)
     maps = {name: np.zeros((3, 4, *shape), dtype) for name, (dtype, shape) in MAPS.items()}
@@ -693,6 +712,7 @@ ENDLESS = (
     "emulate --link link --camera unix:camera --recording {}",
     "evaluate --out out --recording {}",
     "record a.h5 out.h5 --fast --camera {}.json",
+    "simulate out --rig {}.toml",
     "simulate out.h5 --world {}.toml",
     "simulate out.h5 --world room --trajectory {}.tum",
     "simulate out.h5 --picture pic.png --camera {}.json",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import tracemalloc
 from pathlib import Path
@@ -139,8 +140,13 @@ def test_a_part_of_a_hello_is_an_object(part: str, value: str) -> None:
         hello(f'{{"width":64,"height":48,"{part}":{value}}}')
 
 
-@pytest.mark.parametrize("kind", [*range(1, 8), 0, 8, 255])
-@pytest.mark.parametrize("length", [(1 << 32) - 1, 1 << 31, 5_000_000])
+@pytest.mark.parametrize(
+    ("kind", "length"),
+    [
+        *itertools.product([*range(1, 8), 0, 9, 255], [(1 << 32) - 1, 1 << 31, 5_000_000]),
+        *((8, length) for length in ((1 << 32) - 1, 1 << 31, (1 << 28) + 1)),  # a tensor
+    ],
+)
 def test_a_length_is_bounded_before_anything_is_held(kind: int, length: int) -> None:
     tracemalloc.start()
     try:
