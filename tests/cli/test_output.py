@@ -255,12 +255,13 @@ def path_options(name: str) -> Iterator[tuple[str, bool]]:
             marks = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, str)]
             if "Path" in str(getattr(hint, "__origin__", hint)) and NO_FILE not in marks:
                 argument = any(isinstance(mark, ArgumentInfo) for mark in hint.__metadata__)
-                named = [
-                    mark.param_decls for mark in hint.__metadata__ if isinstance(mark, OptionInfo)
-                ]
-                declared = named[0] if named and named[0] else (f"--{one.replace('_', '-')}",)
+                option = f"--{one.replace('_', '-')}"
+                for mark in hint.__metadata__:
+                    # typer keeps a name that an annotation gives as its default
+                    if isinstance(mark, OptionInfo) and str(mark.default).startswith("--"):
+                        option = mark.default
                 yield (
-                    "" if argument else declared[0],
+                    "" if argument else option,
                     bool({OUTPUT, OUTPUT_FOLDER, OUTPUT_EITHER} & set(marks)),
                 )
 
