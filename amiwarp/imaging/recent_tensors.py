@@ -36,7 +36,7 @@ from amiwarp.validation import real, whole
 MOST_DEPTH = 256
 """Largest number of latest events of a pixel."""
 MOST_STACKS = 32
-"""Largest number of stacks: the last one of so many has the last event only."""
+"""Largest number of stacks: each has about half as many events as the one before it."""
 
 
 @guarded
@@ -193,7 +193,10 @@ def mixed_density_stack(
     batch = batch_of(events, (width, height), windows, t_start, t_end, model, encoder, device)
     out = batch.empty((stacks, height, width), wp.int8)
     size = height * width
-    for first, number, last in _values(batch, Grid(*batch.size), recent_events.keep_last, 1, 0):
+    kept = _values(
+        batch, Grid(*batch.size), recent_events.keep_last, 1, 0, results_per_number=stacks
+    )
+    for first, number, last in kept:
         rows, _ = window_rows(batch.windows[first : first + number], batch.device)
         part = result_rows(out, first, number)
         inputs = [last, rows, size, stacks]
@@ -278,19 +281,26 @@ def event_spike_tensor(
 
 
 def _values(
-    batch: WindowBatch, grid: Grid, kernel: Any, images: int, empty: Any
+    batch: WindowBatch,
+    grid: Grid,
+    kernel: Any,
+    images: int,
+    empty: Any,
+    *,
+    results_per_number: int = 1,
 ) -> Iterator[tuple[int, int, wp.array]]:
     """Run a kernel on the events of all windows. Yield the first window, the number of windows, and their numbers.
 
     A window has ``images`` images of 64-bit numbers, ``empty`` at first, which the next windows overwrite. On a CPU,
-    each thread takes some of the windows.
+    each thread takes some of the windows. ``results_per_number``: numbers of the result for each of them, all of which
+    32-bit indices must reach.
     """
     device = batch.device
     count = len(batch.windows)
     size = images * grid.height * grid.width
     threads = cpu_threads() if device.is_cpu else 1
     fitting = max(MOST_BYTES["cpu" if device.is_cpu else "cuda"] // (8 * size), threads)
-    most = max(1, min(fitting, count, MOST_EVENTS // size))
+    most = max(1, min(fitting, count, MOST_EVENTS // (size * results_per_number)))
     values = wp.empty(min(most, count) * size, dtype=wp.int64, device=device)
     columns = [batch.events.x, batch.events.y, batch.events.t, batch.events.p]
     length = int(kernels.BLOCK) if device.is_cpu else 1

@@ -211,7 +211,10 @@ class RigWriter:
         self.folder = Path(folder)
         """Folder of the rig."""
         self._overwrite = overwrite
-        self._metadata = dict(metadata or {})
+        self._metadata: dict[str, MetadataValue] = {}
+        for name, value in (metadata or {}).items():
+            plain = value.item() if isinstance(value, np.generic) else value
+            self._metadata[name] = _metadata_value(name, plain)
         self._sensors: dict[str, dict[str, Any]] = {}
         self._writers = contextlib.ExitStack()
         self._is_open = False

@@ -9,6 +9,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import inside_image
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
 from amiwarp.schema.calls import guarded
@@ -109,10 +110,7 @@ def places_in(
     rotation, position = trajectory.poses(times * 1e-6)
     rays = np.einsum("ni,nij->nj", in_world - position, rotation)
     points = np.asarray(camera.rays_to_pixels(rays), np.float64)
-    size = np.array([camera.width, camera.height])
-    # A place that is NaN is not inside.
-    in_image = (points >= -0.5) & (points < size - 0.5)
-    visible: NDArray[np.bool_] = np.asarray(in_image.all(axis=1))
+    visible = inside_image(points[:, 0], points[:, 1], camera.width, camera.height)
     if world is not None:
         inside = np.flatnonzero(visible)
         hidden = _hidden(

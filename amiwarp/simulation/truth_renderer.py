@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import inside_image
 from amiwarp.events.truth import OUTSIDE, FrameTruth
 from amiwarp.optics.models.angles import wrap_angle
 from amiwarp.optics.models.plate import PlateModel
@@ -343,8 +344,7 @@ class TruthRenderer:
         self._world.set_instants(np.array([later]))
         hit = surfaces_at(self._world, rays, rotation, position, centres=centres)
         hidden = hit.depth < depth * (1.0 - NEARER)
-        size = np.array([camera.width, camera.height])
-        inside = ((ends > -0.5) & (ends < size - 0.5)).all(axis=1)
+        inside = inside_image(ends[:, 0], ends[:, 1], camera.width, camera.height)
         occlusion = np.where(inside, hidden, OUTSIDE).astype(np.uint8)
         moved = (ends - self._pixels).astype(np.float32)
         return moved.reshape(*shape, 2), occlusion.reshape(shape)

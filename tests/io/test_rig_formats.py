@@ -2,6 +2,7 @@
 
 import csv
 import functools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -374,7 +375,7 @@ def test_kalibr_folder(tmp_path: Path) -> None:
         assert fields["rostopic"] == f"/cam{index}/image_raw"
         assert len(list((tmp_path / f"k/cam{index}").iterdir())) == 4
     assert chain["cam0"]["distortion_model"] == "radtan"
-    stored = np.asarray(Image.open(tmp_path / f"k/cam1/{1000 * TIMES[3]}.png"))
+    stored = np.asarray(Image.open(tmp_path / f"k/cam1/{1000 * TIMES[3]:019d}.png"))
     taken = rig["colour"].recording.frames
     assert taken is not None
     np.testing.assert_array_equal(stored, taken[3])
@@ -413,7 +414,7 @@ def test_what_is_not_in_the_rig_is_said(tmp_path: Path) -> None:
         luma = 0.299 * red + 0.587 * green + 0.114 * blue
         assert np.abs(file["davis/left/image_raw"][1] - luma).max() < 1  # level
     convert_rig(deep, tmp_path / "k16", format="kalibr")
-    stored = (tmp_path / f"k16/cam0/{1000 * TIMES[0]}.png").read_bytes()
+    stored = (tmp_path / f"k16/cam0/{1000 * TIMES[0]:019d}.png").read_bytes()
     colours = cv2.imdecode(np.frombuffer(stored, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1]
     np.testing.assert_array_equal(colours, pictured[0])
 
@@ -501,6 +502,37 @@ def test_bags_hold_all_sensors(tmp_path: Path, ending: str) -> None:
         given = make_rig()[name].recording.events[:]
         for column in ("x", "y", "t", "p"):
             np.testing.assert_array_equal(getattr(back, column), getattr(given, column))
+
+
+def compensated_rig() -> RigRecording:
+    """A rig whose left events are between pixels, outside the image, or without a place."""
+    left = make_rig()["left"]
+    events = left.recording.events[:20]
+    x = events.x.astype(np.float32) + 0.25
+    y = events.y.astype(np.float32) - 0.25
+    x[3] = -7.5
+    y[5] = np.nan
+    moved = MemoryEvents(Events(x, y, events.t, events.p), LEFT.width, LEFT.height)
+    recording = replace(left.recording, events=moved, truth=None)
+    return RigRecording({"left": replace(left, recording=recording)})
+
+
+@pytest.mark.parametrize("ending", ["bag", "mcap"])
+def test_bags_round_compensated_events(tmp_path: Path, ending: str) -> None:
+    out = tmp_path / f"rig.{ending}"
+    done = convert_rig(compensated_rig(), out)
+    assert any("left are rounded to whole pixels" in note for note in done.notes)
+    read = amiwarp.open_recording(out).events[:]
+    kept = np.delete(make_rig()["left"].recording.events[:20].x, [3, 5])
+    np.testing.assert_array_equal(read.x, kept)
+
+
+def test_dsec_rounds_compensated_events(tmp_path: Path) -> None:
+    done = convert_rig(compensated_rig(), tmp_path / "d", format="dsec", left="left")
+    assert any("left are rounded to whole pixels" in note for note in done.notes)
+    with h5py.File(tmp_path / "d/events/left/events.h5") as file:
+        kept = np.delete(make_rig()["left"].recording.events[:20].y, [3, 5])
+        np.testing.assert_array_equal(file["events/y"][:], kept)
 
 
 def matrix_of(transform: Any) -> np.ndarray:

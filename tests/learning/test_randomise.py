@@ -109,7 +109,7 @@ def by_hand(item: Any, picture: Path) -> amiwarp.Simulation:
     omega = 2.0 * math.pi * v["shake_hz"]
     speed = math.radians(v["shake_deg"]) * omega * np.cos(omega * t)
     direction = math.radians(v["shake_direction_deg"])
-    rates = np.column_stack([t, speed * math.sin(direction), speed * math.cos(direction), 0.0 * t])
+    rates = np.column_stack([t, speed * -math.sin(direction), speed * math.cos(direction), 0.0 * t])
     ideal = amiwarp.SensorModel.ideal()
     return amiwarp.Simulation(
         scene,
@@ -212,7 +212,7 @@ shake_direction_deg = {choice = [30.0]}
 
     # A sinusoidal rotation about an axis of the camera, and no other motion
     poses = recording.truth.poses[:]
-    axis = np.array([math.sin(math.radians(30.0)), math.cos(math.radians(30.0)), 0.0])
+    axis = np.array([-math.sin(math.radians(30.0)), math.cos(math.radians(30.0)), 0.0])
     angle = math.radians(0.8) * np.sin(2.0 * math.pi * 40.0 * poses.t * 1e-6)
     assert np.abs(angle).max() > math.radians(0.79)
     at_rest, position = way.poses(poses.t * 1e-6)
@@ -239,7 +239,12 @@ def test_a_shake_moves_the_image_along_its_direction(place: Path) -> None:
         "speeds_rpm = [720.0]\n", ""
     )
     counts = []
-    for k, degrees in enumerate((0.0, 90.0)):
+    for k, degrees in enumerate((0.0, 90.0, 45.0, 135.0)):
+        if degrees == 45.0:
+            y, x = np.mgrid[:64, :64]  # edges along which x and y grow alike
+            Image.fromarray(np.where((x - y) // 6 % 2, 40, 250).astype(np.uint8)).save(
+                place / "noise.png"
+            )
         ranges = f"[randomise]\nshake_direction_deg = {{choice = [{degrees}]}}\n" + SHAKE
         items_of(place, head + PICTURES + ranges)
         done = amiwarp.make_dataset(place / "spec.toml", place / f"out{k}", workers=1)
@@ -247,6 +252,9 @@ def test_a_shake_moves_the_image_along_its_direction(place: Path) -> None:
         counts.append(done.events)
     assert counts[0] > 100
     assert counts[1] == 0
+    # y points down: at 45 degrees the image moves along the edges, at 135 degrees across them.
+    assert counts[3] > 100
+    assert counts[2] < 0.2 * counts[3]
 
 
 WRONG: dict[str, tuple[str, str]] = {

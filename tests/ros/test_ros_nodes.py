@@ -240,6 +240,10 @@ def test_angles_of_joint_states_lie_on_the_events_clock(ros: Any, wrapped: bool)
     for t in times:
         source.put_joints(joint(ros, t, wrapped=wrapped))
     source.put_joints(joint(ros, times[-1], wrapped=wrapped))  # twice
+    for nothing in (float("nan"), float("inf")):
+        broken = joint(ros, 250_000)
+        broken.position = [nothing for _ in broken.position]
+        source.put_joints(broken)
     other = joint(ros, 300_000)
     other.name = ["wheel", "arm"]
     source.put_joints(other)

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from amiwarp.events.rig_recording import SensorKind
 from amiwarp.io.camera_files import kalibr_camera
 from amiwarp.io.export import export
-from amiwarp.io.output_formats import OutputFormat
+from amiwarp.io.output_formats import OutputFormat, Rounding
 from amiwarp.io.rig_formats.files import write_yaml
 from amiwarp.io.rig_formats.pictures import eight_bits, png_bytes
 from amiwarp.io.rig_formats.rectification import Rectified, rectify
-from amiwarp.io.rig_formats.task import Matrix, RigTask, has_events, has_frames
+from amiwarp.io.rig_formats.task import ROUNDED, Matrix, RigTask, has_events, has_frames
 
 NUMBERS = {"cam0": 0, "cam1": 1, "cam2": 2, "cam3": 3}
 """Numbers of the cameras."""
@@ -60,6 +60,11 @@ def _frame_roles(task: RigTask, left: str, right: str | None) -> dict[str, str]:
     names.sort(key=lambda name: float(task.rig[name].to_rig[0, 3]))
     if not names:
         names = [name for name in (left, right) if name is not None and has_frames(task, name)]
+    if len(names) > 1 and task.between(names[1], names[0])[0, 3] <= 0.0:
+        task.note(
+            f"{names[1]} does not lie to the right of {names[0]}: only the frames of {names[0]} are written"
+        )
+        names = names[:1]
     return dict(zip(("cam1", "cam2"), names, strict=False))
 
 
@@ -88,6 +93,9 @@ def _write_events(
     folder.mkdir(parents=True)
     name = task.roles[camera]
     events = task.recording(name).events
+    is_compensated = len(events) > 0 and not events.slice(0, 1).whole_pixels
+    if is_compensated:
+        task.note(ROUNDED.format(name))
     export(
         events,
         folder / "events.h5",
@@ -96,6 +104,7 @@ def _write_events(
         codec=task.codec,
         progress=task.progress,
         overwrite=False,
+        rounding=Rounding.NEAREST if is_compensated else None,
     )
     if rectified is None:
         return

@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 
 from amiwarp.events.other_sensors import mean_rate
 from amiwarp.io.camera_files import kalibr_camera
-from amiwarp.io.rig_formats.files import camera_from_imu, write_imu_table, write_yaml
+from amiwarp.io.rig_formats.files import (
+    camera_from_imu,
+    frame_file,
+    write_imu_table,
+    write_yaml,
+)
 from amiwarp.io.rig_formats.kalibr import frame_cameras, write_frames
 from amiwarp.io.rig_formats.task import RigTask, pose_matrices
 
@@ -66,7 +71,7 @@ def _write_camera(task: RigTask, folder: Path, name: str, first: str, carrier: s
     frames = task.recording(name).frames
     assert frames is not None
     lines = ["#timestamp [ns],filename"]
-    lines += [f"{1000 * t},{1000 * t}.png" for t in frames.t.tolist()]
+    lines += [f"{1000 * t},{frame_file(t)}" for t in frames.t.tolist()]
     (folder / "data.csv").write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
     lens = kalibr_camera(task.camera(name))
     to_camera = task.between(first, name)

@@ -20,6 +20,19 @@ def write_yaml(path: Path, data: dict[str, Any]) -> None:
     path.write_text(text, encoding="utf-8", newline="\n")
 
 
+def padded_ns(t_us: int) -> str:
+    """Return a time [us] in nanoseconds, with zeros before it to 19 digits.
+
+    Programs that read Kalibr's folders take the last nine digits for the part of a second, and sort names as texts.
+    """
+    return f"{1000 * t_us:019d}"
+
+
+def frame_file(t_us: int) -> str:
+    """Return the name of the file of a frame at a time [us]."""
+    return f"{padded_ns(t_us)}.png"
+
+
 def write_imu_table(path: Path, header: str, imu: ImuSamples) -> None:
     """Write IMU samples as rows of time [ns], angular velocity [rad/s] and acceleration [m/s^2]."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -29,7 +42,7 @@ def write_imu_table(path: Path, header: str, imu: ImuSamples) -> None:
             imu.t.tolist(), imu.angular_velocity.tolist(), imu.acceleration.tolist(), strict=True
         ):
             numbers = ",".join(repr(value) for value in (*turning, *force))
-            file.write(f"{1000 * t},{numbers}\n")
+            file.write(f"{padded_ns(t)},{numbers}\n")
 
 
 def camera_chain(task: RigTask, names: Sequence[str], carrier: str | None) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from amiwarp.io.rig_formats.files import camera_chain, write_imu_table, write_yaml
+from amiwarp.io.rig_formats.files import camera_chain, frame_file, write_imu_table, write_yaml
 from amiwarp.io.rig_formats.pictures import png_bytes
 from amiwarp.io.rig_formats.task import RigTask, has_frames
 
@@ -48,7 +48,7 @@ def frame_cameras(task: RigTask) -> list[str]:
 
 
 def write_frames(task: RigTask, names: list[str], folders: list[Path]) -> None:
-    """Write the frames of each camera to its folder, as ``TIME.png`` with the time in nanoseconds."""
+    """Write the frames of each camera to its folder, see :func:`frame_file`."""
     for index, (name, folder) in enumerate(zip(names, folders, strict=True)):
         folder.mkdir(parents=True, exist_ok=True)
         frames = task.recording(name).frames
@@ -56,5 +56,5 @@ def write_frames(task: RigTask, names: list[str], folders: list[Path]) -> None:
         if frames.exposure is not None:
             task.left_out.add("exposures")
         for number, (t, image) in enumerate(zip(frames.t.tolist(), frames, strict=True)):
-            (folder / f"{1000 * t}.png").write_bytes(png_bytes(image))
+            (folder / frame_file(t)).write_bytes(png_bytes(image))
             task.progress("writing frames", (index + (number + 1) / len(frames)) / len(names))

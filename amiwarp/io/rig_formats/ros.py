@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.events.other_sensors import ImageStore
-from amiwarp.io.export import check_limits
-from amiwarp.io.output_formats import LIMITS, Outline, OutputFormat
+from amiwarp.io.export import Pixels, check_limits
+from amiwarp.io.output_formats import LIMITS, Outline, OutputFormat, Rounding
 from amiwarp.io.rig_description import span_of
-from amiwarp.io.rig_formats.task import Matrix, RigTask
+from amiwarp.io.rig_formats.task import ROUNDED, Matrix, RigTask
 from amiwarp.io.ros.ros1_writer import ARRAY, EARLIEST_NS, ArrayEncoder
 from amiwarp.io.ros.ros2_writer import MESSAGE, PacketEncoder, ros2_file
 
@@ -213,7 +213,15 @@ def _streams(task: RigTask, ros: _Ros, name: str, about: Outline) -> list[Any]:
 def _event_messages(task: RigTask, ros: _Ros, name: str, about: Outline) -> Messages:
     encoder = ArrayEncoder(about, name) if ros.version == 1 else PacketEncoder(about, name)
     topic = ros.topic(f"/{name}/events", ARRAY if ros.version == 1 else MESSAGE)
-    for block in task.recording(name).events.blocks():
+    limits = LIMITS[OutputFormat.ROS1 if ros.version == 1 else OutputFormat.ROS2]
+    events = task.recording(name).events
+    rounded = Pixels(limits, events.size, Rounding.NEAREST, 0)
+    for block in events.blocks():
+        if not block.whole_pixels:
+            task.note(ROUNDED.format(name))
+            block = rounded(block)
+        if not len(block):
+            continue
         for t_ns, data in encoder(block):
             yield t_ns, topic, bytes(data)
 

@@ -19,6 +19,11 @@ from amiwarp.tasks import Progress, silent
 
 Matrix = NDArray[np.float64]
 
+ROUNDED = (
+    "compensated events of {} are rounded to whole pixels; events outside the image are left out"
+)
+"""Note of a layout that holds whole pixels, with the name of the sensor."""
+
 
 @dataclass(slots=True)
 class RigTask:

@@ -42,7 +42,7 @@ def lit(world: World, light: float) -> World:
 def shake_axis(drawn: Mapping[str, float]) -> NDArray[np.float64]:
     """Return the axis about which the camera shakes, in its own frame: the image moves along the drawn direction."""
     direction = math.radians(drawn.get("shake_direction_deg", 0.0))
-    return np.array([math.sin(direction), math.cos(direction), 0.0])
+    return np.array([-math.sin(direction), math.cos(direction), 0.0])
 
 
 def shaken_motion(

@@ -32,7 +32,7 @@ from amiwarp.live.commands.session import (
 )
 from amiwarp.live.commands.stage_options import StageOptions, stage_lines, stage_summary
 from amiwarp.live.commands.stream_description import StreamDescription
-from amiwarp.live.commands.tensor_options import TensorOptions, tensor_lines
+from amiwarp.live.commands.tensor_options import LiveTensors, TensorOptions, tensor_lines
 from amiwarp.live.link.link import Link
 from amiwarp.live.queues import Policy
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper
@@ -354,11 +354,11 @@ def run_live(
         )
         if calibrated is None:
             line.say("no calibration: events are not compensated; give one with --calibration")
-        status = _follow(session, stop, stream.seconds, line, receivers)
+        status = _follow(session, stop, stream.seconds, line, receivers, live_tensors)
         if picture_stream is not None:
             picture_stream.close()
         if live_tensors is not None:
-            live_tensors.output.close()
+            live_tensors.output.close(session.drain_left)
     files = list(outputs.files)
     if pictures.picture is not None:
         files.append(str(pictures.picture))
@@ -572,6 +572,7 @@ def _follow(
     seconds: float | None,
     line: StatusLine,
     receivers: _Receivers,
+    tensors: LiveTensors | None,
 ) -> SessionStatus:
     """Run the session to its end, for at most ``seconds``, and show its status on ``line``."""
 
@@ -579,6 +580,8 @@ def _follow(
         line.update(status)
         if receivers.sink is not None:
             receivers.sink.tick()
+        if tensors is not None:
+            tensors.tick()
 
     status = session.run(stop, update, seconds=seconds)
     line.report_lost_packets(receivers.sink, receivers.raw_sink)

@@ -75,9 +75,11 @@ class TensorOptions:
                 f"--tensor-bins applies to voxel and stack; --tensor is {self.tensor}; remove it",
                 ErrorCode.OPTIONS,
             )
-        if self.tensor_to == "-":
+        # Tensors are larger than a datagram, or a slot of shared memory.
+        if self.tensor_to is not None and not self.tensor_to.startswith(("tcp:", "unix:")):
             raise AmiwarpError(
-                "--tensor-to - is not possible; give tcp:HOST:PORT or unix:PATH", ErrorCode.OPTIONS
+                f"--tensor-to {self.tensor_to} is not possible; give tcp:HOST:PORT or unix:PATH",
+                ErrorCode.OPTIONS,
             )
 
     def build(
@@ -141,6 +143,13 @@ class LiveTensors:
     """Taker of the packets of the session."""
     sink: Sink | None
     """Server of the tensors."""
+
+    def tick(self) -> None:
+        """Let the server accept receivers, and send what waits for them."""
+        if self.sink is not None:
+            # An error of an earlier packet comes with the next one, which ends the session in order.
+            with contextlib.suppress(Exception):
+                self.output.later(self.sink.tick)
 
     def summary(self) -> dict[str, Any]:
         """Return the counts for ``--json``."""

@@ -149,7 +149,9 @@ class DatagramReceiver:
             waiting = itertools.islice(iter(self._next, None), MOST_JOINED)
             self._packets.extend(join_packets(waiting))
             now = time.monotonic()
-            if self._stream is not None and now - self._latest_s > SILENT_S:
+            is_silent = self._stream is not None and now - self._latest_s > SILENT_S
+            # A foreign or late datagram ends the loop above before the good ones behind it.
+            if is_silent and not self._packets and not ready(self._socket, 0.0):
                 self.problem = f"its sender has sent nothing for {SILENT_S:g} s"
             if not self._packets:
                 if self.problem is not None or now >= until:

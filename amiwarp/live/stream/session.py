@@ -198,7 +198,7 @@ class Session:
         if not reader.is_alive():
             self._source.close()
         if self._phase_check is not None and not self._hasty:
-            self._phase_check.close(self._drain_left)
+            self._phase_check.close(self.drain_left)
         if self._keeper is not None and not self._hasty:
             self._keeper.close()
         self._consumers.join()
@@ -213,7 +213,7 @@ class Session:
         self._stop.set()
 
     @property
-    def _drain_left(self) -> float:
+    def drain_left(self) -> float:
         """Remaining time for the waiting data [s]."""
         return max(self._drain_until - self._seconds, 0.0)
 
@@ -350,4 +350,4 @@ class Session:
             self._poll_encoder()
         if self._compensator is not None:
             self._give_compensated(self._compensator.flush())
-        self._consumers.drain(self._drain_left)
+        self._consumers.drain(self.drain_left)

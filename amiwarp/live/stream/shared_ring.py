@@ -42,7 +42,7 @@ SLOT_HEAD = 16
 SLOTS = 384
 """Default number of slots. The default ring has 48 MiB: containers often have 64 MiB of shared memory."""
 SLOT_BYTES = 1 << 17
-"""Default size of a slot [bytes]: 7,280 compensated events fit. Packets that are cut cost three times the time."""
+"""Default size of a slot [bytes]: 7,279 compensated events fit. Packets that are cut cost three times the time."""
 BEAT_S = 0.2
 """Time between two beats of the writer [s]."""
 DEAD_S = 3.0

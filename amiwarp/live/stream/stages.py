@@ -61,6 +61,7 @@ class SessionStages:
         self._camera = undistort
         self._target = None if undistort is None else replace(undistort, distortion=None)
         self._running = None if chosen is None else RunningFilter(chosen, size)
+        self._outside = 0
         self._read = Stage("read")
         self._filter = Stage("filter")
         self._compensate = Stage("compensate")
@@ -95,6 +96,8 @@ class SessionStages:
         """Return a packet of the compensator after the last stage."""
         count = len(packet.events)
         self._compensate.count(count, count, self._delay_us(int(packet.events.t[-1])))
+        # After an undistortion, the flag says something else.
+        self._outside += int(np.count_nonzero(packet.flags & OUTSIDE))
         return self._undistorted(packet)
 
     def _undistorted(self, packet: Compensated) -> Compensated:
@@ -118,7 +121,7 @@ class SessionStages:
         read.removed = {"queue": status.dropped}
         read.marked = {"late": status.late}
         self._compensate.status.marked = {
-            "outside": status.outside,
+            "outside": self._outside,
             "extrapolated": status.guessed,
             "without angle": status.unknown,
         }

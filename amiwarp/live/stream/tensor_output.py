@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from types import TracebackType
@@ -11,12 +12,9 @@ from amiwarp.events.recording import Events, held_bytes
 from amiwarp.imaging.tensor_stream import StreamTensor, TensorStream
 from amiwarp.live.background_worker import BackgroundWorker
 
-DRAIN_S = 10.0
-"""Longest time for the waiting events after the stream has ended [s]. The rest is dropped, and counted."""
-
 
 class TensorOutput:
-    """Takes the packets of a session, and gives tensors to ``give``, in a background thread. It loses no event.
+    """Takes the packets of a session, and gives tensors to ``give``, in a background thread.
 
     A session waits for it while much waits. Close it before what ``give`` writes to.
     """
@@ -55,13 +53,20 @@ class TensorOutput:
         """Number of events that were dropped at the end of the stream."""
         return self._worker.dropped
 
-    def close(self) -> None:
-        """Make the last tensor, and end the thread. Raises the error of the thread."""
+    def later(self, job: Callable[[], object]) -> None:
+        """Run a job in the thread, after the waiting packets. Raises the error of an earlier packet."""
+        self._worker.put(job)
+
+    def close(self, most_s: float = math.inf) -> None:
+        """Make the last tensors for at most ``most_s`` [s], drop and count the rest, and end the thread.
+
+        Raises the error of the thread.
+        """
         if self._closed:
             return
         self._closed = True
         self._worker.put(self._finish)
-        self._worker.close(DRAIN_S)
+        self._worker.close(most_s)
 
     def _put(self, events: Events) -> None:
         for found in self._stream.put(events):

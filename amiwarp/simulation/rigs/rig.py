@@ -87,7 +87,7 @@ class Rig:
         instance(self.world, World, "rig's world")
         instance(self.trajectory, Trajectory, "rig's trajectory")
         real(self.duration_s, "duration_s", 1e-3, LONGEST_S, " s")
-        whole(self.seed, "seed", 0, (1 << 31) - 1)
+        object.__setattr__(self, "seed", whole(self.seed, "seed", 0, (1 << 31) - 1))
         if not self.sensors:
             raise AmiwarpError("the rig has no sensors; give at least one camera")
         known: dict[str, str] = {}

@@ -84,10 +84,10 @@ class MessageSource:
             return
         t_us = stamp_us(message) - offset_us
         angle = float(message.position[index])
-        if self._angle is not None:
-            angle += 2.0 * math.pi * round((self._angle - angle) / (2.0 * math.pi))
         if not math.isfinite(angle) or t_us <= self._last_sample_us:
             return
+        if self._angle is not None:
+            angle += 2.0 * math.pi * round((self._angle - angle) / (2.0 * math.pi))
         self._angle = angle
         self._last_sample_us = t_us
         sample = np.array([t_us]), np.array([angle])
