@@ -176,6 +176,11 @@ def test_compensated_events_are_filtered_before_and_undistorted_after(
     wanted = LENS.undistort(Events(*columns, kept.t, kept.p))
     names = [stage["name"] for stage in result["stages"]]
     assert names == ["read", "filter", "compensate", "undistort"]
+    # Each of both counts the events that lie outside after it.
+    inside = (xy >= -0.5) & (xy < np.array(SIZE) - 0.5)
+    marked = [stage["marked"].get("outside") for stage in result["stages"]]
+    assert marked[2] == pytest.approx(np.count_nonzero(~inside.all(axis=1)), abs=2)
+    assert marked[2] != marked[3]
     found = open_recording(out).events[:]
     assert np.array_equal(found.t, kept.t)
     np.testing.assert_allclose(found.x, wanted.x, rtol=0, atol=1e-3)  # px
@@ -345,6 +350,7 @@ def test_a_receiver_that_dies_or_sleeps_stops_nothing(folder: Path, tmp_path: Pa
         (["--tensor", "voxel", "--tensor-out", "t.npz"], "give a name that ends in .h5"),
         (["--tensor", "count", "--tensor-bins", "3", "--tensor-out", "t.h5"], "--tensor is count"),
         (["--tensor", "voxel", "--tensor-to", "-"], "give tcp:HOST:PORT"),
+        (["--tensor", "voxel", "--tensor-to", "shm:x"], "give tcp:HOST:PORT"),
         (["--tensor", "voxel", "--tensor-out", "plain.h5"], "plain.h5"),
     ],
 )
