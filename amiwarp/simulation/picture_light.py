@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.inputs import input_path
+from amiwarp.simulation.radiance_pictures import read_radiance
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear red, green and blue in the luminance (ITU-R BT.709)."""
@@ -43,8 +44,10 @@ def read_picture(path: str | Path) -> NDArray[np.float32]:
 def read_pixels(path: str | Path) -> NDArray[Any]:
     """Return the pixel values of a picture file, as :func:`linear_luminance` takes them.
 
-    Raises :class:`AmiwarpError` if the file cannot be read.
+    Files that end in ``.hdr`` hold linear values of any size. Raises :class:`AmiwarpError` if the file cannot be read.
     """
+    if Path(path).suffix.lower() == ".hdr":
+        return read_radiance(Path(path))
     from PIL import Image
 
     try:

@@ -44,7 +44,12 @@ def read_colours(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32] |
     """
     pixels = read_pixels(path)
     light = linear_luminance(pixels, name=str(path))
-    if pixels.ndim == 2 or pixels.dtype != np.uint8 or light.size > MOST_COLOURED:
+    if pixels.ndim == 2 or light.size > MOST_COLOURED:
+        return light, None
+    if pixels.dtype == np.float32:
+        _, relative = split_colours(pixels)
+        return light, None if is_grey(relative) else relative
+    if pixels.dtype != np.uint8:
         return light, None
     if has_no_colour(pixels):
         return light, None
