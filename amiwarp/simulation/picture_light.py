@@ -47,7 +47,7 @@ def read_pixels(path: str | Path) -> NDArray[Any]:
     Files that end in ``.hdr`` hold linear values of any size. Raises :class:`AmiwarpError` if the file cannot be read.
     """
     if Path(path).suffix.lower() == ".hdr":
-        return read_radiance(Path(path))
+        return read_radiance(Path(path), MOST_PIXELS)
     from PIL import Image
 
     try:

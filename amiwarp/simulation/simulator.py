@@ -33,12 +33,7 @@ from amiwarp.simulation.motion import (
     Vibration,
 )
 from amiwarp.simulation.picture_maps import log_view
-from amiwarp.simulation.recorded_simulation import (
-    blocks_of,
-    header_of,
-    stored_prism,
-    write_recording,
-)
+from amiwarp.simulation.recorded_simulation import blocks_of, stored_prism
 from amiwarp.simulation.recorded_truth import RecordedTruth, chosen_instants
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.true_parameters import true_parameters
@@ -313,6 +308,41 @@ class Simulation(SimulationValues):
         with RecordingWriter(path, overwrite=overwrite, **header) as writer:
             write_recording(self, recorded, writer, progress)
         return len(writer)
+
+
+def header_of(simulation: Simulation, recorded: RecordedTruth) -> dict[str, Any]:
+    """Return the arguments of :class:`RecordingWriter` that describe the recording of a simulation."""
+    return {
+        "width": simulation.camera.width,
+        "height": simulation.camera.height,
+        "camera": simulation.camera,
+        "prism": stored_prism(simulation),
+        "encoder": simulation.encoder(),
+        "truth_parameters": simulation.truth_parameters(),
+        "truth_labels": recorded.labels,
+        "metadata": simulation.metadata(),
+    }
+
+
+def write_recording(
+    simulation: Simulation,
+    recorded: RecordedTruth,
+    writer: RecordingWriter,
+    progress: Progress | None = None,
+) -> None:
+    """Simulate a whole recording into an open writer, in constant memory."""
+    imu = simulation.imu_samples()
+    if imu is not None:
+        writer.append_imu(imu)
+    for block, now_us in blocks_of(simulation, progress=progress):
+        writer.append(block.events(), truth=block.truth())
+        for frame in recorded.frames_before(now_us):
+            writer.append_frame(frame)
+        for t_us, mask in recorded.known.take():
+            writer.append_known(t_us, mask)
+        poses = recorded.poses_before(now_us)
+        if poses is not None:
+            writer.append_poses(poses)
 
 
 @guarded

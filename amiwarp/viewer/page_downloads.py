@@ -7,20 +7,17 @@ import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from amiwarp.imaging.export import save_values
 from amiwarp.viewer import clouds_film, downloads, layout
 from amiwarp.viewer.job_progress import JobCancelled, JobProgress
-
-if TYPE_CHECKING:
-    from amiwarp.viewer.panel import Panel
+from amiwarp.viewer.page_panel import PagePanel
 
 
 class PageDownloads:
     """Files that a panel writes for the browser, in a folder of its own."""
 
-    def __init__(self, panel: Panel) -> None:
+    def __init__(self, panel: PagePanel) -> None:
         self.panel = panel
         """The panel whose view is written."""
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from amiwarp.io.event_rates import EventRates
 from amiwarp.viewer import captions, layout, page_state
 from amiwarp.viewer.inspector import Inspector
-
-if TYPE_CHECKING:
-    from amiwarp.viewer.panel import Panel
+from amiwarp.viewer.page_panel import PagePanel
 
 STEP_S = 0.2
 """Duration of counting events after which the timeline shows what is counted [s]."""
@@ -18,7 +16,7 @@ STEP_S = 0.2
 class PageTimeline:
     """Counted events of a panel's recording, and of the recordings on its time axis."""
 
-    def __init__(self, panel: Panel) -> None:
+    def __init__(self, panel: PagePanel) -> None:
         self._panel = panel
         self._rates: list[EventRates] = []
         self._rates_first_us = 0

@@ -47,8 +47,8 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
+from amiwarp.cli import common as cli
 from amiwarp.cli.app import COMMANDS, function_of
-from amiwarp.cli.common import NO_FILE, OUTPUT, OUTPUT_EITHER, OUTPUT_FOLDER
 from amiwarp.events.truth import MAPS, MemoryFrames
 from amiwarp.imaging.export import IweFiles
 from amiwarp.io import LiveWriter, file_access, outputs, unfinished
@@ -253,7 +253,7 @@ def path_options(name: str) -> Iterator[tuple[str, bool]]:
         group = get_type_hints(kind, include_extras=True) if is_dataclass(kind) else {key: kind}
         for one, hint in group.items():
             marks = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, str)]
-            if "Path" in str(getattr(hint, "__origin__", hint)) and NO_FILE not in marks:
+            if "Path" in str(getattr(hint, "__origin__", hint)) and cli.NO_FILE not in marks:
                 argument = any(isinstance(mark, ArgumentInfo) for mark in hint.__metadata__)
                 option = f"--{one.replace('_', '-')}"
                 for mark in hint.__metadata__:
@@ -262,7 +262,7 @@ def path_options(name: str) -> Iterator[tuple[str, bool]]:
                         option = mark.default
                 yield (
                     "" if argument else option,
-                    bool({OUTPUT, OUTPUT_FOLDER, OUTPUT_EITHER} & set(marks)),
+                    bool({cli.OUTPUT, cli.OUTPUT_FOLDER, cli.OUTPUT_EITHER} & set(marks)),
                 )
 
 
@@ -453,7 +453,7 @@ def output_options() -> set[tuple[str, str]]:
         hints = get_type_hints(function_of(command), include_extras=True)
         for kind in [hint for hint in hints.values() if is_dataclass(hint)]:
             hints |= get_type_hints(kind, include_extras=True)
-        marked = {OUTPUT, OUTPUT_FOLDER, OUTPUT_EITHER}
+        marked = {cli.OUTPUT, cli.OUTPUT_FOLDER, cli.OUTPUT_EITHER}
         found |= {
             (command, name)
             for name, hint in hints.items()

@@ -18,7 +18,7 @@ INNER = {
     "benchmarks": 2,
     "brightness": 1,
     "calib": 236,
-    "cli": 35,
+    "cli": 33,
     "command_line": 1,
     "compensation": 15,
     "conftest": 1,

@@ -19,7 +19,6 @@ from amiwarp.io import RigWriter
 from amiwarp.optics.prism import Prism
 from amiwarp.schema.calls import guarded
 from amiwarp.simulation.motion import LONGEST_S
-from amiwarp.simulation.recorded_simulation import header_of, write_recording
 from amiwarp.simulation.recorded_truth import RecordedTruth, chosen_instants, labels_of, poses_at
 from amiwarp.simulation.rigs.cameras import (
     RigCamera,
@@ -29,7 +28,7 @@ from amiwarp.simulation.rigs.cameras import (
 )
 from amiwarp.simulation.rigs.paper_platform import APEX, VGA, paper_platform
 from amiwarp.simulation.rigs.taken_frames import TakenFrame, taken_frames
-from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.simulator import Simulation, header_of, write_recording
 from amiwarp.simulation.worlds.device_world import device_world
 from amiwarp.simulation.worlds.mounted_trajectory import MountedTrajectory
 from amiwarp.simulation.worlds.trajectory import Trajectory
