@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,9 +36,6 @@ from amiwarp.validation import (
     vector,
     whole,
 )
-
-if TYPE_CHECKING:
-    from amiwarp.events.encoder_stream import EncoderStream
 
 MOST_SAMPLES = 1 << 28
 """Largest number of samples that :meth:`Encoder.constant_speed` makes: three days at one sample per millisecond."""
@@ -737,7 +734,15 @@ def together(encoders: Sequence[Encoder]) -> Encoder:
     return first
 
 
-def check_prisms(encoder: Encoder | EncoderStream, angles: int) -> None:
+class HasSecond(Protocol):
+    """Encoder of a recording or of a stream, with or without the encoder of a second angle (protocol)."""
+
+    @property
+    def second(self) -> object:
+        """Encoder of the second angle; None without one."""
+
+
+def check_prisms(encoder: HasSecond, angles: int) -> None:
     """Raise :class:`AmiwarpError` if an encoder does not measure this number of angles of a model."""
     if angles == 1 and encoder.second is not None:
         raise AmiwarpError(
