@@ -317,7 +317,9 @@ def test_an_encoder_off_centre_is_corrected_behind_a_plate(seen: amiwarp.Recordi
     assert found.harmonics is not None
     # sin e of the encoder's angle, which is too large by 0.04 sin: a fifth to a third stays in so small an image
     assert found.harmonics == pytest.approx((0.0, -0.03, 0.0, 0.0), abs=0.005)
-    (said,) = found.warnings
+    # On some processors a doubt of 0.01 px about the principal point is said as well.
+    *others, said = found.warnings
+    assert all("the principal point" in other and "0.01 px" in other for other in others)
     assert said.startswith("the encoder's angle is wrong by 1.")
     assert "once a turn: it was corrected" in said
     assert found.parameters["phase"] == pytest.approx(PHASE, abs=0.01)
