@@ -41,6 +41,8 @@ PLANE_PX = 0.3
 """Distance of the orbits' radii at successive inverse depths [px]."""
 LARGEST_PX = 14.0
 """Largest radius of an orbit that is tried [px]: a tile must hold waves that are longer than it."""
+TOGETHER = 256
+"""Number of tiles that are transformed at a time."""
 TILES_OF_LAG = 8
 """Number of tiles from which the lag of the events is found: the ones with the largest sums."""
 LARGEST_REST = 0.9
@@ -96,25 +98,44 @@ def depths_in_phase(
 ) -> TileDepths:
     """Return the inverse depths of tiles. ``largest``: largest to try [1/m]; ``report`` gets the finished share."""
     tried = inverse_depths_to_try(model, largest)
-    middles, spectra = _tiles(sums)
-    orbits = np.stack([_orbits(model, middles, inverse) for inverse in tried.tolist()])
-    report(0.3)
+    tiles = _Tiles(sums)
+    count = len(tiles.corners)
+    orbits = np.stack([_orbits(model, tiles.middles, inverse) for inverse in tried.tolist()])
+    report(0.2)
 
-    strongest = np.argsort(-np.abs(spectra[:, 0]).sum(axis=(1, 2)), kind="stable")[:TILES_OF_LAG]
-    lag_costs = []
+    strength = tiles.strength()
+    strongest = np.argsort(-strength, kind="stable")[:TILES_OF_LAG]
+    lag = _lag_of(tiles.spectra(strongest), orbits[:, strongest])
+    report(0.4)
+
+    late = _late(orbits, lag)
+    parts = []
+    for first in range(0, count, TOGETHER):
+        some = np.arange(first, min(first + TOGETHER, count))
+        parts.append(_depths_of(tiles.spectra(some), tried, late[:, some]))
+        report(0.4 + 0.6 * (some[-1] + 1) / count)
+    inverse_depth, std, rest = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return TileDepths(tiles.middles, inverse_depth, std, rest)
+
+
+def _lag_of(spectra: NDArray[np.complex64], orbits: NDArray[np.complex128]) -> float:
+    """Return the lag of the events of some tiles [rad], each at its best inverse depth."""
+    costs = []
     for lag in LAGS:
-        late = _late(orbits[:, strongest], lag)
-        left, total = tile_squares(spectra[strongest], late, FINEST, damping=DAMPING)
-        lag_costs.append(left.min(axis=0).sum() / max(total[0].sum(), 1e-30))
-    lag = lag_of_costs(LAGS, np.array(lag_costs))
-    report(0.6)
+        left, total = tile_squares(spectra, _late(orbits, lag), FINEST, damping=DAMPING)
+        costs.append(left.min(axis=0).sum() / max(total[0].sum(), 1e-30))
+    return lag_of_costs(LAGS, np.array(costs))
 
-    left, total = tile_squares(spectra, _late(orbits, lag), FINEST, damping=DAMPING)
-    inverse_depth, std, lowest = _minima(tried, left, waves=spectra[0, 0].size * HARMONICS)
+
+def _depths_of(
+    spectra: NDArray[np.complex64], tried: NDArray[np.float64], late: NDArray[np.complex64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return inverse depth, its standard deviation, and the share of the squares that is left, of some tiles."""
+    left, total = tile_squares(spectra, np.ascontiguousarray(late), FINEST, damping=DAMPING)
+    inverse_depth, std, lowest = _minima(tried, left, waves=spectra[0].size)
     rest = lowest / np.maximum(total[0], 1e-30)
     std[(total[0] <= 0.0) | (rest > LARGEST_REST)] = np.inf
-    report(1.0)
-    return TileDepths(middles, inverse_depth, std, rest)
+    return inverse_depth, std, rest
 
 
 def inverse_depths_to_try(model: PlateModel, largest: float) -> NDArray[np.float64]:
@@ -126,24 +147,44 @@ def inverse_depths_to_try(model: PlateModel, largest: float) -> NDArray[np.float
     return np.linspace(least, most, max(5, count))
 
 
-def _tiles(sums: PhaseSums) -> tuple[NDArray[np.float64], NDArray[np.complex64]]:
-    """Return the middle of each tile [px], (n, 2), and the Fourier transforms of its windowed sums."""
-    values = sums.values
-    _, height, width = values.shape
-    padded = np.pad(values, ((0, 0), (SIDE, SIDE), (SIDE, SIDE)))
-    line = np.hanning(SIDE + 2)[1:-1]
-    window = np.outer(line, line).astype(np.float32)
-    tops = np.arange((STEP - SIDE) // 2, height - SIDE // 2, STEP)
-    lefts = np.arange((STEP - SIDE) // 2, width - SIDE // 2, STEP)
-    corners = [(int(top), int(left)) for top in tops for left in lefts]
-    parts = np.empty((len(corners), len(values), SIDE, SIDE), np.complex64)
-    for k, (top, left) in enumerate(corners):
-        rows = slice(top + SIDE, top + 2 * SIDE)
-        columns = slice(left + SIDE, left + 2 * SIDE)
-        np.multiply(padded[:, rows, columns], window, out=parts[k])
-    spectra = scipy.fft.fft2(parts, workers=cpu_threads(), overwrite_x=True)
-    middles = np.array([(left + (SIDE - 1) / 2, top + (SIDE - 1) / 2) for top, left in corners])
-    return middles, spectra.astype(np.complex64, copy=False)
+class _Tiles:
+    """Windowed tiles of sums in phase, whose spectra are made for some at a time: all would take gigabytes."""
+
+    def __init__(self, sums: PhaseSums) -> None:
+        """Place the tiles over the image, row by row."""
+        _, height, width = sums.values.shape
+        self._padded = np.pad(sums.values, ((0, 0), (SIDE, SIDE), (SIDE, SIDE)))
+        line = np.hanning(SIDE + 2)[1:-1]
+        self._window = np.outer(line, line).astype(np.float32)
+        tops = np.arange((STEP - SIDE) // 2, height - SIDE // 2, STEP)
+        lefts = np.arange((STEP - SIDE) // 2, width - SIDE // 2, STEP)
+        self.corners = [(int(top), int(left)) for top in tops for left in lefts]
+        """First row and column of each tile, which may lie outside of the image [px]."""
+        middle = (SIDE - 1) / 2
+        self.middles = np.array([(left + middle, top + middle) for top, left in self.corners])
+        """Middle of each tile [px], shape (n, 2)."""
+
+    def strength(self) -> NDArray[np.float64]:
+        """Return the sum of the sizes of the waves of each tile's first sum, shape (n,)."""
+        found = np.empty(len(self.corners))
+        for first in range(0, len(found), TOGETHER):
+            some = np.arange(first, min(first + TOGETHER, len(found)))
+            found[some] = np.abs(self.spectra(some, harmonics=1)[:, 0]).sum(axis=(1, 2))
+        return found
+
+    def spectra(
+        self, some: NDArray[np.intp], *, harmonics: int | None = None
+    ) -> NDArray[np.complex64]:
+        """Return the Fourier transforms of the windowed sums of some tiles, shape (tiles, harmonics, side, side)."""
+        values = self._padded[:harmonics]
+        parts = np.empty((len(some), len(values), SIDE, SIDE), np.complex64)
+        for k, tile in enumerate(some.tolist()):
+            top, left = self.corners[tile]
+            rows = slice(top + SIDE, top + 2 * SIDE)
+            columns = slice(left + SIDE, left + 2 * SIDE)
+            np.multiply(values[:, rows, columns], self._window, out=parts[k])
+        spectra = scipy.fft.fft2(parts, workers=cpu_threads(), overwrite_x=True)
+        return np.asarray(spectra, np.complex64)
 
 
 def _orbits(
