@@ -1,4 +1,4 @@
-"""Evaluation of the camera's rotation from events against a gyroscope, and of what it tells of the gyroscope's bias."""
+"""Evaluation of the camera's rotation from events against a gyroscope, and of the bias of the gyroscope."""
 
 from __future__ import annotations
 
