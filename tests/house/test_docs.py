@@ -292,8 +292,35 @@ def untested(page_commands: Any, text: str) -> list[str]:
 def test_each_block_that_is_not_tested_has_a_twin_with_its_commands_and_options(
     page_commands: Any,
 ) -> None:
-    found = {page: untested(page_commands, page.read_text()) for page in page_commands.pages_of()}
+    found = {page: untested(page_commands, page.read_text()) for page in run_pages(page_commands)}
     assert {page: problems for page, problems in found.items() if problems} == {}
+
+
+def run_pages(page_commands: Any) -> list[Path]:
+    """Return the pages whose commands the site's build runs, those that it copies from other folders among them."""
+    return [*page_commands.pages_of(), ROOT / "rig/numbers.md", ROOT / "ros/amiwarp_ros/README.md"]
+
+
+ELSEWHERE = re.compile(r"^(?:sudo|ros2|colcon|docker)\b", re.M)
+"""Commands of programs that the machine which builds the site need not have."""
+
+
+def runs_elsewhere(page_commands: Any, text: str) -> list[int]:
+    """Return the lines of a page's blocks that would run such a program."""
+    return [
+        block.line
+        for block in page_commands.blocks(text)
+        if block.kind == "sh"
+        and ELSEWHERE.search(block.text)
+        and not block.text.startswith(page_commands.NOT_RUN)
+        and not page_commands.INSTALLATION.search(block.text)
+    ]
+
+
+def test_blocks_of_programs_that_the_site_lacks_are_marked(page_commands: Any) -> None:
+    found = {p: runs_elsewhere(page_commands, p.read_text()) for p in run_pages(page_commands)}
+    assert {page: lines for page, lines in found.items() if lines} == {}
+    assert runs_elsewhere(page_commands, "```sh\namiwarp info a\nros2 topic list\n```\n") == [1]
 
 
 def test_a_missing_twin_and_a_missing_option_are_seen(page_commands: Any) -> None:
