@@ -61,6 +61,9 @@ api_rooms = [
 repository_pages = {
     "changelog": "CHANGELOG.md",
     "contributing": "CONTRIBUTING.md",
+    "releasing": "RELEASING.md",
+    "security": "SECURITY.md",
+    "code-of-conduct": "CODE_OF_CONDUCT.md",
     "how-to/rig-numbers": "rig/numbers.md",
     "how-to/robot-nodes": "ros/amiwarp_ros/README.md",
     "reference/measurements/*": "benchmarks/results/*.md",
