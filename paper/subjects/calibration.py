@@ -5,7 +5,17 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 
 from paper.drawing import COLOURS, new_figure
-from paper.sources import Row, Table, Values, fixed, median, percents, results, significant
+from paper.sources import (
+    Row,
+    Table,
+    Values,
+    fixed,
+    median,
+    percents,
+    results,
+    significant,
+    table_after,
+)
 
 APEXES = (0.5, 1.0, 2.0)
 
@@ -18,6 +28,13 @@ def rows() -> list[Row]:
 def at_apex(apex_deg: float) -> list[Row]:
     """Return the recordings with an apex angle."""
     return [row for row in rows() if row["apex_true_deg"] == apex_deg]
+
+
+def measure_px(cost: str, smoothing: str) -> str:
+    """Return the median error [px] of a measure of sharpness alone, on nine other recordings."""
+    table = table_after("calibration_defaults.md", "## Costs and smoothing, without dither")
+    row = next(row for row in table if f"`{cost}`" in row["cost"])
+    return row[smoothing].strip("*").split(" / ")[0]
 
 
 def apex_coverage() -> list[float]:
@@ -36,6 +53,8 @@ def values() -> Values:
         "calibration.accepted": str(sum(row["ok"] for row in found)),
         "calibration.sharpness_least": significant(min(sharpness), 1),
         "calibration.sharpness_most": significant(max(sharpness), 1),
+        "calibration.variance": measure_px("variance", "1 px"),
+        "calibration.gradient": measure_px("gradient", "not smoothed"),
         "calibration.both_median": fixed(median(found, "model_error_px"), 4),
         "calibration.both_largest": fixed(max(row["model_error_px"] for row in found), 4),
         "calibration.largest_phase": fixed(max(abs(row["phase_error_deg"]) for row in found), 2),

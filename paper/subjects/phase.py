@@ -37,6 +37,13 @@ def turning(camera_deg_s: float) -> list[Row]:
     return [row for row in rows("camera_deg_s") if row["camera_deg_s"] == camera_deg_s]
 
 
+def flickering() -> list[Row]:
+    """Return the recordings with the deepest flicker."""
+    found = rows("lamp_depth")
+    deepest = max(row["lamp_depth"] for row in found)
+    return [row for row in found if row["lamp_depth"] == deepest]
+
+
 def speed_range(method: str) -> tuple[str, str]:
     """Return the least and the largest time of a method at full size on two cores [ms]."""
     times = [1e3 * row[method]["duration_s"] for row in rows("speed")]
@@ -68,6 +75,8 @@ def values() -> Values:
         "phase.turning_detail": fixed(median_of(turning(30.0), "phase", "detail"), 2),
         "phase.turning_solver": fixed(median_of(turning(30.0), "solver", "detail"), 2),
         "phase.turning_speed": f"{max(row['camera_deg_s'] for row in rows('camera_deg_s')):g}",
+        "phase.lamp_whole": fixed(median_of(flickering(), "phase", "whole"), 2),
+        "phase.lamp_solver": fixed(median_of(flickering(), "solver", "whole"), 2),
         "phase.cuda_events": significant(1e-6 * found["result"]["events"]),
         "phase.cuda_sums_ms": stage_ms("sums", "launches"),
         "phase.cuda_detail_ms": stage_ms("events to detail"),
