@@ -33,7 +33,12 @@ def read_list(text: str) -> tuple[dict[str, str], list[str]]:
 def checked_files(skipped: list[str]) -> Iterator[Path]:
     """Yield all files that are checked."""
     yield from sorted(ROOT.glob("*.md"))
-    folders = (("amiwarp", (".py", ".pyi")), ("docs", (".md", ".py")), ("ros", (".md", ".py")))
+    folders = (
+        ("amiwarp", (".py", ".pyi")),
+        ("docs", (".md", ".py")),
+        ("ros", (".md", ".py")),
+        ("paper", (".md", ".py", ".typ")),
+    )
     for folder, endings in folders:
         for path in sorted((ROOT / folder).rglob("*")):
             name = path.relative_to(ROOT).as_posix()

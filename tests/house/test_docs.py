@@ -231,7 +231,8 @@ def unknown_commands(text: str) -> list[str]:
     """Return what code on a page names and does not exist: dotted names, commands, programs and their options."""
     commands = {name: options_of(one) for name, one in typer.main.get_command(app).commands.items()}
     programs = {path.stem: path.read_text() for path in (ROOT / "benchmarks").glob("*.py")}
-    sources = [*programs.values(), (ROOT / "rig" / "__main__.py").read_text()]
+    others = (ROOT / "rig" / "__main__.py", ROOT / "paper" / "build.py")
+    sources = [*programs.values(), *(path.read_text() for path in others)]
     anywhere = set().union(*commands.values()) | {
         option for source in sources for option in OPTION.findall(source)
     }
