@@ -151,6 +151,21 @@ def test_options_of_a_body(tmp_path: Path) -> None:
         np.testing.assert_allclose(seen_corners(hand, t), carried, rtol=0, atol=1e-6)
 
 
+def test_bodies_of_an_animation_begin_again_together(tmp_path: Path) -> None:
+    """After the last key of the whole animation, also those whose own last key comes earlier."""
+    maker = Maker([{"name": "early", "mesh": 0}, {"name": "late", "mesh": 0}])
+    channels: list[Channel] = [
+        (k, "translation", "LINEAR", [0, end], [(0, 0, 0), (1, 0, 0)])
+        for k, end in enumerate((0.5, 1.0))
+    ]
+    maker.animate("Both", channels)
+    maker.write(tmp_path / "two.glb")
+    world, _ = load_world(world_file(tmp_path, "two.glb", animation_loop=True))
+    for t, early, late in ((0.25, 0.5, 0.25), (0.75, 1.0, 0.75), (1.25, 0.5, 0.25)):
+        for body, x in zip(world.bodies, (early, late), strict=True):
+            np.testing.assert_allclose(seen_corners(body, t)[0, 0], x, rtol=0, atol=1e-9)
+
+
 def test_the_first_animation_unless_one_is_named(tmp_path: Path) -> None:
     maker = Maker([{"name": "a", "mesh": 0}])
     for name, x in (("Near", 1.0), (None, 2.0)):

@@ -39,6 +39,8 @@ class NodeMotion:
     """Name of the animation."""
     others: tuple[str, ...]
     """Names of the other animations of the file."""
+    end: float
+    """Time of the last key of the animation, whichever node it moves [s]."""
     chain: Sequence[Node]
     """Nodes from the root to the node."""
     turn: Array
@@ -62,15 +64,15 @@ class AnimatedTrajectory(Trajectory):
         self_set(self, "motion", motion)
         self_set(self, "_axes", motion.turn / scale)
         self_set(self, "_speed", speed)
-        self_set(self, "_loop", loop and keys[-1] > 0.0)
-        self_set(self, "_end", float(keys[-1]))
+        self_set(self, "_loop", loop and motion.end > 0.0)
+        self_set(self, "_end", motion.end)
         self_set(self, "_keys", keys)
         self_set(self, "_carrier", carrier)
         (shape,), _ = placed(motion.chain, np.zeros(1), np.zeros(1))
         self_set(self, "_unshape", np.linalg.inv(shape))
-        if self._loop and keys[-1] < SHORTEST_S * speed:
+        if self._loop and motion.end < SHORTEST_S * speed:
             raise AmiwarpError(
-                f"animation {motion.animation!r} would be repeated after {keys[-1] / speed:.3g} s; give "
+                f"animation {motion.animation!r} would be repeated after {motion.end / speed:.3g} s; give "
                 "animation_loop = false"
             )
         from scipy.spatial.transform import Rotation

@@ -203,6 +203,12 @@ class Animation:
         """Whether the animation has channels."""
         return bool(self._channels)
 
+    @property
+    def end(self) -> float:
+        """Time of the last key of all channels [s]."""
+        ends = [channel.t[-1] for of in self._channels.values() for channel in of.values()]
+        return float(max(ends))
+
     def nodes(self) -> list[Node]:
         """Return all nodes of the file."""
         return [self.node(index) for index in range(len(self._nodes))]

@@ -52,12 +52,12 @@ class AnimatedScene:
             self.source = document.with_names(names)
 
     @property
-    def names(self) -> dict[str, Any]:
-        """Names of the chosen animation and of the others."""
+    def clip(self) -> dict[str, Any]:
+        """Names of the chosen animation and of the others, and the time of its last key [s]."""
         if self._animation is None:
-            return {"animation": None, "others": []}
+            return {"animation": None, "others": [], "end": 0.0}
         others = [name for name in self._animation.names if name != self._animation.name]
-        return {"animation": self._animation.name, "others": others}
+        return {"animation": self._animation.name, "others": others, "end": self._animation.end}
 
     def sorted_nodes(self, nodes: Iterable[str]) -> list[str]:
         """Return the names of nodes in trimesh's scene, in the order of their names in the file."""

@@ -145,7 +145,8 @@ def load_mesh(
         for k, about in enumerate(answer["parts"]):
             if about["chain"] is not None:
                 chain = [nodes[number] for number in about["chain"]]
-                motion = NodeMotion(answer["animation"], tuple(answer["others"]), chain, turn)
+                others = tuple(answer["others"])
+                motion = NodeMotion(answer["animation"], others, answer["end"], chain, turn)
                 parts[k] = parts[k]._replace(motion=motion)
     if not parts:
         raise AmiwarpError(
@@ -234,7 +235,7 @@ def read_parts(
             parts.append({**about, "reflectance": reflectance, "shapes": shapes})
             arrays += [value.ravel() for value in values if value is not None]
     nodes, of_nodes = animated.nodes()
-    answer = {"files": files, "parts": parts, "nodes": nodes, **animated.names}
+    answer = {"files": files, "parts": parts, "nodes": nodes, **animated.clip}
     return answer, [*arrays, *of_nodes]
 
 
