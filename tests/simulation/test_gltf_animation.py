@@ -338,6 +338,19 @@ def test_a_body_that_starts_slowly_is_not_missed(tmp_path: Path, seeing: str) ->
     assert 0.6 < middle / len(events) < 0.78
 
 
+def test_a_short_fast_motion_is_seen_in_short_steps(tmp_path: Path) -> None:
+    """Its edge passes one column of pixels after the other, although the motion lasts 2 ms of 200."""
+    values = [(0, 0, 0), (0, 0, 0), (0.4, 0, 0), (0.4, 0, 0)]
+    world = slide(tmp_path, "LINEAR", [0, 0.1005, 0.1025, 0.2], values)
+    events = events_of(world, 0.2, seeing="rays")
+    right = events.x > CAMERA.cx + 2
+    columns = np.unique(events.x[right])
+    times = [np.median(events.t[right & (events.x == column)]) for column in columns]
+    assert len(times) >= 5
+    assert (np.diff(times[:-1]) > 100).all()  # us; the last is reached in part
+    assert np.ptp(times) > 1000
+
+
 @pytest.mark.parametrize("seeing", ["maps", "rays"])
 @pytest.mark.parametrize("loop", [False, True])
 def test_a_jump_makes_events_at_its_time_alone(tmp_path: Path, seeing: str, loop: bool) -> None:
@@ -451,6 +464,10 @@ REFUSED: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "buffer too short": (
         changed_slide(lambda m: accessor(m, count=3)),
+        f"{HERE} reaches beyond its buffer",
+    ),
+    "view beyond the buffer": (
+        changed_slide(lambda m: m.views[-1].update(byteOffset=10**6)),
         f"{HERE} reaches beyond its buffer",
     ),
     "negative offset": (
