@@ -341,7 +341,7 @@ def test_a_body_that_starts_slowly_is_not_missed(tmp_path: Path, seeing: str) ->
 def test_a_short_fast_motion_is_seen_in_short_steps(tmp_path: Path) -> None:
     """Its edge passes one column of pixels after the other, although the motion lasts 2 ms of 200."""
     values = [(0, 0, 0), (0, 0, 0), (0.4, 0, 0), (0.4, 0, 0)]
-    world = slide(tmp_path, "LINEAR", [0, 0.1005, 0.1025, 0.2], values)
+    world = slide(tmp_path, "LINEAR", [0, 0.1025, 0.1045, 0.2], values)
     events = events_of(world, 0.2, seeing="rays")
     right = events.x > CAMERA.cx + 2
     columns = np.unique(events.x[right])
