@@ -20,6 +20,7 @@ from amiwarp.simulation.view import mirrored, prism_view_of
 from amiwarp.simulation.worlds.device_world import device_world
 from amiwarp.simulation.worlds.sight import WorldSight
 from amiwarp.simulation.worlds.surfaces import SurfaceView, pixel_rays, surfaces_at
+from amiwarp.simulation.worlds.trajectory import poses_near
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.validation import whole
 
@@ -256,7 +257,7 @@ class TruthRenderer:
         """
 
         def ray_at(later: float) -> NDArray[np.float64]:
-            rays, _ = self._ray_at(surfaces, pixels, t, later)
+            rays, _ = self._ray_at(surfaces, pixels, t, later, smooth=True)
             return rays
 
         change = rate_of_change(ray_at, t, self._simulation.duration_s)
@@ -271,11 +272,18 @@ class TruthRenderer:
         return np.asarray((after - before) / (2.0 * ANGLE) * rate)
 
     def _ray_at(
-        self, surfaces: SurfaceView, pixels: NDArray[np.float64], t: float, later: float
+        self,
+        surfaces: SurfaceView,
+        pixels: NDArray[np.float64],
+        t: float,
+        later: float,
+        *,
+        smooth: bool = False,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return unit rays from the camera at time ``later`` [s] to the points that pixels see at time ``t`` [s].
 
         The rays are in the camera's frame, shape (n, 3). The second array has the depths of the points [m], shape (n,).
+        ``smooth``: whether bodies move on from ``t`` as if no abrupt change of their motion came between.
         """
         (rotation, later_rotation), (position, later_position) = self._poses([t, later])
         rays = self._simulation.camera.pixels_to_rays(pixels).astype(np.float64)
@@ -288,7 +296,10 @@ class TruthRenderer:
         for k, body in enumerate(self._world.movers):
             on_body = (surfaces.mover == k) & ~sky
             if body.trajectory is not None and on_body.any():
-                (turn, later_turn), (place, later_place) = body.trajectory.poses([t, later])
+                near = [t, t] if smooth else [t, later]
+                turns, places = poses_near(body.trajectory, near, [t, later])
+                turn, later_turn = turns
+                place, later_place = places
                 in_body = (points[on_body] - place) @ turn
                 points[on_body] = in_body @ later_turn.T + later_place
 

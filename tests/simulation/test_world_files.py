@@ -24,6 +24,7 @@ from amiwarp.simulation.picture_light import LUMINANCE
 from amiwarp.simulation.worlds import trajectory
 from amiwarp.simulation.worlds.mesh_reader import load_mesh
 from tests import ROOT
+from tests.gltf_files import Maker
 
 PAGE = ROOT / "docs" / "reference" / "world-files.md"
 EXAMPLE = re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.S)[0]
@@ -52,6 +53,12 @@ def folder(tmp_path: Path) -> Path:
     box.visual.vertex_colors = [GREY, GREY, GREY, 255]
     box.export(tmp_path / "toy.ply")
     (tmp_path / "toy.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0,0,1,0,0,0,1\n1,0.5,0,1,0,0,0,1\n")
+    fan = Maker([{"name": "blade", "mesh": 0}])
+    fan.animate(
+        "Turn",
+        [(0, "rotation", "LINEAR", [0, 1, 2], [(0, 0, 0, 1), (0, 0, 0.6, 0.8), (0, 0, 0, 1)])],
+    )
+    fan.write(tmp_path / "fan.glb")
     picture(tmp_path / "wood.png")
     picture(tmp_path / "sky.png", (16, 8))
     (tmp_path / "shelf.toml").write_text(EXAMPLE)
@@ -60,11 +67,11 @@ def folder(tmp_path: Path) -> Path:
 
 def test_the_documented_example(folder: Path) -> None:
     world, trajectory = load_world(folder / "shelf.toml")
-    board, toy = world.bodies
-    assert (world.name, world.ambient, world.triangles) == ("shelf", 0.4, 14)
-    assert world.instances == ("board", "toy car")
-    assert world.categories == ("furniture", "toy")
-    assert world.moving == (toy,)
+    board, toy, fan = world.bodies
+    assert (world.name, world.ambient, world.triangles) == ("shelf", 0.4, 18)
+    assert world.instances == ("board", "toy car", "fan")
+    assert world.categories == ("furniture", "toy", "")
+    assert world.moving == (toy, fan)
     assert world.sun is not None
     np.testing.assert_allclose(
         world.sun.direction, np.array([1, -1, 2]) / np.sqrt(6), rtol=0, atol=1e-12
@@ -282,8 +289,8 @@ def test_parts_of_a_scene_stand_where_they_are_put(tmp_path: Path, folder: Path)
     data["bodies"][1]["mesh"] = "two.glb"
     (folder / "w.json").write_text(json.dumps(data))
     world, _ = load_world(folder / "w.json")
-    assert [body.name for body in world.bodies] == ["board", "toy/left", "toy/right"]
-    assert world.instances == ("board", "toy car")
+    assert [body.name for body in world.bodies] == ["board", "toy/left", "toy/right", "fan"]
+    assert world.instances == ("board", "toy car", "fan")
 
 
 @pytest.mark.parametrize(("kind", "linear"), [("ply", False), ("obj", False), ("glb", True)])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from amiwarp.cli import common as cli
+from amiwarp.cli import say
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.output_formats import check_ending
 from amiwarp.simulation.choices import Seeing
@@ -127,11 +128,13 @@ class WorldOptions:
 
     def build_scene(self, duration_s: float, *, seed: int, blur: float) -> WorldScene:
         """Return the world and the camera's trajectory. ``blur``: standard deviation of the optical blur [px]."""
-        from amiwarp.simulation.worlds.world_choice import open_world
+        from amiwarp.simulation.worlds.world_choice import animation_notes, open_world
 
         world, trajectory = open_world(
             self.world or "", self.trajectory, seed=seed, duration_s=duration_s
         )
+        for note in animation_notes(world):
+            say(note)
         given = {
             name: value
             for name in ("seeing", "motion_px")

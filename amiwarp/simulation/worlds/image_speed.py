@@ -15,7 +15,7 @@ from amiwarp.simulation.description import SimulationValues
 from amiwarp.simulation.worlds.bodies import Body
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.surfaces import pixel_rays, surfaces_at
-from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.simulation.worlds.trajectory import Trajectory, abrupt_changes, poses_near
 from amiwarp.simulation.worlds.world_scene import WorldScene
 
 PROBE = 48
@@ -37,7 +37,8 @@ def body_speed(
     assert body.trajectory is not None
     centre, radius = body.mesh.bounding_sphere
     rotation, position = body.trajectory.poses(t)
-    rotation_after, position_after = body.trajectory.poses(t + MOMENT_S)
+    # A jump is no speed.
+    rotation_after, position_after = poses_near(body.trajectory, t, t + MOMENT_S)
     _, camera = trajectory.poses(t)
     _, camera_after = trajectory.poses(t + MOMENT_S)
 
@@ -119,6 +120,29 @@ def movers_speed(
     return np.max([np.zeros(len(t)), *speeds], axis=0)
 
 
+def changes_of(world: DeviceWorld, stop: float) -> NDArray[np.float64]:
+    """Return the times from 0 to ``stop`` [s] at which the motion of a body may change abruptly, increasing."""
+    changes: list[NDArray[np.float64]] = [np.empty(0)]
+    for body in world.movers:
+        assert body.trajectory is not None
+        changes.append(abrupt_changes(body.trajectory, stop))
+    return np.unique(np.concatenate(changes))
+
+
+def fastest_between_changes(
+    world: DeviceWorld, camera: Camera, trajectory: Trajectory, start: float, stop: float
+) -> float:
+    """Return an upper bound of the speed of moving bodies in the image [px/s] at the abrupt changes of their motion
+    from ``start`` to ``stop`` [s] and in the middle between two; 0 if there are none."""
+    changes = changes_of(world, stop)
+    inside = changes[changes >= start]
+    if not len(inside):
+        return 0.0
+    middles = (inside[1:] + inside[:-1]) / 2.0
+    moments = np.concatenate([inside, middles])
+    return float(movers_speed(world, camera, trajectory, moments).max())
+
+
 def rotation_speed(
     camera: Camera, trajectory: Trajectory, t: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -171,8 +195,15 @@ def image_speed_at(
     """Return the largest speeds of a world's image at times [s], shape ``(n,)``."""
     world.set_instants(t)
     speed = movers_speed(world, camera, trajectory, t)
+    others = np.zeros(len(t))
     if trajectory.moves:
         for k, moment in enumerate(t.tolist()):
-            speed[k] += parallax_speed(world, camera, trajectory, moment, k)
-    total = speed + rotation_speed(camera, trajectory, t)
-    return ImageSpeed(float(total.max()), float(speed.max()))
+            others[k] = parallax_speed(world, camera, trajectory, moment, k)
+    speed += others
+    turning = rotation_speed(camera, trajectory, t)
+    total = speed + turning
+    # Motion between keys may lie between the given times.
+    fastest = fastest_between_changes(world, camera, trajectory, float(t.min()), float(t.max()))
+    largest_total = max(total.max(), fastest + (others + turning).max() if fastest else 0.0)
+    largest = max(speed.max(), fastest + others.max() if fastest else 0.0)
+    return ImageSpeed(float(largest_total), float(largest))

@@ -14,7 +14,12 @@ from amiwarp.simulation.maps import SMALLEST_COSINE, TEXELS_PER_PIXEL, MapSlots
 from amiwarp.simulation.picture_light import DARK
 from amiwarp.simulation.picture_placement import Placement
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.image_speed import flicker_interval_s, movers_speed, parallax_speed
+from amiwarp.simulation.worlds.image_speed import (
+    changes_of,
+    flicker_interval_s,
+    movers_speed,
+    parallax_speed,
+)
 from amiwarp.simulation.worlds.map_renderer import MapRenderer
 from amiwarp.simulation.worlds.surfaces import device_pose
 from amiwarp.simulation.worlds.world_scene import WorldScene
@@ -24,6 +29,10 @@ MARGIN_PX = 24.0
 orientation of the maps changes."""
 LONGEST_S = 0.5
 """Longest time between two successive maps if the camera or a body moves, or a lamp flickers [s]."""
+SHORTEST_S = 1e-6
+"""Shortest time between two successive maps [s]."""
+SPEEDS_BETWEEN = 8
+"""Number of moments until the next key of an animation at which the speed of bodies is computed."""
 SAMPLES = 4
 """Default number of rays per texel at edges."""
 TEXEL_VARIANCE = 1.0 / 12.0 + 1.0 / 6.0
@@ -86,6 +95,8 @@ class WorldMapRing:
         self._held: list[HeldMap] = []
         # Whole maps before and after the last held map; one at the start.
         self._whole: list[HeldMap] = []
+        # No map is interpolated across an abrupt change of a body's motion.
+        self._motion_changes = changes_of(world, simulation.duration_s + LONGEST_S)
         self.rendered = 0
         """Number of whole maps rendered so far."""
 
@@ -172,10 +183,26 @@ class WorldMapRing:
         longest = min(LONGEST_S, flicker_interval_s(scene.world))
         whole = min(longest, scene.motion_px / max(parallax, 1e-9))
         between = min(longest, scene.motion_px / max(parallax + movers, 1e-9))
+        if len(self._motion_changes):
+            between = self._until_change(t, between, parallax)
         if not self._world.device.is_cpu:
             # A GPU renders a whole map faster than the host finds the tiles in which bodies move.
             whole = between
-        return max(whole, 1e-6), max(between, 1e-6)
+        return max(whole, SHORTEST_S), max(between, SHORTEST_S)
+
+    def _until_change(self, t: float, interval: float, parallax: float) -> float:
+        """Return an interval from ``t`` [s], shortened so that it ends at the next abrupt change of a body's motion,
+        and that bodies move in it by no more than they should.
+
+        ``parallax``: speed due to the camera's translation [px/s].
+        """
+        following = np.searchsorted(self._motion_changes, t + SHORTEST_S / 2.0, side="right")
+        for change in self._motion_changes[following : following + 1].tolist():
+            interval = min(interval, change - t)
+        # Bodies that start from rest are fast only later.
+        moments = np.linspace(t, t + interval, SPEEDS_BETWEEN, endpoint=False)
+        speeds = movers_speed(self._world, self._camera, self._scene.trajectory, moments)
+        return min(interval, self._scene.motion_px / max(parallax + speeds.max(), 1e-9))
 
     def _fits(self, turned: NDArray[np.float64]) -> bool:
         """Return whether the view of a camera, rotated by ``turned`` (3, 3) relative to the map, lies on the map."""

@@ -27,6 +27,7 @@ from amiwarp.simulation.picture_light import (
     PICTURE_FORMATS,
     srgb_to_linear,
 )
+from amiwarp.simulation.worlds.animated_trajectory import NodeMotion
 from amiwarp.simulation.worlds.bodies import Material, Mesh
 from amiwarp.simulation.worlds.colours import (
     MOST_COLOURED,
@@ -35,6 +36,7 @@ from amiwarp.simulation.worlds.colours import (
     is_grey,
     split_colours,
 )
+from amiwarp.simulation.worlds.gltf_parts import AnimatedScene, received_nodes
 from amiwarp.validation import one_of, real
 
 if TYPE_CHECKING:
@@ -81,14 +83,23 @@ class LoadedMesh(NamedTuple):
     """One mesh of a mesh file, with its material."""
 
     mesh: Mesh
-    """Triangles in the frame of the file, turned so that z points up [m]."""
+    """Triangles in the frame of the file, turned so that z points up [m]; of a part that an animation moves, in the
+    frame of its node at the time 0 of the animation, with the axes of the file."""
     material: Material
     """Reflectance, texture and colour that the file gives the mesh."""
     name: str
     """Name of the mesh's node in the file."""
+    motion: NodeMotion | None = None
+    """Motion of the node by the chosen animation; None for a part at rest."""
 
 
-def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) -> list[LoadedMesh]:
+def load_mesh(
+    path: str | Path,
+    *,
+    up: str | None = None,
+    scale: float = 1.0,
+    animation: str | None = None,
+) -> list[LoadedMesh]:
     """Read the meshes of a glTF, GLB, OBJ, PLY or STL file.
 
     Needs trimesh: ``pip install "amiwarp[worlds]"``.
@@ -101,16 +112,19 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
         Axis of the file that points up, ``"y"`` or ``"z"``. None means y in glTF and GLB files, and z in other files.
     scale : float
         Length of the file's unit [m].
+    animation : str, optional
+        Name of the animation of a glTF or GLB file that moves its nodes; by default the first one.
 
     Returns
     -------
     list of LoadedMesh
-        Mesh, material and name of each part. The meshes are in the frame of the file, with z up.
+        Mesh, material, name and motion of each part. The meshes are in the frame of the file, with z up.
 
     Raises
     ------
     AmiwarpError
-        If the file does not exist, has an unknown format or no faces, or refers to a file that is missing.
+        If the file does not exist, has an unknown format or no faces, or refers to a file that is missing; if an
+        animation is damaged, or meshes change their shape.
     """
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")
@@ -125,8 +139,15 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
     turn = real(scale, "mesh scale", 1e-9, 1e9) * rotation
     _check_trimesh(path)
     with errors_name(path, lambda: "cannot be read as a mesh"):
-        answer, arrays = _called(path, kind, turn)
+        answer, arrays = _called(path, kind, turn, animation)
         parts = [_received(about, arrays) for about in answer["parts"]]
+        nodes = received_nodes(answer["nodes"], arrays)
+        for k, about in enumerate(answer["parts"]):
+            if about["chain"] is not None:
+                chain = [nodes[number] for number in about["chain"]]
+                others = tuple(answer["others"])
+                motion = NodeMotion(answer["animation"], others, answer["end"], chain, turn)
+                parts[k] = parts[k]._replace(motion=motion)
     if not parts:
         raise AmiwarpError(
             f"{path}: holds no faces; give a file with triangles, not points or lines alone",
@@ -143,7 +164,7 @@ def mesh_files(path: Path) -> list[Path]:
     _check_trimesh(path)
     try:
         with errors_name(path, lambda: "cannot be read as a mesh"):
-            answer, _ = _called(path, kind, np.eye(3))
+            answer, _ = _called(path, kind, np.eye(3), None)
     except AmiwarpError:
         return []
     return [Path(file) for file in answer["files"]]
@@ -159,7 +180,7 @@ def _check_trimesh(path: Path) -> None:
 
 
 def _called(
-    path: Path, kind: str, turn: NDArray[np.float64]
+    path: Path, kind: str, turn: NDArray[np.float64], animation: str | None
 ) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     """Return what :func:`read_parts` returns, and register the files as inputs."""
     # a glTF file has its arrays in files next to it
@@ -168,7 +189,7 @@ def _called(
     process = borrow()
     try:
         answer, arrays = process.call(
-            f"{__name__}:read_parts", path, kind, turn.tolist(), allowance=allowance
+            f"{__name__}:read_parts", path, kind, turn.tolist(), animation, allowance=allowance
         )
     finally:
         give_back(process)
@@ -191,37 +212,45 @@ def _received(about: dict[str, Any], arrays: list[NDArray[Any]]) -> LoadedMesh:
 
 
 def read_parts(
-    path: str, kind: str, turn: list[list[float]]
+    path: str, kind: str, turn: list[list[float]], animation: str | None
 ) -> tuple[dict[str, Any], list[NDArray[Any]]]:
     """Read the parts of a mesh file, in the reading process.
 
-    ``kind``: suffix of the file; ``turn``: matrix (3, 3) by which vertices are multiplied. The first value holds the
-    files that the mesh file refers to, and of each part the name, the reflectance and the shapes of its arrays,
-    which :data:`Arrays` lists. A shape is None if the part has no such array.
+    ``kind``: suffix of the file; ``turn``: matrix (3, 3) by which vertices are multiplied; ``animation``: name of an
+    animation, or None. The first value holds the files that the mesh file refers to, and of each part the name, the
+    reflectance, the nodes that move it and the shapes of its arrays, which :data:`Arrays` lists. A shape is None if
+    the part has no such array.
     """
-    scene, files = _open(Path(path), kind)
+    scene, files, animated = _open(Path(path), kind, animation)
     parts: list[dict[str, Any]] = []
     arrays: list[NDArray[Any]] = []
-    for node in sorted(scene.graph.nodes_geometry):
+    for node in animated.sorted_nodes(scene.graph.nodes_geometry):
         placed, geometry = scene.graph[node]
         part = scene.geometry[geometry]
         if len(getattr(part, "faces", ())):
-            matrix = np.array(turn) @ placed[:3]
+            matrix = np.array(turn) @ animated.place(node, placed[:3])
             values, reflectance = _part(part, matrix[:, :3], matrix[:, 3], kind)
             shapes = [None if value is None else value.shape for value in values]
-            parts.append({"name": str(node), "reflectance": reflectance, "shapes": shapes})
+            about = {"name": animated.name_of(node), "chain": animated.chain_of(node)}
+            parts.append({**about, "reflectance": reflectance, "shapes": shapes})
             arrays += [value.ravel() for value in values if value is not None]
-    return {"files": files, "parts": parts}, arrays
+    nodes, of_nodes = animated.nodes()
+    answer = {"files": files, "parts": parts, "nodes": nodes, **animated.clip}
+    return answer, [*arrays, *of_nodes]
 
 
-def _open(path: Path, kind: str) -> tuple[Any, list[str]]:
-    """Return the file as a trimesh scene, and the files that it refers to."""
+def _open(path: Path, kind: str, animation: str | None) -> tuple[Any, list[str], AnimatedScene]:
+    """Return the file as a trimesh scene, the files that it refers to, and what moves its nodes."""
     import trimesh
 
     files = _named_files(path)
     with open_input(path) as file:
         try:
-            scene = trimesh.load(file, file_type=kind, resolver=files, force="scene", process=False)
+            animated = AnimatedScene(file, kind, files.get, animation)
+            source = animated.source
+            scene = trimesh.load(
+                source, file_type=kind, resolver=files, force="scene", process=False
+            )
         except Exception:
             if files.missing is None:
                 raise
@@ -229,7 +258,7 @@ def _open(path: Path, kind: str) -> tuple[Any, list[str]]:
             raise AmiwarpError(
                 f"refers to the file {files.missing}; put a valid file next to the mesh file"
             )
-    return scene, files.read
+    return scene, files.read, animated
 
 
 def _named_files(path: Path) -> Any:

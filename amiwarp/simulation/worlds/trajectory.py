@@ -114,6 +114,10 @@ class Trajectory:
             speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
         orientation = self._orientation
         rate = (orientation[:-1].inv() * orientation[1:]).magnitude() / step
+        self._check_speeds(speed, rate)
+
+    def _check_speeds(self, speed: NDArray[np.float64], rate: NDArray[np.float64]) -> None:
+        """Raise :class:`AmiwarpError` if a speed [m/s] or an angular velocity [rad/s] between two poses is too high."""
         self._check_speed("moves", speed, LARGEST_SPEED, "m/s")
         self._check_speed("turns", rate, LARGEST_TURN_RATE, "rad/s")
 
@@ -178,10 +182,7 @@ class Trajectory:
         from scipy.spatial.transform import Slerp
 
         times, position = self._table()
-        given = np.atleast_1d(np.asarray(array(t, "t"), np.float64))
-        if given.ndim != 1 or np.isnan(given).any():
-            what = "holds NaN" if given.ndim == 1 else f"has shape {given.shape}"
-            raise AmiwarpError(f"t {what}; give times in seconds, shape (k,)")
+        given = checked_times(t)
         inside = np.clip(given, times[0], times[-1])
         if times.size == 1:
             turns = np.repeat(self._orientation.as_matrix(), inside.size, axis=0)
@@ -193,6 +194,16 @@ class Trajectory:
             return Slerp(times, self._orientation)(inside).as_matrix(), between
         turn, place = self._splines
         return turn(inside).as_matrix(), np.asarray(place(inside))
+
+    def _poses_near(
+        self, t: NDArray[np.float64], later: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what :func:`poses_near` returns."""
+        return self.poses(later)
+
+    def _changes(self, stop: float) -> NDArray[np.float64]:
+        """Return what :func:`abrupt_changes` returns."""
+        return np.empty(0)
 
     def _derivatives(
         self, t: NDArray[np.float64]
@@ -372,6 +383,33 @@ class Trajectory:
         for row in table.tolist():
             lines.append(" ".join(map(repr, row)))
         write_text(path, "\n".join(lines) + "\n", overwrite=overwrite)
+
+
+def checked_times(t: ArrayLike) -> NDArray[np.float64]:
+    """Return times [s], shape (k,); raise :class:`AmiwarpError` if they are none, or hold NaN."""
+    given = np.atleast_1d(np.asarray(array(t, "t"), np.float64))
+    if given.ndim != 1 or np.isnan(given).any():
+        what = "holds NaN" if given.ndim == 1 else f"has shape {given.shape}"
+        raise AmiwarpError(f"t {what}; give times in seconds, shape (k,)")
+    return given
+
+
+def poses_near(
+    trajectory: Trajectory, t: ArrayLike, later: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the poses at times ``later`` [s], as if the motion at the times ``t`` went on smoothly, each shape (k,).
+
+    Difference quotients of these poses are speeds on one side of a key at which a motion changes abruptly or jumps.
+    """
+    return trajectory._poses_near(checked_times(t), checked_times(later))
+
+
+def abrupt_changes(trajectory: Trajectory, stop: float) -> NDArray[np.float64]:
+    """Return the times from 0 to ``stop`` [s] at which a motion may change abruptly, increasing.
+
+    There are none in a trajectory of poses, which is smooth.
+    """
+    return trajectory._changes(stop)
 
 
 def derivatives_of(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from amiwarp.errors import AmiwarpError, ErrorCode
+from amiwarp.simulation.worlds.animated_trajectory import AnimatedTrajectory
 from amiwarp.simulation.worlds.named.camera_paths import TRAJECTORIES
 from amiwarp.simulation.worlds.named.catalogue import WORLDS, named_world
 from amiwarp.simulation.worlds.trajectory import Trajectory
@@ -48,6 +49,19 @@ def open_world(
             ErrorCode.CONTENT_MISSING,
         )
     return world, chosen
+
+
+def animation_notes(world: World) -> list[str]:
+    """Return which animation of a glTF file moves each object of a world, and the other animations of the file."""
+    notes: list[str] = []
+    for body in world.bodies:
+        if isinstance(body.trajectory, AnimatedTrajectory):
+            motion = body.trajectory.motion
+            others = "".join(f", not {name!r}" for name in motion.others)
+            notes.append(
+                f"note: {body.instance or body.name} follows animation {motion.animation!r}{others}"
+            )
+    return list(dict.fromkeys(notes))
 
 
 def _check_is_name(what: str, name: str, names: tuple[str, ...], suffixes: tuple[str, ...]) -> None:

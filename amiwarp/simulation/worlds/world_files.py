@@ -13,6 +13,7 @@ from amiwarp.io.inputs import errors_name
 from amiwarp.io.json_files import read_json, read_toml
 from amiwarp.schema.calls import guarded
 from amiwarp.schema.records import at_field, build, check_format, fields_of
+from amiwarp.simulation.worlds.animated_trajectory import AnimatedTrajectory
 from amiwarp.simulation.worlds.bodies import Body, Material
 from amiwarp.simulation.worlds.colours import read_colours, relative_colour
 from amiwarp.simulation.worlds.lights import Lamp, Sky, Sun
@@ -44,6 +45,9 @@ class BodyEntry:
     rotation: Quaternion | None = None
     category: str = ""
     instance: str | None = None
+    animation: str | None = None
+    animation_loop: bool | None = None
+    animation_speed: float | None = None
 
 
 @dataclass(frozen=True)
@@ -209,8 +213,14 @@ class _Reader:
         trajectory = self._body_trajectory(given, entry, where)
         parts = at_field(
             f"{where}.mesh",
-            lambda: load_mesh(self._folder / entry.mesh, up=entry.up, scale=entry.scale),
+            lambda: load_mesh(
+                self._folder / entry.mesh,
+                up=entry.up,
+                scale=entry.scale,
+                animation=entry.animation,
+            ),
         )
+        _check_animation(entry, parts, where)
         texture = (None, None)
         if material.texture is not None:
             picture_name = material.texture
@@ -224,7 +234,7 @@ class _Reader:
                 name=name,
                 mesh=part.mesh,
                 material=own_material,
-                trajectory=trajectory,
+                trajectory=at_field(where, partial(_animated, part, entry, trajectory)),
                 category=entry.category,
                 instance=entry.instance or entry.name,
             )
@@ -266,6 +276,32 @@ class _Reader:
                 [pose.t for pose in poses], [pose.position for pose in poses], turns
             ),
         )
+
+
+def _check_animation(entry: BodyEntry, parts: list[LoadedMesh], where: str) -> None:
+    """Raise :class:`AmiwarpError` if an entry has fields of an animation whose values cannot apply."""
+    if entry.animation_speed is not None:
+        real(entry.animation_speed, f"field {where}.animation_speed", 1e-3, 1e3)
+    given = [
+        name for name in ("animation_loop", "animation_speed") if getattr(entry, name) is not None
+    ]
+    if given and not any(part.motion for part in parts):
+        raise AmiwarpError(
+            f"field {where}.{given[0]}: no animation moves a part of {entry.mesh}; remove the field",
+            ErrorCode.FIELD,
+        )
+
+
+def _animated(
+    part: LoadedMesh, entry: BodyEntry, trajectory: Trajectory | None
+) -> Trajectory | None:
+    """Return the trajectory of a part of a mesh file: its animation, in the frame that ``trajectory`` moves."""
+    if part.motion is None:
+        return trajectory
+    speed = 1.0 if entry.animation_speed is None else entry.animation_speed
+    return AnimatedTrajectory(
+        part.motion, loop=bool(entry.animation_loop), speed=speed, carrier=trajectory
+    )
 
 
 def _text(value: Any, where: str) -> str:
