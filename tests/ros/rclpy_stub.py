@@ -187,6 +187,7 @@ class Node:
 
     def create_timer(self, timer_period_sec: float, callback: Callable[[], None]) -> object:
         self.timers_.append(callback)
+        NODES.append(self)  # the last call of the constructors
         return object()
 
     def get_logger(self) -> Logger:
@@ -206,6 +207,8 @@ class Node:
         self.destroyed = True
 
 
+NODES: list[Node] = []
+"""Nodes that were made."""
 OVERRIDES: dict[str, Any] = {}
 """Values of parameters, as from a launch file."""
 

@@ -74,8 +74,12 @@ def ros() -> Iterator[Any]:
 
 @pytest.fixture
 def overrides(ros: Any) -> Iterator[dict[str, Any]]:
+    """Values of parameters. At the end all nodes are closed, because the thread of an open one keeps the program."""
     yield ros.stub.OVERRIDES
     ros.stub.OVERRIDES.clear()
+    for node in ros.stub.NODES:
+        node.close()
+    ros.stub.NODES.clear()
 
 
 @pytest.fixture
@@ -285,17 +289,18 @@ def test_the_compensate_node_publishes_what_compensation_gives(
         node.callbacks["events"](packet(ros, part, k))
         for t in range(int(part.t[0]), int(part.t[-1]) + 1001, 1000):
             node.callbacks["joint_states"](joint(ros, t))
-    wait_for(lambda: node.status.done == 8000)
-    node.timers_[0]()
-    node.close()
-    messages = node.publishers_["compensated/events"].messages
-    got = decoded(ros, messages)
     t = np.arange(1000, 82_001, 1000)
     model = Calibration.load(calibration).model
     events = Events.concatenate(parts)
     xy = np.rint(compensate_events(events, model, Encoder(t, RAD_PER_US * t)))
     inside = (xy[:, 0] >= 0) & (xy[:, 0] < 64) & (xy[:, 1] >= 0) & (xy[:, 1] < 48)
     assert 4000 < np.count_nonzero(inside) < 8000
+    published = str(np.count_nonzero(inside))
+    wait_for(lambda: node.status.done == 8000 and node.figures()["published events"] == published)
+    node.timers_[0]()
+    node.close()
+    messages = node.publishers_["compensated/events"].messages
+    got = decoded(ros, messages)
     np.testing.assert_array_equal(got.t, events.t[inside])
     np.testing.assert_array_equal(got.x, xy[inside, 0])
     np.testing.assert_array_equal(got.y, xy[inside, 1])
@@ -308,7 +313,7 @@ def test_the_compensate_node_publishes_what_compensation_gives(
     values = {value.key: value.value for value in said.status[0].values}
     assert (said.status[0].level, said.status[0].name) == (b"\0", "/compensate")
     assert values["events"] == "8000"
-    assert values["published events"] == str(len(got))
+    assert values["published events"] == str(len(got)) == published
     assert values["missing messages"] == "0"
     assert int(values["events with an extrapolated angle"]) == 0
 
