@@ -1,4 +1,4 @@
-"""Files of cameras: JSON of this package, YAML of ROS and of Kalibr, and ``calib.txt``.
+"""Files of cameras: JSON of this package, YAML of ROS, OpenCV and Kalibr, and ``calib.txt``.
 
 The layout of ROS is described in `camera_calibration_parsers <https://wiki.ros.org/camera_calibration_parsers>`_, with
 the distortion models of ``sensor_msgs/CameraInfo``; Kalibr's is its `camchain
@@ -32,6 +32,12 @@ KALIBR_MODELS = {"radtan": 4, "equidistant": 4, "none": 0}
 """Distortion models of Kalibr's pinhole camera that this package has, with their numbers of coefficients."""
 FISHEYES = ("equidistant", "fisheye")
 """Names of OpenCV's fisheye model in these files."""
+OPENCV_YAML = (
+    (b"%YAML:1.0", b"%YAML 1.1"),
+    (b"!!opencv-matrix", b""),
+    (b"!!opencv-nd-matrix", b""),
+)
+"""What OpenCV writes, and what is read instead: in old releases a first line that is no YAML, and tags."""
 MOST_YAML_BYTES = 1 << 16
 """Largest YAML file that is read [bytes], because PyYAML parses only 100 kB in a second. A camera takes 1 kB."""
 
@@ -43,8 +49,9 @@ def load_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
     Parameters
     ----------
     path : str or Path
-        A file ``.json`` (a camera or a calibration), ``.yaml`` or ``.yml`` (ROS's camera info, or Kalibr's camchain
-        with one camera), or with any other extension a ``calib.txt`` (fx fy cx cy k1 k2 p1 p2 k3).
+        A file ``.json`` (a camera or a calibration), ``.yaml`` or ``.yml`` (ROS's camera info, what OpenCV's
+        calibration programs write, or Kalibr's camchain with one camera), or with any other extension a
+        ``calib.txt`` (fx fy cx cy k1 k2 p1 p2 k3).
     size : tuple of int, optional
         Width and height of the image [px], which ``calib.txt`` does not hold.
 
@@ -133,6 +140,8 @@ def _read_yaml(path: Path) -> Any:
             f"{path}: is larger than {MOST_YAML_BYTES >> 10} KiB, so it is no camera; give another file",
             ErrorCode.FORMAT_UNKNOWN,
         )
+    for written, read in OPENCV_YAML:
+        text = text.replace(written, read)
     try:
         return yaml.safe_load(text)
     except RecursionError as error:
@@ -148,7 +157,7 @@ def _read_yaml(path: Path) -> Any:
 
 
 def _camera_from_yaml(data: Any) -> Camera:
-    """Return the camera of the content of a YAML file, in ROS's or in Kalibr's layout."""
+    """Return the camera of the content of a YAML file, in the layout of ROS, OpenCV or Kalibr."""
     if isinstance(data, dict) and "camera_matrix" in data:
         return _from_ros(data)
     cameras: dict[Any, dict[str, Any]] = {}
@@ -163,7 +172,7 @@ def _camera_from_yaml(data: Any) -> Camera:
         )
     if not cameras:
         raise AmiwarpError(
-            "holds neither camera_matrix (ROS) nor cam0.camera_model (Kalibr); give a file of one of them",
+            "holds neither camera_matrix (ROS, OpenCV) nor cam0.camera_model (Kalibr); give a file of one of them",
             ErrorCode.FORMAT_UNKNOWN,
         )
     [(name, given)] = cameras.items()
@@ -174,11 +183,30 @@ def _from_ros(data: dict[str, Any]) -> Camera:
     width = whole(_field(data, "image_width"), "field image_width", 1, LARGEST_INTEGER)
     height = whole(_field(data, "image_height"), "field image_height", 1, LARGEST_INTEGER)
     matrix = np.reshape(_numbers(data, "camera_matrix", (9,)), (3, 3))
-    # Files that name no model are older than the field, and plumb_bob was the only one then.
-    model = one_of(data.get("distortion_model", "plumb_bob"), ROS_MODELS, "field distortion_model")
+    model = data.get("distortion_model", _unnamed_model(data))
+    one_of(model, ROS_MODELS, "field distortion_model")
     counts = (4, 5) if model == "plumb_bob" else (ROS_MODELS[model],)
     coefficients = _numbers(data, "distortion_coefficients", counts)
     return Camera.from_opencv(matrix, coefficients, (width, height), fisheye=model in FISHEYES)
+
+
+def _unnamed_model(data: dict[str, Any]) -> str:
+    """Return the lens model of a file without its name: one of OpenCV, or an old one of ROS.
+
+    Raises :class:`AmiwarpError` for four coefficients, which may be those of two models.
+    """
+    if data.get("fisheye_model"):
+        return "fisheye"
+    given = data.get("distortion_coefficients")
+    values = given.get("data") if isinstance(given, dict) else given
+    count = len(values) if isinstance(values, list) else 0
+    if count == 4 and "distortion_model" not in data and "fisheye_model" not in data:
+        raise AmiwarpError(
+            "field distortion_model is missing, and 4 coefficients are k1, k2, p1, p2 or those of a fisheye lens; add "
+            "distortion_model: plumb_bob, or distortion_model: equidistant",
+            ErrorCode.AMBIGUOUS,
+        )
+    return "rational_polynomial" if count == 8 else "plumb_bob"
 
 
 def _from_kalibr(data: dict[str, Any], name: str) -> Camera:

@@ -7,6 +7,13 @@ from amiwarp.kernels.native_code import load_int64
 wp.set_module_options({"enable_backward": False})
 
 NEVER = wp.constant(wp.int64(-(2**63)))  # time of a pixel without events
+AFTER_NEVER = wp.constant(wp.int64(1 - 2**63))
+
+
+@wp.func
+def never() -> wp.int64:
+    """Return :data:`NEVER`. Kernels with it as a literal make the compiler warn: C++ has no negative literals."""
+    return AFTER_NEVER - wp.int64(1)
 
 
 @wp.func

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from amiwarp.kernels.background_activity import NEVER, latest_nearby
+from amiwarp.kernels.background_activity import latest_nearby, never
 from amiwarp.kernels.native_code import (
     load_int64,
     load_uint8,
@@ -66,7 +66,7 @@ class FilterState:
 def is_early(parts: FilterParts, state: FilterState, pixel: int, t: wp.int64) -> bool:
     """Return whether an event is within the refractory period of the last kept one of its pixel."""
     last = load_int64(state.kept_t, pixel)
-    if last != NEVER and t - last < parts.refractory_us:
+    if last != never() and t - last < parts.refractory_us:
         return True
     store_int64(state.kept_t, pixel, t)
     return False
@@ -79,14 +79,14 @@ def is_background(parts: FilterParts, state: FilterState, x: int, y: int, t: wp.
     pixel = (y + 1) * stride + x + 1
     near = latest_nearby(state.fired_t, pixel, stride)
     store_int64(state.fired_t, pixel, t)
-    return near == NEVER or t - near > parts.background_us
+    return near == never() or t - near > parts.background_us
 
 
 @wp.func
 def is_over_rate(parts: FilterParts, state: FilterState, t: wp.int64) -> bool:
     """Return whether an event exceeds the rate. Each other one costs a credit of 1, which grows with time."""
     last = state.rate_t[0]
-    if last != NEVER:
+    if last != never():
         grown = state.credit[0] + parts.rate_per_us * wp.float64(t - last)
         state.credit[0] = wp.min(parts.most_credit, grown)
     state.rate_t[0] = t

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.background_activity import NEVER
+from amiwarp.kernels.background_activity import never
 from amiwarp.kernels.native_code import (
     add_squares,
     add_words,
@@ -169,7 +169,7 @@ def keep_latest_windows(
     window = wp.tid()
     latest = out[window]
     for place in range(latest.shape[0]):
-        store_int64(latest, place, NEVER)
+        store_int64(latest, place, never())
     start, stop = events_of(windows, window, grid, x, y, t, faults)
     for i in range(start, stop):
         col, row = nearest(x[i]), nearest(y[i])

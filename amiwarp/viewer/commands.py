@@ -21,6 +21,7 @@ from amiwarp.io import open_recording
 from amiwarp.io.output_formats import check_ending
 from amiwarp.io.rig_files import is_rig, open_rig
 from amiwarp.live.commands.session import SourceOptions, check_angles
+from amiwarp.viewer.captions import beside_rows
 from amiwarp.viewer.host_names import is_local
 from amiwarp.viewer.look import PICTURE_PX
 
@@ -198,6 +199,9 @@ class LookOptions:
             "drawn": drawn,
             "sharpness_before": shown.sharpness_before,
             "sharpness_after": shown.sharpness_after if math.isfinite(inspector.turn_us) else None,
+            "beside": [
+                f"{name}: {', '.join(figures)}" for name, *figures in beside_rows(inspector, shown)
+            ],
             "region": list(shown.region),
             "notes": [*missing, *notes],
         }
@@ -533,6 +537,7 @@ def run_view(
                 opened = rig.rig[rig.main].recording
             elif latest is None:
                 opened = open_recording(recording, **layout.given())
+                _check_whole_pixels(opened, recording)
             else:
                 opened = latest()
             inspector = start.build(
@@ -568,6 +573,16 @@ def run_view(
             return unused.pop() if unused else new_inspector()
 
         page.serve(inspector_of_tab, library, name=recording.name, common=common)
+
+
+def _check_whole_pixels(opened: Recording, path: Path) -> None:
+    """Raise :class:`AmiwarpError` if the events of a recording were moved, so that no parameters can move them."""
+    if len(opened.events) and not opened.events.slice(0, 1).whole_pixels:
+        raise AmiwarpError(
+            f"{path}: its events are already compensated or undistorted; show them beside the recording that they come "
+            f"from, with amiwarp view RECORDING --beside {path.name}",
+            ErrorCode.CONTENT_MISSING,
+        )
 
 
 def _rig_of(folder: Path, start: StartOptions, layout: cli.LayoutOptions) -> ShownRig:
@@ -640,7 +655,9 @@ def exposure_warning(host: str) -> str | None:
 
 
 def _lines(picture: dict[str, Any]) -> list[str]:
-    """Return the lines that are printed about a written picture."""
+    """Return the lines that are printed about a written picture; of two recordings, each with its own figures."""
+    if picture["beside"]:
+        return [*picture["notes"], *picture["beside"], picture["file"]]
     sharpness = f"sharpness {picture['sharpness_before']:.3f} as recorded"
     if picture["sharpness_after"] is not None:
         sharpness += f", {picture['sharpness_after']:.3f} compensated"

@@ -45,6 +45,26 @@ cam0:
 """Example of Kalibr's documentation."""
 
 
+OPENCV = """%YAML:1.0
+---
+calibration_time: "Tue 01 Dec 2026 11:00:00 AM UTC"
+image_width: 640
+image_height: 480
+fisheye_model: 0
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 4.3878e+02, 0., 3.0559e+02, 0., 4.3730e+02, 2.4373e+02, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ -3.6e-01, 1.1e-01, 1.0e-03, 5.0e-04, -2.0e-02 ]
+"""
+"""Layout of OpenCV's sample ``camera_calibration.cpp``, as FileStorage writes it."""
+
+
 def camera(lens: Distortion | None) -> Camera:
     return Camera(640, 480, 520.1, 521.7, 322.0, 1 / 3, lens)
 
@@ -89,6 +109,43 @@ def test_files_of_other_programs(tmp_path: Path) -> None:
     assert load_camera(path) == Camera(752, 480, 461.629, 460.152, 362.680, 246.049, lens)
     path.write_text(KALIBR.replace("radtan", "equidistant"))
     assert load_camera(path).distortion == Fisheye(-0.27695497, 0.06712482, 0.00087538, 0.00011556)
+
+
+def test_files_of_opencv(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yml"
+    path.write_text(OPENCV)
+    lens = RadialTangential(-0.36, 0.11, 1e-3, 5e-4, -0.02)
+    assert load_camera(path) == Camera(640, 480, 438.78, 437.3, 305.59, 243.73, lens)
+    path.write_text(OPENCV.replace("fisheye_model: 0\n", ""))
+    assert load_camera(path).distortion == lens
+    four = OPENCV.replace(", -2.0e-02", "")
+    path.write_text(four)
+    assert load_camera(path).distortion == RadialTangential(-0.36, 0.11, 1e-3, 5e-4)
+    path.write_text(four.replace("model: 0", "model: 1"))
+    assert load_camera(path).distortion == Fisheye(-0.36, 0.11, 1e-3, 5e-4)
+    eight = OPENCV.replace("-2.0e-02", "-2.0e-02, 0.1, 0.2, 0.3")
+    path.write_text(eight)
+    assert load_camera(path).distortion == RadialTangential(
+        -0.36, 0.11, 1e-3, 5e-4, -0.02, 0.1, 0.2, 0.3
+    )
+    path.write_text(four.replace("fisheye_model: 0\n", ""))
+    with pytest.raises(AmiwarpError, match="4 coefficients are k1, k2, p1, p2 or those of a fish"):
+        load_camera(path)
+
+
+def test_what_opencv_writes_itself(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    path = tmp_path / "camera.yml"
+    expected = camera(RadialTangential(-0.3, 0.1, 1e-5, -2e-4, 0.02))
+    matrix, coefficients = expected.to_opencv()
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    file.write("image_width", 640)
+    file.write("image_height", 480)
+    file.write("camera_matrix", matrix)
+    file.write("distortion_coefficients", coefficients)
+    file.release()
+    assert "!!opencv-matrix" in path.read_text()
+    assert load_camera(path) == expected
 
 
 def test_written_files_have_the_fields_of_their_programs(tmp_path: Path) -> None:

@@ -574,6 +574,10 @@ REFUSED: dict[str, tuple[Maker, str]] = {
     "nanoseconds since the start": (
         array(np.c_[T * 100_000, X, Y, P]), r"unit of time is in doubt: times are whole numbers, .* --time-unit",
     ),
+    "milliseconds since the start": (
+        archive(ts=COUNT // 60, xs=COUNT % 640, ys=COUNT % 7, ps=COUNT % 2),
+        r"unit of time is in doubt: times are whole numbers, and the first 60,000 events span 999; ",
+    ),
     "more events than a sensor sends": (
         archive(ts=COUNT // 59_999, xs=COUNT % 640, ys=COUNT % 7, ps=COUNT % 2),
         r"unit of time is in doubt: times are whole numbers, and the first 60,000 events span 1; ",

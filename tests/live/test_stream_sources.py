@@ -164,6 +164,23 @@ def test_samples_of_two_encoders_come_in_step(tmp_path):
             )
 
 
+def test_what_a_replayed_file_does_not_state_is_said(tmp_path):
+    path = tmp_path / "table.csv"
+    rows = [f"{1000 * k},{k % 240},{k % 180},{k % 2}" for k in range(500)]
+    path.write_text("\n".join(["t,x,y,p", *rows]))
+    said: list[str] = []
+    source = open_source(str(path), say=said.append)
+    assert source.size == (240, 180)
+    assert len(said) == 2
+    assert "assumed time unit us (--time-unit): amiwarp convert has the option" in said[0]
+    assert "assumed size 240x180 (--size): amiwarp convert" in said[1]
+    rows[-1] = "4000000000,1,1,1"  # over an hour
+    path.write_text("\n".join(["t,x,y,p", *rows]))
+    message = r"--time-unit s, ms, us or ns: amiwarp convert has the option; play the file that"
+    with pytest.raises(AmiwarpError, match=message):
+        open_source(str(path))
+
+
 def test_files_that_cannot_be_replayed(tmp_path):
     moved = make(10)
     moved = Events(moved.x.astype(np.float32), moved.y.astype(np.float32), moved.t, moved.p)
@@ -260,7 +277,7 @@ def test_a_stream_that_breaks_off_is_used_up_to_there(tail, problem):
         ),
         (
             encode_compensated(Events.from_arrays([0.5], [0.5], [1], [1]), np.zeros(1, np.uint8)),
-            "sends compensated",
+            "sends compensated or undistorted events; .* --raw-to passes on, or .* with its --out",
         ),
         (encode_events(Events.from_arrays([320], [0], [1], [1])), "outside the 320x240 frame"),
         (encode_encoder(np.arange(1), np.array([np.nan])), "not finite"),
@@ -470,6 +487,8 @@ def test_addresses_that_are_none(tmp_path):
             AmiwarpError, match=f"{address}: is not an address; give tcp:HOST:PORT or unix:PATH"
         ):
             open_source(address)
+    with pytest.raises(AmiwarpError, match="with a port up to 65535"):
+        open_source("tcp:host:65536")
     with socket.create_server(("127.0.0.1", 0)) as server:
         taken = f"tcp:127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(AmiwarpError, match=f"{taken}: cannot listen at this address: .*in use"):

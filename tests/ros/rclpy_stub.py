@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import array
 import copy
+import runpy
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, List, NamedTuple  # noqa: UP035 (what launch knows)
+from unittest import mock
 
 import numpy as np
+import yaml
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 EVENT_PACKET = """std_msgs/Header header
@@ -80,9 +84,7 @@ def message_class(full: str) -> type:
 
     def __setattr__(self: Any, field: str, value: Any) -> None:
         assert field in fields, f"{full} has no field {field}"
-        # What was received belongs to the subscriber, who may replace it
-        if not isinstance(value, np.ndarray):
-            check(full, field, fields[field], value)
+        check(full, field, fields[field], value)
         object.__setattr__(self, field, value)
 
     members = {"__init__": __init__, "__setattr__": __setattr__, "full": full}
@@ -185,6 +187,7 @@ class Node:
 
     def create_timer(self, timer_period_sec: float, callback: Callable[[], None]) -> object:
         self.timers_.append(callback)
+        NODES.append(self)  # the last call of the constructors
         return object()
 
     def get_logger(self) -> Logger:
@@ -204,6 +207,8 @@ class Node:
         self.destroyed = True
 
 
+NODES: list[Node] = []
+"""Nodes that were made."""
 OVERRIDES: dict[str, Any] = {}
 """Values of parameters, as from a launch file."""
 
@@ -226,8 +231,65 @@ class ParameterDescriptor:
         self.integer_range: list[Any] = []
 
 
+class ParameterException(Exception):
+    """Base of what rclpy raises for a parameter."""
+
+
 class ExternalShutdownException(Exception):
     """Raised by spin when ROS ends."""
+
+
+class LaunchConfiguration(NamedTuple):
+    """Value of an argument of a launch file."""
+
+    name: str
+
+    def evaluate(self, declared: dict[str, str]) -> str:
+        """Return the default, which must be declared."""
+        return declared[self.name]
+
+
+class ParameterValue:
+    """Parameter of a node with its type, as launch_ros converts it."""
+
+    def __init__(self, value: LaunchConfiguration, *, value_type: Any) -> None:
+        assert value_type in (int, float, bool, str, List[int])  # noqa: UP006 (what launch knows)
+        self.value = value
+        self.value_type = value_type
+
+    def evaluate(self, declared: dict[str, str]) -> Any:
+        """Return the value: a list as YAML, another type from the text."""
+        text = self.value.evaluate(declared)
+        return yaml.safe_load(text) if self.value_type is List[int] else self.value_type(text)  # noqa: UP006
+
+
+def launched(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
+    """Return the defaults of the arguments of a launch file, and what it says of its one node."""
+    declared: dict[str, str] = {}
+    nodes: list[dict[str, Any]] = []
+
+    def declare(name: str, *, default_value: str, description: str) -> None:
+        assert description
+        declared[name] = default_value
+
+    modules: dict[str, dict[str, Any]] = {
+        "launch": {"LaunchDescription": list},
+        "launch.actions": {"DeclareLaunchArgument": declare},
+        "launch.substitutions": {"LaunchConfiguration": LaunchConfiguration},
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": lambda **what: nodes.append(what)},
+        "launch_ros.parameter_descriptions": {"ParameterValue": ParameterValue},
+    }
+    with mock.patch.dict(sys.modules, {name: _module(name, of) for name, of in modules.items()}):
+        runpy.run_path(str(path))["generate_launch_description"]()
+    (node,) = nodes
+    return declared, node
+
+
+def _module(name: str, members: dict[str, Any]) -> ModuleType:
+    module = ModuleType(name)
+    vars(module).update(members)
+    return module
 
 
 def install() -> list[str]:
@@ -239,6 +301,7 @@ def install() -> list[str]:
             "QoSProfile": QoSProfile,
             "ReliabilityPolicy": SimpleNamespace(BEST_EFFORT="best effort"),
         },
+        "rclpy.exceptions": {"ParameterException": ParameterException},
         "rclpy.executors": {"ExternalShutdownException": ExternalShutdownException},
         "rcl_interfaces.msg": {
             "ParameterDescriptor": ParameterDescriptor,
@@ -252,7 +315,5 @@ def install() -> list[str]:
     for name in list(modules):
         modules.setdefault(name.partition(".")[0], {})
     for name, members in modules.items():
-        module = ModuleType(name)
-        vars(module).update(members)
-        sys.modules[name] = module
+        sys.modules[name] = _module(name, members)
     return list(modules)

@@ -74,8 +74,12 @@ def ros() -> Iterator[Any]:
 
 @pytest.fixture
 def overrides(ros: Any) -> Iterator[dict[str, Any]]:
+    """Values of parameters. At the end all nodes are closed, because the thread of an open one keeps the program."""
     yield ros.stub.OVERRIDES
     ros.stub.OVERRIDES.clear()
+    for node in ros.stub.NODES:
+        node.close()
+    ros.stub.NODES.clear()
 
 
 @pytest.fixture
@@ -219,6 +223,24 @@ def test_after_a_cut_words_that_need_lost_ones_are_dropped(ros: Any) -> None:
     assert (events.x.tolist(), events.y.tolist(), events.t.tolist()) == ([8], [10], [4099])
 
 
+def test_a_message_is_left_as_it_came(ros: Any) -> None:
+    message = packet(ros, make(10), 0)
+    before = message.events
+    ros.packets.PacketDecoder().decode(message)
+    assert message.events is before
+
+
+def test_a_bag_that_is_played_again_ends_the_node(ros: Any) -> None:
+    """Its stamps and numbers are those of the first time, so nothing would be published any more."""
+    bag = [packet(ros, make(5, 1000 * (k + 1)), k) for k in range(30)]
+    decoder = ros.packets.PacketDecoder()
+    for message in [*bag, *bag[1:10], packet(ros, make(5, 99_000), 30), *bag[11:20]]:
+        decoder.decode(message)
+    assert decoder.late == 18
+    with pytest.raises(AmiwarpError, match="seq 20 after 30; the bag was played anew"):
+        decoder.decode(bag[20])
+
+
 def test_the_clock_takes_the_smallest_delay_of_the_last_seconds(ros: Any) -> None:
     clock = ros.source.StampClock()
     assert clock.offset_us is None
@@ -267,17 +289,18 @@ def test_the_compensate_node_publishes_what_compensation_gives(
         node.callbacks["events"](packet(ros, part, k))
         for t in range(int(part.t[0]), int(part.t[-1]) + 1001, 1000):
             node.callbacks["joint_states"](joint(ros, t))
-    wait_for(lambda: node.status.done == 8000)
-    node.timers_[0]()
-    node.close()
-    messages = node.publishers_["compensated/events"].messages
-    got = decoded(ros, messages)
     t = np.arange(1000, 82_001, 1000)
     model = Calibration.load(calibration).model
     events = Events.concatenate(parts)
     xy = np.rint(compensate_events(events, model, Encoder(t, RAD_PER_US * t)))
     inside = (xy[:, 0] >= 0) & (xy[:, 0] < 64) & (xy[:, 1] >= 0) & (xy[:, 1] < 48)
     assert 4000 < np.count_nonzero(inside) < 8000
+    published = str(np.count_nonzero(inside))
+    wait_for(lambda: node.status.done == 8000 and node.figures()["published events"] == published)
+    node.timers_[0]()
+    node.close()
+    messages = node.publishers_["compensated/events"].messages
+    got = decoded(ros, messages)
     np.testing.assert_array_equal(got.t, events.t[inside])
     np.testing.assert_array_equal(got.x, xy[inside, 0])
     np.testing.assert_array_equal(got.y, xy[inside, 1])
@@ -290,7 +313,7 @@ def test_the_compensate_node_publishes_what_compensation_gives(
     values = {value.key: value.value for value in said.status[0].values}
     assert (said.status[0].level, said.status[0].name) == (b"\0", "/compensate")
     assert values["events"] == "8000"
-    assert values["published events"] == str(len(got))
+    assert values["published events"] == str(len(got)) == published
     assert values["missing messages"] == "0"
     assert int(values["events with an extrapolated angle"]) == 0
 
@@ -350,6 +373,27 @@ def test_the_pictures_node_publishes_grey_images(
     assert 84_000 < end_us <= 241_000  # after a whole turn, of 83 ms
 
 
+def test_the_compensate_node_publishes_pictures_too(
+    ros: Any, overrides: dict[str, Any], calibration: Path
+) -> None:
+    """In one node, because only one can open the controller's port."""
+    overrides.update(calibration=str(calibration), joint="prism", pictures_hz=50.0, wait_ms=1e4)
+    node = ros.Compensate()
+    for k in range(40):
+        part = make(200, 1000 + 4000 * k, 20)
+        node.callbacks["events"](packet(ros, part, k))
+        for t in range(int(part.t[0]), int(part.t[-1]) + 1001, 1000):
+            node.callbacks["joint_states"](joint(ros, t))
+    images = node.publishers_["picture"].messages
+    wait_for(lambda: len(images) >= 2 and node.status.done == 8000)
+    assert int(node.figures()["pictures"]) >= 2
+    node.close()
+    assert node.publishers_["compensated/events"].messages
+    plain = dict(overrides, pictures_hz=0.0)
+    overrides.update(plain)
+    assert "picture" not in ros.Compensate().publishers_
+
+
 def test_the_filter_node_keeps_what_the_filter_of_files_keeps(
     ros: Any, overrides: dict[str, Any]
 ) -> None:
@@ -387,6 +431,40 @@ def test_parameters_have_descriptions_and_ranges(
 def test_a_node_without_a_calibration_ends_with_one_line(ros: Any) -> None:
     with pytest.raises(SystemExit, match="amiwarp_ros: the parameter calibration is empty"):
         ros.compensate_main([])
+
+
+def test_a_parameter_of_another_type_ends_with_one_line(
+    ros: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_args: Any) -> None:
+        raise ros.stub.ParameterException("'wait_ms' is '10' of type 'INTEGER', expecting 'DOUBLE'")
+
+    monkeypatch.setattr(ros.stub.Node, "declare_parameter", refuse)
+    with pytest.raises(SystemExit, match=r"'wait_ms' is '10' .*; a DOUBLE has a decimal point"):
+        ros.compensate_main([])
+
+
+@pytest.mark.parametrize("name", ["Compensate", "Filter"])
+def test_every_parameter_is_an_argument_of_the_launch_file(
+    ros: Any, overrides: dict[str, Any], calibration: Path, name: str
+) -> None:
+    """ROS ignores an argument that no launch file declares, without a word."""
+    declared, node = ros.stub.launched(PACKAGE / "launch" / f"{name.lower()}.launch.py")
+    assert node["executable"] == name.lower()
+    given = {key: value.evaluate(declared) for key, value in node["parameters"][0].items()}
+    overrides.update(calibration=str(calibration))
+    parameters = getattr(ros, name)().parameters
+    parameters["calibration"] = ""
+    if name == "Filter":
+        del parameters["calibration"]
+        parameters["background_us"] = 5000
+    assert given == parameters
+    assert {key: type(value) for key, value in given.items()} == {
+        key: type(value) for key, value in parameters.items()
+    }
+    topics = {key: value.evaluate(declared) for key, value in node["remappings"]}
+    assert topics["events"] == "/event_camera/events"
+    assert node["namespace"].evaluate(declared) == ""
 
 
 def test_a_node_ends_with_ros(

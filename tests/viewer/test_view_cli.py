@@ -184,6 +184,32 @@ def test_a_picture_without_a_rotating_prism_shows_one_cloud(files: Path, tmp_pat
     ).any()  # its points are in the middle of the picture
 
 
+def test_undistorted_events_are_shown_beside_the_recording(files: Path, tmp_path: Path) -> None:
+    """Each recording has its own numbers, in the printed lines as in the picture."""
+    recording, out = open_recording(files / "recording.h5"), tmp_path / "out.png"
+    events = recording.events.slice(0, 5_000)
+    plain = replace(recording, encoder=None, truth=None, prism=None)
+    save_recording(tmp_path / "raw.h5", replace(plain, events=MemoryEvents(events, 120, 90)))
+    moved = events[::4]
+    moved = replace(moved, x=moved.x.astype(np.float32), y=moved.y.astype(np.float32))
+    save_recording(tmp_path / "moved.h5", replace(plain, events=MemoryEvents(moved, 120, 90)))
+    code, _, said = view(tmp_path / "moved.h5", "--screenshot", out)
+    assert code == 1
+    assert "already compensated or undistorted; show them beside" in said
+    beside = ("--beside", tmp_path / "moved.h5", "--screenshot", out, "--size", "400x200")
+    code, said, _ = view(tmp_path / "raw.h5", *beside, "--json")
+    assert code == 0
+    data = json.loads(said)
+    out.unlink()
+    code, said, _ = view(tmp_path / "raw.h5", *beside)
+    *_, first, second, file = said.splitlines()
+    assert file == str(out)
+    assert first.startswith("moved: ")
+    assert second.startswith(f"raw: {data['events']:,} events")
+    assert first.endswith(f"sharpness {data['sharpness_before']:.3f}")
+    assert f"{data['events']:,} events" not in first
+
+
 def test_a_picture_of_a_plain_recording_asks_for_no_encoder(files: Path, tmp_path: Path) -> None:
     recording = open_recording(files / "recording.h5")
     events = MemoryEvents(recording.events.slice(0, 5_000), *recording.events.size)

@@ -19,6 +19,9 @@ LONGEST_S = 3600
 """Longest recording whose unit is inferred from whole numbers [s]."""
 MOST_PER_US = 1000
 """Largest rate of events that is plausible [1/us]."""
+MOST_ASSUMED_PER_US = 50
+"""Largest rate for which whole numbers of an unknown unit are taken for microseconds [1/us]. Milliseconds would seem to
+have such a rate at 50,000 events per second; the bursts of large sensors are half as fast."""
 
 EPOCH_NS = (10**17, 4 * 10**18)
 """Range of times since 1970, from 1973 to 2096 [ns]."""
@@ -149,6 +152,8 @@ def _unit_of_whole(t: NDArray[Any]) -> tuple[str, str]:
             return unit, "times are whole numbers, as those since 1970"
     _check_whole(t)
     span = int(t.max()) - int(t.min())
+    if t.size > MOST_ASSUMED_PER_US * max(span, 1) + 1000:
+        raise AmiwarpError(_whole_doubt(t), ErrorCode.AMBIGUOUS)
     if span > LONGEST_S * 10**6:
         raise AmiwarpError(_whole_doubt(t), ErrorCode.AMBIGUOUS)
     why = f"times are whole numbers, and the first {t.size:,} events span {span * 1e-6:.3g} s then"

@@ -58,8 +58,10 @@ def _parse(address: str) -> str | tuple[str, int]:
 def host_and_port(address: str, forms: str) -> tuple[str, int]:
     """Return host and port of ``KIND:HOST:PORT``, 127.0.0.1 without a host. ``forms``: what a message suggests."""
     host, _, port = address.partition(":")[2].rpartition(":")
-    if not port.isdecimal() or int(port) > 65535:
+    if not port.isdecimal():
         raise AmiwarpError(f"{address}: is not an address; give {forms}")
+    if int(port) > 65535:
+        raise AmiwarpError(f"{address}: is not an address; give {forms}, with a port up to 65535")
     return host.strip("[]") or "127.0.0.1", int(port)
 
 

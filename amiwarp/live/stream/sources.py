@@ -44,7 +44,10 @@ def open_source(
         return open_stream(spec)
     if kind in CAMERAS:
         return open_camera_source(spec, say, packet_us=packet_us)
-    return FileSource(spec, pace=pace, packet_us=packet_us)
+    source = FileSource(spec, pace=pace, packet_us=packet_us)
+    for text in source.assumptions:
+        say(f"assumed {text}: amiwarp convert has the option; play the file that it writes")
+    return source
 
 
 def reopen_source(spec: str, stop: threading.Event) -> Source | None:

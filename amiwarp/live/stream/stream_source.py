@@ -16,6 +16,7 @@ from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.encoder import LARGEST_ANGLE
 from amiwarp.events.recording import Events
 from amiwarp.io import open_recording
+from amiwarp.io.assumptions import assumed_texts
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.datagrams import DatagramReceiver
 from amiwarp.live.stream.packets import IDLE_S, NO_TIMES, Packet, make_packet
@@ -85,12 +86,21 @@ class FileSource:
                 f"packet_us = {packet_us}; give the duration of a packet, 1 us or more"
             )
         self.name = str(path)
-        recording = open_recording(path)
+        try:
+            recording = open_recording(path)
+        except AmiwarpError as error:
+            if error.code is not ErrorCode.AMBIGUOUS:
+                raise
+            raise AmiwarpError(
+                f"{error}: amiwarp convert has the option; play the file that it writes"
+            ) from error
+        self.assumptions = assumed_texts(recording.metadata)
+        """What the file does not state and is assumed, as texts."""
         self._events = recording.events
         encoder = recording.encoder
         if len(self._events) and self._events.slice(0, 1).x.dtype != np.uint16:
             raise AmiwarpError(
-                f"{path}: is compensated already; give a recording with the sensor's events",
+                f"{path}: is compensated already, or undistorted; give a recording with the sensor's events",
                 ErrorCode.CONTENT_MISSING,
             )
         self.size = self._events.size
@@ -242,7 +252,8 @@ class StreamSource:
         now = monotonic_us()
         if isinstance(message, Compensated):
             raise AmiwarpError(
-                f"{self.name}: sends compensated events; give the stream of a sensor",
+                f"{self.name}: sends compensated or undistorted events; give the stream of a sensor, which amiwarp "
+                "live --raw-to passes on, or write these events with its --out",
                 ErrorCode.CONTENT_MISSING,
             )
         if len(message.t) and not (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,17 @@ TIME_HIGH = 8
 ROW = 0
 TIME_LOW = 6
 """Types of the words of EVT 3.0 with the row, and with the lower bits of the time."""
+LATE_MESSAGES = 10
+"""Number of late messages without a new one between after which a topic counts as begun anew."""
+
+
+class Content(NamedTuple):
+    """What is decoded of a message. A message of rclpy takes no NumPy array, so its bytes are put here."""
+
+    encoding: str
+    time_base: int
+    is_bigendian: bool
+    events: NDArray[np.uint8]
 
 
 class PacketDecoder:
@@ -36,6 +47,7 @@ class PacketDecoder:
         self.note: str | None = None
         """What is assumed of the words, if it is not certain."""
         self._number: int | None = None
+        self._late_in_a_row = 0
         self._stamp_us = 0
         self._layout: Layout | None = None
         self._encoding: str | None = None
@@ -45,28 +57,34 @@ class PacketDecoder:
     def decode(self, message: Any) -> tuple[Events, NDArray[np.int64]]:
         """Return the events of a message, and the times of the rising edges at the trigger input [us].
 
-        Raises :class:`AmiwarpError` for an encoding that amiwarp does not read, and if the driver was started anew.
+        Raises :class:`AmiwarpError` for an encoding that amiwarp does not read, and if the driver or a bag was
+        started anew.
         """
         if not self._is_next(int(message.seq), stamp_us(message)):
             return Events.empty(), np.zeros(0, np.int64)
-        message.events = np.frombuffer(bytes(message.events), np.uint8)  # rclpy has array.array
+        content = Content(
+            encoding=message.encoding,
+            time_base=int(message.time_base),
+            is_bigendian=bool(message.is_bigendian),
+            events=np.frombuffer(bytes(message.events), np.uint8),
+        )
         if self._encoding not in (None, message.encoding):
             raise AmiwarpError(
                 f"the encoding has changed from {self._encoding} to {message.encoding}; restart this node"
             )
         self._encoding = message.encoding
         if message.encoding not in EVT:
-            columns, edges = decode_packet(message)
+            columns, edges = decode_packet(content)
             x, y, t, p = columns
             _, _, edge_t, rising = edges
             order = np.argsort(t, kind="stable")
             events = Events.from_arrays(x[order], y[order], t[order], p[order])
             return events, np.asarray(edge_t)[np.asarray(rising) == 1].astype(np.int64)
         if self._layout is None:
-            self._layout, self.note = layout_of(message.encoding, [message])
+            self._layout, self.note = layout_of(content.encoding, [content])
         if self._words is None:
             self._words = EvtDecoder(self._layout.version, swapped=self._layout.swapped)
-        words = checked_words(message, message.encoding)
+        words = checked_words(content, content.encoding)
         if self._cut:
             words = _after_cut(words, self._layout)
             self._cut = not len(words)
@@ -84,7 +102,14 @@ class PacketDecoder:
                     "this node, for example with respawn in a launch file"
                 )
             self.late += 1
+            self._late_in_a_row += 1
+            if self._late_in_a_row == LATE_MESSAGES:
+                raise AmiwarpError(
+                    f"{LATE_MESSAGES} messages came a second time: seq {number} after {last}; the bag was played anew; "
+                    "restart this node, for example with respawn in a launch file"
+                )
             return False
+        self._late_in_a_row = 0
         if last is not None and number > last + 1:
             self.missing += number - last - 1
             self._cut = True

@@ -1,35 +1,43 @@
-"""Start the compensation and, with ``pictures:=true``, the pictures of one camera."""
+"""Start the compensation of one camera's events and, with ``pictures_hz:=15``, pictures of the scene."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+ARGUMENTS = {
+    "namespace": ("", "namespace of the node and its topics"),
+    "events": ("/event_camera/events", "topic of the camera's events"),
+    "joint_states": ("/prism/joint_states", "topic of the prism's angle"),
+}
+PARAMETERS = {
+    "calibration": (str, "", "calibration file of amiwarp (.json)"),
+    "port": (str, "", "serial port of the prism's controller; empty: angles from joint_states"),
+    "joint": (str, "", "name of the prism's joint in joint_states; empty: the first one"),
+    "wait_ms": (float, "10.0", "longest wait of an event for its angle (ms)"),
+    "device": (str, "cpu", "device that computes: cpu or cuda:0"),
+    "pictures_hz": (float, "0.0", "pictures of the scene per second (Hz); 0: none"),
+}
+"""Type, default and description of each parameter of the node. ROS ignores arguments that are not declared."""
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the nodes and their arguments."""
-    arguments = {
-        "calibration": ("", "calibration file of amiwarp (.json)"),
-        "events": ("/event_camera/events", "topic of the camera's events"),
-        "port": ("", "serial port of the prism's controller; empty: angles from joint_states"),
-        "joint_states": ("/prism/joint_states", "topic of the prism's angle"),
-        "pictures": ("false", "whether to make pictures of the scene"),
-    }
-    parameters = {name: LaunchConfiguration(name) for name in ("calibration", "port")}
-    topics = [(name, LaunchConfiguration(name)) for name in ("events", "joint_states")]
-    compensate = Node(
-        package="amiwarp_ros", executable="compensate", parameters=[parameters], remappings=topics
-    )
-    pictures = Node(
-        package="amiwarp_ros",
-        executable="pictures",
-        parameters=[parameters],
-        remappings=topics,
-        condition=IfCondition(LaunchConfiguration("pictures")),
-    )
+    """Return the node and its arguments."""
+    texts = {name: (default, text) for name, (_, default, text) in PARAMETERS.items()}
     declared = [
-        DeclareLaunchArgument(name, default_value=value, description=text)
-        for name, (value, text) in arguments.items()
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in {**ARGUMENTS, **texts}.items()
     ]
-    return LaunchDescription([*declared, compensate, pictures])
+    parameters = {
+        name: ParameterValue(LaunchConfiguration(name), value_type=kind)
+        for name, (kind, _, _) in PARAMETERS.items()
+    }
+    node = Node(
+        package="amiwarp_ros",
+        executable="compensate",
+        namespace=LaunchConfiguration("namespace"),
+        parameters=[parameters],
+        remappings=[(name, LaunchConfiguration(name)) for name in ("events", "joint_states")],
+    )
+    return LaunchDescription([*declared, node])
