@@ -35,9 +35,10 @@ def works_on_one_core() -> bool:
 
 def cores() -> int:
     """Return the number of CPU cores that this process may use."""
-    available = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):
         available = len(os.sched_getaffinity(0))
+    else:
+        available = os.cpu_count() or 1
     return available if _limit is None else min(available, _limit)
 
 

@@ -302,7 +302,7 @@ def _values(
     fitting = max(MOST_BYTES["cpu" if device.is_cpu else "cuda"] // (8 * size), threads)
     most = max(1, min(fitting, count, MOST_EVENTS // (size * results_per_number)))
     values = wp.empty(min(most, count) * size, dtype=wp.int64, device=device)
-    columns = [batch.events.x, batch.events.y, batch.events.t, batch.events.p]
+    columns = batch.device_columns()
     length = int(kernels.BLOCK) if device.is_cpu else 1
     load(kernel, device)
 

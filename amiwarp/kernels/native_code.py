@@ -315,6 +315,15 @@ def write_words(
 
 
 @wp.func_native("""
+    int64_t* element = (int64_t*)values.data;
+    const int n = values.shape[0];
+    for (int k = 0; k < n; ++k) element[k] = value;
+""")
+def fill_int64s(values: wp.array(dtype=wp.int64), value: wp.int64):
+    """Set all elements of a contiguous array of int64."""
+
+
+@wp.func_native("""
     const int* place = (const int*)places.data;
     uint64_t* sum = (uint64_t*)sums.data + first;
 #ifndef __CUDACC__

@@ -18,6 +18,7 @@ from amiwarp.kernels.native_code import (
     copy_bytes,
     count_places,
     descends,
+    fill_int64s,
     load_int,
     load_int64,
     load_uint8,
@@ -168,8 +169,7 @@ def keep_latest_windows(
     """Keep the latest times of the events of each thread's window, which are in order."""
     window = wp.tid()
     latest = out[window]
-    for place in range(latest.shape[0]):
-        store_int64(latest, place, NEVER)
+    fill_int64s(latest, NEVER)
     start, stop = events_of(windows, window, grid, x, y, t, faults)
     for i in range(start, stop):
         col, row = nearest(x[i]), nearest(y[i])
