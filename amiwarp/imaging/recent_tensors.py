@@ -16,6 +16,7 @@ from amiwarp.imaging.tensors import MOST_BINS, EventsLike
 from amiwarp.imaging.window_batch import MOST_EVENTS, WindowBatch, batch_of, window_rows
 from amiwarp.imaging.window_images import (
     MOST_BYTES,
+    SMALLEST,
     Grid,
     check_lengths,
     result_rows,
@@ -121,8 +122,7 @@ def tore_volume(
         ends_us = batch.windows.t_end[first : first + number]
         ends = wp.array(ends_us, dtype=wp.int64, device=batch.device)
         part = result_rows(out, first, number)
-        inputs = [recent, ends, size, shortest, longest]
-        launch(recent_events.read_recent, part.size, inputs, [part], device=batch.device)
+        _read(batch, recent_events.read_recent, [recent, ends, size, shortest, longest], part)
     return batch.finish(out)
 
 
@@ -276,8 +276,22 @@ def event_spike_tensor(
     check_lengths(batch.windows, grid)
     for first, number, sums in _values(batch, grid, recent_events.add_spikes, 2 * bins, 0):
         part = result_rows(out, first, number)
-        launch(recent_events.read_spikes, part.size, [sums], [part], device=batch.device)
+        _read(batch, recent_events.read_spikes, [sums], part)
     return batch.finish(out)
+
+
+def _read(batch: WindowBatch, kernel: Any, inputs: list[Any], out: wp.array) -> None:
+    """Run a kernel that computes elements of the result: on a CPU, a thread computes a row of an image."""
+    width, _ = batch.size
+    length = width if batch.device.is_cpu else 1
+    launch(
+        kernel,
+        out.size // length,
+        [*inputs, length],
+        [out],
+        device=batch.device,
+        smallest=SMALLEST,
+    )
 
 
 def _values(
@@ -302,7 +316,7 @@ def _values(
     fitting = max(MOST_BYTES["cpu" if device.is_cpu else "cuda"] // (8 * size), threads)
     most = max(1, min(fitting, count, MOST_EVENTS // (size * results_per_number)))
     values = wp.empty(min(most, count) * size, dtype=wp.int64, device=device)
-    columns = [batch.events.x, batch.events.y, batch.events.t, batch.events.p]
+    columns = batch.device_columns()
     length = int(kernels.BLOCK) if device.is_cpu else 1
     load(kernel, device)
 

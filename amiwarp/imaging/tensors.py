@@ -168,13 +168,13 @@ def polarity_histogram(
     return batch.finish(_counted(batch, Grid(*batch.size, layers=2)))
 
 
-def _counted(batch: WindowBatch, grid: Grid) -> wp.array:
+def _counted(batch: WindowBatch, grid: Grid) -> wp.array | NDArray[Any]:
     """Return the counts of all windows, shape (windows, layers, height, width)."""
     if not batch.events.whole_pixels:
         return share_images(batch, grid, 1)
     shape = grid.layers, grid.height, grid.width
     if takes_whole_windows(batch):
-        out = batch.zeros(shape, wp.int32)
+        out = batch.zeros(shape, np.int32)
         settings = [struct_of(kernels.Grid, *grid)]
         run_on_windows(batch, tensors_by_window.count_windows, settings, out)
         return out
@@ -337,7 +337,7 @@ def stacked_histogram(
     grid = Grid(*batch.size, steps=bins, rate=bins, layers=2)
     if takes_whole_windows(batch) and are_sparse(batch, 2 * bins * width * height):
         check_lengths(batch.windows, grid)
-        out = batch.zeros((2 * bins, height, width), wp.uint8)
+        out = batch.zeros((2 * bins, height, width), np.uint8)
         settings = [struct_of(kernels.Grid, *grid), limit]
         run_on_windows(batch, tensors_by_window.clip_windows, settings, out)
         return batch.finish(out)
@@ -441,7 +441,7 @@ def time_surface(
     if carry:
         _check_carry(events, batch.windows)
     elif takes_whole_windows(batch):
-        out = batch.zeros((grid.layers, height, width), wp.float32)
+        out = batch.zeros((grid.layers, height, width), np.float32)
         settings = [struct_of(kernels.Grid, *grid), decay]
         run_on_windows(batch, tensors_by_window.decay_windows, settings, out, scratch=size)
         return batch.finish(out if per_polarity else out.reshape((-1, height, width)))
@@ -526,7 +526,7 @@ def latest_times(
         _check_carry(events, batch.windows)
     elif takes_whole_windows(batch):
         settings = [struct_of(kernels.Grid, *grid)]
-        run_on_windows(batch, tensors_by_window.keep_latest_windows, settings, out)
+        run_on_windows(batch, tensors_by_window.keep_latest_windows, settings, out.numpy())
         return batch.finish(out if per_polarity else out.reshape((-1, height, width)))
     for first, number, images in latest_images(batch, grid, carry=carry):
         size = number * grid.layers * height * width

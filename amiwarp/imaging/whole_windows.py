@@ -7,12 +7,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import warp as wp
+from numpy.typing import NDArray
 
-from amiwarp.imaging.window_batch import WindowBatch, window_rows
+from amiwarp.imaging.window_batch import WindowBatch, table_of_windows
 from amiwarp.imaging.windows import Windows
 from amiwarp.imaging.zeroed_words import give_zeros, take_zeros
-from amiwarp.kernels.loading import load
+from amiwarp.kernels.launch import launch_on_host
 from amiwarp.kernels.workers import run_together
 from amiwarp.tasks import cpu_threads
 
@@ -28,7 +28,7 @@ def takes_whole_windows(batch: WindowBatch) -> bool:
     """Return whether threads should take whole windows: on a CPU, if that uses as many of them as there is work for."""
     if not batch.device.is_cpu:
         return False
-    return len(batch.windows) >= cpu_threads() or len(batch.events) < FEW_EVENTS
+    return len(batch.events) < FEW_EVENTS or len(batch.windows) >= cpu_threads()
 
 
 def are_sparse(batch: WindowBatch, size: int) -> bool:
@@ -38,44 +38,37 @@ def are_sparse(batch: WindowBatch, size: int) -> bool:
 
 
 def run_on_windows(
-    batch: WindowBatch, kernel: Any, settings: list[Any], out: wp.array, *, scratch: int = 0
+    batch: WindowBatch, kernel: Any, settings: list[Any], out: NDArray[Any], *, scratch: int = 0
 ) -> None:
     """Run a kernel of :mod:`amiwarp.kernels.tensors_by_window` on all windows.
 
     ``settings``: its inputs after the windows. ``out``: the result of all windows. ``scratch``: number of words that
     the kernel needs, all zero before and after.
     """
-    events = batch.events
-    columns = [events.x, events.y, events.t, events.p]
     if not len(batch.windows):
         return
-    rows, _ = window_rows(batch.windows, batch.device)
+    rows, _ = table_of_windows(batch.windows)
     results = out.reshape((len(batch.windows), -1))
-    load(kernel, batch.device)
 
     def run(first: int, stop: int) -> None:
-        inputs = [*columns, _part(rows, first, stop), *settings]
-        outputs = [batch.faults]
+        arguments = [*batch.columns, rows[first:stop], *settings, batch.faults]
+        words = None
         if scratch:
-            outputs.append(take_zeros(scratch))
-        outputs.append(_part(results, first, stop))
-        wp.launch(kernel, stop - first, inputs, outputs, device=batch.device)
-        if scratch:
-            give_zeros(outputs[1])
+            words = take_zeros(scratch)
+            arguments.append(words)
+        arguments.append(results[first:stop])
+        launch_on_host(kernel, stop - first, arguments)
+        if words is not None:
+            give_zeros(words)
 
     run_together([partial(run, *span) for span in _shares(batch.windows, out.size)])
 
 
-def _part(rows: wp.array, first: int, stop: int) -> wp.array:
-    """Return some rows; all of them without the time that a view takes."""
-    return rows if stop - first == len(rows) else rows[first:stop]
-
-
 def _shares(cut: Windows, size: int) -> list[tuple[int, int]]:
     """Return ranges of windows with about the same work, one for each thread. ``size``: elements of the result."""
-    threads = min(cpu_threads(), len(cut))
-    if threads == 1:
+    if len(cut) == 1 or cpu_threads() == 1:
         return [(0, len(cut))]
+    threads = min(cpu_threads(), len(cut))
     work = np.cumsum(cut.stop - cut.start + size // (32 * len(cut)))
     threads = max(1, min(threads, int(work[-1]) // LEAST_WORK))
     edges = np.searchsorted(work, work[-1] * np.arange(1, threads) / threads)

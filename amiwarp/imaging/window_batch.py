@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import (
+    NAMES,
     DeviceEvents,
     check_sensor,
     device_for,
@@ -29,7 +31,7 @@ from amiwarp.kernels.compensation import LaunchPlan
 from amiwarp.kernels.encoder_pieces import encoder_params
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.models.base import Model
-from amiwarp.validation import whole
+from amiwarp.validation import packed, whole
 
 MOST_EVENTS = (1 << 31) - 1
 """Largest number of events, and of pixels in all images of a window, that kernels can address."""
@@ -39,7 +41,10 @@ MOST_EVENTS = (1 << 31) - 1
 class WindowBatch:
     """Events on a device and their windows, as the kernels take them."""
 
-    events: DeviceEvents
+    events: Events | DeviceEvents
+    columns: tuple[Any, ...]
+    """Arrays of the events, without gaps: of NumPy on a CPU, else of Warp."""
+    device: Any
     windows: Windows
     single: bool
     """Whether the result has no axis of windows."""
@@ -50,49 +55,66 @@ class WindowBatch:
     faults: wp.array
     """Faults of the events by number, 1 if they occur. Memory of the host, which the device writes to."""
 
-    @property
-    def device(self) -> Any:
-        return self.events.device
+    def device_columns(self) -> list[wp.array]:
+        """Return the arrays of the events as Warp arrays."""
+        if not self.device.is_cpu:
+            return list(self.columns)
+        return [wp.array(values, device=self.device, copy=False) for values in self.columns]
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
         """Return an array for the result, shape (windows, *shape)."""
-        return self._allocated(np.empty, shape, dtype)
+        every_shape = self._every_shape(shape)
+        if not self.device.is_cpu or not len(self.windows):
+            return wp.empty(every_shape, dtype=dtype, device=self.device)
+        # NumPy asks for large pages of memory, which are there in less time.
+        values = np.empty(every_shape, wp.dtype_to_numpy(dtype))
+        return wp.array(values, dtype=dtype, device=self.device, copy=False)
 
-    def zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """Return an array of zeros for the result on a CPU, shape (windows, *shape)."""
-        return self._allocated(np.zeros, shape, dtype)
+    def zeros(self, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+        """Return zeros for the result on a CPU, shape (windows, *shape)."""
+        return np.zeros(self._every_shape(shape), dtype)
 
-    def _allocated(self, allocate: Any, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """Return an array for the result, on a CPU by a function of NumPy.
-
-        NumPy asks for large pages of memory, which are there in less time.
-        """
+    def _every_shape(self, shape: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the shape of a result, of which each window has a part of the given shape."""
         if math.prod(shape) > MOST_EVENTS:
             raise AmiwarpError(
                 f"a tensor has shape {shape}, more than {MOST_EVENTS} elements; give fewer bins"
             )
-        every_shape = (len(self.windows), *shape)
-        if not self.device.is_cpu or not len(self.windows):
-            return wp.empty(every_shape, dtype=dtype, device=self.device)
-        values = allocate(every_shape, wp.dtype_to_numpy(dtype))
-        return wp.array(values, dtype=dtype, device=self.device, copy=False)
+        return (len(self.windows), *shape)
 
-    def finish(self, out: wp.array) -> Any:
-        """Return the result of a public function.
+    def finish(self, out: wp.array | NDArray[Any]) -> Any:
+        """Return the result of a public function: a Warp array, unless the events came in NumPy arrays.
 
         Raises :class:`AmiwarpError` if times decrease in a window, or an event of a sensor lies outside the image.
         """
         wait(self.device)
         found_faults = self.faults.numpy()
         if found_faults[kernels.DESCENDING] or found_faults[kernels.OUTSIDE]:
-            _check_windows(self.events.to_host(), self.windows, self.size)
+            events = self.events
+            on_host = events if isinstance(events, Events) else events.to_host()
+            _check_windows(on_host, self.windows, self.size)
         idle_numbers[self.device.is_cpu, wp.int32].append(self.faults)
-        result = out.numpy() if self.on_host else out
+        result = out
+        if self.on_host:
+            result = out if isinstance(out, np.ndarray) else out.numpy()
+        elif isinstance(out, np.ndarray):
+            result = wp.array(out, device=self.device, copy=False)
         return result[0] if self.single else result
 
 
 def window_rows(cut: Windows, device: Any) -> tuple[wp.array, int]:
+    """Return windows as the array that kernels take, on a device, and the number of their blocks."""
+    rows, blocks = table_of_windows(cut)
+    return wp.array(rows, dtype=wp.int64, device=device, copy=not device.is_cpu), blocks
+
+
+def table_of_windows(cut: Windows) -> tuple[NDArray[np.int64], int]:
     """Return windows as the array that kernels take, and the number of their blocks."""
+    if len(cut) == 1:  # in less time
+        start, stop = cut.start.item(), cut.stop.item()
+        t_start, t_end = cut.t_start.item(), cut.t_end.item()
+        row = (start, stop, 0, t_start, max(t_end - t_start, 1), t_end)
+        return np.array([row], np.int64), -(-(stop - start) // int(kernels.BLOCK))
     blocks = -(-(cut.stop - cut.start) // int(kernels.BLOCK))  # rounded up
     ends = np.cumsum(blocks)
     rows = np.empty((len(cut), 6), np.int64)
@@ -103,8 +125,7 @@ def window_rows(cut: Windows, device: Any) -> tuple[wp.array, int]:
     rows[:, 3] = cut.t_start
     rows[:, 4] = np.maximum(cut.t_end - cut.t_start, 1)
     rows[:, 5] = cut.t_end
-    on_device = wp.array(rows, dtype=wp.int64, device=device, copy=not device.is_cpu)
-    return on_device, int(ends[-1])
+    return rows, int(ends[-1])
 
 
 def _check_windows(events: Events, cut: Windows, size: tuple[int, int]) -> None:
@@ -158,12 +179,21 @@ def batch_of(
         )
     width = whole(size[0], "width", 1, LARGEST_SIZE, " pixels")
     height = whole(size[1], "height", 1, LARGEST_SIZE, " pixels")
-    events_on_target = on_device(events, target)
     if model is not None and encoder is not None:
-        events_on_target = _compensated(events_on_target, (width, height), cut, model, encoder)
-    return WindowBatch(
-        events_on_target, cut, single, on_host, (width, height), host_numbers(2, wp.int32, target)
-    )
+        on_target = on_device(events, target)
+        events = _compensated(on_target, (width, height), cut, model, encoder)
+    columns = _columns(events, target)
+    faults = host_numbers(2, wp.int32, target)
+    return WindowBatch(events, columns, target, cut, single, on_host, (width, height), faults)
+
+
+def _columns(events: Events | DeviceEvents, target: Any) -> tuple[Any, ...]:
+    """Return the arrays of events without gaps: of NumPy on a CPU, else of Warp on the device."""
+    if isinstance(events, Events) and target.is_cpu:
+        return tuple(packed(getattr(events, name)) for name in NAMES)
+    events = on_device(events, target)
+    columns = (getattr(events, name) for name in NAMES)
+    return tuple(values.numpy() if target.is_cpu else values for values in columns)
 
 
 def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | None) -> Windows:

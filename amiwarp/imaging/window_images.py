@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import find_indices
@@ -72,7 +73,6 @@ def _images(
     images are overwritten by the next ones; on a CPU, the caller clears images of words.
     """
     cut = batch.windows
-    events = batch.events
     device = batch.device
     check_lengths(cut, grid)
     # A window has a group of pixels for each part of its time intervals.
@@ -96,13 +96,13 @@ def _images(
     in_words = device.is_cpu and on_cpu is tensors_cpu.add_event_word_blocks
     images = take_zeros(size) if in_words else wp.empty(size, dtype=dtype, device=device)
 
+    columns = batch.device_columns()
     for first in range(0, len(cut), most or 1):
         number = min(most, len(cut) - first)
         if not in_words:
             images.fill_(empty)
         together = cut if number == len(cut) else cut[first : first + number]
         rows, blocks = window_rows(together, device)
-        columns = [events.x, events.y, events.t, events.p]
         inputs = [*columns, rows, struct_of(kernels.Grid, *grid)]
         outputs = [batch.faults, images]
         if device.is_cpu:
@@ -233,7 +233,7 @@ def latest_images(
         yield first, number, images
 
 
-def share_images(batch: WindowBatch, grid: Grid, bins: int) -> wp.array:
+def share_images(batch: WindowBatch, grid: Grid, bins: int) -> wp.array | NDArray[np.float32]:
     """Return the bins of all windows, shape (windows, layers * bins, height, width)."""
     shape = grid.layers * bins, grid.height, grid.width
     parts = 1
@@ -276,10 +276,12 @@ def share_images(batch: WindowBatch, grid: Grid, bins: int) -> wp.array:
     return out
 
 
-def _shares_of_whole_windows(batch: WindowBatch, grid: Grid, bins: int, scratch: int) -> wp.array:
+def _shares_of_whole_windows(
+    batch: WindowBatch, grid: Grid, bins: int, scratch: int
+) -> NDArray[np.float32]:
     """Return what :func:`share_images` returns, by kernels that take whole windows."""
     check_lengths(batch.windows, grid)
-    out = batch.zeros((grid.layers * bins, grid.height, grid.width), wp.float32)
+    out = batch.zeros((grid.layers * bins, grid.height, grid.width), np.float32)
     if batch.events.whole_pixels:
         kernel = tensors_by_window.add_word_windows
     else:
@@ -337,7 +339,7 @@ def _parts(batch: WindowBatch, grid: Grid) -> tuple[int, int]:
     return 1, most
 
 
-def normalise(values: wp.array) -> None:
+def normalise(values: wp.array | NDArray[np.float32]) -> None:
     """Bring the values of each row that are not zero to a mean of 0 and a standard deviation of 1."""
     device = values.device
     rows, columns = values.shape

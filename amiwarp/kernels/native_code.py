@@ -278,52 +278,81 @@ def read_words(
     """
 
 
+@wp.func_native("""
+#ifndef __CUDACC__
+    const uint64_t* pair = (const uint64_t*)words.data;
+    const int* pixel = (const int*)pixels.data + first;
+    const float* bin = (const float*)out.data + at;
+    for (int k = 0; k < n; ++k) {
+        __builtin_prefetch(pair + 2 * pixel[k], 1);
+        __builtin_prefetch(bin + pixel[k], 1);
+        __builtin_prefetch(bin + size + pixel[k], 1);
+    }
+#endif
+""")
+def prefetch_bins(
+    out: wp.array(dtype=float),
+    at: int,
+    size: int,
+    words: wp.array(dtype=wp.int64),
+    pixels: wp.array(dtype=int),
+    first: int,
+    n: int,
+):
+    """Fetch what :func:`add_to_bins` changes into a core's cache, while it goes on."""
+
+
 @wp.func_native(
     _HALVES
     + """
-    const int* pixel = (const int*)pixels.data;
-    const uint64_t* starts = (const uint64_t*)words.data + start;
-    const uint64_t* ends = (const uint64_t*)words.data + end;
-    float* to = (float*)out.data + at;
-#ifndef __CUDACC__
+    const int* pixel = (const int*)pixels.data + first;
+    const uint64_t* word = (const uint64_t*)added.data + first;
+    float* bin = (float*)out.data + at;
     for (int k = 0; k < n; ++k) {
-        __builtin_prefetch(starts + pixel[k]);
-        __builtin_prefetch(ends + pixel[k]);
-        __builtin_prefetch(to + pixel[k], 1);
-    }
-#endif
-    for (int k = 0; k < n; ++k) {
-        const int64_t total = start_of(starts[pixel[k]]) + end_of(ends[pixel[k]]);
-        to[pixel[k]] = (float)((double)total * unit);
+        uint64_t* pair = (uint64_t*)words.data + 2 * pixel[k];
+        const uint64_t sum = pair[this_word] += word[k];
+        const int64_t total = start_of(sum) + end_of(pair[1 - this_word]);
+        bin[pixel[k]] = (float)((double)total * unit);
+        if (size) bin[size + pixel[k]] = (float)((double)end_of(sum) * unit);
     }
 """
 )
-def write_words(
+def add_to_bins(
     out: wp.array(dtype=float),
     at: int,
+    size: int,
     words: wp.array(dtype=wp.int64),
     low: int,
-    start: int,
-    end: int,
+    this_word: int,
     pixels: wp.array(dtype=int),
+    added: wp.array(dtype=wp.int64),
+    first: int,
     n: int,
 ):
-    """Write a bin of a voxel grid, which begins at ``out[at]``, at ``n`` pixels.
+    """Add the words of ``n`` events of a time interval, and write what is known of both its bins. For CPUs.
 
-    ``start``: first word of the image of the time interval that starts there, ``end``: of the one that ends.
+    A pixel has two words: number ``this_word`` of this interval, the other one of the interval before. ``at``: first
+    element of the bin at the interval's start; the bin at its end is ``size`` further, 0 if there is none. The last
+    event of a pixel leaves the right value; at the end, unless the next interval has one there.
     """
 
 
 @wp.func_native("""
-    const int* place = (const int*)places.data;
-    uint64_t* sum = (uint64_t*)sums.data + first;
-#ifndef __CUDACC__
-    for (int k = 0; k < n; ++k) __builtin_prefetch(sum + place[k], 1);
-#endif
-    for (int k = 0; k < n; ++k) sum[place[k]] = 0;
+    const int* pixel = (const int*)pixels.data;
+    uint64_t* pair = (uint64_t*)words.data;
+    for (int k = 0; k < n; ++k) pair[2 * pixel[k] + of_pair] = 0;
 """)
-def clear_words(sums: wp.array(dtype=wp.int64), first: int, places: wp.array(dtype=int), n: int):
-    """Set the words at ``n`` places to 0, counted from ``sums[first]``. For CPUs."""
+def clear_words(words: wp.array(dtype=wp.int64), of_pair: int, pixels: wp.array(dtype=int), n: int):
+    """Set one of the two words of ``n`` pixels to 0. For CPUs."""
+
+
+@wp.func_native("""
+    int64_t* element = (int64_t*)values.data;
+    const int n = values.shape[0];
+    for (int k = 0; k < n; ++k) element[k] = value;
+""")
+def fill_int64s(values: wp.array(dtype=wp.int64), value: wp.int64):
+    """Set all elements of a contiguous array of int64."""
 
 
 @wp.func_native("""

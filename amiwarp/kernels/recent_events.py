@@ -8,6 +8,7 @@ from typing import Any
 
 import warp as wp
 
+from amiwarp.kernels.native_code import load_int64, store_float
 from amiwarp.kernels.tensors import (
     BLOCK,
     EARLIEST,
@@ -65,6 +66,13 @@ def keep_recent(
                     time = wp.min(time, wp.atomic_max(recent, place, time))
 
 
+@wp.func
+def log_age(age: wp.float64, shortest: wp.float64, longest: wp.float64) -> float:
+    """Return the logarithm of an age, limited to ``shortest`` and ``longest``."""
+    one = wp.float64(1.0)
+    return float(wp.log((wp.clamp(age, shortest, longest) + one) / (shortest + one)))
+
+
 @wp.kernel
 def read_recent(
     recent: wp.array(dtype=wp.int64),
@@ -72,17 +80,20 @@ def read_recent(
     size: int,
     shortest: wp.float64,
     longest: wp.float64,
+    length: int,
     start: int,
     out: wp.array(dtype=float),
 ):
-    """Compute the logarithms of the ages of the latest events. ``size``: numbers of a window."""
-    i = start + wp.tid()
-    one = wp.float64(1.0)
-    age = longest
-    if recent[i] >= EARLIEST:
-        age = wp.float64(t_end[i / size] - recent[i])
-    age = wp.clamp(age, shortest, longest)
-    out[i] = float(wp.log((age + one) / (shortest + one)))
+    """Compute the logarithms of the ages of the latest events, ``length`` per thread. ``size``: numbers of a window."""
+    first = (start + wp.tid()) * length
+    # Most pixels have no events: one logarithm for all of them
+    without_event = log_age(longest, shortest, longest)
+    for i in range(first, first + length):
+        value = without_event
+        if load_int64(recent, i) >= EARLIEST:
+            age = wp.float64(t_end[i / size] - load_int64(recent, i))
+            value = log_age(age, shortest, longest)
+        store_float(out, i, value)
 
 
 @wp.kernel
@@ -174,10 +185,13 @@ def add_spikes(
 
 
 @wp.kernel
-def read_spikes(sums: wp.array(dtype=wp.int64), start: int, out: wp.array(dtype=float)):
-    """Compute the event spike tensor from its sums."""
-    i = start + wp.tid()
-    out[i] = float(wp.float64(sums[i]) / wp.float64(WHOLE))
+def read_spikes(
+    sums: wp.array(dtype=wp.int64), length: int, start: int, out: wp.array(dtype=float)
+):
+    """Compute the event spike tensor from its sums, ``length`` elements per thread."""
+    first = (start + wp.tid()) * length
+    for i in range(first, first + length):
+        store_float(out, i, float(wp.float64(load_int64(sums, i)) / wp.float64(WHOLE)))
 
 
 for _coordinate in (wp.uint16, wp.float32):

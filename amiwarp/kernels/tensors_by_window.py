@@ -2,8 +2,9 @@
 
 The images of :mod:`amiwarp.kernels.tensors_cpu` are cleared and read as a whole, which takes longer than adding a few
 events. Here, counts and latest times go to the result at once. Sums have two images, for the time interval of the
-events and for the one before, which take turns. After an interval, its events and those before tell the pixels of the
-bin between both, and the older image is cleared at them. The result is 0 at first.
+events and for the one before, which take turns. With words, each event writes the bins at both ends of its interval
+anew. With two sums, the events of an interval and those before tell the pixels of the bin between both after it. The
+older image is then cleared at its events. The result is 0 at first.
 """
 
 from typing import Any
@@ -13,21 +14,21 @@ import warp as wp
 from amiwarp.kernels.background_activity import never
 from amiwarp.kernels.native_code import (
     add_squares,
-    add_words,
+    add_to_bins,
     clear_words,
     copy_bytes,
     count_places,
     descends,
+    fill_int64s,
     load_int,
     load_int64,
     load_uint8,
     load_uint16,
-    prefetch_words,
+    prefetch_bins,
     store_float,
     store_int,
     store_int64,
     store_uint8,
-    write_words,
 )
 from amiwarp.kernels.tensor_values import Decay, decayed, pixel_sum
 from amiwarp.kernels.tensors import (
@@ -168,8 +169,7 @@ def keep_latest_windows(
     """Keep the latest times of the events of each thread's window, which are in order."""
     window = wp.tid()
     latest = out[window]
-    for place in range(latest.shape[0]):
-        store_int64(latest, place, never())
+    fill_int64s(latest, never())
     start, stop = events_of(windows, window, grid, x, y, t, faults)
     for i in range(start, stop):
         col, row = nearest(x[i]), nearest(y[i])
@@ -249,23 +249,36 @@ def add_interval(
     first: int,
     stop: int,
     words: wp.array(dtype=wp.int64),
+    bins: int,
+    voxels: wp.array(dtype=float),
 ) -> int:
-    """Add the words of a time interval's events to one of the two images; return the index after its last event."""
+    """Add a time interval's events to the bins at both its ends; return the index after its last event."""
     ends = wp.zeros(shape=(64,), dtype=int)
-    places = wp.zeros(shape=(64,), dtype=int)
+    pixels = wp.zeros(shape=(64,), dtype=int)
     added = wp.zeros(shape=(64,), dtype=wp.int64)
-    image = (interval % 2) * grid.width * grid.height
+    size = grid.width * grid.height
+    to_end = wp.where(interval + 1 < bins, size, 0)
     at = int(first)
     number = int(BLOCK)
     while number == BLOCK and at < stop:
         number = time_events(grid, windows, window, interval, t, at, stop, ends)
-        place_pixels(grid, x, y, at, stop, places)
+        place_pixels(grid, x, y, at, stop, pixels)
         for k in range(number):
-            store_int(places, k, image + load_int(places, k))
             weight = weight_of(grid, load_uint8(p, at + k))
             store_int64(added, k, word_of(grid, weight, load_int(ends, k)))
-        prefetch_words(words, places, 0, number)
-        add_words(words, places, added, 0, number)
+        prefetch_bins(voxels, interval * size, to_end, words, pixels, 0, number)
+        add_to_bins(
+            voxels,
+            interval * size,
+            to_end,
+            words,
+            grid.low,
+            interval % 2,
+            pixels,
+            added,
+            0,
+            number,
+        )
         at += number
     return at
 
@@ -283,11 +296,10 @@ def add_word_windows(
     words: wp.array(dtype=wp.int64),
     out: wp.array2d(dtype=float),
 ):
-    """Compute the voxel grid of each thread's window. ``words``: two images of zeros, and again zeros afterwards."""
+    """Compute the voxel grid of each thread's window. ``words``: two zeros a pixel, and again zeros afterwards."""
     pixels = wp.zeros(shape=(64,), dtype=int)
     window = wp.tid()
     voxels = out[window]
-    size = grid.width * grid.height
     start, stop = events_of(windows, window, grid, x, y, t, faults)
     # The events of the interval before: from `before` to `first`; of this one: from `first` to `after`
     before = int(start)
@@ -295,16 +307,12 @@ def add_word_windows(
     for interval in range(grid.steps + 1):
         after = int(first)
         if interval < grid.steps:
-            after = add_interval(grid, windows, window, interval, x, y, t, p, first, stop, words)
-        this = (interval % 2) * size
-        older = size - this
-        if interval < bins:
-            for at in range(before, after, BLOCK):
-                n = place_pixels(grid, x, y, at, after, pixels)
-                write_words(voxels, interval * size, words, grid.low, this, older, pixels, n)
+            after = add_interval(
+                grid, windows, window, interval, x, y, t, p, first, stop, words, bins, voxels
+            )
         for at in range(before, first, BLOCK):
             n = place_pixels(grid, x, y, at, first, pixels)
-            clear_words(words, older, pixels, n)
+            clear_words(words, 1 - interval % 2, pixels, n)
         before = int(first)
         first = int(after)
 

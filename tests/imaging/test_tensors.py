@@ -3,9 +3,12 @@
 The oracles follow the definitions of the programs that they are named after, but are written anew.
 """
 
+import gc
 import pickle
 import re
+import weakref
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -501,6 +504,47 @@ def in_both_ways(make: Callable[[], list[np.ndarray]]) -> None:
         of_windows = [make(), make()]  # the second time in the memory of the first
     for again in of_windows:
         assert all(np.array_equal(a, b) for a, b in zip(of_blocks, again, strict=True))
+
+
+@pytest.mark.parametrize("between", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 1000])
+def test_few_events_have_the_bits_of_many(count: int, between: bool, every_core: None) -> None:
+    """The direct way of small calls, for one window, and for the same arrays on a device."""
+    events = positions(some_events())[9:] if between else some_events()
+    few = events[:count]
+    on_device = DeviceEvents.from_arrays(few.x, few.y, few.t, few.p)
+    given = {"t_start": int(events.t[0]) + 20, "t_end": int(events.t[0]) + 2_000}
+    for options in ({}, given) if count else ({},):
+        for function in EVERY.values():
+            in_both_ways(lambda f=function, o=options: [f(few, WIDTH, HEIGHT, **o)])
+            found = function(few, WIDTH, HEIGHT, **options)
+            there = function(on_device, WIDTH, HEIGHT, **options)
+            assert isinstance(found, np.ndarray)
+            assert isinstance(there, wp.array)
+            assert np.array_equal(found, there.numpy())
+
+
+def test_recorded_launches_take_other_arrays() -> None:
+    """A recorded launch takes images and events of other sizes, from several threads, and keeps none alive."""
+    events = some_events()
+    sizes = [(WIDTH, HEIGHT, 900), (WIDTH + 7, HEIGHT, 30), (WIDTH, HEIGHT + 9, 2000)] * 20
+
+    def counts(size: tuple[int, int, int]) -> bool:
+        width, height, count = size
+        found = amiwarp.event_count(events[:count], width, height)
+        expected = np.zeros((height, width), np.int32)
+        np.add.at(expected, (events.y[:count], events.x[:count]), 1)
+        return np.array_equal(found, expected)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(counts, sizes))
+    columns = [values[:50].copy() for values in (events.x, events.y, events.t, events.p)]
+    freed = [weakref.ref(values) for values in columns]
+    grid = amiwarp.voxel_grid(Events(*columns), WIDTH, HEIGHT, 3)
+    freed.append(weakref.ref(grid))
+    del columns, grid
+    gc.collect()
+    assert all(reference() is None for reference in freed)
 
 
 @pytest.mark.parametrize("between", [False, True])
