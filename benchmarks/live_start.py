@@ -3,7 +3,8 @@
     python -m benchmarks.live_start [--repeats 7] [--out FILE.json]
 
 A recording of 1280 x 720 px is filtered and undistorted, and one is compensated. ``first_packet_s`` counts from the
-start of the process to the first whole packet of events. All events that come are counted. The exit status is 1 if one lacks.
+start of the process to the first whole packet of events. All events that come are counted. The exit status is 1 if one
+lacks.
 """
 
 from __future__ import annotations
