@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, cast
@@ -70,10 +71,10 @@ class EventFilter:
     hot_pixels: NDArray[np.bool_] | None = field(default=None, compare=False)
     """Pixels whose events are removed, shape ``(height, width)``, as :func:`find_hot_pixels` returns them."""
     refractory_us: int = 0
-    """Time after a kept event in which further events of its pixel are removed [us]."""
+    """Time after a kept event in which further events of its pixel are removed [us], at most 1000 s."""
     background_us: int = 0
-    """Events are removed as noise if none of the eight neighbours of their pixel fired within this time before [us].
-    0 keeps all. See :func:`find_background_activity`."""
+    """Events are removed as noise if none of the eight neighbours of their pixel fired within this time before [us], at
+    most 1000 s. 0 keeps all. See :func:`find_background_activity`."""
     most_per_s: float = 0.0
     """Largest rate [events/s]: each kept event costs a credit that grows with time, up to a millisecond's. 0 keeps
     all."""
@@ -98,7 +99,8 @@ class EventFilter:
         if self.polarity is not None:
             object.__setattr__(self, "polarity", whole(self.polarity, "polarity", 0, 1))
         for name in ("refractory_us", "background_us"):
-            object.__setattr__(self, name, whole(getattr(self, name), name, 0, TIME_LIMIT, " us"))
+            time_us = whole(getattr(self, name), name, 0, kernels.LONGEST_US, " us")
+            object.__setattr__(self, name, time_us)
         rate = real(self.most_per_s, "most_per_s", 0.0, 1e12, " events/s")
         object.__setattr__(self, "most_per_s", rate)
         object.__setattr__(self, "every", whole(self.every, "every", 1, 1 << 31))
@@ -138,8 +140,16 @@ class RunningFilter:
     """Number of events that each part of the filter has removed so far, by its name."""
     _state: Any = field(init=False)
     """What the kernel remembers of the events before."""
-    _block: list[NDArray[Any]] = field(init=False)
-    """Memory for the columns x, y, t and p of a block of events, and for the part that removes each."""
+    _given: list[NDArray[Any]] = field(init=False)
+    """Memory for the columns x, y, t and p of a block of events."""
+    _kept: list[NDArray[Any]] = field(init=False)
+    """Memory for the columns of its kept events."""
+    _kept_count: NDArray[Any] = field(init=False)
+    """Number of its kept events, of shape ``(1,)``."""
+    _removed: NDArray[Any] = field(init=False)
+    """Number of events that each part has removed, at its number in the kernel."""
+    _removing: NDArray[Any] = field(init=False)
+    """Memory for the part that removes each of its events."""
     _launch: RecordedLaunch = field(init=False)
     """Launch of the kernel over the first events of the block. A new launch would cost more than a packet."""
     _last_t: int | None = None
@@ -164,40 +174,54 @@ class RunningFilter:
             )
         self.removed = {name: 0 for name in PARTS if is_given(self.chosen, name)}
         self._state = _new_state(self.chosen, self.size)
-        arrays = [wp.empty(BLOCK, dtype=kind, device="cpu") for kind in BLOCK_TYPES]
-        self._block = [array.numpy() for array in arrays]
-        inputs = [_part_values(self.chosen, self.size), self._state, *arrays, 0]
-        self._launch = RecordedLaunch(kernels.find_removing_parts, inputs, [], device="cpu")
+        given, self._given = _new_columns()
+        kept, self._kept = _new_columns()
+        kept_count = wp.zeros(1, dtype=int, device="cpu")
+        removing = wp.empty(BLOCK, dtype=wp.uint8, device="cpu")
+        self._kept_count = kept_count.numpy()
+        self._removing = removing.numpy()
+        self._removed = self._state.removed.numpy()
+        parts = _part_values(self.chosen, self.size)
+        inputs = [parts, self._state, given, kept, kept_count, removing, 0]
+        self._launch = RecordedLaunch(kernels.filter_events, inputs, [], device="cpu")
 
     def keep(self, events: Events) -> NDArray[np.bool_]:
         """Return which events are kept, where the events follow the events of the last call, bool, shape ``(n,)``."""
-        check_sensor(events)
-        check_events(events, *self.size, where="events", after_t=self._last_t)
-        if not len(events):
-            return np.ones(0, np.bool_)
-        self._last_t = int(events.t[-1])
-        removing = np.empty(len(events), np.uint8)
-        for start in range(0, len(events), BLOCK):
-            stop = min(start + BLOCK, len(events))
-            removing[start:stop] = self._removing(events[start:stop])
-        for name in self.removed:
-            self.removed[name] += int(np.count_nonzero(removing == PARTS[name]))
-        return removing == 0
+        keep = np.empty(len(events), np.bool_)
+        for start, stop in self._blocks(events):
+            keep[start:stop] = self._removing[: stop - start] == 0
+        return keep
 
     def kept(self, events: Events) -> Events:
         """Return the events that are kept, as :meth:`keep` chooses them, in new arrays."""
-        # An index takes a quarter of the time of a mask
-        return events[np.flatnonzero(self.keep(events))]
+        columns: list[NDArray[Any]] = [np.empty(len(events), kind) for kind in NUMPY_TYPES]
+        end = 0
+        for _ in self._blocks(events):
+            count = int(self._kept_count[0])
+            for column, block in zip(columns, self._kept, strict=True):
+                column[end : end + count] = block[:count]
+            end += count
+        # Few kept events would hold the memory of all
+        few = end < len(events) // 2
+        return Events(*(column[:end].copy() if few else column[:end] for column in columns))
 
-    def _removing(self, events: Events) -> NDArray[np.uint8]:
-        """Return the number of the part that removes each event of a block, until the next call."""
-        count = len(events)
-        *columns, removing = self._block
-        for column, values in zip(columns, (events.x, events.y, events.t, events.p), strict=True):
-            column[:count] = values
-        self._launch.set(COUNT, count)
-        self._launch.repeat()
-        return removing[:count]
+    def _blocks(self, events: Events) -> Iterator[tuple[int, int]]:
+        """Yield start and end of each block of events, while the memory holds what the kernel found of it."""
+        check_sensor(events)
+        check_events(events, *self.size, where="events", after_t=self._last_t)
+        if len(events):
+            self._last_t = int(events.t[-1])
+        given = (events.x, events.y, events.t, events.p)
+        for start in range(0, len(events), BLOCK):
+            stop = min(start + BLOCK, len(events))
+            count = stop - start
+            for block, column in zip(self._given, given, strict=True):
+                block[:count] = column[start:stop]
+            self._launch.set(COUNT, count)
+            self._launch.repeat()
+            for name in self.removed:
+                self.removed[name] = int(self._removed[PARTS[name]])
+            yield start, stop
 
     def hot_counts(self) -> tuple[tuple[int, int, int], ...]:
         """Return column, row [px] and number of removed events of each hot pixel, the busiest first."""
@@ -212,10 +236,26 @@ class RunningFilter:
 
 BLOCK = 1 << 14
 """Largest number of events that the kernel filters at a time. They stay in a core's cache."""
-BLOCK_TYPES = (wp.uint16, wp.uint16, wp.int64, wp.uint8, wp.uint8)
-"""Types of the arrays of a block: x, y, t, p, and the part that removes an event."""
-COUNT = 2 + len(BLOCK_TYPES)
+TILE = 4
+"""Side of the tiles of the image of times [px]: one fills a line of the cache."""
+LINE_BYTES = 64
+"""Size of a line of the cache [bytes]."""
+LARGE_BYTES = 1 << 22
+"""Smallest array for which NumPy asks for large pages [bytes]."""
+NUMPY_TYPES = (np.uint16, np.uint16, np.int64, np.uint8)
+"""Types of the columns x, y, t, p."""
+COUNT = 6
 """Place of the number of events among the arguments of the kernel."""
+
+
+def _new_columns() -> tuple[Any, list[NDArray[Any]]]:
+    """Return memory for a block of events: for the kernel, and its columns x, y, t and p."""
+    columns = kernels.EventColumns()
+    columns.x = wp.empty(BLOCK, dtype=wp.uint16, device="cpu")
+    columns.y = wp.empty(BLOCK, dtype=wp.uint16, device="cpu")
+    columns.t = wp.empty(BLOCK, dtype=wp.int64, device="cpu")
+    columns.p = wp.empty(BLOCK, dtype=wp.uint8, device="cpu")
+    return columns, [columns.x.numpy(), columns.y.numpy(), columns.t.numpy(), columns.p.numpy()]
 
 
 def _part_values(chosen: EventFilter, size: tuple[int, int]) -> Any:
@@ -228,7 +268,7 @@ def _part_values(chosen: EventFilter, size: tuple[int, int]) -> Any:
     parts.polarity = -1 if chosen.polarity is None else chosen.polarity
     hot = np.zeros(0, np.uint8)
     if chosen.hot_pixels is not None:
-        hot = chosen.hot_pixels.ravel().astype(np.uint8)
+        hot = np.packbits(chosen.hot_pixels.ravel(), bitorder="little")
     parts.hot = wp.array(hot, dtype=wp.uint8, device="cpu")
     parts.refractory_us = chosen.refractory_us
     parts.background_us = chosen.background_us
@@ -242,21 +282,48 @@ def _new_state(chosen: EventFilter, size: tuple[int, int]) -> Any:
     """Return what the kernel remembers before the first event. Parts that are not given need no memory."""
     width, height = size
     pixels = width * height
-    with_border = (width + 2) * (height + 2)
     state = kernels.FilterState()
-    state.kept_t = _never(pixels if chosen.refractory_us else 0)
-    state.fired_t = _never(with_border if chosen.background_us else 0)
+    state.base_t = _times(-TIME_LIMIT)
+    has_times = chosen.refractory_us or chosen.background_us
+    if has_times:
+        state.across, state.down, count = _tiled(width + 2, height + 2)
+        state.passed_t = _aligned(count)
+        state.passed_t.fill_(kernels.LONG_AGO)
+    state.removed = wp.zeros(len(PARTS) + 1, dtype=wp.int64, device="cpu")
     has_hot = chosen.hot_pixels is not None
     state.hot_counts = wp.zeros(pixels if has_hot else 0, dtype=wp.int64, device="cpu")
     state.credit = wp.full(1, _most_credit(chosen), dtype=wp.float64, device="cpu")
-    state.rate_t = _never(1)
+    state.rate_t = _times(NEVER)
     state.reached = wp.zeros(1, dtype=wp.int64, device="cpu")
     return state
 
 
-def _never(count: int) -> wp.array:
-    """Return times before the first event."""
-    return wp.full(count, wp.int64(NEVER), dtype=wp.int64, device="cpu")
+def _times(value: int) -> wp.array:
+    """Return an array of one time [us]."""
+    return wp.full(1, wp.int64(value), dtype=wp.int64, device="cpu")
+
+
+def _tiled(columns: int, rows: int) -> tuple[wp.array, wp.array, int]:
+    """Return what column and row add to a pixel's place in an image of tiles, and the number of places."""
+    column = np.arange(columns)
+    row = np.arange(rows)
+    row_of_tiles = -(-columns // TILE) * TILE * TILE
+    across = column // TILE * TILE * TILE + column % TILE
+    down = row // TILE * row_of_tiles + row % TILE * TILE
+    count = -(-rows // TILE) * row_of_tiles
+    arrays = (wp.array(places, dtype=int, device="cpu") for places in (across, down))
+    return *arrays, count
+
+
+def _aligned(count: int) -> wp.array:
+    """Return memory for integers of 32 bits that begins with a line of the cache.
+
+    NumPy asks the system for large pages from 4 MiB on. With small ones, addresses are often looked up for longer than
+    the times.
+    """
+    memory = np.empty(max(count, LARGE_BYTES // 4) + LINE_BYTES // 4, np.int32)
+    first = -memory.ctypes.data % LINE_BYTES // 4
+    return wp.array(memory[first : first + count], dtype=int, device="cpu", copy=False)
 
 
 def _most_credit(chosen: EventFilter) -> float:

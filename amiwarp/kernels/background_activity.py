@@ -1,8 +1,6 @@
-"""Noise of a sensor: the latest event near a pixel, and the search for hot pixels."""
+"""Search for hot pixels of a sensor, and the time of a pixel without events."""
 
 import warp as wp
-
-from amiwarp.kernels.native_code import load_int64
 
 wp.set_module_options({"enable_backward": False})
 
@@ -14,22 +12,6 @@ AFTER_NEVER = wp.constant(wp.int64(1 - 2**63))
 def never() -> wp.int64:
     """Return :data:`NEVER`. Kernels with it as a literal make the compiler warn: C++ has no negative literals."""
     return AFTER_NEVER - wp.int64(1)
-
-
-@wp.func
-def latest_of_three(latest: wp.array(dtype=wp.int64), pixel: int) -> wp.int64:
-    """Return the latest time of a pixel and of the pixels left and right of it [us]."""
-    sides = wp.max(load_int64(latest, pixel - 1), load_int64(latest, pixel + 1))
-    return wp.max(sides, load_int64(latest, pixel))
-
-
-@wp.func
-def latest_nearby(latest: wp.array(dtype=wp.int64), pixel: int, stride: int) -> wp.int64:
-    """Return the latest time of the eight neighbours of a pixel [us]. The image has a border of one pixel."""
-    beside = wp.max(load_int64(latest, pixel - 1), load_int64(latest, pixel + 1))
-    above = latest_of_three(latest, pixel - stride)
-    below = latest_of_three(latest, pixel + stride)
-    return wp.max(beside, wp.max(above, below))
 
 
 @wp.func

@@ -2,14 +2,18 @@
 
 import warp as wp
 
-from amiwarp.kernels.background_activity import latest_nearby, never
+from amiwarp.kernels.background_activity import never
 from amiwarp.kernels.native_code import (
+    load_int,
     load_int64,
+    load_one_int,
     load_uint8,
     load_uint16,
-    prefetch_int64,
+    prefetch_int,
+    store_int,
     store_int64,
     store_uint8,
+    store_uint16,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -26,6 +30,12 @@ EVERY = wp.constant(8)
 
 AHEAD = wp.constant(16)
 """Number of events after which the times of a pixel that are fetched now are needed."""
+LONGEST_US = 1_000_000_000
+"""Longest refractory period, and longest time of the background [us]."""
+LONG_AGO = wp.constant(-1_100_000_000)
+"""Time of a pixel without events, or whose last one matters no longer, from the base [us]."""
+MOST_AFTER_BASE = wp.constant(wp.int64(1_000_000_000))
+"""Longest time from the base before it is moved [us]. The difference of two times then fits into 32 bits."""
 
 
 @wp.struct
@@ -40,9 +50,9 @@ class FilterParts:
     right: int
     bottom: int
     polarity: int  # -1: both
-    hot: wp.array(dtype=wp.uint8)  # 1 for each hot pixel, row by row; empty: none
-    refractory_us: wp.int64  # 0: none
-    background_us: wp.int64  # 0: none
+    hot: wp.array(dtype=wp.uint8)  # a bit for each pixel, row by row; empty: none
+    refractory_us: int  # 0: none
+    background_us: int  # 0: none
     rate_per_us: wp.float64  # 0: no limit
     most_credit: wp.float64
     every: int
@@ -52,34 +62,19 @@ class FilterParts:
 class FilterState:
     """What a filter remembers of the events before."""
 
-    kept_t: wp.array(dtype=wp.int64)  # time of the last kept event of each pixel [us]
-    fired_t: wp.array(
-        dtype=wp.int64
-    )  # time of the last event of each pixel [us], with a border of one pixel
+    passed_t: wp.array(dtype=int)
+    """Time of the last event of each pixel that all parts before the background passed [us], after `base_t`.
+
+    With a border of a pixel, at `across[column + 1] + down[row + 1]`: in tiles, of which each fills a line of a core's
+    cache, so that a pixel and its neighbours lie in few lines."""
+    base_t: wp.array(dtype=wp.int64)
+    across: wp.array(dtype=int)
+    down: wp.array(dtype=int)
+    removed: wp.array(dtype=wp.int64)  # number of events that each part removed, at its number
     hot_counts: wp.array(dtype=wp.int64)  # number of removed events of each hot pixel
     credit: wp.array(dtype=wp.float64)  # number of events that the rate allows at once
     rate_t: wp.array(dtype=wp.int64)  # time of the last event at which the credit grew [us]
     reached: wp.array(dtype=wp.int64)  # number of events that reached the last part
-
-
-@wp.func
-def is_early(parts: FilterParts, state: FilterState, pixel: int, t: wp.int64) -> bool:
-    """Return whether an event is within the refractory period of the last kept one of its pixel."""
-    last = load_int64(state.kept_t, pixel)
-    if last != never() and t - last < parts.refractory_us:
-        return True
-    store_int64(state.kept_t, pixel, t)
-    return False
-
-
-@wp.func
-def is_background(parts: FilterParts, state: FilterState, x: int, y: int, t: wp.int64) -> bool:
-    """Return whether no neighbour of an event's pixel fired shortly before."""
-    stride = parts.columns + 2
-    pixel = (y + 1) * stride + x + 1
-    near = latest_nearby(state.fired_t, pixel, stride)
-    store_int64(state.fired_t, pixel, t)
-    return near == never() or t - near > parts.background_us
 
 
 @wp.func
@@ -105,67 +100,156 @@ def is_left_out(parts: FilterParts, state: FilterState) -> bool:
 
 
 @wp.func
-def is_hot(parts: FilterParts, state: FilterState, pixel: int) -> bool:
-    """Return whether a pixel is hot, and count its event."""
-    if load_uint8(parts.hot, pixel) == wp.uint8(0):
-        return False
-    state.hot_counts[pixel] = state.hot_counts[pixel] + wp.int64(1)
-    return True
+def is_hot(parts: FilterParts, pixel: int) -> bool:
+    """Return whether a pixel is hot."""
+    eight = int(load_uint8(parts.hot, pixel >> 3))
+    return ((eight >> (pixel & 7)) & 1) != 0
 
 
 @wp.func
-def removed_by(parts: FilterParts, state: FilterState, x: int, y: int, t: wp.int64, p: int) -> int:
-    """Return the number of the first part that removes an event, 0 for none."""
-    pixel = y * parts.columns + x
+def removed_before_times(parts: FilterParts, x: int, y: int, t: wp.int64, p: int) -> int:
+    """Return the number of the first part that removes an event, of those without a memory; 0 for none."""
     if t < parts.start or t >= parts.end:
         return WINDOW
     if x < parts.left or x >= parts.right or y < parts.top or y >= parts.bottom:
         return REGION
     if parts.polarity >= 0 and p != parts.polarity:
         return POLARITY
-    if parts.hot.shape[0] > 0 and is_hot(parts, state, pixel):
+    if parts.hot.shape[0] > 0 and is_hot(parts, y * parts.columns + x):
         return HOT_PIXELS
-    if parts.refractory_us > wp.int64(0) and is_early(parts, state, pixel, t):
-        return REFRACTORY
-    if parts.background_us > wp.int64(0) and is_background(parts, state, x, y, t):
-        return BACKGROUND
-    if parts.rate_per_us > wp.float64(0.0) and is_over_rate(parts, state, t):
-        return RATE
-    if parts.every > 1 and is_left_out(parts, state):
-        return EVERY
     return 0
 
 
 @wp.func
-def prefetch_times(parts: FilterParts, state: FilterState, x: int, y: int):
+def latest_of_two(latest: wp.array(dtype=int), first: int, second: int) -> int:
+    """Return the later one of the times at two places [us]."""
+    return wp.max(load_one_int(latest, first), load_one_int(latest, second))
+
+
+@wp.func
+def removed_by_times(parts: FilterParts, state: FilterState, x: int, y: int, t: int) -> int:
+    """Return whether the refractory period or the background removes an event, as the number of the part; 0: none.
+
+    ``t`` counts from the base. Without branches, which would often be mispredicted.
+    """
+    middle = load_int(state.across, x + 1)
+    row = load_int(state.down, y + 1)
+    last = load_int(state.passed_t, row + middle)
+    is_early = t - last < parts.refractory_us
+    number = wp.where(is_early, REFRACTORY, 0)
+    if parts.background_us > 0:
+        left = load_int(state.across, x)
+        right = load_int(state.across, x + 2)
+        above = load_int(state.down, y)
+        below = load_int(state.down, y + 2)
+        at_left = latest_of_two(state.passed_t, above + left, below + left)
+        at_middle = latest_of_two(state.passed_t, above + middle, below + middle)
+        at_right = latest_of_two(state.passed_t, above + right, below + right)
+        beside = latest_of_two(state.passed_t, row + left, row + right)
+        near = wp.max(wp.max(at_left, at_middle), wp.max(at_right, beside))
+        is_alone = t - near > parts.background_us
+        number = wp.where(is_early, REFRACTORY, wp.where(is_alone, BACKGROUND, 0))
+    store_int(state.passed_t, row + middle, wp.where(is_early, last, t))
+    return number
+
+
+@wp.func
+def removed_by(
+    parts: FilterParts, state: FilterState, x: int, y: int, t: wp.int64, p: int, base_t: wp.int64
+) -> int:
+    """Return the number of the first part that removes an event, 0 for none."""
+    first = removed_before_times(parts, x, y, t, p)
+    if first > 0:
+        if first == HOT_PIXELS:
+            pixel = y * parts.columns + x
+            state.hot_counts[pixel] = state.hot_counts[pixel] + wp.int64(1)
+        return first
+    number = int(0)
+    if state.passed_t.shape[0] > 0:
+        number = removed_by_times(parts, state, x, y, int(t - base_t))
+    if parts.rate_per_us > wp.float64(0.0):
+        if number == 0 and is_over_rate(parts, state, t):
+            number = RATE
+    if parts.every > 1:
+        if number == 0 and is_left_out(parts, state):
+            number = EVERY
+    return number
+
+
+@wp.func
+def prefetch_pixel(parts: FilterParts, state: FilterState, x: int, y: int):
     """Fetch the times that an event of a pixel will need: a large sensor's do not fit into a core's cache."""
-    if parts.refractory_us > wp.int64(0):
-        prefetch_int64(state.kept_t, y * parts.columns + x)
-    if parts.background_us > wp.int64(0):
-        stride = parts.columns + 2
-        above = y * stride + x + 1
-        prefetch_int64(state.fired_t, above)
-        prefetch_int64(state.fired_t, above + stride)
-        prefetch_int64(state.fired_t, above + 2 * stride)
+    if state.passed_t.shape[0] > 0:
+        middle = load_int(state.across, x + 1)
+        row = load_int(state.down, y + 1)
+        prefetch_int(state.passed_t, row + middle)
+    if parts.background_us > 0:
+        left = load_int(state.across, x)
+        right = load_int(state.across, x + 2)
+        above = load_int(state.down, y)
+        below = load_int(state.down, y + 2)
+        prefetch_int(state.passed_t, above + left)
+        prefetch_int(state.passed_t, below + right)
+
+
+@wp.func
+def move_base(parts: FilterParts, state: FilterState, t: wp.int64):
+    """Count the times of all pixels from the time ``t`` on. Times that matter no longer become `LONG_AGO`."""
+    longest = wp.max(parts.refractory_us, parts.background_us)
+    passed = t - state.base_t[0]
+    for i in range(state.passed_t.shape[0]):
+        age = passed - wp.int64(state.passed_t[i])
+        state.passed_t[i] = wp.where(age > wp.int64(longest), LONG_AGO, -int(age))
+    state.base_t[0] = t
+
+
+@wp.struct
+class EventColumns:
+    """Columns of a block of events."""
+
+    x: wp.array(dtype=wp.uint16)
+    y: wp.array(dtype=wp.uint16)
+    t: wp.array(dtype=wp.int64)
+    p: wp.array(dtype=wp.uint8)
 
 
 @wp.kernel
-def find_removing_parts(
+def filter_events(
     parts: FilterParts,
     state: FilterState,
-    x: wp.array(dtype=wp.uint16),
-    y: wp.array(dtype=wp.uint16),
-    t: wp.array(dtype=wp.int64),
-    p: wp.array(dtype=wp.uint8),
+    given: EventColumns,
+    kept: EventColumns,
+    kept_count: wp.array(dtype=int),
     removing: wp.array(dtype=wp.uint8),
     count: int,
 ):
-    """Find the part that removes each of the first events. One thread passes over them, in their order."""
-    for i in range(count):
+    """Find the part that removes each of the first events, and copy the kept ones one after the other.
+
+    One thread passes over them, in their order.
+    """
+    i = int(0)  # a while loop takes fewer instructions than a range
+    end = int(0)
+    base_t = state.base_t[0]
+    while i < count:
         later = wp.min(i + AHEAD, count - 1)
-        prefetch_times(parts, state, int(load_uint16(x, later)), int(load_uint16(y, later)))
-        column = int(load_uint16(x, i))
-        row = int(load_uint16(y, i))
-        polarity = int(load_uint8(p, i))
-        number = removed_by(parts, state, column, row, load_int64(t, i), polarity)
+        prefetch_pixel(
+            parts, state, int(load_uint16(given.x, later)), int(load_uint16(given.y, later))
+        )
+        column = int(load_uint16(given.x, i))
+        row = int(load_uint16(given.y, i))
+        t = load_int64(given.t, i)
+        polarity = int(load_uint8(given.p, i))
+        if t - base_t > MOST_AFTER_BASE:
+            move_base(parts, state, t)
+            base_t = t
+        number = removed_by(parts, state, column, row, t, polarity, base_t)
+        store_int64(state.removed, number, load_int64(state.removed, number) + wp.int64(1))
         store_uint8(removing, i, number)
+        # Always stored, and overwritten by the next event if this one is removed: a branch would often be mispredicted
+        store_uint16(kept.x, end, column)
+        store_uint16(kept.y, end, row)
+        store_int64(kept.t, end, t)
+        store_uint8(kept.p, end, polarity)
+        end += int(number == 0)
+        i += 1
+    kept_count[0] = end

@@ -28,6 +28,16 @@ def load_int(values: wp.array(dtype=int), i: int) -> int:
     """Load element ``i`` of a contiguous array of int32."""
 
 
+@wp.func_native("return ((const volatile int32_t*)values.data)[i];")
+def load_one_int(values: wp.array(dtype=int), i: int) -> int:
+    """Load element ``i`` by an instruction for it alone. Compilers make one of several loads, which CPUs run slowly."""
+
+
+@wp.func_native("return ((const volatile float*)values.data)[i];")
+def load_one_float(values: wp.array(dtype=float), i: int) -> float:
+    """Load element ``i`` by an instruction for it alone, as :func:`load_one_int` does."""
+
+
 @wp.func_native("return ((const int64_t*)values.data)[i];")
 def load_int64(values: wp.array(dtype=wp.int64), i: int) -> wp.int64:
     """Load element ``i`` of a contiguous array of int64."""
@@ -56,6 +66,11 @@ def store_float(values: wp.array(dtype=float), i: int, value: float):
 @wp.func_native("((uint8_t*)values.data)[i] = (uint8_t)value;")
 def store_uint8(values: wp.array(dtype=wp.uint8), i: int, value: int):
     """Store ``value`` as element ``i`` of a contiguous array of uint8."""
+
+
+@wp.func_native("((uint16_t*)values.data)[i] = (uint16_t)value;")
+def store_uint16(values: wp.array(dtype=wp.uint16), i: int, value: int):
+    """Store ``value`` as element ``i`` of a contiguous array of uint16."""
 
 
 @wp.func_native("((uint32_t*)values.data)[i] = value;")
@@ -195,10 +210,19 @@ def prefetch_words(sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), 
 
 @wp.func_native("""
 #ifndef __CUDACC__
-    __builtin_prefetch((const int64_t*)values.data + i, 1);
+    __builtin_prefetch((const int32_t*)values.data + i, 1);
 #endif
 """)
-def prefetch_int64(values: wp.array(dtype=wp.int64), i: int):
+def prefetch_int(values: wp.array(dtype=int), i: int):
+    """Fetch element ``i`` into a core's cache, while it goes on."""
+
+
+@wp.func_native("""
+#ifndef __CUDACC__
+    __builtin_prefetch((const float*)values.data + i);
+#endif
+""")
+def prefetch_float(values: wp.array(dtype=float), i: int):
     """Fetch element ``i`` into a core's cache, while it goes on."""
 
 

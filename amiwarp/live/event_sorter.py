@@ -65,7 +65,8 @@ class EventSorter:
             t[:late] = self._last_out_us
             joined = Events(joined.x, joined.y, t, joined.p)
         ready = int(np.searchsorted(joined.t, until, "right"))
-        count = max(ready, len(joined) - self._most_events)
+        # Late events wait for nothing; held back, they would be overtaken by others that are as late.
+        count = max(ready, late, len(joined) - self._most_events)
         out = joined[:count]
         held = joined[count:]
         self._held = held if len(held) else None

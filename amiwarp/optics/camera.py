@@ -337,8 +337,8 @@ def undistorted_places(events: Any, camera: Camera, target: Camera) -> Undistort
     """
     if not events.whole_pixels:
         return _places_of(np.stack([events.x, events.y], axis=1), camera, target)
-    _check_pixels(events, camera)
-    table = _places_of_pixels(camera, target)
+    check_pixels(events, camera)
+    table = places_of_pixels(camera, target)
     pixel = events.y.astype(np.intp)
     pixel *= camera.width
     pixel += events.x
@@ -346,7 +346,7 @@ def undistorted_places(events: Any, camera: Camera, target: Camera) -> Undistort
 
 
 @lru_cache(maxsize=4)
-def _places_of_pixels(camera: Camera, target: Camera) -> UndistortedPlaces:
+def places_of_pixels(camera: Camera, target: Camera) -> UndistortedPlaces:
     """Return the places of all pixels, row by row."""
     rows, columns = np.indices((camera.height, camera.width), np.float32)
     return _places_of(np.stack([columns.ravel(), rows.ravel()], axis=1), camera, target)
@@ -361,7 +361,7 @@ def _places_of(xy: NDArray[np.float32], camera: Camera, target: Camera) -> Undis
     return UndistortedPlaces(x, y, ~(in_columns & in_rows))
 
 
-def _check_pixels(events: Any, camera: Camera) -> None:
+def check_pixels(events: Any, camera: Camera) -> None:
     """Raise :class:`AmiwarpError` if an event lies outside the camera's image."""
     if not len(events):
         return

@@ -124,6 +124,34 @@ def test_each_part_keeps_what_plain_python_keeps_in_blocks_of_any_length(name: s
         assert len(running.removed) == (7 if name == "all" else 1)
 
 
+@pytest.mark.parametrize(
+    ("refractory_us", "background_us"),
+    [(900_000_000, 0), (0, 800_000_000), (600_000_000, 999_999_999)],
+)
+@pytest.mark.parametrize("start", [0, -(2**59)])
+def test_times_of_pixels_are_kept_over_hours(
+    refractory_us: int, background_us: int, start: int
+) -> None:
+    """The filter remembers times from a base, which it moves every 1000 s."""
+    rng = np.random.default_rng(4)
+    n = 2500
+    steps = rng.choice(
+        [1, 70_000, 250_000_000, 999_999_999, 1_000_000_001, 5_000_000_000],
+        n,
+        p=[0.3, 0.3, 0.25, 0.06, 0.06, 0.03],
+    )
+    t = start + np.cumsum(steps)
+    x, y = rng.integers(0, 5, n), rng.integers(0, 4, n)
+    events = Events.from_arrays(x, y, t, rng.integers(0, 2, n))
+    chosen = EventFilter(refractory_us=refractory_us, background_us=background_us)
+    known = expected(Events(events.x, events.y, events.t - start, events.p), chosen)
+    assert 200 < len(known) < n - 200
+    running = RunningFilter(chosen, (5, 4))
+    kept = [running.kept(events[a : a + 300]) for a in range(0, n, 300)]
+    assert_equal(Events.concatenate(kept), events[np.array(known)])
+    assert sum(running.removed.values()) == n - len(known)
+
+
 def test_removed_events_of_hot_pixels_are_counted_one_by_one() -> None:
     events = some_events()
     running = RunningFilter(EventFilter(hot_pixels=HOT), (WIDTH, HEIGHT))
@@ -196,6 +224,7 @@ def test_simulated_hot_pixels_are_found() -> None:
         ({"polarity": 2}, "polarity"),
         ({"every": 0}, "every"),
         ({"refractory_us": -1}, "refractory_us"),
+        ({"background_us": 1_000_000_001}, "background_us"),
         ({"most_per_s": math.nan}, "most_per_s"),
     ],
 )

@@ -69,10 +69,13 @@ class _Client:
 
     connection: socket.socket
     waiting: deque[memoryview] = field(default_factory=deque)
+    counts: deque[int] = field(default_factory=deque)
+    """Number of packets in each of ``waiting``."""
     waiting_bytes: int = 0
 
     def put(self, data: bytes) -> None:
         self.waiting.append(memoryview(data))
+        self.counts.append(packet_count(data))
         self.waiting_bytes += len(data) + PACKET_OVERHEAD
 
     def push(self) -> bool:
@@ -85,6 +88,7 @@ class _Client:
                 if rest:
                     self.waiting.appendleft(rest)
                 else:
+                    self.counts.popleft()
                     self.waiting_bytes -= PACKET_OVERHEAD
         except BlockingIOError:
             pass
@@ -175,6 +179,8 @@ class SocketSink:
             time.sleep(0.002)
             self._push()
         for client in self._clients:
+            if client.waiting:
+                self.lost += sum(client.counts) - 1  # all but the end
             client.connection.close()
         self._clients = []
 

@@ -14,7 +14,8 @@ from amiwarp.compensation.streams import OUTSIDE, Compensated
 from amiwarp.events.recording import Events
 from amiwarp.imaging.filters import NAMES, EventFilter, RunningFilter
 from amiwarp.live.stream.session_status import Latencies, SessionStatus, StageStatus
-from amiwarp.optics.camera import Camera, undistorted_places
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.running_undistortion import RunningUndistortion
 
 
 class Stage:
@@ -58,8 +59,7 @@ class SessionStages:
         self.filters = chosen is not None
         """Whether there is a filter."""
         self._delay_us = delay_us
-        self._camera = undistort
-        self._target = None if undistort is None else replace(undistort, distortion=None)
+        self._undistortion = None if undistort is None else RunningUndistortion(undistort)
         self._running = None if chosen is None else RunningFilter(chosen, size)
         self._outside = 0
         self._read = Stage("read")
@@ -102,9 +102,9 @@ class SessionStages:
 
     def _undistorted(self, packet: Compensated) -> Compensated:
         """Return a packet without lens distortion. The flag :data:`OUTSIDE` then belongs to the new places."""
-        if self._camera is None or self._target is None:
+        if self._undistortion is None:
             return packet
-        places = undistorted_places(packet.events, self._camera, self._target)
+        places = self._undistortion.places(packet.events)
         events = replace(packet.events, x=places.x, y=places.y)
         outside = places.outside * np.uint8(OUTSIDE)
         flags = (packet.flags & np.uint8(~OUTSIDE & 0xFF)) | outside
