@@ -244,13 +244,11 @@ def _open(path: Path, kind: str, animation: str | None) -> tuple[Any, list[str],
     import trimesh
 
     files = _named_files(path)
-    with open_input(path) as file:
+    with open_input(path) as opened:
         try:
-            animated = AnimatedScene(file, kind, files.get, animation)
-            source = animated.source
-            scene = trimesh.load(
-                source, file_type=kind, resolver=files, force="scene", process=False
-            )
+            animated = AnimatedScene(opened, kind, files.get, animation)
+            file = animated.source
+            scene = trimesh.load(file, file_type=kind, resolver=files, force="scene", process=False)
         except Exception:
             if files.missing is None:
                 raise
