@@ -133,8 +133,8 @@ class CameraOptions:
     camera: Annotated[
         Path | None,
         in_camera(
-            help="Camera intrinsics: JSON (width, height, fx, fy, cx, cy, distortion), a calibration file, YAML of ROS "
-            "OpenCV or Kalibr, or calib.txt (fx fy cx cy k1 k2 p1 p2 k3)."
+            help="Camera intrinsics: JSON (width, height, fx, fy, cx, cy, distortion), a calibration file, YAML of "
+            "ROS, OpenCV or Kalibr, or calib.txt (fx fy cx cy k1 k2 p1 p2 k3)."
         ),
     ] = None
 

@@ -193,7 +193,7 @@ def _from_ros(data: dict[str, Any]) -> Camera:
 def _unnamed_model(data: dict[str, Any]) -> str:
     """Return the lens model of a file without its name: one of OpenCV, or an old one of ROS.
 
-    Raises :class:`AmiwarpError` for four coefficients, which may be those of two models.
+    Raises :class:`AmiwarpError` for four coefficients, which two models have.
     """
     if data.get("fisheye_model"):
         return "fisheye"
@@ -202,7 +202,7 @@ def _unnamed_model(data: dict[str, Any]) -> str:
     count = len(values) if isinstance(values, list) else 0
     if count == 4 and "distortion_model" not in data and "fisheye_model" not in data:
         raise AmiwarpError(
-            "field distortion_model is missing, and 4 coefficients are k1, k2, p1, p2 or those of a fisheye lens; add "
+            "field distortion_model is missing, and 4 coefficients are k1, k2, p1, p2 or a fisheye's k1 to k4; add "
             "distortion_model: plumb_bob, or distortion_model: equidistant",
             ErrorCode.AMBIGUOUS,
         )

@@ -129,7 +129,7 @@ def test_files_of_opencv(tmp_path: Path) -> None:
         -0.36, 0.11, 1e-3, 5e-4, -0.02, 0.1, 0.2, 0.3
     )
     path.write_text(four.replace("fisheye_model: 0\n", ""))
-    with pytest.raises(AmiwarpError, match="4 coefficients are k1, k2, p1, p2 or those of a fish"):
+    with pytest.raises(AmiwarpError, match="4 coefficients are k1, k2, p1, p2 or a fisheye"):
         load_camera(path)
 
 
