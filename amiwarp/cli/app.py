@@ -160,6 +160,11 @@ COMMANDS = {
         "Check the AMI-EV paper's results: compare with a plain event camera on simulated worlds, and write a report.",
         "amiwarp evaluate --out evaluation --only texture",
     ),
+    "bench": Command(
+        "studies.bench",
+        "Make the recordings of AMI-Bench, answer them by baselines, and score submissions.",
+        "amiwarp bench --small",
+    ),
     "truth": Command(
         "io",
         "Export the ground truth of a simulated world: optical flow in the DSEC or MVSEC format, poses as TUM files.",

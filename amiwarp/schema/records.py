@@ -92,7 +92,7 @@ def check_given(data: Mapping[str, Any], where: str, *needed: str) -> None:
             )
 
 
-def check_format(data: Mapping[str, Any], name: str, version: int) -> None:
+def check_format(data: Mapping[str, Any], name: str, version: int | str) -> None:
     """Raise :class:`AmiwarpError` if the fields ``format`` and ``version`` of a file are others than expected."""
     if data["format"] != name or data["version"] != version:
         given = f"{shown(data['format'])} and {shown(data['version'])}"

@@ -281,6 +281,7 @@ def test_every_input_of_every_command_is_in_the_tables() -> None:
         read = {(command, option) for option, writes in options if not writes}
         assert read <= endless
         if command not in (
+            "bench",
             "chart",
             "dataset",
             "demo",
@@ -437,6 +438,7 @@ NAMES: dict[tuple[str, str], tuple[str, tuple[str, ...]]] = {
     ("dataset", "out"): ("dataset spec.toml {}", FOLDER),
     ("demo", "out"): ("demo --size 64x48 --duration 0.1 --picture pic.png --out {}", FOLDER),
     ("design", "out"): ("design --size 64x48 --apex-deg 1 --rpm 720 --out {}", FOLDER),
+    ("bench", "out"): ("bench --small --methods frames --out {}", FOLDER),
     ("evaluate", "out"): ("evaluate --quick --out {}", FOLDER),
     ("export-c", "out"): ("export-c {}", FOLDER),
     ("export", "out"): ("export made {} --to webdataset", FOLDER),
@@ -711,6 +713,8 @@ ENDLESS = (
     "export {} out --to parquet",
     "design --out out --camera {}.json --apex-deg 1 --rpm 720",
     "emulate --link link --camera unix:camera --recording {}",
+    "bench run frames --out out --data {}",
+    "bench score mine --truth {}",
     "evaluate --out out --recording {}",
     "record a.h5 out.h5 --fast --camera {}.json",
     "simulate out --rig {}.toml",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from amiwarp.simulation.description import Scene, Still
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.picture_light import read_picture
 from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.simulation.worlds.world import World
 from amiwarp.simulation.worlds.world_scene import BLUR_PX
 
 SAMPLES_PER_PERIOD = 32
@@ -27,16 +25,6 @@ def picture_scene(path: str, drawn: Mapping[str, float]) -> Scene:
     luminance = read_picture(path) ** np.float32(drawn.get("gamma", 1.0))
     light = np.float32(drawn.get("light", 1.0))
     return Scene(Still(light * luminance), blur=drawn.get("blur_px", BLUR_PX))
-
-
-def lit(world: World, light: float) -> World:
-    """Return a world whose ambient light, sun, lamps and sky are ``light`` times as bright."""
-    sun = world.sun
-    if sun is not None:
-        sun = replace(sun, intensity=light * sun.intensity)
-    lamps = tuple(replace(lamp, intensity=light * lamp.intensity) for lamp in world.lamps)
-    sky = replace(world.sky, luminance=light * world.sky.luminance)
-    return replace(world, ambient=light * world.ambient, sun=sun, lamps=lamps, sky=sky)
 
 
 def shake_axis(drawn: Mapping[str, float]) -> NDArray[np.float64]:

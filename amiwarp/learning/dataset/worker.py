@@ -26,7 +26,7 @@ from amiwarp.io.output_formats import make_folder
 from amiwarp.io.outputs import put_in_place
 from amiwarp.io.tensor_files import save_tensors
 from amiwarp.learning.dataset import specification as spec
-from amiwarp.learning.dataset.drawn_scene import lit, picture_scene, shaken, shaken_motion
+from amiwarp.learning.dataset.drawn_scene import picture_scene, shaken, shaken_motion
 from amiwarp.learning.dataset.items import Item
 from amiwarp.learning.dataset.randomise import SENSOR
 from amiwarp.learning.dataset.sources import content_digest
@@ -39,6 +39,7 @@ from amiwarp.simulation.recorded_truth import RecordedTruth, chosen_instants
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.translation.translator import translation
+from amiwarp.simulation.worlds.world import lit
 from amiwarp.simulation.worlds.world_choice import POSE_FILES, open_world
 from amiwarp.simulation.worlds.world_scene import BLUR_PX, WorldScene
 from amiwarp.studies import cluster

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -93,3 +93,13 @@ class World:
     def triangles(self) -> int:
         """Number of triangles of all bodies."""
         return sum(len(np.asarray(body.mesh.faces)) for body in self.bodies)
+
+
+def lit(world: World, light: float) -> World:
+    """Return a world whose ambient light, sun, lamps and sky are ``light`` times as bright."""
+    sun = world.sun
+    if sun is not None:
+        sun = replace(sun, intensity=light * sun.intensity)
+    lamps = tuple(replace(lamp, intensity=light * lamp.intensity) for lamp in world.lamps)
+    sky = replace(world.sky, luminance=light * world.sky.luminance)
+    return replace(world, ambient=light * world.ambient, sun=sun, lamps=lamps, sky=sky)
