@@ -37,8 +37,8 @@ from amiwarp.io import recorded_dataset
 from amiwarp.io.finished_work import read_journal
 from amiwarp.kernels.quiet_start import start_quietly
 from amiwarp.learning.dataset import files, making
+from amiwarp.learning.dataset.digests import content_digest
 from amiwarp.learning.dataset.items import Item, list_items
-from amiwarp.learning.dataset.sources import content_digest
 from amiwarp.learning.dataset.specification import load_specification
 from amiwarp.learning.dataset.worker import simulation_of, write_recording
 from amiwarp.simulation.engine import Engine

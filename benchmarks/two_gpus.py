@@ -35,8 +35,8 @@ from amiwarp import compensate, make_dataset, open_recording
 from amiwarp.io import recorded_dataset
 from amiwarp.kernels.quiet_start import start_quietly
 from amiwarp.learning.dataset import making
+from amiwarp.learning.dataset.digests import content_digest
 from amiwarp.learning.dataset.items import Item, list_items
-from amiwarp.learning.dataset.sources import content_digest
 from amiwarp.learning.dataset.specification import load_specification
 from amiwarp.learning.dataset.worker import simulation_of, write_recording
 from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, run_jobs, start_workers

@@ -12,11 +12,14 @@ from typing import Any
 
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.recording import Events, Recording
+from amiwarp.events.rig_recording import RigRecording
 from amiwarp.io.formats import open_recording
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.json_files import read_json
+from amiwarp.io.rig_files import open_rig
 from amiwarp.io.tensor_files import read_tensors
 from amiwarp.schema.calls import guarded
+from amiwarp.schema.records import value_of
 from amiwarp.validation import instance, shown, whole
 
 FORMAT = "amiwarp-dataset"
@@ -47,6 +50,8 @@ class ManifestItem:
     events: int
     representation: str | None
     """Representation of the tensors that the file holds; None for a recording."""
+    cameras: tuple[str, ...] = ()
+    """Cameras of the rig that the file, a folder, holds; none for one recording."""
 
 
 @guarded
@@ -64,8 +69,10 @@ class RecordedDataset:
         Name of the part to use, such as "train"; by default all parts.
     transform : callable, optional
         Called with the :class:`Recording` and the dict of its labels. Its return value is the item. Without it, an item
-        is the tuple of all events and the labels. If the data set holds tensors instead of recordings, ``transform`` is
-        called with a dict of arrays and the labels; without it, an item is the array ``tensor`` and the labels.
+        is the tuple of all events and the labels. If the data set holds recorded rigs, ``transform`` is called with the
+        :class:`RigRecording` and the labels; without it, an item is the tuple of these. If the data set holds tensors
+        instead of recordings, ``transform`` is called with a dict of arrays and the labels; without it, an item is the
+        array ``tensor`` and the labels.
         Worker processes that are spawned need a function of a module.
     structured : bool, default False
         Whether items are as in tonic's data sets: a structured array of the events with the fields x, y, t [us]
@@ -77,7 +84,7 @@ class RecordedDataset:
     ------
     AmiwarpError
         If the folder has no manifest, the manifest is damaged or of a newer version, no recording is in the split,
-        ``target_transform`` is given without ``structured``, or ``structured`` for a data set of tensors.
+        ``target_transform`` is given without ``structured``, or ``structured`` for a data set of tensors or rigs.
 
     Examples
     --------
@@ -129,6 +136,13 @@ class RecordedDataset:
                 "out structured, or make the data set without [output]",
                 ErrorCode.OPTIONS,
             )
+        rigs = [item for item in self._items if item.cameras]
+        if structured and rigs:
+            raise AmiwarpError(
+                f"{self.folder}: holds rigs of the cameras {', '.join(rigs[0].cameras)}, but structured items are of "
+                "one camera; leave out structured, and take the events of a camera in transform",
+                ErrorCode.OPTIONS,
+            )
         self.transform = transform
         self.structured = structured
         self.target_transform = target_transform
@@ -158,6 +172,11 @@ class RecordedDataset:
             if self.transform is None:
                 return arrays["tensor"], labels
             return self.transform(arrays, labels)
+        if item.cameras:
+            rig = open_rig_item(self.folder, item)
+            if self.transform is None:
+                return rig, labels
+            return self.transform(rig, labels)
         recording = open_item(self.folder, item)
         if self.structured:
             return self._structured_item(recording.events.slice(0, item.events), labels)
@@ -189,6 +208,27 @@ def open_item(folder: Path, item: ManifestItem) -> Recording:
         given = f"{path}: holds {count} events, the manifest says {item.events}"
         raise AmiwarpError(f"{given}; make this recording again, or correct the manifest")
     return recording
+
+
+def open_rig_item(folder: Path, item: ManifestItem) -> RigRecording:
+    """Open a recorded rig of a data set.
+
+    Raises :class:`AmiwarpError` if a file is missing or the rig is not the one that the manifest describes.
+    """
+    path = folder / item.file
+    rig = open_rig(path)
+    found = (tuple(rig.sensors), rig_events(rig))
+    if found != (item.cameras, item.events):
+        raise AmiwarpError(
+            f"{path}: holds {found[1]} events of {', '.join(found[0])}, the manifest says {item.events} of "
+            f"{', '.join(item.cameras)}; make this recording again, or correct the manifest"
+        )
+    return rig
+
+
+def rig_events(rig: RigRecording) -> int:
+    """Return the number of events of all cameras of a rig."""
+    return sum(len(sensor.recording.events) for sensor in rig.sensors.values())
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], list[ManifestItem]]:
@@ -245,6 +285,9 @@ def _item(entry: Any, where: str) -> ManifestItem:
     representation = fields.get("representation")
     if representation is not None:
         instance(representation, str, f"field {where}.representation")
+    cameras = fields.get("rig")
+    if cameras is not None:
+        cameras = value_of(tuple[str, ...], cameras, f"{where}.rig")
     return ManifestItem(
         entry=fields,
         file=file,
@@ -252,4 +295,5 @@ def _item(entry: Any, where: str) -> ManifestItem:
         labels=labels,
         events=events,
         representation=representation,
+        cameras=cameras or (),
     )

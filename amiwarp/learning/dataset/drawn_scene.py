@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.learning.dataset.items import Item
 from amiwarp.simulation.description import Scene, Still
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.picture_light import read_picture
 from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.simulation.worlds.world import World, lit
+from amiwarp.simulation.worlds.world_choice import POSE_FILES, open_world
 from amiwarp.simulation.worlds.world_scene import BLUR_PX
 
 SAMPLES_PER_PERIOD = 32
@@ -59,3 +63,20 @@ def shaken(trajectory: Trajectory, drawn: Mapping[str, float], duration_s: float
     angle = math.radians(drawn["shake_deg"]) * np.sin(2.0 * math.pi * drawn["shake_hz"] * t)
     shakes = Rotation.from_rotvec(np.outer(angle, shake_axis(drawn)))
     return Trajectory(t, positions, (Rotation.from_matrix(matrices) * shakes).as_quat())
+
+
+def drawn_world(item: Item) -> tuple[World, Trajectory]:
+    """Return the world of a recording in its light, and the trajectory through it with its shake.
+
+    The seed of a named world is the specification's.
+    """
+    recipe = item.recipe
+    trajectory = recipe["trajectory"]
+    if trajectory is not None and trajectory.lower().endswith(POSE_FILES):
+        trajectory = os.fspath(item.folder / trajectory)
+    name = item.source if item.kind == "worlds" else os.fspath(item.folder / item.source)
+    duration_s = recipe["duration_s"]
+    world, path = open_world(name, trajectory, seed=recipe["seed"], duration_s=duration_s)
+    if "light" in item.drawn:
+        world = lit(world, item.drawn["light"])
+    return world, shaken(path, item.drawn, duration_s)

@@ -202,6 +202,11 @@ def _exportable(
             f"{folder}: has no recordings to export; make some with 'amiwarp dataset'",
             ErrorCode.CONTENT_MISSING,
         )
+    rigs = [item for item in items if item.cameras]
+    if rigs:
+        raise AmiwarpError(
+            f"{folder}: holds recorded rigs, and the layouts are for one camera; convert a rig with 'amiwarp convert'"
+        )
     tensors = [item for item in items if item.representation is not None]
     if tensors and chosen is ExportFormat.PARQUET:
         raise AmiwarpError(

@@ -14,12 +14,16 @@ from typing import Any
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError, ErrorCode, optional_module
 from amiwarp.io.finished_work import append_line, create_journal, read_journal
-from amiwarp.io.output_formats import make_folder
-from amiwarp.io.outputs import NewFile, put_in_place, write_text
+from amiwarp.io.outputs import NewFile, write_text
 from amiwarp.io.recorded_dataset import FORMAT, MANIFEST, VERSION
 from amiwarp.learning.dataset import specification as spec
 from amiwarp.learning.dataset.items import Item
-from amiwarp.learning.dataset.sources import content_digest
+from amiwarp.learning.dataset.stored import (
+    put_stored,
+    remove_stored,
+    stored_bytes,
+    stored_digest,
+)
 from amiwarp.learning.dataset.worker import Failed, Made
 from amiwarp.schema.records import build
 
@@ -69,32 +73,30 @@ class Journal:
         """Move the recording of an item to the folder of its split, if it is in the folder of an earlier split."""
         made = self.made[item.key]
         if made.file != item.file:
-            make_folder((self._out / item.file).parent)
-            put_in_place(self._out / made.file, self._out / item.file, overwrite=True)
+            put_stored(self._out / made.file, self._out / item.file, item.cameras)
             self.add(replace(made, file=item.file))
 
     def drop(self, item: Item) -> None:
         """Forget the recording of an item, which is made again, and remove it from the folder of an earlier split."""
         made = self.made.pop(item.key, None)
         if made is not None and made.file != item.file:
-            (self._out / made.file).unlink(missing_ok=True)
+            remove_stored(self._out / made.file, item.cameras)
 
     def is_there(self, item: Item) -> bool:
-        """Return whether the recording of an item is in the journal, and its file has the size stated there.
+        """Return whether the recording of an item is in the journal, and its files have the size stated there.
 
         It may lie in the folder of an earlier split.
         """
         made = self.made.get(item.key)
         if made is None:
             return False
-        path = self._out / made.file
-        return path.is_file() and path.stat().st_size == made.bytes
+        return stored_bytes(self._out / made.file, item.cameras) == made.bytes
 
     def is_intact(self, item: Item) -> bool:
-        """Return whether the file of a recording that is there has the checksum of the journal."""
+        """Return whether the files of a recording that is there have the checksum of the journal."""
         made = self.made[item.key]
         try:
-            if content_digest(self._out / made.file, noted=False) == made.sha256:
+            if stored_digest(self._out / made.file, item.cameras) == made.sha256:
                 return True
         except AmiwarpError as error:  # a file that cannot be read is made again, as a damaged one
             self.damaged.append(str(error))
@@ -187,6 +189,7 @@ def _row(item: Item, made: Made) -> dict[str, Any]:
         "sensor": (recipe.get("sensor") or {}).get("name"),
         "variant": recipe.get("seed"),
         "trajectory": recipe.get("trajectory"),
+        "rig": list(item.cameras) or None,
         "representation": (recipe.get("output") or {}).get("representation"),
         "device": made.device,
         "amiwarp": made.amiwarp,

@@ -18,8 +18,9 @@ from typing import Any
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.inputs import errors_name
 from amiwarp.learning.dataset import specification as spec
+from amiwarp.learning.dataset.digests import content_digest
 from amiwarp.learning.dataset.randomise import draw
-from amiwarp.learning.dataset.sources import Source, content_digest, find_sources
+from amiwarp.learning.dataset.sources import Source, find_sources
 from amiwarp.simulation.worlds.world_choice import POSE_FILES
 from amiwarp.validation import shown
 
@@ -72,9 +73,18 @@ class Item:
 
     @property
     def file(self) -> str:
-        """Path of the recording, relative to the folder of the data set."""
+        """Path of the recording, relative to the folder of the data set. The path of a rig is a folder."""
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", Path(self.source).stem)[:60]
-        return f"{self.split}/{stem}-{self.key}{'.npz' if 'output' in self.recipe else '.h5'}"
+        ending = ".npz" if "output" in self.recipe else ".h5"
+        if self.cameras:
+            ending = ""
+        return f"{self.split}/{stem}-{self.key}{ending}"
+
+    @property
+    def cameras(self) -> Sequence[str]:
+        """Names of the cameras of a rig; none for the recording of one camera."""
+        names: Sequence[str] = self.recipe["rig"]["cameras"] if "rig" in self.recipe else ()
+        return names
 
     @property
     def drawn(self) -> Mapping[str, float]:
@@ -164,9 +174,11 @@ def _identities(specification: spec.Specification, source: Source) -> list[str]:
 
 
 def _axes(specification: spec.Specification, source: Source) -> tuple[Sequence[Any], ...]:
-    """Return what one source is combined with: trajectories, optics, sensors and seeds."""
+    """Return what one source is combined with: trajectories, optics, sensors and seeds; for a rig only the ends."""
     if source.entry.kind == "recordings":
         return ()
+    if specification.of_rig is not None:
+        return _trajectories(specification, source), specification.seeds
     prisms = [asdict(prism) for prism in specification.prisms]
     optics = [
         {"prism": prism, "rpm": rpm}
@@ -191,6 +203,9 @@ def _recipes(
     if entry.kind == "recordings":
         yield base
         return
+    if specification.of_rig is not None:
+        yield from _rig_recipes(specification, base, entry, axes)
+        return
     base |= {"camera": asdict(specification.camera)}
     if entry.kind in ("videos", "translated"):
         base |= {"fps": entry.fps, "duration_s": entry.duration_s}
@@ -202,6 +217,25 @@ def _recipes(
         base |= {"rotate_deg_s": entry.rotate_deg_s}
     for trajectory, optic, sensor, seed in itertools.product(*axes):
         recipe = base | trajectory | optic | {"sensor": sensor, "seed": seed}
+        if specification.randomise:
+            recipe["drawn"] = draw(specification.randomise, recipe)
+        yield recipe
+
+
+def _rig_recipes(
+    specification: spec.Specification,
+    base: Mapping[str, Any],
+    entry: spec.SourceEntry,
+    axes: Sequence[Sequence[Any]],
+) -> Iterator[dict[str, Any]]:
+    """Yield what determines each recorded rig in one world."""
+    assert specification.of_rig is not None
+    shared = {
+        "rig": specification.of_rig.recipe,
+        "duration_s": entry.duration_s or specification.duration_s,
+    }
+    for trajectory, seed in itertools.product(*axes):
+        recipe = dict(base) | shared | trajectory | {"seed": seed}
         if specification.randomise:
             recipe["drawn"] = draw(specification.randomise, recipe)
         yield recipe

@@ -14,10 +14,11 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io.unfinished import scratch_folder
 from amiwarp.learning.dataset import specification as spec
 from amiwarp.learning.dataset import worker
+from amiwarp.learning.dataset.drawn_rig import shortest_sample_s
 from amiwarp.learning.dataset.files import Journal, check_folder
 from amiwarp.learning.dataset.items import Item, list_items, sources_of_splits
 from amiwarp.learning.dataset.randomise import drawn_ranges
-from amiwarp.learning.dataset.sources import content_digest
+from amiwarp.learning.dataset.stored import remove_stored, stored_bytes, stored_digest
 from amiwarp.learning.dataset.worker import simulation_of
 from amiwarp.schema.calls import guarded
 from amiwarp.studies import cluster
@@ -239,7 +240,7 @@ def _sample(
         for count, item in enumerate(chosen, 1):
             with noted(failed, item.file):
                 if not costs:  # compiles the kernels
-                    _cost(item, scratch, device, 1e-3)
+                    _cost(item, scratch, device, max(1e-3, shortest_sample_s(item)))
                 costs.append(_whole_cost(item, scratch, device))
             if not costs and count == len(chosen):
                 raise AmiwarpError(
@@ -273,14 +274,14 @@ def _whole_cost(item: Item, scratch: Path, device: str) -> _Cost:
     whole = item.recipe.get("duration_s")
     if whole is None and item.kind in ("videos", "translated"):
         whole = simulation_of(item, device).duration_s
-    if whole is None or whole <= LONGEST_SAMPLE_S:
+    half = max(0.5 * LONGEST_SAMPLE_S, shortest_sample_s(item))
+    if whole is None or whole <= 2.0 * half:
         return _cost(item, scratch, device, None)
-    half = 0.5 * LONGEST_SAMPLE_S
     short = _cost(item, scratch, device, half)
-    long = _cost(item, scratch, device, LONGEST_SAMPLE_S)
+    long = _cost(item, scratch, device, 2.0 * half)
     slope = long.plus(short, -1.0)
     rising = _Cost(max(0.0, slope.events), max(0.0, slope.bytes), max(0.0, slope.seconds))
-    return long.plus(rising, (whole - LONGEST_SAMPLE_S) / half)
+    return long.plus(rising, (whole - 2.0 * half) / half)
 
 
 def _cost(item: Item, scratch: Path, device: str, duration_s: float | None) -> _Cost:
@@ -288,7 +289,8 @@ def _cost(item: Item, scratch: Path, device: str, duration_s: float | None) -> _
     path = scratch / Path(item.file).name
     began = time.perf_counter()
     events, *_ = worker.write_recording(item, path, device, duration_s)
-    content_digest(path, noted=False)
-    cost = _Cost(events, path.stat().st_size, time.perf_counter() - began)
-    path.unlink()
+    stored_digest(path, item.cameras)
+    seconds = time.perf_counter() - began
+    cost = _Cost(events, stored_bytes(path, item.cameras) or 0, seconds)
+    remove_stored(path, item.cameras)
     return cost

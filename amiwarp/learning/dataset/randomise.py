@@ -113,12 +113,10 @@ class DrawEntry:
         return min(max(float(f"{value:.6g}"), low), high)
 
 
-def check_randomise(
-    entries: Mapping[str, DrawEntry], kinds: Sequence[str], prisms: int, speeds: int
-) -> None:
+def check_randomise(entries: Mapping[str, DrawEntry], kinds: Sequence[str]) -> None:
     """Raise :class:`AmiwarpError` for values that cannot be drawn.
 
-    ``kinds``: kinds of the sources of the specification; ``prisms``, ``speeds``: numbers of its prisms and speeds.
+    ``kinds``: kinds of the sources of the specification.
     """
     for name, entry in entries.items():
         where = f"randomise.{name}"
@@ -131,6 +129,19 @@ def check_randomise(
                     f"field {where} does not apply to sources[{k}], {kind}; remove one of them",
                     ErrorCode.FIELD,
                 )
+    if ("shake_deg" in entries) != ("shake_hz" in entries):
+        raise AmiwarpError(
+            "field randomise has one of shake_deg and shake_hz; give both", ErrorCode.FIELD
+        )
+    if "shake_direction_deg" in entries and "shake_deg" not in entries:
+        raise AmiwarpError(
+            "field randomise.shake_direction_deg needs shake_deg and shake_hz; give them too",
+            ErrorCode.FIELD,
+        )
+
+
+def check_drawn_prism(entries: Mapping[str, DrawEntry], prisms: int, speeds: int) -> None:
+    """Raise :class:`AmiwarpError` for values of the prism that do not fit the numbers of prisms and speeds."""
     for name, count, others in (("apex_deg", prisms, "prisms"), ("rpm", speeds, "speeds_rpm")):
         if name in entries and count != 1:
             raise AmiwarpError(
@@ -140,15 +151,6 @@ def check_randomise(
     if "start_deg" in entries and not prisms:
         raise AmiwarpError(
             "field randomise.start_deg is the angle of a prism, but there are no prisms; remove it",
-            ErrorCode.FIELD,
-        )
-    if ("shake_deg" in entries) != ("shake_hz" in entries):
-        raise AmiwarpError(
-            "field randomise has one of shake_deg and shake_hz; give both", ErrorCode.FIELD
-        )
-    if "shake_direction_deg" in entries and "shake_deg" not in entries:
-        raise AmiwarpError(
-            "field randomise.shake_direction_deg needs shake_deg and shake_hz; give them too",
             ErrorCode.FIELD,
         )
 
@@ -171,7 +173,8 @@ def draw(entries: Mapping[str, DrawEntry], recipe: Mapping[str, Any]) -> dict[st
     same = [source["sha256"] or source["name"], recipe.get("seed"), recipe.get("trajectory")]
     values = {}
     for name, entry in entries.items():
-        if name in OPTIC and recipe["prism"] is None:
+        is_plain = "prism" in recipe and recipe["prism"] is None
+        if name in OPTIC and is_plain:
             continue
         digest = hashlib.sha256(json.dumps([*same, name]).encode()).hexdigest()
         values[name] = entry.at(int(digest[:13], 16) / 16**13)

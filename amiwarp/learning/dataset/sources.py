@@ -15,6 +15,7 @@ from typing import Any
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.io.inputs import errors_name, open_input
 from amiwarp.io.json_files import read_json, read_toml
+from amiwarp.learning.dataset.digests import content_digest
 from amiwarp.learning.dataset.patterns import matches
 from amiwarp.learning.dataset.specification import SourceEntry, Specification
 from amiwarp.simulation.worlds.mesh_reader import mesh_files
@@ -165,21 +166,6 @@ def _column(values: list[str]) -> list[Any]:
     if all(re.fullmatch(r"-?(0|[1-9]\d*)(\.\d+)?([eE][+-]?\d{1,2})?", value) for value in values):
         return [float(value) for value in values]
     return list(values)
-
-
-def content_digest(path: Path, *, noted: bool = True) -> str:
-    """Return the SHA-256 of a file, or of the names and contents of the files in a folder.
-
-    ``noted`` is False for a recording of the data set, which may be replaced.
-    """
-    with errors_name(path, lambda: "cannot be read"):
-        if path.is_dir():
-            total = hashlib.sha256()
-            for file in sorted(inner for inner in path.iterdir() if inner.is_file()):
-                total.update(f"{file.name}\0{content_digest(file)}\n".encode())
-            return total.hexdigest()
-        with open_input(path, noted=noted) as opened:
-            return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 def _world_digest(known: dict[Path, str], path: Path) -> str:

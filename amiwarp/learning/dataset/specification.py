@@ -14,7 +14,14 @@ from amiwarp.imaging import recent_tensors, tensors
 from amiwarp.io.inputs import errors_name
 from amiwarp.io.json_files import read_toml
 from amiwarp.io.recorded_dataset import SPLIT_NAME
-from amiwarp.learning.dataset.randomise import DrawEntry, check_randomise
+from amiwarp.learning.dataset.randomise import DrawEntry, check_drawn_prism, check_randomise
+from amiwarp.learning.dataset.rig_cameras import (
+    DatasetRig,
+    check_duration,
+    check_fields_beside_rig,
+    check_rig_randomise,
+    read_dataset_rig,
+)
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.schema.records import (
@@ -291,6 +298,8 @@ class _File:
     """Ranges from which each recording draws values, by their names."""
     seeds: Annotated[Any, _seeds] = (0,)
     """Seed of each recording of the same source, optic and sensor."""
+    rig: Any = None
+    """File of a rig, or a table of its cameras, that records instead of one camera; None for one camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -300,6 +309,8 @@ class Specification(_File):
     path: Path
     data: Mapping[str, Any]
     """Fields of the file, unchanged."""
+    of_rig: DatasetRig | None = None
+    """Cameras of the rig; None for one camera."""
 
     @property
     def folder(self) -> Path:
@@ -312,32 +323,24 @@ def load_specification(path: str | Path) -> Specification:
     path = Path(path)
     data = read_toml(path, "a specification of a data set")
     with errors_name(path, lambda: "is no specification of a data set"):
-        optics = () if data.get("no_prism") else ("prisms", "speeds_rpm")
+        optics = () if data.get("no_prism") or "rig" in data else ("prisms", "speeds_rpm")
         check_given(data, "", "format", "version", "duration_s", *optics, "sources")
         check_format(data, FORMAT, VERSION)
         values = build(_File, data, "")
         _check(values)
+        of_rig = None
+        if "rig" in data:
+            check_fields_beside_rig(data)
+            of_rig = read_dataset_rig(values.rig, path.parent)
+            _check_rig(values, of_rig)
+        else:
+            _check_camera(values)
         named = vars(values) | {"name": values.name or path.stem}
-        return Specification(**named, path=path, data=data)
+        return Specification(**named, path=path, data=data, of_rig=of_rig)
 
 
 def _check(values: _File) -> None:
     """Raise :class:`AmiwarpError` for values that do not belong together and for repeated ones."""
-    at_field("camera", values.camera.build)
-    if not values.no_prism or values.prisms or values.speeds_rpm:
-        for name in ("prisms", "speeds_rpm"):
-            other = (
-                " or, for plain cameras only, remove both prisms and speeds_rpm"
-                if values.no_prism
-                else ""
-            )
-            _check_distinct(getattr(values, name), name, other)
-    for k, prism in enumerate(values.prisms):
-        at_field(f"prisms[{k}]", prism.build)
-    for k, rpm in enumerate(values.speeds_rpm):
-        at_field(f"speeds_rpm[{k}]", lambda rpm=rpm: PrismMotion(rpm))  # type: ignore[misc]
-    if values.output is not None:
-        _check_output(values.output)
     if len(values.splits) > MOST_SPLITS:
         raise AmiwarpError(
             f"field splits has {len(values.splits):,} names; give at most {MOST_SPLITS}",
@@ -363,9 +366,45 @@ def _check(values: _File) -> None:
     for k, entry in enumerate(values.sources):
         _check_source(entry, f"sources[{k}]")
     kinds = [entry.kind for entry in values.sources]
-    check_randomise(values.randomise, kinds, len(values.prisms), len(values.speeds_rpm))
+    check_randomise(values.randomise, kinds)
+
+
+def _check_camera(values: _File) -> None:
+    """Raise :class:`AmiwarpError` for optics, a camera and tensors of a data set of one camera that do not fit."""
+    at_field("camera", values.camera.build)
+    if not values.no_prism or values.prisms or values.speeds_rpm:
+        for name in ("prisms", "speeds_rpm"):
+            other = (
+                " or, for plain cameras only, remove both prisms and speeds_rpm"
+                if values.no_prism
+                else ""
+            )
+            _check_distinct(getattr(values, name), name, other)
+    for k, prism in enumerate(values.prisms):
+        at_field(f"prisms[{k}]", prism.build)
+    for k, rpm in enumerate(values.speeds_rpm):
+        at_field(f"speeds_rpm[{k}]", lambda rpm=rpm: PrismMotion(rpm))  # type: ignore[misc]
+    if values.output is not None:
+        _check_output(values.output)
+    check_drawn_prism(values.randomise, len(values.prisms), len(values.speeds_rpm))
     if values.no_prism:
         _check_motion(values.sources, shakes="shake_deg" in values.randomise)
+
+
+def _check_rig(values: _File, of_rig: DatasetRig) -> None:
+    """Raise :class:`AmiwarpError` for sources and ranges that do not fit a rig."""
+    for k, entry in enumerate(values.sources):
+        where = f"sources[{k}]"
+        if entry.kind not in ("worlds", "world_files"):
+            raise AmiwarpError(
+                f"field {where}.{entry.kind} does not apply to a rig, which moves through a world; give worlds or "
+                "world_files",
+                ErrorCode.FIELD,
+            )
+        of_source = entry.duration_s is not None
+        name = f"{where}.duration_s" if of_source else "duration_s"
+        check_duration(of_rig.cameras, entry.duration_s or values.duration_s, name)
+    check_rig_randomise(values.randomise, of_rig.cameras)
 
 
 def _check_output(output: OutputEntry) -> None:

@@ -21,15 +21,15 @@ from amiwarp.events.device_events import DeviceEvents
 from amiwarp.events.recording import Events
 from amiwarp.events.truth import MAPS, FrameTruth
 from amiwarp.imaging.windows import windows
-from amiwarp.io import convert, open_recording
-from amiwarp.io.output_formats import make_folder
-from amiwarp.io.outputs import put_in_place
+from amiwarp.io import convert, open_recording, open_rig
+from amiwarp.io.recorded_dataset import rig_events
 from amiwarp.io.tensor_files import save_tensors
 from amiwarp.learning.dataset import specification as spec
-from amiwarp.learning.dataset.drawn_scene import picture_scene, shaken, shaken_motion
+from amiwarp.learning.dataset.drawn_rig import rig_of
+from amiwarp.learning.dataset.drawn_scene import drawn_world, picture_scene, shaken_motion
 from amiwarp.learning.dataset.items import Item
 from amiwarp.learning.dataset.randomise import SENSOR
-from amiwarp.learning.dataset.sources import content_digest
+from amiwarp.learning.dataset.stored import put_stored, stored_bytes, stored_digest
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.schema.records import LARGEST_INTEGER
@@ -39,8 +39,6 @@ from amiwarp.simulation.recorded_truth import RecordedTruth, chosen_instants
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.translation.translator import translation
-from amiwarp.simulation.worlds.world import lit
-from amiwarp.simulation.worlds.world_choice import POSE_FILES, open_world
 from amiwarp.simulation.worlds.world_scene import BLUR_PX, WorldScene
 from amiwarp.studies import cluster
 from amiwarp.studies.failures import failure_text
@@ -62,21 +60,21 @@ class Made:
     key: Annotated[str, partial(_of_pattern, "[0-9a-f]{16}")]
     """Key of the item."""
     file: Annotated[
-        str, partial(_of_pattern, "[A-Za-z0-9_-]+/[A-Za-z0-9_-]*-[0-9a-f]{16}[.](h5|npz)")
+        str, partial(_of_pattern, "[A-Za-z0-9_-]+/[A-Za-z0-9_-]*-[0-9a-f]{16}([.]h5|[.]npz)?")
     ]
-    """Path, relative to the folder of the data set."""
+    """Path, relative to the folder of the data set. The path of a rig is a folder."""
     bytes: Annotated[int, partial(whole, low=0, high=LARGEST_INTEGER)]
     """Size [bytes]."""
     sha256: Annotated[str, partial(_of_pattern, "[0-9a-f]{64}")]
-    """SHA-256 of the file, in hexadecimal."""
+    """SHA-256 of the file, or of the files of a rig, in hexadecimal."""
     events: Annotated[int, partial(whole, low=0, high=LARGEST_INTEGER)]
     """Number of events."""
     duration_s: Annotated[float, partial(real, low=0.0, high=LARGEST_INTEGER * 1e-6)]
     """Duration: as simulated, or from the first event to the last [s]."""
-    width: Annotated[int, partial(whole, low=1, high=LARGEST_SIZE)]
-    """Width of the sensor [px]."""
-    height: Annotated[int, partial(whole, low=1, high=LARGEST_SIZE)]
-    """Height of the sensor [px]."""
+    width: Annotated[int, partial(whole, low=1, high=LARGEST_SIZE)] | None
+    """Width of the sensor [px]; None for a rig."""
+    height: Annotated[int, partial(whole, low=1, high=LARGEST_SIZE)] | None
+    """Height of the sensor [px]; None for a rig."""
     seconds: Annotated[float, partial(real, low=0.0, high=1e9)]
     """Time that the worker took [s]."""
     processor_s: Annotated[float, partial(real, low=0.0, high=1e9)]
@@ -141,13 +139,13 @@ def _make(job: Job) -> Made:
     path = job.out / item.file
     part = job.scratch / path.name
     written = write_recording(item, part, device)
-    digest = content_digest(part, noted=False)
-    make_folder(path.parent)
-    put_in_place(part, path, overwrite=True)
+    size = stored_bytes(part, item.cameras)
+    digest = stored_digest(part, item.cameras)
+    put_stored(part, path, item.cameras)
     return Made(
         item.key,
         item.file,
-        path.stat().st_size,
+        size or 0,
         digest,
         *written,
         seconds=round(time.perf_counter() - began, 6),
@@ -159,12 +157,16 @@ def _make(job: Job) -> Made:
 
 def write_recording(
     item: Item, path: Path, device: str, duration_s: float | None = None
-) -> tuple[int, float, int, int]:
+) -> tuple[int, float, int | None, int | None]:
     """Write a recording or its tensors to ``path``, replacing it. ``duration_s`` shortens a simulated recording.
 
     Return its number of events, its duration (as simulated, or from the first event to the last) [s], and the width and
-    height of the sensor [px].
+    height of the sensor [px], which are None for a rig.
     """
+    if item.cameras:
+        rig = rig_of(item, device, duration_s)
+        rig.write(path, overwrite=True)
+        return rig_events(open_rig(path)), rig.duration_s, None, None
     if item.kind == "recordings":
         return _write_existing(item, path, device)
     simulation = simulation_of(item, device, duration_s)
@@ -271,7 +273,7 @@ def _seen_through(
     if item.kind == "videos":
         return _of_video(item, source, camera, **common)
     if item.kind != "pictures":
-        return Simulation(_world(item, source), camera.build(), **common)
+        return Simulation(_world(item), camera.build(), **common)
     rates = [math.radians(rate) for rate in recipe.get("rotate_deg_s", (0.0, 0.0, 0.0))]
     return Simulation(
         picture_scene(source, drawn),
@@ -290,17 +292,7 @@ def _of_video(item: Item, source: str, entry: spec.CameraEntry, **settings: Any)
     return translation(pictures, camera=camera, **settings)
 
 
-def _world(item: Item, source: str) -> WorldScene:
-    """Return the world of a recording. The seed of a named world is the specification's."""
-    recipe = item.recipe
-    trajectory = recipe["trajectory"]
-    if trajectory is not None and trajectory.lower().endswith(POSE_FILES):
-        trajectory = os.fspath(item.folder / trajectory)
-    name = item.source if item.kind == "worlds" else source
-    duration_s = recipe["duration_s"]
-    world, path = open_world(name, trajectory, seed=recipe["seed"], duration_s=duration_s)
-    drawn = item.drawn
-    if "light" in drawn:
-        world = lit(world, drawn["light"])
-    blur = drawn.get("blur_px", BLUR_PX)
-    return WorldScene(world, shaken(path, drawn, duration_s), blur=blur)
+def _world(item: Item) -> WorldScene:
+    """Return the scene of a recording of a world."""
+    world, trajectory = drawn_world(item)
+    return WorldScene(world, trajectory, blur=item.drawn.get("blur_px", BLUR_PX))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.rig_recording import check_to_rig
+from amiwarp.events.rig_recording import check_sensor_name, check_to_rig
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Plate, Prism
 from amiwarp.results.pixel_map import PixelMap
@@ -267,6 +268,20 @@ class RigDepthCamera(_OnRig):
 
 RigCamera = RigEventCamera | RigFrameCamera | RigDepthCamera
 """Any camera of a rig."""
+
+
+def check_camera_names(names: Collection[str]) -> None:
+    """Raise :class:`AmiwarpError` for names of a rig's cameras that cannot be names of files next to each other."""
+    if not names:
+        raise AmiwarpError("the rig has no sensors; give at least one camera")
+    known: dict[str, str] = {}
+    for name in names:
+        check_sensor_name(name)
+        other = known.setdefault(name.lower(), name)
+        if other != name:
+            raise AmiwarpError(
+                f"rig has sensors named {other!r} and {name!r}; give names that differ in more than case"
+            )
 
 
 def checked_rate(rate_hz: float) -> float:

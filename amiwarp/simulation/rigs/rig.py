@@ -13,7 +13,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.other_sensors import MemoryImages
 from amiwarp.events.poses import Poses
 from amiwarp.events.recording import Events, MemoryEvents, MetadataValue, Recording
-from amiwarp.events.rig_recording import RigRecording, RigSensor, SensorKind, check_sensor_name
+from amiwarp.events.rig_recording import RigRecording, RigSensor, SensorKind
 from amiwarp.events.truth import Truth
 from amiwarp.io import RigWriter
 from amiwarp.optics.prism import Prism
@@ -25,6 +25,7 @@ from amiwarp.simulation.rigs.cameras import (
     RigDepthCamera,
     RigEventCamera,
     RigFrameCamera,
+    check_camera_names,
 )
 from amiwarp.simulation.rigs.paper_platform import APEX, VGA, paper_platform
 from amiwarp.simulation.rigs.taken_frames import TakenFrame, taken_frames
@@ -87,16 +88,8 @@ class Rig:
         instance(self.trajectory, Trajectory, "rig's trajectory")
         real(self.duration_s, "duration_s", 1e-3, LONGEST_S, " s")
         object.__setattr__(self, "seed", whole(self.seed, "seed", 0, (1 << 31) - 1))
-        if not self.sensors:
-            raise AmiwarpError("the rig has no sensors; give at least one camera")
-        known: dict[str, str] = {}
+        check_camera_names(self.sensors)
         for name, sensor in self.sensors.items():
-            check_sensor_name(name)
-            other = known.setdefault(name.lower(), name)
-            if other != name:
-                raise AmiwarpError(
-                    f"rig has sensors named {other!r} and {name!r}; give names that differ in more than case"
-                )
             if not isinstance(sensor, RigCamera):
                 raise AmiwarpError(
                     f"rig's sensor {name!r} is {shown(sensor)}; expected a RigEventCamera, RigFrameCamera or "

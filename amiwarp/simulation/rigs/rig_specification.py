@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,8 +25,16 @@ VERSION = 1
 """Values of the fields ``format`` and ``version``."""
 
 
-@dataclass(frozen=True)
-class RigEntry:
+@dataclass(frozen=True, kw_only=True)
+class CamerasEntry:
+    """Fields of a rig's file that name its cameras."""
+
+    rig: str | None = None
+    sensors: tuple[Any, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigEntry(CamerasEntry):
     """Fields of a rig's file."""
 
     format: str
@@ -36,8 +43,6 @@ class RigEntry:
     duration_s: Annotated[float, partial(real, low=1e-3, high=LONGEST_S, hint=" s")]
     trajectory: str | None = None
     seed: Annotated[int, partial(whole, low=0, high=2**31 - 1)] = 0
-    rig: str | None = None
-    sensors: tuple[Any, ...] = ()
 
 
 @guarded
@@ -100,15 +105,12 @@ def load_rig(
     ['left', 'right']
     """
     path = Path(path)
-    data = read_toml(path, "a rig")
     overriding: dict[str, Any] = {"duration_s": duration_s, "seed": seed}
     given = {name: value for name, value in overriding.items() if value is not None}
+    entry = replace(read_rig_file(path), **given)
     with errors_name(path, lambda: "is no file of a rig"):
-        check_given(data, "", "format", "version")
-        check_format(data, FORMAT, VERSION)
-        entry = replace(build(RigEntry, data, ""), **given)
         folder = path.parent
-        sensors = _sensors(entry, folder)
+        sensors = read_cameras(entry, folder)
         world_name = world or _in_folder(entry.world, WORLD_FILES, folder)
         way = trajectory
         if way is None and entry.trajectory is not None:
@@ -117,19 +119,31 @@ def load_rig(
         return Rig(of_world, of_rig, sensors, entry.duration_s, entry.seed, device)
 
 
+def read_rig_file(path: Path) -> RigEntry:
+    """Return the fields of a rig's file. The values of its cameras are not checked yet."""
+    data = read_toml(path, "a rig")
+    with errors_name(path, lambda: "is no file of a rig"):
+        check_given(data, "", "format", "version")
+        check_format(data, FORMAT, VERSION)
+        return build(RigEntry, data, "")
+
+
 def _in_folder(name: str, endings: tuple[str, ...], folder: Path) -> str:
     """Return a name as it is, or the path of the file in a folder that it names."""
     return str(folder / name) if name.lower().endswith(endings) else name
 
 
-def _sensors(entry: RigEntry, folder: Path) -> Mapping[str, RigCamera]:
-    """Return the cameras of a rig's file by name."""
+def read_cameras(entry: CamerasEntry, folder: Path, within: str = "") -> dict[str, RigCamera]:
+    """Return the cameras of a rig by name.
+
+    ``folder``: folder of the files that they name; ``within``: name of the field that holds the entry, with a dot.
+    """
     sensors: dict[str, RigCamera] = {}
     if entry.rig is not None:
-        one_of(entry.rig, (PAPER_PLATFORM,), "field rig")
+        one_of(entry.rig, (PAPER_PLATFORM,), f"field {within}rig")
         sensors |= paper_platform()
     for k, data in enumerate(entry.sensors):
-        where = f"sensors[{k}]"
+        where = f"{within}sensors[{k}]"
         if not isinstance(data, dict):
             raise AmiwarpError(f"field {where} is {shown(data)}; expected a table", ErrorCode.FIELD)
         check_given(data, where, "name", "kind")
@@ -143,7 +157,7 @@ def _sensors(entry: RigEntry, folder: Path) -> Mapping[str, RigCamera]:
         sensors[name] = read_camera(rest, where, folder)
     if not sensors:
         raise AmiwarpError(
-            f'field sensors is missing; add [[sensors]], or rig = "{PAPER_PLATFORM}"',
+            f'field {within}sensors is missing; add [[{within}sensors]], or rig = "{PAPER_PLATFORM}"',
             ErrorCode.FIELD,
         )
     return sensors
