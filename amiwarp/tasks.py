@@ -185,8 +185,10 @@ class BackgroundLoop:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        # An error of the block is the cause; what the loop then lacks would hide it.
+        with contextlib.nullcontext() if kind is None else contextlib.suppress(Exception):
+            self.close()
 
     def close(self) -> None:
         """End the loop and wait for it. Raises the error that ended it, once."""

@@ -105,7 +105,7 @@ def run_render(
     from amiwarp.plotting.film import render
     from amiwarp.reconstruction.film_files import check_film
 
-    check_film(out)  # before the recording is read
+    check_film(out, fps=frames.fps)  # before the recording is read
     began = time.perf_counter()
     device = cli.choose_device(common.device)
     recording = open_recording(source, topic=topic, **layout.given())

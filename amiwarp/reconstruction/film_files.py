@@ -23,9 +23,17 @@ FILM_SUFFIXES = (VIDEO, ".gif")
 """File suffixes of films."""
 
 
-def check_film(path: Path, *, overwrite: bool = False) -> Any:
-    """Return PyAV. Raises :class:`AmiwarpError` without it, and for a file that cannot be a film or be written."""
+def check_film(path: Path, *, fps: float, overwrite: bool = False) -> Any:
+    """Return PyAV.
+
+    Raises :class:`AmiwarpError` without it, and for a file that cannot be a film, have this rate or be written.
+    """
     check_ending(path, "pictures are written", FILM_SUFFIXES)
+    if path.suffix.lower() == ".gif" and fps > GIF_FPS:
+        raise AmiwarpError(
+            f"{path}: a GIF has at most {GIF_FPS:g} frames/s that programs show at their speed, not {fps:g}; give "
+            "fewer, or write .mp4"
+        )
     check_output(path, overwrite=overwrite)
     return video_library(path)
 
@@ -38,14 +46,9 @@ def save_film(
     Each frame has shape (height, width) or (height, width, 3). Raises :class:`AmiwarpError` for no frames, an unknown
     suffix, a folder that does not exist, or without PyAV.
     """
-    av = check_film(path, overwrite=overwrite)
+    av = check_film(path, fps=fps, overwrite=overwrite)
     count = 0
     kind = path.suffix.lower().removeprefix(".")
-    if kind == "gif" and fps > GIF_FPS:
-        raise AmiwarpError(
-            f"{path}: a GIF has at most {GIF_FPS:g} frames/s that programs show at their speed, not {fps:g}; give "
-            "fewer, or write .mp4"
-        )
     with (
         _films_are_written(path),
         NewFile(path, overwrite=overwrite) as new,

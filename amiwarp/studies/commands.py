@@ -224,7 +224,9 @@ def run_design(
             *lines_of_rig,
             "",
             *files.values(),
-            *failed_names({**recommended.failed, **comparison.failed}),
+            *failed_names(
+                {name: why for name, why in comparison.failed.items() if name not in recommended.failed}
+            ),
         ]
     cli.report(common, {**data, "files": files, "device": device}, lines)
 

@@ -74,5 +74,8 @@ def given_polarity(text: str) -> dict[int, bool]:
             raise AmiwarpError(
                 f"--polarity {text!r} is not a list of values; write it like 1=on,2=off"
             )
-        is_on[int(value)] = meaning == "on"
+        if is_on.setdefault(int(value), meaning == "on") != (meaning == "on"):
+            raise AmiwarpError(
+                f"--polarity {text!r} says both on and off of {value}; give each value once"
+            )
     return is_on

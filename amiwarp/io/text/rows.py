@@ -124,7 +124,11 @@ class TextRow:
         if text.startswith((mark, b" " + mark)):
             return True
         gaps = (mark + mark, mark + b" " + mark, b"\n" + mark, b"\n " + mark)
-        return any(gap in text for gap in gaps)
+        if any(gap in text for gap in gaps):
+            return True
+        # Only values that are padded need the slower search.
+        padded = b"  " in text or (b"\t" in text and mark != b"\t")
+        return padded and re.search(_first_empty(mark), text) is not None
 
     def words(self, line: bytes) -> list[bytes]:
         """Return the values of a line without empty ones at its end."""
@@ -210,11 +214,17 @@ def is_number(word: bytes) -> bool:
     return True
 
 
+def _first_empty(separator: bytes) -> bytes:
+    """Return the pattern of an empty value that a separator follows."""
+    mark = re.escape(separator)
+    return rb"(?m)(?:^|(?<=" + mark + rb"))[ \t]*(?=" + mark + rb")"
+
+
 def _filled(text: bytes, separator: bytes) -> bytes:
     """Return lines with ``nan`` for each empty value that others follow, and without the empty ones at their ends."""
     mark = re.escape(separator)
     text = re.sub(rb"(?m)(?:[ \t]*" + mark + rb")+[ \t]*(?=\r?$)", b"", text)
-    return re.sub(rb"(?m)(?:^|(?<=" + mark + rb"))[ \t]*(?=" + mark + rb")", b"nan", text)
+    return re.sub(_first_empty(separator), b"nan", text)
 
 
 @cache

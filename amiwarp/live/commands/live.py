@@ -228,7 +228,7 @@ class PictureOptions:
         if self.picture is not None:
             from amiwarp.reconstruction.film_files import check_film
 
-            check_film(self.picture)
+            check_film(self.picture, fps=self.picture_hz)
 
     @property
     def wanted(self) -> bool:

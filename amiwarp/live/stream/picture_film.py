@@ -23,11 +23,12 @@ STEP_S = 0.1
 class PictureFilm(BackgroundLoop):
     """Writes pictures as a film, in a background thread. The film has the speed of the stream.
 
-    Raises :class:`AmiwarpError` for a name that is not a film's, a file that exists, or without PyAV.
+    Raises :class:`AmiwarpError` for a name that is not a film's, a rate that it cannot have, a file that exists, or
+    without PyAV.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
-        check_film(path)
+        check_film(path, fps=fps)
         self._path = path
         self._fps = fps
         self._waiting: queue.Queue[LivePicture] = queue.Queue(MOST_WAITING)
