@@ -1,9 +1,11 @@
 """Data sets of recorded rigs: what is made, drawn, kept and repaired, read, and refused."""
 
 import dataclasses
+import errno
 import hashlib
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,6 @@ from scipy.spatial.transform import Rotation
 
 import amiwarp
 from amiwarp import AmiwarpError, DatasetSummary, make_dataset
-from amiwarp.io.recorded_dataset import MANIFEST
-from amiwarp.learning.dataset import stored
 from tests.learning.specifications import items_of
 
 WALL = """
@@ -118,7 +118,7 @@ def make(place: Path, **options: Any) -> DatasetSummary:
 
 
 def manifest(place: Path) -> dict[str, Any]:
-    found = json.loads((place / "out" / MANIFEST).read_text())
+    found = json.loads((place / "out" / "manifest.json").read_text())
     assert isinstance(found, dict)
     return found
 
@@ -323,14 +323,15 @@ def test_a_rig_of_old_and_new_files_never_looks_complete(
     (first, *_) = sorted({Path(name).parent for name in contents(fast_place)})
     folder = fast_place / "out" / first
     (folder / "grey.h5").write_bytes(b"damaged")
-    put = stored.put_in_place
 
-    def planted(part: Path, path: Path, **more: Any) -> None:
-        if path.name == "depth.h5":
-            raise AmiwarpError(f"{path}: cannot be written: disk full")
-        put(part, path, **more)
+    replace = os.replace
 
-    monkeypatch.setattr(stored, "put_in_place", planted)
+    def planted(part: Path, path: Path) -> None:
+        if path == folder / "depth.h5":
+            raise OSError(errno.ENOSPC, "no space is left")
+        replace(part, path)
+
+    monkeypatch.setattr(os, "replace", planted)
     done = make_dataset(fast_place / "spec.toml", fast_place / "out", workers=1)
     assert len(done.failed) == 1
     with pytest.raises(AmiwarpError, match=r"rig\.json"):
@@ -380,7 +381,7 @@ def test_a_loader_gets_rigs(place: Path) -> None:
         AmiwarpError, match="holds recorded rigs, and the layouts are for one camera"
     ):
         amiwarp.export_dataset(place / "out", place / "tars", "webdataset")
-    path = place / "out" / MANIFEST
+    path = place / "out" / "manifest.json"
     path.write_text(path.read_text().replace('"ami", "plain"', '"plain", "ami"'))
     changed = amiwarp.RecordedDataset(place / "out")
     with pytest.raises(AmiwarpError, match=r"the manifest says .* of plain, ami, grey, depth"):
