@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError, ErrorCode
 from amiwarp.events.other_sensors import ImageStore
-from amiwarp.events.recording import EventSource, Recording
+from amiwarp.events.recording import EventSource, MetadataValue, Recording
 from amiwarp.io.formats import open_recording
 from amiwarp.io.json_files import read_json
 from amiwarp.io.native.copying import save_recording
@@ -87,7 +87,10 @@ def _simulate(folder: Path, entry: Entry, device: str, progress: Progress) -> No
     """Simulate the three cameras of a recording, and write what their user would know."""
     found = entry.rig(device).run(progress=progress)
     cameras = {name: sensor.recording for name, sensor in found.sensors.items()}
-    about = {"benchmark": f"AMI-Bench {VERSION}", "duration_us": entry.duration_us}
+    about: dict[str, MetadataValue] = {
+        "benchmark": f"AMI-Bench {VERSION}",
+        "duration_us": entry.duration_us,
+    }
     plain = replace(cameras[PLAIN], frames=cameras[FRAMES].frames)
     files = files_of(folder, entry)
     for camera, recording in ((PRISM, cameras[PRISM]), (PLAIN, plain)):
@@ -154,7 +157,7 @@ def _bytes(values: NDArray[Any], dtype: str) -> bytes:
 
 def stated_checksums() -> Mapping[str, Mapping[str, str]]:
     """Return the checksums in the package, by set and name."""
-    return read_json(CHECKSUMS, "checksums of AMI-Bench", noted=False)["sets"]  # type: ignore[no-any-return]
+    return read_json(CHECKSUMS, "checksums of AMI-Bench", noted=False)["sets"]
 
 
 def _write_index(path: Path, entries: Sequence[Entry]) -> None:

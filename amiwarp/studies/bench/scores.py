@@ -37,7 +37,8 @@ def calibration_grid(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.fl
     x = np.linspace(0.0, camera.width - 1.0, COLUMNS)
     y = np.linspace(0.0, camera.height - 1.0, ROWS)
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
-    return pixels, np.arange(ANGLES) * (2.0 * math.pi / ANGLES)
+    angles = np.arange(ANGLES, dtype=np.float64) * (2.0 * math.pi / ANGLES)
+    return pixels, np.asarray(angles, np.float64)
 
 
 def displacement_of(model: Model, lag: float = 0.0) -> NDArray[np.float64]:

@@ -241,12 +241,14 @@ def _difference(
     where: str, value: float | None, expected: float | None, column: Column
 ) -> list[str]:
     """Return a line if a score is another one than expected."""
-    if value is None and expected is None:
-        return []
-    both = value is not None and expected is not None
-    if both and abs(value - expected) <= column.tolerance:
-        return []
-    beyond = f", beyond {column.tolerance:g}" if both else ""
+    beyond = ""
+    if value is None or expected is None:
+        if value is expected:
+            return []
+    else:
+        if abs(value - expected) <= column.tolerance:
+            return []
+        beyond = f", beyond {column.tolerance:g}"
     return [f"{where}: {_text(value)}, in the table {_text(expected)}{beyond}"]
 
 

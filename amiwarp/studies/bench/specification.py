@@ -20,7 +20,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.schema.records import build, check_format
 from amiwarp.simulation.choices import FrameEncoding
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.rigs.cameras import RigEventCamera, RigFrameCamera
+from amiwarp.simulation.rigs.cameras import RigCamera, RigEventCamera, RigFrameCamera
 from amiwarp.simulation.rigs.rig import Rig
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.named.catalogue import named_world
@@ -193,7 +193,7 @@ class Entry:
             bits=16,
             encoding=FrameEncoding.LINEAR,
         )
-        cameras = {
+        cameras: dict[str, RigCamera] = {
             PRISM: behind_prism,
             PLAIN: RigEventCamera(self.camera, sensor=sensor),
             FRAMES: frames,

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,8 @@ from amiwarp.io.json_files import read_json
 from amiwarp.schema.records import build, check_format, check_given
 from amiwarp.studies.bench.answer_files import ArrayField, read_arrays
 from amiwarp.studies.bench.scores import ANGLES, COLUMNS, ROWS
-from amiwarp.studies.bench.specification import VERSION, Entry, entries
-from amiwarp.validation import shown
+from amiwarp.studies.bench.specification import SETS, VERSION, Entry, entries
+from amiwarp.validation import one_of, shown
 
 FORMAT = "ami-bench-submission"
 FILE = "submission.json"
@@ -81,7 +81,9 @@ def _name(value: str, where: str) -> str:
     return value
 
 
-TaskName = Literal["calibration", "picture", "flow", "detection", "rotation"]
+def _set_name(value: str, where: str) -> str:
+    """Return the name of a set; raise :class:`AmiwarpError` for another one."""
+    return one_of(value, SETS, where)
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class Submission:
 
     format: str
     version: str
-    set: Literal["small", "full"]
+    set: Annotated[str, _set_name]
     """Name of the set of recordings."""
     name: Annotated[str, _name]
     """Name of the method, for the table."""
