@@ -297,14 +297,14 @@ class EncoderOptions:
         ),
     ] = None
 
-    def build(self, source: Path, topic: str | None) -> Encoder | None:
+    def build(self, source: Path, topic: str | None, chip: str | None) -> Encoder | None:
         """Return the encoder of the log or of the recording's triggers, or None if neither is given."""
         if self.second_encoder is not None and self.second_ratio is not None:
             raise AmiwarpError(
                 "--second-encoder and --second-ratio both describe the second prism; give one of them",
                 ErrorCode.OPTIONS,
             )
-        first = replace(self, second_encoder=None, second_ratio=None)._first(source, topic)
+        first = replace(self, second_encoder=None, second_ratio=None)._first(source, topic, chip)
         if self.second_encoder is None and self.second_ratio is None:
             return first
         if first is None:
@@ -315,11 +315,11 @@ class EncoderOptions:
         if self.second_ratio is not None:
             return first.with_second(self.second_ratio)
         of_second = replace(self, encoder=self.second_encoder, encoder_from=None)
-        return first.with_second(cast("Encoder", of_second._first(source, topic)))
+        return first.with_second(cast("Encoder", of_second._first(source, topic, chip)))
 
-    def _first(self, source: Path, topic: str | None) -> Encoder | None:
+    def _first(self, source: Path, topic: str | None, chip: str | None) -> Encoder | None:
         if self.encoder_from is not None:
-            return self._from_triggers(self.encoder_from, source, topic)
+            return self._from_triggers(self.encoder_from, source, topic, chip)
         if self.encoder is None:
             if self != EncoderOptions():
                 what = "--counts-per-turn, --counter-bits and --direction describe an encoder log"
@@ -334,7 +334,9 @@ class EncoderOptions:
             direction=int(self.direction),
         )
 
-    def _from_triggers(self, text: str, source: Path, topic: str | None) -> Encoder:
+    def _from_triggers(
+        self, text: str, source: Path, topic: str | None, chip: str | None
+    ) -> Encoder:
         kind, colon, channel = text.partition(":")
         if kind != "triggers" or (colon and not channel.isdecimal()):
             raise AmiwarpError(
@@ -351,6 +353,7 @@ class EncoderOptions:
             counts_per_turn=self.counts_per_turn or 1,
             direction=int(self.direction),
             topic=topic,
+            chip=chip,
         )
 
 

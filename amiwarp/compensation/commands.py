@@ -122,7 +122,7 @@ def run_compensate(
     if preset is not None:
         model_name = Preset.load(preset, "compensation").settings["model"]
         calibrated = simplified(calibrated, model_name)
-    log = encoder.build(recording, topic)
+    log = encoder.build(recording, topic, layout.chip)
     opened = open_recording(recording, topic=topic, **layout.given())
     if log is not None:
         opened = replace(opened, encoder=log)

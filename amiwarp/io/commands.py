@@ -261,14 +261,14 @@ def run_convert(
                 "options",
                 ErrorCode.OPTIONS,
             )
-        log = encoder.build(source, topic)
+        log = encoder.build(source, topic, layout.chip)
         recording = open_recording(source, topic=topic, **layout.given())
         if log is not None:
             recording = replace(recording, encoder=log)
         _write_for_viewer(recording, out, viewers, common, began)
         return
 
-    log = encoder.build(source, topic)
+    log = encoder.build(source, topic, layout.chip)
     lens = wedge = None
     # Opening may read the whole file, so it is done only for these options.
     if has_optics:

@@ -26,11 +26,13 @@ def read_encoder_triggers(
     counts_per_turn: int = 1,
     direction: int = 1,
     topic: str | None = None,
+    chip: str | None = None,
 ) -> Encoder:
     """Return the encoder whose pulses a camera recorded at its trigger input, on the clock of the events.
 
     Each rising edge of ``channel`` moves the angle by one count, or back if ``direction`` is -1. With one count per
-    turn the edges are index pulses, at which the angle is a multiple of 2 pi. ``topic`` chooses a topic of a ROS bag.
+    turn the edges are index pulses, at which the angle is a multiple of 2 pi. ``topic`` chooses a topic of a ROS bag,
+    and ``chip`` is the camera's in an AEDAT 2.0 file that does not state it.
     Raises :class:`AmiwarpError` if the file stores no triggers, or fewer than two rising edges of the channel.
     """
     path = Path(path)
@@ -46,7 +48,7 @@ def read_encoder_triggers(
         )
     check_topic(path, topic, format)
     with errors_name(path, lambda: "reading the triggers"):
-        channels, t, rising = _edges(path, format, topic)
+        channels, t, rising = _edges(path, format, topic, chip)
     pulse_t = np.unique(t[(channels == channel) & rising])
     if pulse_t.size < 2:
         counts = []
@@ -65,10 +67,12 @@ def read_encoder_triggers(
     return Encoder(pulse_t, angle, index_t=index_t)
 
 
-def _edges(path: Path, format: Format, topic: str | None) -> tuple[Any, Any, Any]:
+def _edges(path: Path, format: Format, topic: str | None, chip: str | None) -> tuple[Any, Any, Any]:
     """Return channel, time [us] and whether it rises, of each edge."""
-    read = io_function(TRIGGERS[format])
-    source: Any = read(path, topic) if format is Format.ROSBAG else read(path)
+    # What only files of one format leave open
+    choices: dict[Format, str | None] = {Format.ROSBAG: topic, Format.AEDAT2: chip}
+    chosen = [choices[format]] if format in choices else []
+    source: Any = io_function(TRIGGERS[format])(path, *chosen)
     nothing = np.zeros(0, np.int64)
     parts: list[tuple[Any, ...]] = [(nothing, nothing, np.zeros(0, np.bool_))]
     count = 0

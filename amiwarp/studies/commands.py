@@ -225,7 +225,11 @@ def run_design(
             "",
             *files.values(),
             *failed_names(
-                {name: why for name, why in comparison.failed.items() if name not in recommended.failed}
+                {
+                    name: why
+                    for name, why in comparison.failed.items()
+                    if name not in recommended.failed
+                }
             ),
         ]
     cli.report(common, {**data, "files": files, "device": device}, lines)

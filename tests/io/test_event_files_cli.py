@@ -156,6 +156,8 @@ def test_layout_options(tmp_path: Path) -> None:
     path = tmp_path / "events.csv"
     path.write_text("".join(f"{x},{y},{p},{t}\n" for x, y, p, t in rows))
     assert "--polarity" in fails("info", path)
+    twice = fails("info", path, "--polarity", "1=on,2=off,1=off")
+    assert "says both on and off of 1; give each value once" in twice
     options = ("--polarity", "1=on,2=off", "--columns", "x,y,p,t", "--sort")
     assert "--time-unit" not in fails("info", path, *options[:4])  # but --sort
     shown = run("info", path, *options)

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import zstandard
 from faery.extension import aedat, dat, es, evt
+from typer.testing import CliRunner
 
 from amiwarp import (
     AmiwarpError,
@@ -71,6 +72,7 @@ from reference.io_samples_extra import (
     write_ros1,
     write_ros2,
 )
+from tests.command_line import app
 from tests.io.test_io_readers import assert_equal, assert_same_source
 
 EVENTS = make_events()
@@ -377,6 +379,21 @@ def test_triggers_of_a_dvs128(tmp_path):
     used = replace(recording, encoder=read_encoder_triggers(tmp_path / "a.aedat"))
     assert left_out(used, OutputFormat.NATIVE) == ()
     assert np.diff(read_encoder_triggers(tmp_path / "a.aedat").t).tolist() == [2000]
+
+
+def test_triggers_of_an_unknown_camera_take_its_chip(tmp_path):
+    edges = np.array([[1 << 15 | 0x7FFF, 1000], [1 << 15, 3000]], ">u4").tobytes()
+    path = tmp_path / "a.aedat"
+    write_aedat2(path, small(EVENTS, 128, 128, t_first=0), chip="DVS128", between=edges)
+    path.write_bytes(path.read_bytes().replace(b"DVS128", b"MyChip", 1))
+    with pytest.raises(AmiwarpError, match="choose one with --chip"):
+        read_encoder_triggers(path)
+    assert np.diff(read_encoder_triggers(path, chip="dvs128").t).tolist() == [2000]
+    given = ("--chip", "dvs128", "--encoder-from", "triggers:0")
+    out = tmp_path / "a.h5"
+    done = CliRunner().invoke(app, ["convert", str(path), str(out), *given])
+    assert done.exit_code == 0, done.stderr
+    assert np.diff(open_recording(tmp_path / "a.h5").encoder.t).tolist() == [2000]
 
 
 def test_fields_of_words_are_read_over_their_whole_range(tmp_path):

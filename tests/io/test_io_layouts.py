@@ -1123,6 +1123,14 @@ def test_an_empty_value_does_not_shift_a_row(
                 open_recording(path)
 
 
+@pytest.mark.parametrize("padding", ["", " ", "  ", "\t", " \t "])
+def test_columns_without_use_may_be_empty(tmp_path: Path, padding: str) -> None:
+    rows = [f"{t},{x},{y},{p},{padding},3" for t, x, y, p in ROWS.tolist()]
+    path = tmp_path / "a.csv"
+    path.write_text("t,x,y,p,note,z\n" + "\n".join(rows) + "\n")
+    assert_same(open_recording(path))
+
+
 UNDER_NAMES = {
     "units": ("t,x,y,p\nus,px,px,-\n", "us", True),
     "units in brackets": ("t,x,y,p\n[ms],[px],[px],[-]\n", "ms", True),

@@ -400,6 +400,24 @@ def test_live_without_a_whole_turn_keeps_its_other_files(folder: Path, tmp_path:
     assert [path.name for path in tmp_path.iterdir()] == ["o.h5"]
 
 
+def test_a_gif_with_too_many_frames_is_refused_before_the_stream_begins(
+    folder: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("av")
+    options = ("--fast", "--picture", str(tmp_path / "f.gif"), "--picture-hz", "100")
+    done = CliRunner().invoke(app, live(folder, *options, "--out", str(tmp_path / "o.h5")))
+    assert done.exit_code == 1
+    assert "a GIF has at most 50 frames/s" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_film_without_pictures_does_not_hide_why(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    with pytest.raises(RuntimeError, match="the cable"), PictureFilm(tmp_path / "f.mp4", 10.0):
+        raise RuntimeError("the cable")
+    assert threads() == []
+
+
 def test_a_rate_without_pictures_is_refused(folder: Path) -> None:
     done = CliRunner().invoke(app, live(folder, "--fast", "--picture-hz", "40"))
     assert done.exit_code == 1

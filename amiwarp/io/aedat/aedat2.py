@@ -51,10 +51,10 @@ def open_aedat2(path: Path, chip: str | None = None) -> Recording:
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu)
 
 
-def aedat2_triggers(path: Path) -> Iterator[Packet]:
-    """Yield the edges at the external input, all as rising edges of channel 0."""
-    chip, offset, _ = read_aedat2_header(path)
-    for _, others in _decoded(path, chip, offset, {}):
+def aedat2_triggers(path: Path, chip: str | None = None) -> Iterator[Packet]:
+    """Yield the edges at the external input, all as rising edges of channel 0. ``chip`` as for :func:`open_aedat2`."""
+    camera, offset, _ = read_aedat2_header(path, chip)
+    for _, others in _decoded(path, camera, offset, {}):
         zeros = np.zeros(others.edge_t.size, np.int64)
         rising = zeros + 1
         yield zeros, zeros, others.edge_t, rising
