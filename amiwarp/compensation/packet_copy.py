@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from amiwarp.events.recording import Events
 from amiwarp.kernels.launch import RecordedLaunch
-from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
+from amiwarp.kernels.packet_copy import COUNT, FOUND, ROW, SOURCES, TARGETS, gather_parts
 from amiwarp.kernels.workers import pool
 from amiwarp.workarounds import address, pointer_places
 
@@ -116,10 +116,10 @@ class PacketCopier:
         for k, column in enumerate(targets):
             columns = [getattr(part, COLUMNS[k]) for part in parts]
             places, alive = pointer_places(columns)
-            table[:, k] = places
-            table[:, 4 + k] = address(column) + WIDTHS[k] * offsets
+            table[:, SOURCES + k] = places
+            table[:, TARGETS + k] = address(column) + WIDTHS[k] * offsets
             kept_alive.append(alive)
-        table[:, 8] = counts
+        table[:, COUNT] = counts
         return kept_alive
 
     def _wait(self, jobs: list[Future[None]], rows: int, _kept: object) -> ColumnCheck:

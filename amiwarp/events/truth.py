@@ -36,7 +36,7 @@ class Cause(Option):
     LEAK = "leak"
     """Leak: drift of the pixel's stored reference level. Code 2."""
     HOT_PIXEL = "hot_pixel"
-    """Additional random event of a hot pixel. Code 3."""
+    """Random event of a hot pixel: one of its additional ones, or of its shot noise. Code 3."""
 
     @property
     def code(self) -> int:

@@ -22,12 +22,14 @@ ROWS = 16
     uint64_t first = 0, second = 0;
     int rows;
     for (uint64_t left = size / 32; left > 0; left -= rows) {
+        // After n rows, a is up to 65535 n, and b up to 65535 n (n + 1) / 2: 360 rows fit 32 bits
         sums a = {}, b = {};
         rows = left < 360 ? (int)left : 360;
         for (int k = 0; k < rows; ++k) {
             a += __builtin_convertvector(*next++, sums);
             b += a;
         }
+        // Each word adds the sum before these rows once more; word k of a row comes k words later than b counts
         second = (second + 16 * rows * first) % 65535;
         for (uint64_t k = 0; k < 16; ++k) {
             first += a[k];
@@ -39,6 +41,7 @@ ROWS = 16
         first += rest[k] + (k + 1 < size % 32 ? rest[k + 1] << 8 : 0);
         second += first;
     }
+    // Words are big-endian: times 256 swaps bytes modulo 65535. A remainder of 0 is stored as 65535
     const uint64_t high = (256 * second + 65534) % 65535 + 1, low = (256 * first + 65534) % 65535 + 1;
     return first ? high << 16 | low : 0;
 #else

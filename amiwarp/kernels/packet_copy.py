@@ -7,12 +7,14 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+SOURCES = 0
+"""First of four entries of a row of the table of packets: addresses of the pointers to x, y, t and p."""
+TARGETS = 4
+"""First of four entries of a row: addresses to which x, y, t and p go; 0 to skip p."""
+COUNT = 8
+"""Entry of a row: number of events."""
 ROW = 9
-"""Number of entries per row of the table of packets.
-
-The entries are: addresses of the pointers to x, y, t and p; destination addresses (p: 0 to skip it); and number of
-events.
-"""
+"""Number of entries of a row."""
 FOUND = 3
 """Number of results per row of the table of packets: 1 if the times are out of order, else 0; largest x [px]; largest y
 [px]."""

@@ -54,7 +54,7 @@ def scene_of_tiles(sums: PhaseSums, model: Model, lag: float, *, with_rest: bool
     harmonics, height, width = sums.values.shape
     plan = plan_of(model, harmonics)
     responses = plan.responses(lag)
-    parts = responses.parts(sums.values)
+    parts = responses.weighted_scenes(sums.values)
     detail = Mosaic((height, width), np.dtype(np.float32))
     for place, part in zip(plan.places, parts, strict=True):
         detail.add(place, part)
@@ -175,7 +175,7 @@ class Responses:
     behind: wp.vec2
     """exp(-i lag), by which the steps turn."""
 
-    def parts(self, values: NDArray[np.complex64]) -> NDArray[np.float32]:
+    def weighted_scenes(self, values: NDArray[np.complex64]) -> NDArray[np.float32]:
         """Return the weighted scenes of all tiles by least squares, shape (tiles, side, side).
 
         ``values`` are the sums in phase of the image, shape (harmonics, height, width).

@@ -25,7 +25,7 @@ def test_scenes_of_all_tiles_are_those_of_one_at_a_time(width: int, height: int)
     values = (rng.normal(size=shape) + 1j * rng.normal(size=shape)).astype(np.complex64)
     plan = phase_tiles.plan_of(model, 5)
     responses = plan.responses(0.1)
-    parts = responses.parts(values)
+    parts = responses.weighted_scenes(values)
     assert len(parts) == len(plan.places)
     for tile, place in enumerate(plan.places):
         spectra = scipy.fft.fft2(phase_tiles.cut_out(values, place, plan.window))
