@@ -325,9 +325,14 @@ def picture_quality(
     b = truth[where].astype(np.float64)
     span = float(np.ptp(np.percentile(truth, TRUTH_PERCENTILES)))
     are_finite = np.isfinite(a).all() and np.isfinite(b).all()
-    if not are_finite or not math.isfinite(span):
+    if not are_finite:
         raise AmiwarpError(
             "picture or truth is not finite in some pixels; exclude these pixels with the mask `where`"
+        )
+    if not math.isfinite(span):
+        raise AmiwarpError(
+            "truth is not finite in some pixels outside the mask `where`, but its range over all pixels is needed; "
+            "give finite values there, too"
         )
     if not (a.size and np.ptp(a) > 0.0 and np.ptp(b) > 0.0 and span > 0.0):
         raise AmiwarpError(

@@ -40,6 +40,7 @@ class EventRates:
         self._edges = self._first + elapsed.astype(np.int64)
         self._counts = np.zeros((2, bins), np.int64)
         self._blocks: Iterator[Events] = iter(source.blocks())
+        self._is_broken = False
         nothing = np.zeros((2, bins + 1), np.int64)
         self._progress = (nothing, self._first)
         """Number of OFF and ON events before each edge, and the time up to which events are read [us]. They are one
@@ -52,21 +53,38 @@ class EventRates:
         duration_us = self._stop - self._first
         return (read_us - self._first) / duration_us
 
+    @property
+    def ended(self) -> bool:
+        """Whether nothing is left to count: all was counted, or the source had an error."""
+        return self._is_broken or self.share >= 1.0
+
     def fill(self, seconds: float) -> bool:
-        """Count events for about ``seconds`` [s], at least one block. Return whether all events are counted."""
+        """Count events for about ``seconds`` [s], at least one block. Return whether nothing is left to count.
+
+        Raises the error of the source, once: what comes after it is not counted.
+        """
+        if self._is_broken:
+            return True
         until = time.perf_counter() + seconds
         _, read_us = self._progress
-        for block in self._blocks:
-            if len(block):
-                self._count(block)
-                read_us = int(block.t[-1])
-            if time.perf_counter() >= until:
-                break
-        else:
-            read_us = self._stop
+        failure: Exception | None = None
+        try:
+            for block in self._blocks:
+                if len(block):
+                    self._count(block)
+                    read_us = int(block.t[-1])
+                if time.perf_counter() >= until:
+                    break
+            else:
+                read_us = self._stop
+        except Exception as error:
+            self._is_broken = True
+            failure = error
         sums = np.zeros((2, len(self._edges)), np.int64)
         np.cumsum(self._counts, axis=1, out=sums[:, 1:])
         self._progress = sums, read_us
+        if failure is not None:
+            raise failure
         return read_us == self._stop
 
     def _count(self, block: Events) -> None:

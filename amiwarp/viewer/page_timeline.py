@@ -77,5 +77,5 @@ class PageTimeline:
             off_beside, on_beside = map(page_state.float_bytes, rates_beside)
             name = captions.beside_text(each)
             rows.append({"name": name, "on": on_beside, "off": off_beside})
-        note = "" if own.share >= 1.0 else f"counting events: {100.0 * own.share:.0f} %"
+        note = "" if own.ended else f"counting events: {100.0 * own.share:.0f} %"
         return {"rate_on": on, "rate_off": off, "rate_note": note, "rate_rows": rows}

@@ -253,9 +253,11 @@ class Window(WindowContents):
 
     def _count_events(self) -> bool:
         """Count events for the timeline for a short time; return whether some were left."""
-        if self._rates.share >= 1.0:
+        if self._rates.ended:
             return False
-        finished = self._rates.fill(COUNT_S)
+        finished = True
+        with self.errors_shown("timeline"):
+            finished = self._rates.fill(COUNT_S)
         now = time.perf_counter()
         if finished or now - self._counted_drawn_s > DRAW_COUNTED_S:
             self._counted_drawn_s = now

@@ -122,7 +122,8 @@ class WindowContents(WindowActions):
             line.show_all()
         if line.window != before:  # else the mouse may have moved the timeline away from it
             line.follow()
-        wanted = line.span, source.t_first, self._rates, self._rates.share
+        progress = self._rates.share, self._rates.ended
+        wanted = line.span, source.t_first, self._rates, progress
         if wanted != self._rates_shown:
             self._rates_shown = wanted
             low, high = (source.t_first + round(end) for end in line.span)
@@ -130,7 +131,7 @@ class WindowContents(WindowActions):
             # Which a live stream has received since
             line.rates[:, edges[1:] > self._counted_stop_us] = np.nan
             line.edges = np.asarray(edges - source.t_first, np.float64)
-            counted = self._rates.share >= 1.0 or self.inspector.latest is not None
+            counted = self._rates.ended or self.inspector.latest is not None
             line.note = "" if counted else f"counting events: {100.0 * self._rates.share:.0f} %"
 
     def _make_images(self) -> None:

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -843,6 +844,28 @@ def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
     edges, coarse = rates.curve(40_000, 41_000, 200)
     assert 30 < coarse.shape[1] < 60
     np.testing.assert_allclose(coarse[0, 1:-1], expected_rates(events, edges)[0, 1:-1])
+
+
+class BreakingOff(MemoryEvents):
+    """Events whose second block cannot be read."""
+
+    def blocks(self, **_: Any) -> Iterator[Events]:
+        yield self.slice(0, 1000)
+        raise AmiwarpError("the rest cannot be read")
+
+
+def test_rates_of_a_damaged_recording_are_unknown_after_the_damage() -> None:
+    events = random_events(3000, 16, 16)
+    rates = EventRates(BreakingOff(events, 16, 16))
+    with pytest.raises(AmiwarpError, match="cannot be read"):
+        rates.fill(60.0)
+    assert rates.ended
+    assert rates.fill(60.0)
+    assert 0.3 < rates.share < 0.4
+    first, stop = int(events.t[0]), int(events.t[-1]) + 1
+    _, found = rates.curve(first, stop, 30)
+    assert np.isfinite(found[:, :9]).all()
+    assert np.isnan(found[:, 11:]).all()
 
 
 def test_rates_are_known_as_far_as_the_recording_is_read(tmp_path: Path) -> None:

@@ -1320,6 +1320,27 @@ def test_the_timeline_has_the_rates_of_the_recording(
     )
 
 
+class BreakingOff(MemoryEvents):
+    """Events of a file whose second chunk cannot be read."""
+
+    def blocks(self, **_: Any) -> Iterator[Events]:
+        yield self.slice(0, 100)
+        raise AmiwarpError("damaged chunk; copy the file again")
+
+
+def test_damage_found_while_counting_is_said_and_the_window_stays(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events = recording.events
+    damaged = BreakingOff(events.slice(0, len(events)), *events.size)
+    window = Window(Inspector(replace(recording, events=damaged)), size=SIZE, off_screen=True)
+    settle(window, monkeypatch)
+    assert "damaged chunk" in window.message
+    assert window.sheets.timeline.note == ""
+    assert np.isnan(window.sheets.timeline.rates[0, -10:]).all()
+    window.scene.close()
+
+
 def test_the_timeline_follows_a_window_that_leaves_it(window: Window) -> None:
     line = window.sheets.timeline
     line.span = 0.0, 50_000.0

@@ -22,6 +22,8 @@ POLL_S = 0.05
 """Longest wait for data between two looks at those that wait for encoder samples [s]."""
 MOST_LATENCIES = 100_000
 """Number of latest pictures whose latency is kept."""
+MOST_ARRIVALS = 100_000
+"""Number of latest packets whose arrival is kept: 100 s of packets of 1 ms. A prism that stands makes no picture."""
 
 
 class PictureStream(BackgroundLoop):
@@ -43,7 +45,7 @@ class PictureStream(BackgroundLoop):
         self._newest = newest
         self._jobs: deque[Callable[[], object]] = deque()
         self._held_bytes = 0
-        self._arrived: deque[tuple[int, int]] = deque()
+        self._arrived: deque[tuple[int, int]] = deque(maxlen=MOST_ARRIVALS)
         self._changed = threading.Condition()
         self._start_thread("amiwarp-pictures")
 
