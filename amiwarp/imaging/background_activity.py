@@ -10,7 +10,8 @@ from amiwarp.events.recording import Events
 from amiwarp.imaging.corners import sensor_side
 from amiwarp.imaging.filters import EventFilter, RunningFilter
 from amiwarp.schema.calls import guarded
-from amiwarp.validation import TIME_LIMIT, instance, vector, whole
+from amiwarp.kernels.event_filter import LONGEST_US
+from amiwarp.validation import instance, vector, whole
 
 SUPPORT_US = 10_000
 """Default time within which a neighbour supports an event [us]."""
@@ -32,7 +33,7 @@ def find_background_activity(
     size : tuple of int
         Sensor size (width, height) [px].
     window_us : int, optional
-        Longest time since an event at one of the eight neighbours [us], at least 1. Polarities are not compared.
+        Longest time since an event at one of the eight neighbours [us], 1 to 1e9. Polarities are not compared.
 
     Returns
     -------
@@ -42,7 +43,7 @@ def find_background_activity(
     Raises
     ------
     AmiwarpError
-        If the events are compensated, out of order or outside the sensor, or ``window_us`` is below 1.
+        If the events are compensated, out of order or outside the sensor, or ``window_us`` is below 1 or over 1e9.
 
     Notes
     -----
@@ -59,6 +60,6 @@ def find_background_activity(
     check_sensor(events)
     sides = vector(size, 2, "size of the sensor", sensor_side)
     width, height = map(int, sides)
-    window_us = whole(window_us, "window_us", 1, TIME_LIMIT, " us")
+    window_us = whole(window_us, "window_us", 1, LONGEST_US, " us")
     chosen = EventFilter(background_us=window_us)
     return ~RunningFilter(chosen, (width, height)).keep(events)

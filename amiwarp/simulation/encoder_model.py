@@ -119,7 +119,7 @@ class EncoderModel:
         # Samples in drop-outs are lost, but never the first and the last one: the encoder covers the events.
         kept = np.ones(len(stamp), np.bool_)
         dropouts = rng.poisson(self.dropouts_hz * duration_us * 1e-6)
-        for start in rng.uniform(0.0, duration_us, dropouts):
+        for start in self.clock_offset_us + rng.uniform(0.0, duration_us, dropouts):
             kept &= (true_t < start) | (true_t >= start + self.dropout_us)
         kept[[0, -1]] = True
         stamp = stamp[kept]

@@ -192,7 +192,7 @@ class Design:
         blur_left = self.limits.tolerance_px**2 - QUANTISATION_PX**2
         added = math.hypot(*self.timing.blur(orbit.radius, rpm))
         if added == 0.0:
-            return smallest_apex, math.inf
+            return smallest_apex, math.inf if blur_left >= 0.0 else 0.0
         return smallest_apex, orbit.apex * (math.sqrt(max(blur_left, 0.0)) / added)
 
 

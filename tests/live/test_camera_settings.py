@@ -297,6 +297,10 @@ def test_a_value_that_the_camera_changes_is_said() -> None:
         ("prophesee:,diff_on=141", "bias bias_diff_on = 141; expected -85 .. 140"),
         ("prophesee:,diff=1", "bias bias_diff cannot be set, it is 0; leave it out"),
         (
+            "prophesee:,diff_on=1,bias_diff_on=2",
+            "bias bias_diff_on is given as 1 and as 2; give it once",
+        ),
+        (
             "prophesee:,onn=1",
             r"IMX636 has no bias 'bias_onn'; its biases, .*, are bias_diff \(0\), bias_",
         ),

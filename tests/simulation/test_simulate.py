@@ -527,6 +527,16 @@ def test_encoder_rounds_jitters_shifts_and_drops_out() -> None:
     assert error.std() == pytest.approx(math.hypot(rounding, jitter), rel=0.1)
 
 
+def test_drop_outs_of_an_encoder_with_another_clock_are_within_the_recording() -> None:
+    ideal = EncoderModel.ideal()
+    model = replace(ideal, clock_offset_us=5e6, dropouts_hz=20.0, dropout_us=9000.0)
+    encoder = model.sample(PrismMotion(720.0), 1_000_000, seed=5)
+    gaps = np.diff(encoder.t) > 5000
+    assert 5 <= gaps.sum() <= 40
+    assert 5_000_000 <= encoder.t[:-1][gaps].min()
+    assert encoder.t[:-1][gaps].max() <= 6_000_000
+
+
 def test_ideal_encoder_is_exact_and_clock_offset_is_undone() -> None:
     motion = PrismMotion(-720.0)
     t = np.arange(0, 500_000, 777)

@@ -527,6 +527,27 @@ def test_variable_strings_are_refused(stored: Path, tmp_path: Path) -> None:
         amiwarp.open_recording(path)
 
 
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"instance": [0, 70_000]}, "truth of instance holds 70000; give whole numbers from 0 to 65535"),
+        ({"cause": [-1, 0]}, "truth of cause holds -1; give whole numbers from 0 to 255"),
+        ({"instance": [0.0, 1.5]}, "truth of instance holds 1.5"),
+    ],
+)
+def test_labels_that_the_file_cannot_hold_are_not_written(
+    tmp_path: Path, values: dict[str, Any], says: str
+) -> None:
+    events = amiwarp.Events.from_arrays([0, 1], [0, 1], [5, 6], [0, 1])
+    truth = amiwarp.EventTruth(**{name: np.array(labels) for name, labels in values.items()})
+    with (
+        pytest.raises(AmiwarpError, match=says),
+        amiwarp.RecordingWriter(tmp_path / "a.h5", width=8, height=8) as writer,
+    ):
+        writer.append(events, truth=truth)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_numbers_that_the_type_cannot_hold_are_refused(stored: Path, tmp_path: Path) -> None:
     path = tmp_path / "wide.h5"
     path.write_bytes(stored.read_bytes())

@@ -569,6 +569,7 @@ def test_a_flickering_lamp_makes_events_of_its_rate() -> None:
     [
         (lambda: Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)), "at least one triangle"),
         (lambda: Mesh(np.zeros((3, 3)), [[0, 1, 3]]), "outside of 0 .. 2"),
+        (lambda: Mesh(np.zeros((3, 3)), [[0.0, 1.0, 2.0]]), "faces are float64; give whole"),
         (lambda: Material(texture=np.zeros(3)), r"shape \(3,\)"),
         (
             lambda: Mesh(np.eye(3), [[0, 1, 2]], light=[0.0, 5.0, -1.0]),

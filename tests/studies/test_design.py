@@ -205,6 +205,12 @@ def test_the_choice_keeps_all_limits_with_the_fewest_events(made: Design) -> Non
     assert f"{made.chosen.rpm:g} rpm" in headline(made)
 
 
+def test_no_prism_suits_a_tolerance_below_the_pixels_even_with_exact_times(made: Design) -> None:
+    exact = replace(made, timing=Timing(clock_us=0.0, encoder=0.0))
+    assert exact.range_at(720.0)[1] == math.inf
+    assert replace(exact, limits=Limits(tolerance_px=0.2)).range_at(720.0)[1] == 0.0
+
+
 def test_each_limit_rules_out_and_says_so(made: Design) -> None:
     fewest = min(c.events_per_s for c in made.choices)
     for limits, name, why in (

@@ -81,10 +81,17 @@ def _truth_columns(truth: EventTruth, count: int) -> Columns:
         given = getattr(truth, name)
         if given is None:
             continue
-        values = np.asarray(given, dtype)
-        if values.shape != (count, *row):
+        found = np.asarray(given)
+        if found.shape != (count, *row):
             raise AmiwarpError(
-                f"truth of {name} has shape {values.shape}; expected {(count, *row)}, one row for each event"
+                f"truth of {name} has shape {found.shape}; expected {(count, *row)}, one row for each event"
+            )
+        with np.errstate(invalid="ignore"):  # of NaN as a whole number, which the comparison finds
+            values = found.astype(dtype)
+        if values.dtype.kind == "u" and not (values == found).all():
+            wrong = found[values != found][0]
+            raise AmiwarpError(
+                f"truth of {name} holds {wrong}; give whole numbers from 0 to {np.iinfo(dtype).max}"
             )
         columns[f"truth/events/{name}"] = values
     for name, values in columns.items():

@@ -28,7 +28,8 @@ def check_latch(talk: Conversation) -> Check:
     name = "latches time and count together"
     t, count = talk.counts_since(0)
     inside = [(pulse_us, c) for pulse_us, c in talk.index if len(t) and t[0] < pulse_us < t[-1]]
-    if len(inside) < 2:
+    # The resolution of the clock is the common divisor of intervals, of which one alone says nothing
+    if len(inside) < 3:
         return Check(name, None, "too few index pulses", "")
     pulse_us, latched = np.array(inside, np.int64).T
     off = latched - np.interp(pulse_us, t, count)
@@ -37,8 +38,10 @@ def check_latch(talk: Conversation) -> Check:
     resolution = math.gcd(*np.diff(pulse_us).tolist())
     rate = abs(talk.rpm) / 60e6 * talk.status.counts_per_turn
     what = f"index pulses within {np.abs(off).max():.1f} counts of the samples, clock in steps of {resolution} us"
+    # Samples are a millisecond apart: a line between two may be off by a hundredth of the way
+    interpolated = 0.01 * 1000.0 * rate
     good = (
-        np.abs(off).max() <= LATCH_COUNTS + LATCH_US * rate + 0.01 * 1000 * rate
+        np.abs(off).max() <= LATCH_COUNTS + LATCH_US * rate + interpolated
         and resolution <= LATCH_US
     )
     return Check(

@@ -164,10 +164,13 @@ class PropheseeSource(CameraSource):
         known: dict[str, int] = {}
         if facility is not None:
             known = {str(name): int(value) for name, value in facility.get_all_biases().items()}
-        given = {
-            name if name in known else f"bias_{name.removeprefix('bias_')}": value
-            for name, value in self.settings.biases.items()
-        }
+        given: dict[str, int] = {}
+        for name, value in self.settings.biases.items():
+            known_name = name if name in known else f"bias_{name.removeprefix('bias_')}"
+            if given.setdefault(known_name, value) != value:
+                raise AmiwarpError(
+                    f"{self.name}: bias {known_name} is given as {given[known_name]} and as {value}; give it once"
+                )
         self.settings = replace(self.settings, biases=given)
         check_bias_names(self.name, model, self.settings, known)
         for name, value in given.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,10 +14,6 @@ from amiwarp.schema.calls import guarded
 from amiwarp.simulation.worlds.colours import checked_colour
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.validation import array, real
-
-if TYPE_CHECKING:
-    pass
-
 
 @guarded
 @dataclass(frozen=True, eq=False)
@@ -53,7 +49,11 @@ class Mesh:
             raise AmiwarpError(
                 f"mesh's faces have shape {faces.shape}; give at least one triangle, shape (m, 3)"
             )
-        if faces.dtype.kind not in "iu" or faces.min() < 0 or faces.max() >= len(vertices):
+        if faces.dtype.kind not in "iu":
+            raise AmiwarpError(
+                f"mesh's faces are {faces.dtype}; give whole numbers, the indices of vertices"
+            )
+        if faces.min() < 0 or faces.max() >= len(vertices):
             raise AmiwarpError(
                 f"mesh's faces refer to vertices outside of 0 .. {len(vertices) - 1}; check the indices"
             )
