@@ -9,8 +9,8 @@ from amiwarp.events.device_events import check_sensor
 from amiwarp.events.recording import Events
 from amiwarp.imaging.corners import sensor_side
 from amiwarp.imaging.filters import EventFilter, RunningFilter
-from amiwarp.schema.calls import guarded
 from amiwarp.kernels.event_filter import LONGEST_US
+from amiwarp.schema.calls import guarded
 from amiwarp.validation import instance, vector, whole
 
 SUPPORT_US = 10_000

@@ -211,7 +211,7 @@ class RunningFilter:
         check_events(events, *self.size, where="events", after_t=self._last_t)
         if len(events):
             self._last_t = int(events.t[-1])
-        given = (events.x, events.y, events.t, events.p)
+        given: list[NDArray[Any]] = [events.x, events.y, events.t, events.p]
         for start in range(0, len(events), BLOCK):
             stop = min(start + BLOCK, len(events))
             count = stop - start

@@ -83,6 +83,16 @@ def test_the_check_sees_what_is_wrong(pattern: Pattern, fault: str) -> None:
     assert check.wrong > 0
 
 
+def test_the_check_sees_a_period_that_comes_twice_and_one_that_lacks(pattern: Pattern) -> None:
+    whole = pattern.expected
+    flags = np.zeros(len(whole), np.uint8)
+    check = Check(pattern)
+    for shift_us, wrong, skipped in ((0, 0, 0), (100_000, 0, 0), (100_000, 1, 0), (400_000, 1, 2)):
+        later = Events(whole.x, whole.y, whole.t + shift_us, whole.p)
+        check.take(Compensated(later, flags, 0))
+        assert (check.wrong, check.skipped) == (wrong, skipped)
+
+
 def test_each_period_of_the_pattern_is_filtered_alike(pattern: Pattern) -> None:
     packets = [pattern.packet(k, 5000) for k in range(2 * PERIOD_PACKETS)]
     assert pattern.filter is not None

@@ -533,7 +533,7 @@ def test_drop_outs_of_an_encoder_with_another_clock_are_within_the_recording() -
     encoder = model.sample(PrismMotion(720.0), 1_000_000, seed=5)
     gaps = np.diff(encoder.t) > 5000
     assert 5 <= gaps.sum() <= 40
-    assert 5_000_000 <= encoder.t[:-1][gaps].min()
+    assert encoder.t[:-1][gaps].min() >= 5_000_000
     assert encoder.t[:-1][gaps].max() <= 6_000_000
 
 

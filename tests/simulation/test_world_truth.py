@@ -530,7 +530,10 @@ def test_variable_strings_are_refused(stored: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "says"),
     [
-        ({"instance": [0, 70_000]}, "truth of instance holds 70000; give whole numbers from 0 to 65535"),
+        (
+            {"instance": [0, 70_000]},
+            "truth of instance holds 70000; give whole numbers from 0 to 65535",
+        ),
         ({"cause": [-1, 0]}, "truth of cause holds -1; give whole numbers from 0 to 255"),
         ({"instance": [0.0, 1.5]}, "truth of instance holds 1.5"),
     ],

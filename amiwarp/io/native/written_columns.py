@@ -91,7 +91,7 @@ def _truth_columns(truth: EventTruth, count: int) -> Columns:
         if values.dtype.kind == "u" and not (values == found).all():
             wrong = found[values != found][0]
             raise AmiwarpError(
-                f"truth of {name} holds {wrong}; give whole numbers from 0 to {np.iinfo(dtype).max}"
+                f"truth of {name} holds {wrong}; give whole numbers from 0 to {np.iinfo(values.dtype).max}"
             )
         columns[f"truth/events/{name}"] = values
     for name, values in columns.items():

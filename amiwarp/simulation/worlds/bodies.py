@@ -15,6 +15,7 @@ from amiwarp.simulation.worlds.colours import checked_colour
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.validation import array, real
 
+
 @guarded
 @dataclass(frozen=True, eq=False)
 class Mesh:
