@@ -33,6 +33,8 @@ from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.models.base import Model
 from amiwarp.validation import packed, whole
 
+LONGEST = (1 << 63) - 1
+"""Largest length of a window that an integer holds [us]."""
 MOST_EVENTS = (1 << 31) - 1
 """Largest number of events, and of pixels in all images of a window, that kernels can address."""
 
@@ -113,7 +115,8 @@ def table_of_windows(cut: Windows) -> tuple[NDArray[np.int64], int]:
     if len(cut) == 1:  # in less time
         start, stop = cut.start.item(), cut.stop.item()
         t_start, t_end = cut.t_start.item(), cut.t_end.item()
-        row = (start, stop, 0, t_start, max(t_end - t_start, 1), t_end)
+        length = min(max(t_end - t_start, 1), LONGEST)
+        row = (start, stop, 0, t_start, length, t_end)
         return np.array([row], np.int64), -(-(stop - start) // int(kernels.BLOCK))
     blocks = -(-(cut.stop - cut.start) // int(kernels.BLOCK))  # rounded up
     ends = np.cumsum(blocks)
@@ -123,7 +126,10 @@ def table_of_windows(cut: Windows) -> tuple[NDArray[np.int64], int]:
     rows[0, 2] = 0
     rows[1:, 2] = ends[:-1]
     rows[:, 3] = cut.t_start
-    rows[:, 4] = np.maximum(cut.t_end - cut.t_start, 1)
+    lengths = cut.t_end - cut.t_start
+    rows[:, 4] = np.where(
+        (lengths < 0) & (cut.t_end > cut.t_start), LONGEST, np.maximum(lengths, 1)
+    )
     rows[:, 5] = cut.t_end
     return rows, int(ends[-1])
 

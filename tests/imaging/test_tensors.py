@@ -1085,3 +1085,15 @@ def test_refusals() -> None:
     ):
         with pytest.raises(AmiwarpError, match=match):
             call()
+
+
+def test_windows_that_are_longer_than_an_integer_have_the_longest_length() -> None:
+    low, high = -(2**63), 2**63 - 1
+    one = amiwarp.Windows(*(np.array([value], np.int64) for value in (0, 1, low, 500)))
+    two = amiwarp.Windows(
+        *(np.array(values, np.int64) for values in ([0, 1], [1, 2], [low, 7], [500, 7]))
+    )
+    for cut in (one, two):
+        rows, _ = window_batch.table_of_windows(cut)
+        assert rows[0].tolist() == [0, 1, 0, low, high, 500]
+    assert rows[1].tolist() == [1, 2, 1, 7, 1, 7]
