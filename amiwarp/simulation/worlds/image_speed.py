@@ -33,7 +33,10 @@ SAFETY = 1.2
 def body_speed(
     body: Body, trajectory: Trajectory, focal: float, t: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return an upper bound of a moving body's speed in the image [px/s] at times [s], shape ``(n,)``."""
+    """Return a moving body's largest speed in the middle of the image [px/s] at times [s], shape ``(n,)``.
+
+    At an angle from the optical axis, a body may be faster by 1/cos² of the angle.
+    """
     assert body.trajectory is not None
     centre, radius = body.mesh.bounding_sphere
     rotation, position = body.trajectory.poses(t)
@@ -64,6 +67,7 @@ def parallax_speed(
 ) -> float:
     """Return the largest speed in the image [px/s] that the camera's translation causes.
 
+    Each surface counts as in the middle of the image, see :func:`body_speed`.
     ``instant``: index of the time ``t`` [s] in the last call of :meth:`DeviceWorld.set_instants`.
     """
     (rotation,), (position,) = trajectory.poses([t])
