@@ -73,6 +73,18 @@ def write_inputs(folder: Path) -> int:
     return len(events)
 
 
+def largest_memory_mib(pid: int) -> float:
+    """Return the largest resident memory that a running process has had [MiB], 0 if it has ended.
+
+    The system's figures of a process that has ended include the memory of the one that started it.
+    """
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        name, _, value = line.partition(":")
+        if name == "VmHWM":
+            return int(value.split()[0]) / 1024
+    return 0.0
+
+
 def started(folder: Path, kind: str) -> dict[str, float]:
     """Run the command once, and return the time to its first packet, its number of events, and its largest memory."""
     began = time.monotonic()
@@ -84,7 +96,9 @@ def started(folder: Path, kind: str) -> dict[str, float]:
         decoder = PacketDecoder(kind)
         first_s = math.nan
         events = 0
+        memory_mib = 0.0
         while data := os.read(child.stdout.fileno(), 1 << 20):
+            memory_mib = max(memory_mib, largest_memory_mib(child.pid))
             for message in decoder.feed(data):
                 if isinstance(message, (Events, Compensated)):
                     first_s = time.monotonic() - began if math.isnan(first_s) else first_s
@@ -95,7 +109,7 @@ def started(folder: Path, kind: str) -> dict[str, float]:
     return {
         "first_packet_s": first_s,
         "events": events,
-        "memory_mib": usage.ru_maxrss / 1024,
+        "memory_mib": memory_mib,
         "cpu_s": usage.ru_utime + usage.ru_stime,
         "exit_status": child.returncode,
     }

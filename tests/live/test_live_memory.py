@@ -13,7 +13,7 @@ MOST_MIB = {"plain": 300.0, "compensated": 500.0}
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss has other units elsewhere")
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 @pytest.mark.parametrize("kind", MOST_MIB)
 def test_a_live_stream_needs_little_memory(tmp_path: Path, kind: str) -> None:
     wanted = write_inputs(tmp_path)

@@ -338,7 +338,8 @@ def test_a_receiver_that_dies_or_sleeps_stops_nothing(folder: Path, tmp_path: Pa
     counts = json.loads(done.stdout)["tensors"]
     assert counts["made"] == 40
     assert counts["events"] == N
-    assert 20 < counts["not_sent"] < 40  # 2.5 MB each, of which 16 MiB may wait
+    # It gets a part of the first one at most, and those that wait for it at the end are lost, too
+    assert 30 < counts["not_sent"] <= 40
 
 
 @pytest.mark.parametrize(
