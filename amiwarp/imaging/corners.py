@@ -20,6 +20,7 @@ from amiwarp.events.device_events import (
 )
 from amiwarp.events.recording import Events, check_events
 from amiwarp.kernels import corners as kernels
+from amiwarp.kernels.event_arrays import EventArrays
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.schema.calls import guarded
@@ -353,7 +354,7 @@ def _rule(method: CornerMethod) -> Any:
 
 def _columns(events: DeviceEvents) -> Any:
     """Return the columns of events as the struct that the kernels take."""
-    columns = kernels.Columns()
+    columns = EventArrays()
     columns.x = events.x
     columns.y = events.y
     columns.t = events.t

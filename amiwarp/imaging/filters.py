@@ -33,6 +33,7 @@ from amiwarp.io.outputs import check_output
 from amiwarp.io.unfinished import scratch_folder
 from amiwarp.kernels import event_filter as kernels
 from amiwarp.kernels.background_activity import NEVER, mark_hot_pixels
+from amiwarp.kernels.event_arrays import new_event_arrays
 from amiwarp.kernels.launch import RecordedLaunch, launch
 from amiwarp.kernels.quiet_start import start_once
 from amiwarp.optics.camera import LARGEST_SIZE
@@ -250,11 +251,7 @@ COUNT = 6
 
 def _new_columns() -> tuple[Any, list[NDArray[Any]]]:
     """Return memory for a block of events: for the kernel, and its columns x, y, t and p."""
-    columns = kernels.EventColumns()
-    columns.x = wp.empty(BLOCK, dtype=wp.uint16, device="cpu")
-    columns.y = wp.empty(BLOCK, dtype=wp.uint16, device="cpu")
-    columns.t = wp.empty(BLOCK, dtype=wp.int64, device="cpu")
-    columns.p = wp.empty(BLOCK, dtype=wp.uint8, device="cpu")
+    columns = new_event_arrays(BLOCK, "cpu")
     return columns, [columns.x.numpy(), columns.y.numpy(), columns.t.numpy(), columns.p.numpy()]
 
 

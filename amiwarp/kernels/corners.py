@@ -12,6 +12,8 @@ from typing import Any
 
 import warp as wp
 
+from amiwarp.kernels.event_arrays import EventArrays
+
 wp.set_module_options({"enable_backward": False})
 
 SMALL_CIRCLE = (
@@ -83,16 +85,6 @@ class Past:
     t: wp.array(dtype=wp.int64)
     lists: Lists
     event: int
-
-
-@wp.struct
-class Columns:
-    """Columns of events."""
-
-    x: wp.array(dtype=wp.uint16)
-    y: wp.array(dtype=wp.uint16)
-    t: wp.array(dtype=wp.int64)
-    p: wp.array(dtype=wp.uint8)
 
 
 @wp.func
@@ -209,7 +201,9 @@ def prefetch(surface: Surface, pixel: int, p: int):
 
 
 @wp.func
-def prefetch_event(events: Columns, surface: Surface, owner: wp.array(dtype=int), k: int, i: int):
+def prefetch_event(
+    events: EventArrays, surface: Surface, owner: wp.array(dtype=int), k: int, i: int
+):
     """Ask for the surroundings of event ``i`` if its band belongs to thread ``k``."""
     if i < events.t.shape[0]:
         y = int(events.y[i])
@@ -234,7 +228,7 @@ def store(surface: Surface, pixel: int, t: wp.int64, p: int, rule: Rule) -> bool
 
 @wp.kernel
 def detect_in_order(
-    events: Columns,
+    events: EventArrays,
     surface: Surface,
     rule: Rule,
     owner: wp.array(dtype=int),
@@ -267,7 +261,7 @@ def detect_in_order(
 
 @wp.kernel
 def key_events(
-    events: Columns,
+    events: EventArrays,
     surface: Surface,
     start: int,
     keys: wp.array(dtype=int),
@@ -297,7 +291,7 @@ def find_lists(keys: wp.array(dtype=int), n: int, start: int, first: wp.array(dt
 
 @wp.kernel
 def mark_fresh(
-    events: Columns,
+    events: EventArrays,
     surface: Surface,
     lists: Lists,
     rule: Rule,
@@ -345,7 +339,7 @@ def move_lists(lists: Lists, place: wp.array(dtype=int), start: int, first: wp.a
 
 @wp.kernel
 def detect_in_lists(
-    events: Columns,
+    events: EventArrays,
     surface: Surface,
     lists: Lists,
     rule: Rule,
@@ -369,7 +363,7 @@ def detect_in_lists(
 
 
 @wp.kernel
-def store_lists(events: Columns, lists: Lists, start: int, surface: Surface):
+def store_lists(events: EventArrays, lists: Lists, start: int, surface: Surface):
     """Store the last event of list ``q`` in the surfaces."""
     q = start + wp.tid()
     end = lists.first[q + 1]
@@ -378,7 +372,7 @@ def store_lists(events: Columns, lists: Lists, start: int, surface: Surface):
 
 
 @wp.kernel
-def store_last(events: Columns, lists: Lists, start: int, surface: Surface):
+def store_last(events: EventArrays, lists: Lists, start: int, surface: Surface):
     """Store time and polarity of the last event of each pixel."""
     pixel = start + wp.tid()
     last = int(-1)

@@ -19,7 +19,7 @@ from amiwarp.kernels.ecf_words import (
     word_at,
 )
 from amiwarp.kernels.event_arrays import EventArrays
-from amiwarp.kernels.native_code import store_uint8
+from amiwarp.kernels.native_code import store_uint8, store_uint16
 
 wp.set_module_options({"enable_backward": False})
 
@@ -140,11 +140,6 @@ def survey_ecf(
                     if left < 0:
                         found.damage = RUNS
     parts[index] = found
-
-
-@wp.func_native("((uint16_t*)values.data)[i] = (uint16_t)value;")
-def store_uint16(values: wp.array(dtype=wp.uint16), i: int, value: int):
-    """Store ``value`` as element ``i`` of a contiguous array of uint16."""
 
 
 @wp.func_native("for (int k = first; k < stop; ++k) ((int64_t*)values.data)[k] = value;")

@@ -3,6 +3,7 @@
 import warp as wp
 
 from amiwarp.kernels.background_activity import never
+from amiwarp.kernels.event_arrays import EventArrays, store_event
 from amiwarp.kernels.native_code import (
     load_int,
     load_int64,
@@ -13,7 +14,6 @@ from amiwarp.kernels.native_code import (
     store_int,
     store_int64,
     store_uint8,
-    store_uint16,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -203,22 +203,12 @@ def move_base(parts: FilterParts, state: FilterState, t: wp.int64):
     state.base_t[0] = t
 
 
-@wp.struct
-class EventColumns:
-    """Columns of a block of events."""
-
-    x: wp.array(dtype=wp.uint16)
-    y: wp.array(dtype=wp.uint16)
-    t: wp.array(dtype=wp.int64)
-    p: wp.array(dtype=wp.uint8)
-
-
 @wp.kernel
 def filter_events(
     parts: FilterParts,
     state: FilterState,
-    given: EventColumns,
-    kept: EventColumns,
+    given: EventArrays,
+    kept: EventArrays,
     kept_count: wp.array(dtype=int),
     removing: wp.array(dtype=wp.uint8),
     count: int,
@@ -246,10 +236,7 @@ def filter_events(
         store_int64(state.removed, number, load_int64(state.removed, number) + wp.int64(1))
         store_uint8(removing, i, number)
         # Always stored, and overwritten by the next event if this one is removed: a branch would often be mispredicted
-        store_uint16(kept.x, end, column)
-        store_uint16(kept.y, end, row)
-        store_int64(kept.t, end, t)
-        store_uint8(kept.p, end, polarity)
+        store_event(kept, end, wp.uint16(column), wp.uint16(row), t, wp.uint8(polarity))
         end += int(number == 0)
         i += 1
     kept_count[0] = end

@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
+from amiwarp.kernels.event_arrays import EventArrays
 from amiwarp.kernels.plate import PlateParams, bent_by_wedge, seen_from
 from amiwarp.kernels.refraction import compensate_direction, state_at
 
@@ -324,23 +325,13 @@ def split_places(
     matrix[i] = wp.quat_to_matrix(wp.transform_get_rotation(places[i]))
 
 
-@wp.struct
-class EventColumns:
-    """Columns of events of all cameras."""
-
-    x: wp.array(dtype=wp.uint16)
-    y: wp.array(dtype=wp.uint16)
-    t: wp.array(dtype=wp.int64)
-    p: wp.array(dtype=wp.uint8)
-
-
 @wp.kernel
 def gather_events(
-    events: EventColumns,
+    events: EventArrays,
     edges: wp.array(dtype=int),
     shift: wp.array(dtype=int),
     start: int,
-    columns: EventColumns,
+    columns: EventArrays,
 ):
     """Copy the events of a step, sorted by camera, behind the events of earlier steps of their camera.
 

@@ -20,8 +20,9 @@ from amiwarp.events.truth import Truth
 from amiwarp.imaging.windows import Windows
 from amiwarp.kernels import scene_rays
 from amiwarp.kernels.camera import camera_params
+from amiwarp.kernels.event_arrays import EventArrays, new_event_arrays
 from amiwarp.kernels.launch import launch
-from amiwarp.kernels.scene_rays import EventColumns, SceneFrames
+from amiwarp.kernels.scene_rays import SceneFrames
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models.base import Model
 from amiwarp.optics.prism import NominalPrism
@@ -542,13 +543,11 @@ def _joined(
     # Where the events of a camera in each part begin
     begins = edges[:-1] + np.cumsum(counts, axis=0) - counts
     total = int(edges[-1])
-    columns = EventColumns()
-    for name, dtype in zip(NAMES, (wp.uint16, wp.uint16, wp.int64, wp.uint8), strict=True):
-        setattr(columns, name, wp.empty(total, dtype=dtype, device=device))
+    columns = new_event_arrays(total, device)
     for (events, windows), begin in zip(parts, begins, strict=True):
         if not len(events):
             continue
-        given = EventColumns()
+        given = EventArrays()
         for name in NAMES:
             setattr(given, name, getattr(events, name))
         firsts = np.append(windows.start, len(events))
